@@ -1,0 +1,61 @@
+# Every task is the same on a laptop and in CI. `make help` lists them.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+JOBS   ?= 2
+export MPLBACKEND = Agg
+# one thread for each numerical library: this work is many small matrices, and the tests already run side by side
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: help demo install test lint types floors unit format bench clean
+
+help:  ## list the tasks
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+demo: $(VENV)/.report  ## learn a sweep from demonstrations, do it around obstacles, write demo/report.html
+	$(BIN)/imitarm demo
+
+install: $(VENV)/.dev  ## the development environment in .venv
+
+test: lint types floors unit  ## everything CI runs
+
+lint: $(VENV)/.dev  ## style and documentation
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.dev  ## strict types of src
+	$(BIN)/mypy
+
+floors: $(VENV)/.dev  ## no import goes up
+	$(BIN)/lint-imports
+
+unit: $(VENV)/.dev  ## the tests
+	$(BIN)/pytest -n $(JOBS)
+
+format: $(VENV)/.dev  ## mend what can be mended mechanically
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(VENV)/.bench  ## speed against installed peers, as ratios
+	$(BIN)/python -m imitarm.benchmark.speed
+
+clean:  ## remove the environment and everything made
+	rm -rf $(VENV) demo .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+$(BIN)/python:
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "imitarm needs Python 3.11 or newer; say make PYTHON=python3.11")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+
+$(VENV)/.report: $(BIN)/python pyproject.toml
+	$(BIN)/python -m pip install --quiet --editable '.[report]'
+	@touch $@
+
+$(VENV)/.dev: $(BIN)/python pyproject.toml
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@
+
+$(VENV)/.bench: $(VENV)/.dev pyproject.toml
+	$(BIN)/python -m pip install --quiet --editable '.[dev,bench]'
+	@touch $@

@@ -1,0 +1,1 @@
+"""Is it any good? Figures that are measured, never asserted."""

@@ -1,0 +1,1 @@
+"""Getting demonstrations ready to learn from: read, check, align."""

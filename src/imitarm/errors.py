@@ -1,0 +1,55 @@
+"""The errors that imitarm raises: one root, so that one ``except`` catches them all.
+
+Every message answers the reader's next question: what is wrong, where, and what to do about it.
+They are raised when something is built or read, not inside a control loop.
+"""
+
+from __future__ import annotations
+
+
+class ImitarmError(Exception):
+    """Root of all errors raised on purpose by imitarm.
+
+    The command line shows only the message and exits with ``exit_status``:
+    2 for bad input, 1 for a task that was understood but could not be done.
+    """
+
+    exit_status = 2
+
+
+class InputError(ImitarmError, ValueError):
+    """A value, shape, unit or option that can't be used; the message names it and the remedy."""
+
+
+class FileFormatError(InputError):
+    """A file that is damaged, foreign or not what its name says; the message names file and place."""
+
+
+class UnknownNameError(InputError):
+    """A name that is in no registry; the message lists the known ones."""
+
+    @classmethod
+    def among(cls, kind: str, name: object, known: object) -> UnknownNameError:
+        """Build the message ``unknown <kind> '<name>'; known: a, b, c``.
+
+        Args:
+            kind: what was being named, for example ``"robot"``.
+            name: the name that was given.
+            known: an iterable of the names that exist.
+        """
+        names = ", ".join(sorted(str(k) for k in known))  # type: ignore[attr-defined]
+        return cls(f"unknown {kind} {name!r}; known: {names}")
+
+
+class TaskFailedError(ImitarmError):
+    """The input was understood, but the task can't be done or was not done (exit status 1)."""
+
+    exit_status = 1
+
+
+class UnreachableError(TaskFailedError):
+    """No joint configuration within the limits reaches the pose that was asked for."""
+
+
+class InfeasibleError(TaskFailedError):
+    """No path with the asked clearance was found; the message names the obstacle and the reason."""

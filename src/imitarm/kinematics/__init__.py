@@ -1,0 +1,1 @@
+"""How an arm, human or robot, moves."""

@@ -1,0 +1,253 @@
+"""Positions and rotations: quaternions (w, x, y, z) as arrays, and the typed :class:`Pose`.
+
+All functions take and return arrays with any leading shape and are vectorised over it.
+Rotation vectors (axis times angle) are in rad. Twists are ``(6,)``: linear velocity [m/s] first,
+then angular velocity [rad/s], both in the base frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError
+
+Array = NDArray[np.float64]
+
+_UNIT_TOLERANCE = 1e-3  # how far from length one a quaternion may be and still be taken as one
+_SMALL_ANGLE = 1e-7  # [rad] below this the series of sin(a)/a is exact to double precision
+
+
+def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
+    """Return the Hamilton product ``p q``: rotate by ``q`` first, then by ``p``.
+
+    Args:
+        p: quaternions wxyz, shape (..., 4).
+        q: quaternions wxyz, shape (..., 4).
+
+    Returns:
+        Quaternions wxyz, shape (..., 4).
+    """
+    pw, px, py, pz = np.moveaxis(np.asarray(p, dtype=float), -1, 0)
+    qw, qx, qy, qz = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    return np.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        axis=-1,
+    )
+
+
+def quaternion_conjugate(q: ArrayLike) -> Array:
+    """Return the inverse rotation of unit quaternions wxyz, shape (..., 4)."""
+    return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def quaternion_exp(rotation_vector: ArrayLike) -> Array:
+    """Return unit quaternions wxyz (..., 4) of rotation vectors (..., 3) [rad]."""
+    v = np.asarray(rotation_vector, dtype=float)
+    half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * v], axis=-1)
+
+
+def quaternion_log(q: ArrayLike) -> Array:
+    """Return rotation vectors (..., 3) [rad], length at most pi, of unit quaternions wxyz (..., 4)."""
+    q = np.asarray(q, dtype=float)
+    q = np.where(q[..., :1] < 0.0, -q, q)  # q and -q are one rotation: take the short way
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, q[..., :1])
+    scale = np.where(sine > _SMALL_ANGLE, angle / np.maximum(sine, _SMALL_ANGLE), 2.0)
+    return np.asarray(scale * q[..., 1:])
+
+
+def quaternion_to_matrix(q: ArrayLike) -> Array:
+    """Return rotation matrices (..., 3, 3) of unit quaternions wxyz (..., 4)."""
+    w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def matrix_to_quaternion(matrix: ArrayLike) -> Array:
+    """Return unit quaternions wxyz (..., 4), w >= 0, of rotation matrices (..., 3, 3).
+
+    Uses the largest column of the 4x4 matrix ``4 q q^T``, so it is well conditioned at every angle
+    (the usual trace formula loses all digits near 180 degrees).
+    """
+    m = np.asarray(matrix, dtype=float)
+    m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    columns = np.stack(
+        [
+            np.stack([1 + m00 + m11 + m22, wx, wy, wz], axis=-1),
+            np.stack([wx, 1 + m00 - m11 - m22, xy, xz], axis=-1),
+            np.stack([wy, xy, 1 - m00 + m11 - m22, yz], axis=-1),
+            np.stack([wz, xz, yz, 1 - m00 - m11 + m22], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(np.diagonal(columns, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(columns, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0.0, -q, q)
+
+
+def rotate(q: ArrayLike, vectors: ArrayLike) -> Array:
+    """Rotate ``vectors`` (..., 3) by unit quaternions wxyz ``q`` (..., 4)."""
+    q, v = np.asarray(q, dtype=float), np.asarray(vectors, dtype=float)
+    t = 2.0 * np.cross(q[..., 1:], v)
+    return np.asarray(v + q[..., :1] * t + np.cross(q[..., 1:], t))
+
+
+def continuous_signs(quaternions: ArrayLike) -> Array:
+    """Flip signs along the first axis so that neighbours never jump from ``q`` to ``-q``.
+
+    Args:
+        quaternions: unit quaternions wxyz in time order, shape (n, 4).
+
+    Returns:
+        The same rotations with continuous signs, shape (n, 4).
+    """
+    q = np.asarray(quaternions, dtype=float)
+    flips = np.where(np.sum(q[1:] * q[:-1], axis=-1) < 0.0, -1.0, 1.0)
+    return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[: len(q), None])
+
+
+def slerp(times: ArrayLike, key_times: ArrayLike, key_quaternions: ArrayLike) -> Array:
+    """Interpolate rotations along the shortest arc between neighbouring keys.
+
+    Args:
+        times: query times [s], shape (n,); outside the keys the first or last rotation is held.
+        key_times: strictly increasing times [s], shape (k,).
+        key_quaternions: unit quaternions wxyz, shape (k, 4).
+
+    Returns:
+        Unit quaternions wxyz, shape (n, 4).
+    """
+    keys = np.asarray(key_times, dtype=float)
+    q = continuous_signs(key_quaternions)
+    if len(keys) == 1:
+        return np.repeat(q, len(np.atleast_1d(np.asarray(times))), axis=0)
+    t = np.clip(np.asarray(times, dtype=float), keys[0], keys[-1])
+    i = np.clip(np.searchsorted(keys, t, side="right") - 1, 0, len(keys) - 2)
+    u = ((t - keys[i]) / (keys[i + 1] - keys[i]))[:, None]
+    step = quaternion_log(quaternion_multiply(quaternion_conjugate(q[i]), q[i + 1]))
+    return continuous_signs(quaternion_multiply(q[i], quaternion_exp(u * step)))
+
+
+def mean_quaternion(quaternions: ArrayLike) -> Array:
+    """Return the rotation (4,) wxyz that is nearest to all ``quaternions`` (n, 4), signs ignored.
+
+    It is the eigenvector of the largest eigenvalue of ``sum q q^T`` (Markley et al. 2007).
+    """
+    q = np.asarray(quaternions, dtype=float).reshape(-1, 4)
+    mean = np.linalg.eigh(q.T @ q)[1][:, -1]
+    return np.asarray(mean if mean[0] >= 0.0 else -mean)
+
+
+def checked_unit_quaternions(quaternions: ArrayLike, what: str) -> Array:
+    """Return ``quaternions`` (..., 4) scaled to length one, or say which are none.
+
+    Args:
+        quaternions: quaternions wxyz, shape (..., 4).
+        what: how to name them in the error.
+
+    Raises:
+        InputError: when the shape is wrong, or a length is not one within 1e-3.
+    """
+    q = np.array(quaternions, dtype=float)
+    if q.shape[-1:] != (4,):
+        raise InputError(f"{what}: quaternions need 4 columns (w, x, y, z), got shape {q.shape}")
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    bad = ~(np.abs(length[..., 0] - 1.0) <= _UNIT_TOLERANCE)
+    if np.any(bad):
+        first = np.flatnonzero(np.atleast_1d(bad))[0]
+        raise InputError(
+            f"{what}: quaternion {first} has length {np.ravel(length)[first]:.4g}, not 1; normalise it first"
+        )
+    return np.asarray(q / length)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A position and a rotation: where a frame is, seen from another one.
+
+    A variable that holds a pose names both frames, ``tool_to_base`` maps tool coordinates to base coordinates:
+    ``p_base = R p_tool + position``.
+
+    Attributes:
+        position: shape (3,) [m].
+        quaternion: unit quaternion w, x, y, z, shape (4,).
+
+    Raises:
+        InputError: when a shape is wrong, a number is not finite or the quaternion is not of length one.
+    """
+
+    position: Array
+    quaternion: Array
+
+    def __post_init__(self) -> None:
+        position = np.array(self.position, dtype=float)
+        if position.shape != (3,) or not np.all(np.isfinite(position)):
+            raise InputError(f"Pose: position must be 3 finite numbers [m], got {self.position!r}")
+        quaternion = checked_unit_quaternions(self.quaternion, "Pose")
+        if quaternion.shape != (4,):
+            raise InputError(f"Pose: quaternion must be 4 numbers (w, x, y, z), got shape {quaternion.shape}")
+        position.setflags(write=False)
+        quaternion.setflags(write=False)
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "quaternion", quaternion)
+
+    @classmethod
+    def identity(cls) -> Pose:
+        """Return the pose of a frame in itself."""
+        return cls(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Pose:
+        """Build from a homogeneous transform, shape (4, 4)."""
+        m = np.asarray(matrix, dtype=float)
+        return cls(m[:3, 3], matrix_to_quaternion(m[:3, :3]))
+
+    @property
+    def rotation(self) -> Array:
+        """Rotation matrix, shape (3, 3)."""
+        return quaternion_to_matrix(self.quaternion)
+
+    @property
+    def matrix(self) -> Array:
+        """Homogeneous transform, shape (4, 4)."""
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = self.rotation, self.position
+        return m
+
+    def inverse(self) -> Pose:
+        """Return the pose the other way round: ``tool_to_base.inverse()`` is ``base_to_tool``."""
+        back = quaternion_conjugate(self.quaternion)
+        return Pose(-rotate(back, self.position), back)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """Chain two poses: ``b_to_a @ c_to_b`` is ``c_to_a``."""
+        q = quaternion_multiply(self.quaternion, other.quaternion)
+        return Pose(self.position + rotate(self.quaternion, other.position), q)
+
+    def apply(self, points: ArrayLike) -> Array:
+        """Map ``points`` (..., 3) [m] through this pose."""
+        return rotate(self.quaternion, points) + self.position
+
+    def error_to(self, target: Pose) -> Array:
+        """Return the displacement (6,) that takes this pose to ``target``, in the common frame.
+
+        Linear part ``p_target - p`` [m], angular part ``log(R_target R^T)`` [rad] (METHODS A.3).
+        """
+        turn = quaternion_multiply(target.quaternion, quaternion_conjugate(self.quaternion))
+        return np.concatenate([target.position - self.position, quaternion_log(turn)])

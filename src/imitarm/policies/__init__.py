@@ -1,0 +1,1 @@
+"""How a skill is reproduced around obstacles, one method a file."""

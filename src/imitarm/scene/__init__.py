@@ -1,0 +1,1 @@
+"""Where to go and what is in the way."""

@@ -1,0 +1,1 @@
+"""What is learnt from demonstrations; knows nothing of obstacles."""

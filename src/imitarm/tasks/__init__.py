@@ -1,0 +1,1 @@
+"""Whole scenes with a success test."""

@@ -1,0 +1,1 @@
+"""Drawing: 3-D playback, plots and the report."""
