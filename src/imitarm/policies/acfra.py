@@ -1,0 +1,121 @@
+"""ACFRA, adaptive collision-free reaching (thesis Chapter 4): adapt the whole path, then follow it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InfeasibleError, InputError, UnknownNameError
+from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply
+from imitarm.policies.adaptation import METHODS, Adaptation, adapt
+from imitarm.policies.policy import Observation, Policy
+
+if TYPE_CHECKING:
+    from imitarm.skills.skill import Skill
+
+Array = NDArray[np.float64]
+
+_SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learnt one is the learnt one
+
+
+class ACFRA(Policy):
+    """Adapt the whole path once, then follow it (thesis Chapter 4).
+
+    ``reset`` adapts the skill to the scene that is seen and refuses when it can't keep the clearance. ``step`` follows
+    the adapted path with the velocity that belongs to it plus a pull towards it::
+
+        twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = 1 / (1 + (|e| / e_0)^2)
+
+    so the phase ``s`` waits for a robot that lags (its speed limits, a hand that holds it) instead of cutting corners.
+
+    Attributes:
+        adaptation: what the last ``reset`` found.
+    """
+
+    def __init__(
+        self,
+        skill: Skill,
+        *,
+        method: str = "certified",
+        tool_radius: float = 0.0,
+        clearance: float = 0.02,
+        forbidden: ArrayLike = (),
+        pinned: Sequence[float] = (),
+        gain: float = 8.0,  # [1/s]
+        patience: float = 0.01,  # [m] a lag of this halves the pace
+        arrival: float = 0.003,  # [m]
+    ) -> None:
+        super().__init__(skill)
+        if method not in METHODS:
+            raise UnknownNameError.among("method", method, METHODS)
+        self._options = {
+            "method": method,
+            "tool_radius": tool_radius,
+            "clearance": clearance,
+            "forbidden": forbidden,
+            "pinned": pinned,
+        }
+        self._gain, self._patience, self._arrival = gain, patience, arrival
+        self.adaptation: Adaptation | None = None
+        self._phase = 0.0
+
+    def reset(self, observation: Observation) -> None:
+        """Adapt the path to the scene, beginning where the tool is.
+
+        Raises:
+            InfeasibleError: when the clearance can't be kept, with the obstacle and the reason.
+        """
+        away = observation.tool_to_base.error_to(self.skill.start_)
+        if not self.skill.gmr_.has_orientation_:
+            away = away[:3]
+        start = observation.tool_to_base if np.linalg.norm(away) > _SAME_PLACE else None
+        self.adaptation = adapt(self.skill, observation.scene, start=start, **self._options)  # type: ignore[arg-type]
+        if not self.adaptation.feasible and self.adaptation.method == "certified":
+            raise InfeasibleError(self.adaptation.reason)
+        path = self.adaptation.trajectory
+        self._velocity = np.gradient(path.positions, path.times, axis=0)
+        self._rotation = np.zeros((len(path), 3))
+        if path.quaternions is not None:
+            turn = quaternion_multiply(path.quaternions[1:], quaternion_conjugate(path.quaternions[:-1]))
+            self._rotation[:-1] = quaternion_log(turn) / np.diff(path.times)[:, None]
+        self._hold = observation.tool_to_base
+        self._phase = 0.0
+
+    def _target(self, adaptation: Adaptation) -> tuple[Pose, Array]:
+        """Return the desired pose and the twist (6,) that belongs to it at the present phase."""
+        path = adaptation.trajectory
+        positions, quaternions = path.at([self._phase])
+        pose = Pose(positions[0], self._hold.quaternion if quaternions is None else quaternions[0])
+        rates = np.concatenate([self._velocity, self._rotation], axis=1)
+        twist = np.array([np.interp(self._phase, path.times, column) for column in rates.T])
+        return pose, twist
+
+    def step(self, observation: Observation, dt: float) -> Array:
+        """Return the twist (6,) that follows the adapted path.
+
+        Raises:
+            InputError: when ``reset`` was not called.
+        """
+        if self.adaptation is None:
+            raise InputError("ACFRA.step: call reset(observation) first")
+        target, forward = self._target(self.adaptation)
+        error = observation.tool_to_base.error_to(target)
+        if self.adaptation.trajectory.quaternions is None:
+            error[3:] = quaternion_log(
+                quaternion_multiply(self._hold.quaternion, quaternion_conjugate(observation.tool_to_base.quaternion))
+            )
+        lag = float(np.linalg.norm(error[:3])) / self._patience
+        pace = 1.0 / (1.0 + lag**2) if self._phase < self.adaptation.trajectory.times[-1] else 0.0
+        self._phase = min(self._phase + pace * dt, float(self.adaptation.trajectory.times[-1]))
+        return pace * forward + self._gain * error
+
+    def finished(self, observation: Observation) -> bool:
+        """Tell whether the end of the path is reached within ``arrival``."""
+        if self.adaptation is None:
+            return False
+        path = self.adaptation.trajectory
+        away = np.linalg.norm(observation.tool_to_base.position - path.positions[-1])
+        return self._phase >= path.times[-1] and bool(away < self._arrival)

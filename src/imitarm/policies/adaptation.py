@@ -1,0 +1,227 @@
+"""Adapt a whole learnt path to a scene by moving only the components near an obstacle (thesis Chapter 4)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError, UnknownNameError
+from imitarm.kinematics.pose import Pose
+from imitarm.policies.certificate import Detour, distances, measured_detour
+from imitarm.policies.certified import find_detour
+from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.potential_components import push_components
+from imitarm.scene.scene import Scene
+from imitarm.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from imitarm.skills.skill import Skill
+
+Array = NDArray[np.float64]
+
+METHODS = ("certified", "mapf", "literal")
+HORIZONTAL_ONLY = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))  # stay in the plane of the table: 2-D avoidance
+NOT_DOWN = ((0.0, 0.0, -1.0),)  # never into the table
+_MOVED = 1e-6  # [m] a mean that moved less than this has not moved
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptation:
+    """What became of a skill's path in a scene.
+
+    Attributes:
+        nominal: the path without obstacles.
+        trajectory: the adapted path, same times; where it is not ``feasible``, the best attempt, not to be executed.
+        displacement: of each component's mean, shape (n_components, 3) [m].
+        moved: which components moved, shape (n_components,).
+        means: centres of the components before they moved, shape (n_components, 3) [m].
+        covariances: position covariances of the components, shape (n_components, 3, 3) [m^2].
+        responsibilities: of each component for each sample, shape (n, n_components).
+        tolerance: covariance of the demonstrations along the path, shape (n, 3, 3) [m^2].
+        min_clearance: smallest distance from the tool's sphere to an obstacle, at the samples [m]; inf without any.
+        certified_clearance: proven lower bound of it on the whole polyline through the samples [m].
+        deviation: how many demonstrated sigmas the farthest mean moved (Mahalanobis).
+        feasible: whether ``certified_clearance`` reaches what was asked.
+        reason: empty when feasible, else which obstacle is in the way and why it can't be avoided.
+        method: which method was used.
+        compute_time: of the whole adaptation [s].
+    """
+
+    nominal: Trajectory
+    trajectory: Trajectory
+    displacement: Array
+    moved: Array
+    means: Array
+    covariances: Array
+    responsibilities: Array
+    tolerance: Array
+    min_clearance: float
+    certified_clearance: float
+    deviation: float
+    feasible: bool
+    reason: str
+    method: str
+    compute_time: float
+
+    @property
+    def unmoved_share(self) -> float:
+        """Share of the components that stayed where they were learnt."""
+        return float(1.0 - np.mean(self.moved))
+
+    @property
+    def rmse_to_nominal(self) -> float:
+        """Root mean square distance between adapted and nominal path (thesis Eq 4.9 with its root) [m]."""
+        return float(np.sqrt(np.mean(np.sum((self.trajectory.positions - self.nominal.positions) ** 2, axis=1))))
+
+
+def adapt(
+    skill: Skill,
+    scene: Scene,
+    method: str = "certified",
+    *,
+    tool_radius: float = 0.0,
+    clearance: float = 0.02,
+    forbidden: ArrayLike = (),
+    pinned: Sequence[float] = (),
+    start: Pose | None = None,
+    n_samples: int = 200,
+) -> Adaptation:
+    """Adapt the whole path of a skill to the obstacles of a scene.
+
+    ``certified`` moves the affected components by the least that keeps the clearance on the whole path, or refuses and
+    says why; ``mapf`` and ``literal`` are the thesis's potential fields (see ``potential_components``), which may fail.
+    Start, goal and ``pinned`` instants do not move.
+
+    Args:
+        skill: a fitted skill.
+        scene: goal (None: the learnt one) and obstacles.
+        method: ``"certified"``, ``"mapf"`` or ``"literal"``.
+        tool_radius: radius of a sphere about the tool's tip that holds the tool [m].
+        clearance: asked distance from that sphere to every obstacle [m].
+        forbidden: directions in which nothing may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
+        pinned: instants [s] at which the path must not move, for example where the dirt lies.
+        start: where the motion begins; None: where it was learnt.
+        n_samples: samples along the path.
+
+    Returns:
+        The adaptation; look at ``feasible`` before executing it.
+
+    Raises:
+        UnknownNameError: when there is no such method.
+        InputError: when a radius, a clearance or a direction can't be used.
+    """
+    if method not in METHODS:
+        raise UnknownNameError.among("method", method, METHODS)
+    if not (0.0 <= tool_radius < np.inf and 0.0 <= clearance < np.inf):
+        raise InputError(f"tool_radius and clearance must be >= 0 m, got {tool_radius} and {clearance}")
+    axes = _unit_rows(forbidden)
+    began = time.perf_counter()
+    path = ComponentPath.of_skill(skill, n_samples=n_samples, start=start, goal=scene.goal, pinned=pinned)
+    margin = tool_radius + clearance
+    detour = _detour(path, scene, margin, method, axes)
+    certified = float(np.min(detour.bounds, initial=np.inf)) - tool_radius
+    return Adaptation(
+        nominal=path.nominal,
+        trajectory=Trajectory(path.nominal.times, detour.positions, path.nominal.quaternions),
+        displacement=detour.displacement,
+        moved=np.linalg.norm(detour.displacement, axis=1) > _MOVED,
+        means=path.means,
+        covariances=path.covariances,
+        responsibilities=path.responsibilities,
+        tolerance=path.tolerance,
+        min_clearance=float(np.min(detour.nearest, initial=np.inf)) - tool_radius,
+        certified_clearance=certified,
+        deviation=path.deviation(detour.displacement),
+        feasible=detour.feasible,
+        reason="" if detour.feasible else _reason(path, scene, detour, method, tool_radius, clearance, len(axes)),
+        method=method,
+        compute_time=time.perf_counter() - began,
+    )
+
+
+def _unit_rows(directions: ArrayLike) -> Array:
+    rows = np.asarray(directions, dtype=float)
+    rows = rows.reshape(-1, 3) if rows.size % 3 == 0 else np.full((1, 3), np.nan)
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    if not np.all(np.isfinite(length)) or np.any(length == 0.0):
+        raise InputError("forbidden: give directions as rows of 3 finite numbers, none of them zero")
+    return np.asarray(rows / length)
+
+
+def _detour(path: ComponentPath, scene: Scene, margin: float, method: str, axes: Array) -> Detour:
+    """Return the detour of the method; nothing is searched when nothing is in the way or a pinned point is covered."""
+    still = np.zeros((path.n_components, 3))
+    if not scene.obstacles:
+        return Detour(still, path.nominal.positions, np.empty(0), np.empty(0), True, 0)
+    measured = _measured(path, scene, still, margin)
+    if measured.feasible or (method == "certified" and _covers_pin(path, scene, margin)):
+        return measured
+    if method == "certified":
+        return find_detour(path, scene.obstacles, margin, forbidden=axes)
+    pushed = push_components(path, scene.obstacles, margin, method=method, forbidden=axes)
+    return _measured(path, scene, pushed, margin)
+
+
+def _measured(path: ComponentPath, scene: Scene, displacement: Array, margin: float) -> Detour:
+    positions = path.displaced(displacement)
+    distance, normal = distances(scene.obstacles, positions)
+    return measured_detour(displacement, positions, distance, normal, margin)
+
+
+def _pins(path: ComponentPath) -> NDArray[np.intp]:
+    """Return the indices of the samples that no displacement can move."""
+    return np.flatnonzero(path.basis.max(axis=1) == 0.0)
+
+
+def _covers_pin(path: ComponentPath, scene: Scene, margin: float) -> bool:
+    return bool(np.min(scene.clearance(path.nominal.positions[_pins(path)])) < margin)
+
+
+def _reason(
+    path: ComponentPath,
+    scene: Scene,
+    detour: Detour,
+    method: str,
+    tool_radius: float,
+    clearance: float,
+    n_forbidden: int,
+) -> str:
+    """Say which obstacle can't be avoided and why, in words that tell what to change."""
+    asked = f"{1e3 * clearance:.0f} mm asked"
+    pins = _pins(path)
+    at_pins = scene.clearance(path.nominal.positions[pins]) - tool_radius
+    if at_pins.min() < clearance:
+        pin = pins[int(np.argmin(at_pins))]
+        name = scene.name_of(int(scene.nearest(path.nominal.positions[pin])))
+        share = path.nominal.times[pin] / path.nominal.times[-1]
+        middle = f"pinned point at {path.nominal.times[pin]:.2f} s"
+        where = "start" if share < 0.02 else "goal" if share > 0.98 else middle
+        lies = (
+            f"covers the {where}"
+            if at_pins.min() <= 0.0
+            else f"leaves {1e3 * at_pins.min():.0f} mm at the {where} ({asked})"
+        )
+        return f"{name} {lies}, which must not move: move the obstacle, or ask for another {where.split()[0]}"
+    worst = int(np.argmin(detour.bounds))
+    left = f"{1e3 * (float(detour.bounds[worst]) - tool_radius) + 0.0:.1f} mm"
+    if method != "certified":
+        return (
+            f"the path passes {scene.name_of(worst)} at {left} ({asked}): method {method!r} pushes components and does "
+            "not look at the path between them; try method 'certified'"
+        )
+    distance = scene.obstacles[worst].signed_distance(detour.positions)
+    sample = int(np.argmin(distance))
+    others = [scene.name_of(i) for i in np.flatnonzero(detour.bounds < tool_radius + clearance) if i != worst]
+    held = path.basis[sample].sum() < 0.5
+    return (
+        f"no way round {scene.name_of(worst)} with {asked}: the best attempt leaves {left}"
+        + (f", and {', '.join(others)} too near as well" if others else "")
+        + ("; it stands too close to a point that must not move" if held else "")
+        + (f"; {n_forbidden} forbidden direction(s) were kept" if n_forbidden else "")
+        + ": move an obstacle, allow another direction, or ask for less clearance"
+    )

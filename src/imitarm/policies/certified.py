@@ -1,0 +1,246 @@
+"""Move the fewest components by the least so that the whole path keeps its clearance, or say why it can't be done.
+
+The algorithm of :func:`find_detour` (METHODS D.2.5, with its last step replaced by an exact one):
+
+1. **Side.** Take the obstacle that is violated worst. Try directions across the path; along each, the lift that every
+   violated sample needs is the exit from the inflated convex obstacle, found by Newton's method from outside, which
+   on a convex function never overshoots. The smallest amplitudes of the components that give this lift are a small
+   quadratic program. The direction that costs the least (in demonstrated variance, and in what is violated afterwards)
+   is followed, best first, until nothing is violated; the others are kept and come up again if it leads nowhere.
+2. **Least detour** (``least_detour``): on that side, the smallest displacement that keeps the clearance.
+3. **Certificate** (``certificate``): a lower bound of the distance on the whole path, not only at samples.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.policies.certificate import Detour, distances
+from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.least_detour import NEGLIGIBLE_LEVER, UNBOUNDED, LeastDetour, least_norm
+from imitarm.scene.obstacle import Obstacle
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+MAX_LIFT = 0.35  # [m] a sample that would have to move farther than this is given up in that direction
+AFFECTED_DISTANCE = 0.05  # [m] d_0 of METHODS D.2.4: components nearer than this may help
+_ANGLES = np.arange(12) * (np.pi / 6.0)
+_RING = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # directions tried across the path in 3-D
+_MAX_ROWS = 20  # violated samples that vote on a direction; the polish then holds all of them
+_REFINED = 3  # directions whose amplitudes are made smallest; the others wait with a rougher answer
+_VIOLATION_COST = 1e3  # [1/m] price of violated clearance against the style cost (METHODS D.2.5)
+_STYLE_COST = 1e-3
+_REPAIRABLE = 0.003  # [m] a violation that the polish can take out itself
+_NEWTON_STEPS = 12
+_LIFT_TOLERANCE = 1e-4  # [m]
+_THINNED = 2  # sides are rated on every second sample
+
+
+@dataclass(order=True)
+class _Node:
+    cost: float
+    order: int
+    displacement: Array = field(compare=False)
+
+
+def find_detour(
+    path: ComponentPath,
+    obstacles: Sequence[Obstacle],
+    margin: float,
+    *,
+    forbidden: Array,
+    max_choices: int = 60,
+) -> Detour:
+    """Move components so that the path stays ``margin`` away from every obstacle.
+
+    Args:
+        path: the nominal path and its components.
+        obstacles: convex obstacles.
+        margin: tool radius plus asked clearance [m].
+        forbidden: directions in which no component may move, unit rows, shape (m, 3); each displacement has
+            ``Delta . f <= 0``. A direction and its opposite forbid the axis.
+        max_choices: how many choices of a side before giving up.
+
+    Returns:
+        The detour; when it is not feasible, the best attempt with its bounds.
+    """
+    search = _Search(path, obstacles, margin, forbidden)
+    return search.run(max_choices)
+
+
+class _Search:
+    """One call's arrays: the state of the best-first search over sides, and the polish."""
+
+    def __init__(self, path: ComponentPath, obstacles: Sequence[Obstacle], margin: float, forbidden: Array) -> None:
+        self.path, self.obstacles, self.margin, self.forbidden = path, obstacles, margin, forbidden
+        self.least = LeastDetour(path, obstacles, margin, forbidden)
+        self.wanted = self.least.wanted
+
+    def run(self, max_choices: int) -> Detour:
+        heap = [_Node(0.0, 0, np.zeros((self.path.n_components, 3)))]
+        best: Detour | None = None
+        order = expanded = 0
+        while heap:
+            node = heapq.heappop(heap)
+            positions = self.path.displaced(node.displacement)
+            distance, normal = distances(self.obstacles, positions)
+            bounds = distance.min(axis=1)
+            detour = Detour(node.displacement, positions, bounds, bounds, False, expanded)
+            if bounds.min() >= self.wanted - _REPAIRABLE:
+                detour = self.least.shrink(detour, distance, normal)
+            if best is None or detour.bounds.min() > best.bounds.min():
+                best = detour
+            if detour.feasible or expanded >= max_choices:
+                break
+            expanded += 1
+            for cost, displacement in self._children(node.displacement, positions, distance, normal):
+                order += 1
+                heapq.heappush(heap, _Node(cost, order, displacement))
+        assert best is not None
+        return best
+
+    def _children(
+        self, displacement: Array, positions: Array, distance: Array, normal: Array
+    ) -> list[tuple[float, Array]]:
+        """Return what each direction round the worst obstacle leads to: (cost, displacement), affordable ones only."""
+        worst = int(np.argmin(distance.min(axis=1)))
+        rows = np.flatnonzero((distance[worst] < self.wanted) & self.least.movable)
+        if not len(rows):
+            return []
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, _MAX_ROWS).astype(int))] if len(rows) > _MAX_ROWS else rows
+        directions = self._directions(positions, normal[worst], int(np.argmin(distance[worst])))
+        affected = self._affected(rows, displacement, worst)
+        lever = self.path.basis[np.ix_(rows, affected)]
+        lifts = self._exits(self.obstacles[worst], positions[rows], directions)
+        children, costs, entered = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
+        if entered:  # the best way out of this obstacle runs into another one: also try to go beyond all of them
+            for i in range(len(self.obstacles)):
+                if i != worst:
+                    lifts = np.maximum(lifts, self._exits(self.obstacles[i], positions[rows], directions))
+            more, prices, _ = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
+            children, costs = children + more, costs + prices
+        return list(zip(costs, children, strict=True))
+
+    def _rated(
+        self,
+        displacement: Array,
+        lever: Array,
+        lifts: Array,
+        directions: Array,
+        affected: Index,
+        worst: int,
+        distance: Array,
+    ) -> tuple[list[Array], list[float], bool]:
+        """Turn lifts (m, p) along directions (m, 3) into displacements with their costs.
+
+        All directions are first rated with one amplitude for all affected components; the best few then get the
+        smallest amplitudes that do. Also tells whether the cheapest one comes nearer to another obstacle than before.
+        """
+        uniform = (lifts / np.maximum(lever.sum(axis=1), NEGLIGIBLE_LEVER)).max(axis=1, initial=0.0)
+        affordable = uniform <= 2.0 * MAX_LIFT
+        if not affordable.any():
+            return [], [], True
+        lifts, directions, uniform = lifts[affordable], directions[affordable], uniform[affordable]
+        children = np.repeat(displacement[None], len(uniform), axis=0)
+        children[:, affected] += (uniform[:, None] * directions)[:, None, :]
+        costs, _ = self._costs(children)
+        best = np.argsort(costs)[:_REFINED]
+        for i in best:
+            amplitude = self._amplitudes(lever, lifts[i], directions[i], affected)
+            if amplitude is not None:
+                children[i] = displacement
+                children[i, affected] += amplitude[:, None] * directions[i]
+        costs[best], violation = self._costs(children[best])
+        before = np.maximum(0.0, self.wanted - distance[:, ::_THINNED]).sum(axis=1)
+        after = violation[:, np.argmin(costs[best])]
+        entered = bool(np.any(np.delete(after - before, worst) > 0.0))
+        return list(children), costs.tolist(), entered
+
+    def _costs(self, displacements: Array) -> tuple[Array, Array]:
+        """Rate displacements (c, n_components, 3): demonstrated variance they use up, and clearance still violated.
+
+        Returns:
+            costs (c,) and, by obstacle, the violation summed over every second sample (n_obstacles, c) [m].
+        """
+        style = np.einsum("ckd,kde,cke->c", displacements, self.least.precisions, displacements)
+        sampled = self.path.nominal.positions[::_THINNED] + self.path.basis[::_THINNED] @ displacements
+        lacking = [np.maximum(0.0, self.wanted - o.signed_distance(sampled)).sum(axis=1) for o in self.obstacles]
+        violation = np.stack(lacking)
+        return _STYLE_COST * style + _THINNED * _VIOLATION_COST * violation.sum(axis=0), violation
+
+    def _directions(self, positions: Array, normal: Array, at: int) -> Array:
+        """Return unit directions (m, 3) across the path at sample ``at``, none of them forbidden."""
+        tangent = positions[min(at + 1, len(positions) - 1)] - positions[max(at - 1, 0)]
+        tangent = tangent / max(float(np.sqrt(tangent @ tangent)), 1e-12)
+        # The columns of a Householder reflection that takes an axis to the tangent are a basis across it.
+        axis = int(np.argmax(np.abs(tangent)))
+        v = tangent.copy()
+        v[axis] += np.copysign(1.0, tangent[axis])
+        across = np.delete(np.eye(3) - np.outer(v, v) * (2.0 / (v @ v)), axis, axis=0)
+        candidates = np.vstack([_RING @ across, normal[at] - (normal[at] @ tangent) * tangent])
+        for _ in range(2 if len(self.forbidden) else 0):  # taking out one part may bring back a little of another
+            for f in self.forbidden:
+                candidates = candidates - np.maximum(candidates @ f, 0.0)[:, None] * f
+        length = np.sqrt(np.einsum("md,md->m", candidates, candidates))
+        candidates = candidates[length > 0.25] / length[length > 0.25, None]
+        return np.unique(np.round(candidates, 9) + 0.0, axis=0) if len(self.forbidden) else candidates
+
+    def _exits(self, obstacle: Obstacle, points: Array, directions: Array) -> Array:
+        """Return how far each point has to go along each direction to be clear for good.
+
+        Newton's method from ``MAX_LIFT`` inwards: the signed distance along a ray is convex, so it comes down to the
+        largest root without passing it. A ray that is still inside at ``MAX_LIFT`` gets inf.
+
+        Args:
+            obstacle: the one to leave.
+            points: shape (p, 3).
+            directions: unit, shape (m, 3).
+
+        Returns:
+            Lifts, shape (m, p) [m].
+        """
+        lift = np.full((len(directions), len(points)), MAX_LIFT)
+        blocked = np.zeros(lift.shape, dtype=bool)
+        for iteration in range(_NEWTON_STEPS):
+            d, n = obstacle.distance_and_gradient(points + lift[..., None] * directions[:, None, :])
+            gap = d - self.wanted
+            if iteration == 0:
+                blocked = gap < 0.0
+            slope = (n @ directions[:, :, None])[..., 0]
+            falling = slope <= 1e-9  # past the point of closest approach: the ray never enters
+            lift = np.where(falling, 0.0, np.maximum(lift - gap / np.where(falling, 1.0, slope), 0.0))
+            if np.all((gap < _LIFT_TOLERANCE) | (lift <= 0.0)):
+                break
+        return np.where(blocked, np.inf, lift)
+
+    def _affected(self, rows: Index, displacement: Array, worst: int) -> Index:
+        """Return the indices of the components near the obstacle or in charge of a violated sample (METHODS D.2.4)."""
+        centre, normal = self.obstacles[worst].distance_and_gradient(self.path.means + displacement)
+        spread = np.sqrt(np.einsum("kd,kde,ke->k", normal, self.path.covariances, normal))
+        near = centre - spread - self.margin <= AFFECTED_DISTANCE
+        in_charge = self.path.responsibilities[rows].max(axis=0) > 0.25
+        return np.flatnonzero((near | in_charge) & (self.path.basis[rows].max(axis=0) > NEGLIGIBLE_LEVER))
+
+    def _amplitudes(self, lever: Array, lift: Array, u: Array, affected: Index) -> Array | None:
+        """Return amplitudes a >= 0 of least ``sum a_k^2 / (u^T Sigma_k u)`` with ``lever @ a >= lift``, or None.
+
+        Args:
+            lever: basis of the violated samples and affected components, shape (p, k).
+            lift: what each sample needs, shape (p,) [m].
+            u: unit direction (3,).
+            affected: indices of the components, shape (k,).
+
+        Returns:
+            Amplitudes (k,) [m].
+        """
+        spread = np.sqrt(np.einsum("d,kde,e->k", u, self.path.covariances[affected], u))
+        upper = np.concatenate([2.0 * MAX_LIFT / spread, np.full(len(lift), UNBOUNDED)])
+        lower = np.concatenate([np.zeros(len(spread)), lift])
+        z = least_norm(lever * spread, lower, upper)
+        return None if z is None else spread * z

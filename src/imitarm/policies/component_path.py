@@ -1,0 +1,130 @@
+"""A learnt path taken apart into its Gaussian components, so that only some of them need to move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.pose import Pose
+from imitarm.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from imitarm.skills.skill import Skill
+
+Array = NDArray[np.float64]
+
+PIN_WIDTH = 0.06  # share of the duration over which a pinned instant lets go of the path (METHODS D.2.3)
+NEGLIGIBLE_RESPONSIBILITY = 1e-6  # below this a component's influence is cut, so that "unmoved" is bit-identical
+TOLERANCE_FLOOR = 0.005  # [m] nobody demonstrates more precisely than this: keeps planar covariances invertible
+
+
+def quintic_step(u: ArrayLike) -> Array:
+    """Return the smooth step ``10 u^3 - 15 u^4 + 6 u^5`` of ``u`` clipped to [0, 1], elementwise."""
+    v = np.clip(np.asarray(u, dtype=float), 0.0, 1.0)
+    return np.asarray(v**3 * (10.0 - 15.0 * v + 6.0 * v**2))
+
+
+@dataclass(frozen=True, eq=False)
+class ComponentPath:
+    r"""The nominal path, and what moving its components does to it.
+
+    Time-driven GMR gives ``x0(t) = sum_k h_k(t) m_k(t)``, and the responsibilities ``h_k(t)`` depend on time alone.
+    Moving the mean of component ``k`` by ``Delta_k`` therefore changes the path by an affine, smooth amount
+    (METHODS D.2.3)::
+
+        x(t) = x0(t) + w(t) sum_k h_k(t) Delta_k  =  x0(t) + basis(t) @ Delta
+
+    where the window ``w`` is a quintic step that is 0 at every pinned instant (start, goal, contact points) and 1
+    elsewhere. Components with ``Delta_k = 0`` change nothing at all.
+
+    Attributes:
+        nominal: the path without obstacles, n samples.
+        responsibilities: h, shape (n, n_components).
+        basis: w h, shape (n, n_components).
+        means: centres of the components on the nominal path, shape (n_components, 3) [m].
+        covariances: position covariances of the components, floored at (5 mm)^2, (n_components, 3, 3) [m^2].
+        tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
+    """
+
+    nominal: Trajectory
+    responsibilities: Array
+    basis: Array
+    means: Array
+    covariances: Array
+    tolerance: Array
+
+    @classmethod
+    def of_skill(
+        cls,
+        skill: Skill,
+        *,
+        n_samples: int = 200,
+        start: Pose | None = None,
+        goal: Pose | None = None,
+        pinned: Sequence[float] = (),
+    ) -> ComponentPath:
+        """Take the path of a skill apart.
+
+        Args:
+            skill: a fitted skill.
+            n_samples: samples along the path.
+            start: where the motion begins; None: where it was learnt.
+            goal: where the motion ends; None: where it was learnt. A moved start or goal bends the nominal path by
+                the skill's DMP, and the components ride on it.
+            pinned: further instants [s] at which the path must not move, for example a contact point.
+
+        Raises:
+            InputError: when there are fewer than 10 samples or a pinned instant is outside the motion.
+        """
+        if n_samples < 10:
+            raise InputError(f"n_samples must be at least 10, got {n_samples}")
+        gmr = skill.gmr_
+        times = np.linspace(0.0, skill.duration_, n_samples)
+        outside = [p for p in pinned if not 0.0 <= p <= skill.duration_]
+        if outside:
+            raise InputError(f"pinned instant {outside[0]:g} s is outside the motion (0 to {skill.duration_:g} s)")
+        mean, tolerance = gmr.predict(times)
+        quaternions = gmr.predict_orientation(times)[0] if gmr.has_orientation_ else None
+        responsibilities = gmr.responsibilities(times)
+        means = gmr.position_means_
+        if start is not None or goal is not None:
+            moved = skill.generate(start, goal, skill.duration_, skill.duration_ / (n_samples - 1))
+            centre_times = np.clip(gmr.time_means_, times[0], times[-1])
+            shift = moved.positions - mean
+            means = means + np.stack([np.interp(centre_times, times, column) for column in shift.T], axis=1)
+            mean, quaternions = moved.positions, moved.quaternions
+        window = _window(times, [0.0, skill.duration_, *pinned])
+        influence = np.where(responsibilities < NEGLIGIBLE_RESPONSIBILITY, 0.0, responsibilities)
+        return cls(
+            nominal=Trajectory(times, mean, quaternions),
+            responsibilities=responsibilities,
+            basis=window[:, None] * influence,
+            means=means,
+            covariances=gmr.position_covariances_ + TOLERANCE_FLOOR**2 * np.eye(3),
+            tolerance=tolerance,
+        )
+
+    @property
+    def n_components(self) -> int:
+        """Number of components."""
+        return len(self.means)
+
+    def displaced(self, displacement: Array) -> Array:
+        """Return the positions (..., n, 3) when the means move by ``displacement`` (..., n_components, 3) [m]."""
+        return self.nominal.positions + self.basis @ displacement
+
+    def deviation(self, displacement: Array) -> float:
+        """Return the largest Mahalanobis length of a mean's displacement: how many demonstrated sigmas it moved."""
+        solved = np.linalg.solve(self.covariances, displacement[..., None])[..., 0]
+        return float(np.sqrt(np.max(np.sum(displacement * solved, axis=-1), initial=0.0)))
+
+
+def _window(times: Array, pins: Sequence[float]) -> Array:
+    """Return w (n,): 0 at each pinned instant, 1 beyond ``PIN_WIDTH`` of the duration from all of them."""
+    distance = np.min(np.abs(times[:, None] - np.asarray(pins)[None, :]), axis=1)
+    return quintic_step(distance / (PIN_WIDTH * (times[-1] - times[0])))

@@ -1,0 +1,112 @@
+"""The least displacement of components that keeps the clearance, once it is known on which side to pass.
+
+With one tangent plane for each sample and obstacle, "keep the clearance" is a set of linear inequalities in the
+displacements, and because the planes under-estimate the distance, each of their solutions truly keeps it (an inner
+convex approximation). Minimising ``sum_k Delta_k^T Sigma_k^-1 Delta_k`` under them and renewing the planes never leaves
+the feasible set and never gets worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.policies.certificate import Detour, distances, measured_detour
+from imitarm.policies.component_path import ComponentPath
+from imitarm.scene.obstacle import Obstacle
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+NEGLIGIBLE_LEVER = 1e-3  # a sample that no component can move has no row
+UNBOUNDED = 1e30  # daqp's infinity
+_INFLUENCE = 0.06  # [m] obstacles farther from a sample than this get no row
+_STEPS = 6
+_GAIN = 0.97  # stop when a step saves less than 3 %
+_SOLVED = 1  # daqp's exit flag of an optimal solution
+
+
+def least_norm(rows: Array, lower: Array, upper: Array) -> Array | None:
+    """Solve ``min |y|^2`` under ``lower <= rows @ y <= upper`` by an exact active-set method (daqp).
+
+    Args:
+        rows: shape (m, n).
+        lower: shape (m,) or, to bound y itself as well, (n + m,).
+        upper: as ``lower``.
+
+    Returns:
+        y, shape (n,); None when there is no solution.
+    """
+    n = rows.shape[1]
+    y, _, flag, _ = daqp.solve(np.eye(n), np.zeros(n), np.ascontiguousarray(rows), upper, lower)
+    return np.asarray(y) if flag == _SOLVED else None
+
+
+class LeastDetour:
+    """Shrinks detours of one path among one set of obstacles.
+
+    Attributes:
+        wanted: distance planned for at the samples: the margin, and what a chord may sag between two of them [m].
+        precisions: inverse covariances of the components, shape (n_components, 3, 3) [1/m^2].
+        movable: which samples some component can move, shape (n,).
+    """
+
+    def __init__(self, path: ComponentPath, obstacles: Sequence[Obstacle], margin: float, forbidden: Array) -> None:
+        self.path, self.obstacles, self.margin, self.forbidden = path, obstacles, margin, forbidden
+        step = float(np.linalg.norm(np.diff(path.nominal.positions, axis=0), axis=1).max())
+        # A chord of a circle of radius `margin` sags by step^2 / 8 margin.
+        self.wanted = margin + 1e-4 + 1.5 * step**2 / (8.0 * max(margin, 1e-3))
+        self.factors = np.linalg.cholesky(path.covariances)
+        self.precisions = np.linalg.inv(path.covariances)
+        self.movable = path.basis.max(axis=1) > NEGLIGIBLE_LEVER
+
+    def shrink(self, detour: Detour, distance: Array, normal: Array) -> Detour:
+        """Shrink a displacement to the least one that its tangents allow; where a segment dips, ask for more there."""
+        best = measured_detour(detour.displacement, detour.positions, distance, normal, self.margin, detour.expanded)
+        moved = np.flatnonzero(np.any(detour.displacement != 0.0, axis=1))
+        positions, wanted, cost = detour.positions, self.wanted, np.inf
+        for _ in range(_STEPS if len(moved) else 0):
+            displacement = self._least(moved, positions, distance, normal, wanted)
+            if displacement is None:
+                break
+            positions = self.path.displaced(displacement)
+            distance, normal = distances(self.obstacles, positions)
+            trial = measured_detour(displacement, positions, distance, normal, self.margin, detour.expanded)
+            if not trial.feasible:
+                if trial.bounds.min() > best.bounds.min():
+                    best = trial
+                wanted += 1.2 * (self.margin - float(trial.bounds.min())) + 1e-6
+                continue
+            best = trial
+            previous, cost = cost, float(np.einsum("kd,kde,ke->", displacement, self.precisions, displacement))
+            if cost > _GAIN * previous:
+                break
+        return best
+
+    def _least(self, moved: Index, positions: Array, distance: Array, normal: Array, wanted: float) -> Array | None:
+        """Minimise ``sum Delta_k^T Sigma_k^-1 Delta_k`` under the tangents at ``positions``; None: no solution.
+
+        With ``Sigma_k = L_k L_k^T`` and ``Delta_k = L_k y_k`` the cost is ``|y|^2``, so it is a least-norm problem.
+        """
+        o, j = np.nonzero((distance < wanted + _INFLUENCE) & self.movable)
+        n = normal[o, j]
+        factors = self.factors[moved]
+        rows = self.path.basis[np.ix_(j, moved)][:, :, None] * np.swapaxes(n @ factors, 0, 1)
+        offset = np.einsum("rd,rd->r", n, positions[j] - self.path.nominal.positions[j])
+        lower = wanted - distance[o, j] + offset
+        size = 3 * len(moved)
+        if len(self.forbidden):
+            blocks = np.zeros((len(self.forbidden), len(moved), len(moved), 3))
+            index = np.arange(len(moved))
+            blocks[:, index, index] = np.swapaxes(self.forbidden @ factors, 0, 1)
+            rows = np.vstack([rows.reshape(-1, size), -blocks.reshape(-1, size)])
+            lower = np.concatenate([lower, np.zeros(len(self.forbidden) * len(moved))])
+        y = least_norm(rows.reshape(-1, size), lower, np.full(len(lower), UNBOUNDED))
+        if y is None:
+            return None
+        displacement = np.zeros((self.path.n_components, 3))
+        displacement[moved] = (factors @ y.reshape(-1, 3, 1))[..., 0]
+        return displacement

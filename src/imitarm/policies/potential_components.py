@@ -1,0 +1,107 @@
+r"""ACFRA as the thesis has it: push the components' means by a repulsive potential (thesis Eqs 4.2-4.8, METHODS D.2.2).
+
+Two readings share one descent. With ``d`` the distance from an obstacle to the component's ellipse, ``n`` the outward
+normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the obstacle:
+
+* ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The last term does not depend on the
+  position, so it drops out of the force: the spread has no effect.
+* ``mapf``: the dimensionless form that does what the text says,
+  ``U = 1/2 eta s d_th^2 (1/rho - 1)^2`` with ``rho = d / d_th`` and a gain ``s = exp((sigma(n)^2 - mean) / max)`` that
+  lets loosely demonstrated components yield more.
+
+Neither knows whether the path *between* two pushed means is clear, and two components on both sides of an obstacle are
+pushed apart, so that the path goes through it. They are kept to be compared with; ``certified`` is the default.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.policies.component_path import ComponentPath
+from imitarm.scene.obstacle import Obstacle
+
+Array = NDArray[np.float64]
+
+INFLUENCE_DISTANCE = 0.05  # [m] d_0: farther obstacles push nothing
+_STEP = 0.002  # [m] the most that a mean moves in one iteration
+_ITERATIONS = 200
+_RHO_MIN = 0.15  # distances are floored here: inside an obstacle the push stays finite
+_GAIN_RANGE = (0.25, 4.0)
+
+
+def component_distances(
+    path: ComponentPath, displacement: Array, obstacles: Sequence[Obstacle], margin: float
+) -> tuple[Array, Array, Array]:
+    """Return how far the components' one-sigma ellipses are from the inflated obstacles (METHODS D.2.1).
+
+    ``d = sd(mu) - sqrt(n^T Sigma n) - margin``: the ellipse's support towards the obstacle is taken off the centre's
+    distance. Exact for spheres, a lower bound for every convex obstacle that the centre is outside of.
+
+    Returns:
+        distances (n_obstacles, n_components) [m], normals (n_obstacles, n_components, 3) and spreads
+        sigma(n) (n_obstacles, n_components) [m].
+    """
+    pairs = [obstacle.distance_and_gradient(path.means + displacement) for obstacle in obstacles]
+    centre, normal = np.stack([d for d, _ in pairs]), np.stack([n for _, n in pairs])
+    spread = np.sqrt(np.einsum("okd,kde,oke->ok", normal, path.covariances, normal))
+    return centre - spread - margin, normal, spread
+
+
+def literal_force(distance: Array, normal: Array, spread: Array) -> Array:
+    """Return the force of Eq 4.7 as printed, ``k (1/d - 1/d_th) / d^2 n`` with k = 1.
+
+    Args:
+        distance: ellipse to obstacle, (n_obstacles, n_components) [m].
+        normal: outward normals, (n_obstacles, n_components, 3).
+        spread: not used: ``exp(sigma^2)`` is constant in the position, and its gradient is zero.
+    """
+    del spread
+    d = np.clip(distance, _RHO_MIN * INFLUENCE_DISTANCE, INFLUENCE_DISTANCE)
+    return ((1.0 / d - 1.0 / INFLUENCE_DISTANCE) / d**2)[..., None] * normal
+
+
+def modified_force(distance: Array, normal: Array, spread: Array) -> Array:
+    """Return ``s d_th (1/rho - 1) / rho^2 n``: minus the gradient of the modified potential (METHODS D.2.2).
+
+    Args:
+        distance: ellipse to obstacle, (n_obstacles, n_components) [m].
+        normal: outward normals, (n_obstacles, n_components, 3).
+        spread: sigma(n), (n_obstacles, n_components) [m]; the gain's mean and maximum are taken over it.
+    """
+    variance = spread**2
+    gain = np.clip(np.exp((variance - np.median(variance)) / variance.max()), *_GAIN_RANGE)
+    rho = np.clip(distance / INFLUENCE_DISTANCE, _RHO_MIN, 1.0)
+    return (gain * INFLUENCE_DISTANCE * (1.0 / rho - 1.0) / rho**2)[..., None] * normal
+
+
+FORCES = {"literal": literal_force, "mapf": modified_force}
+
+
+def push_components(
+    path: ComponentPath, obstacles: Sequence[Obstacle], margin: float, *, method: str, forbidden: Array
+) -> Array:
+    """Let the potential push the means until nothing is within its influence, or 200 steps are done.
+
+    Args:
+        path: the nominal path and its components.
+        obstacles: obstacles with signed distance and gradient.
+        margin: tool radius plus asked clearance [m].
+        method: ``"literal"`` or ``"mapf"``.
+        forbidden: directions in which no mean may move, unit rows (m, 3).
+
+    Returns:
+        The displacement of each mean, shape (n_components, 3) [m].
+    """
+    displacement = np.zeros((path.n_components, 3))
+    for _ in range(_ITERATIONS):
+        force = FORCES[method](*component_distances(path, displacement, obstacles, margin)).sum(axis=0)
+        for f in forbidden:
+            force = force - np.maximum(force @ f, 0.0)[:, None] * f
+        size = np.linalg.norm(force, axis=1, keepdims=True)
+        if size.max() < 1e-9:
+            break
+        displacement += _STEP * force / np.maximum(size, 1.0)
+    return displacement
