@@ -158,28 +158,22 @@ def _detour(path: ComponentPath, scene: Scene, margin: float, method: str, axes:
     still = np.zeros((path.n_components, 3))
     if not scene.obstacles:
         return Detour(still, path.nominal.positions, np.empty(0), np.empty(0), True, 0)
-    measured = _measured(path, scene, still, margin)
-    if measured.feasible or (method == "certified" and _covers_pin(path, scene, margin)):
-        return measured
-    if method == "certified":
-        return find_detour(path, scene.obstacles, margin, forbidden=axes)
-    pushed = push_components(path, scene.obstacles, margin, method=method, forbidden=axes)
-    return _measured(path, scene, pushed, margin)
-
-
-def _measured(path: ComponentPath, scene: Scene, displacement: Array, margin: float) -> Detour:
-    positions = path.displaced(displacement)
+    positions = path.nominal.positions
     distance, normal = distances(scene.obstacles, positions)
-    return measured_detour(displacement, positions, distance, normal, margin)
+    unmoved = measured_detour(still, positions, distance, normal, margin)
+    if unmoved.feasible:
+        return unmoved
+    if method == "certified":
+        covered = bool(distance[:, _pins(path)].min() < margin)
+        return unmoved if covered else find_detour(path, scene.obstacles, margin, distance, normal, forbidden=axes)
+    pushed = push_components(path, scene.obstacles, margin, method=method, forbidden=axes)
+    positions = path.displaced(pushed)
+    return measured_detour(pushed, positions, *distances(scene.obstacles, positions), margin)
 
 
 def _pins(path: ComponentPath) -> NDArray[np.intp]:
     """Return the indices of the samples that no displacement can move."""
     return np.flatnonzero(path.basis.max(axis=1) == 0.0)
-
-
-def _covers_pin(path: ComponentPath, scene: Scene, margin: float) -> bool:
-    return bool(np.min(scene.clearance(path.nominal.positions[_pins(path)])) < margin)
 
 
 def _reason(

@@ -53,6 +53,8 @@ def find_detour(
     path: ComponentPath,
     obstacles: Sequence[Obstacle],
     margin: float,
+    distance: Array,
+    normal: Array,
     *,
     forbidden: Array,
     max_choices: int = 60,
@@ -63,6 +65,8 @@ def find_detour(
         path: the nominal path and its components.
         obstacles: convex obstacles.
         margin: tool radius plus asked clearance [m].
+        distance: of the nominal path's samples to each obstacle, shape (n_obstacles, n) [m].
+        normal: gradients there, shape (n_obstacles, n, 3).
         forbidden: directions in which no component may move, unit rows, shape (m, 3); each displacement has
             ``Delta . f <= 0``. A direction and its opposite forbid the axis.
         max_choices: how many choices of a side before giving up.
@@ -71,7 +75,7 @@ def find_detour(
         The detour; when it is not feasible, the best attempt with its bounds.
     """
     search = _Search(path, obstacles, margin, forbidden)
-    return search.run(max_choices)
+    return search.run(max_choices, distance, normal)
 
 
 class _Search:
@@ -82,14 +86,16 @@ class _Search:
         self.least = LeastDetour(path, obstacles, margin, forbidden)
         self.wanted = self.least.wanted
 
-    def run(self, max_choices: int) -> Detour:
+    def run(self, max_choices: int, distance: Array, normal: Array) -> Detour:
+        """Follow the cheapest choice of sides until one is feasible; begin at the nominal path."""
         heap = [_Node(0.0, 0, np.zeros((self.path.n_components, 3)))]
         best: Detour | None = None
         order = expanded = 0
         while heap:
             node = heapq.heappop(heap)
             positions = self.path.displaced(node.displacement)
-            distance, normal = distances(self.obstacles, positions)
+            if node.order > 0:
+                distance, normal = distances(self.obstacles, positions)
             bounds = distance.min(axis=1)
             detour = Detour(node.displacement, positions, bounds, bounds, False, expanded)
             if bounds.min() >= self.wanted - _REPAIRABLE:

@@ -67,7 +67,8 @@ class LeastDetour:
         """Shrink a displacement to the least one that its tangents allow; where a segment dips, ask for more there."""
         best = measured_detour(detour.displacement, detour.positions, distance, normal, self.margin, detour.expanded)
         moved = np.flatnonzero(np.any(detour.displacement != 0.0, axis=1))
-        positions, wanted, cost = detour.positions, self.wanted, np.inf
+        positions, wanted = detour.positions, self.wanted
+        cost = self._cost(detour.displacement)
         for _ in range(_STEPS if len(moved) else 0):
             displacement = self._least(moved, positions, distance, normal, wanted)
             if displacement is None:
@@ -81,10 +82,13 @@ class LeastDetour:
                 wanted += 1.2 * (self.margin - float(trial.bounds.min())) + 1e-6
                 continue
             best = trial
-            previous, cost = cost, float(np.einsum("kd,kde,ke->", displacement, self.precisions, displacement))
+            previous, cost = cost, self._cost(displacement)
             if cost > _GAIN * previous:
                 break
         return best
+
+    def _cost(self, displacement: Array) -> float:
+        return float(np.einsum("kd,kde,ke->", displacement, self.precisions, displacement))
 
     def _least(self, moved: Index, positions: Array, distance: Array, normal: Array, wanted: float) -> Array | None:
         """Minimise ``sum Delta_k^T Sigma_k^-1 Delta_k`` under the tangents at ``positions``; None: no solution.

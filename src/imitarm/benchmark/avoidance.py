@@ -1,0 +1,176 @@
+"""How often a method keeps its clearance, over hundreds of seeded scenes: ``python -m imitarm.benchmark.avoidance``.
+
+Success is judged on 4000 points of the path that would be executed, not on the samples that the method planned with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from imitarm.benchmark.families import (
+    CLEARANCE,
+    TOOL_RADIUS,
+    Case,
+    covered_end,
+    narrow_gap,
+    s_shaped_demonstrations,
+    sparse_clutter,
+)
+from imitarm.policies.adaptation import METHODS, Adaptation, adapt
+from imitarm.skills.skill import Skill
+
+Array = NDArray[np.float64]
+
+SLACK = 0.0005  # [m] a path that keeps the asked clearance less this counts as keeping it
+_DENSE = 4000
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a method did in one scene.
+
+    Attributes:
+        accepted: the method said that its path can be executed.
+        kept: the path keeps the asked clearance (less 0.5 mm) on the dense geometry.
+        collision_free: the path touches nothing on the dense geometry.
+        clearance: smallest distance on the dense geometry [m].
+        rmse: root mean square distance to the nominal path [m].
+        unmoved: share of components that did not move.
+        seconds: compute time [s].
+    """
+
+    accepted: bool
+    kept: bool
+    collision_free: bool
+    clearance: float
+    rmse: float
+    unmoved: float
+    seconds: float
+
+
+def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Return the Wilson score interval of a rate (95 % by default).
+
+    Args:
+        successes: how often it went well, 0 to ``trials``.
+        trials: how often it was tried, at least 1.
+        z: normal quantile of the confidence.
+    """
+    p = successes / trials
+    centre = p + z * z / (2 * trials)
+    spread = z * np.sqrt(p * (1 - p) / trials + z * z / (4 * trials**2))
+    scale = 1 + z * z / trials
+    return max(0.0, float((centre - spread) / scale)), min(1.0, float((centre + spread) / scale))
+
+
+def learn(*, planar: bool) -> tuple[Skill, Array]:
+    """Learn the S-shaped reach with 8 components; return the skill and its path (400, 3) [m]."""
+    skill = Skill(n_components=8).fit(s_shaped_demonstrations(planar=planar))
+    path, _ = skill.gmr_.predict(np.linspace(0.0, skill.duration_, 400))
+    return skill, path
+
+
+def judge(case: Case, adaptation: Adaptation) -> Outcome:
+    """Measure an adaptation on the dense geometry of its scene."""
+    times = adaptation.trajectory.times
+    points, _ = adaptation.trajectory.at(np.linspace(times[0], times[-1], _DENSE))
+    clearance = float(np.min(case.scene.clearance(points))) - TOOL_RADIUS
+    return Outcome(
+        accepted=adaptation.feasible,
+        kept=clearance >= CLEARANCE - SLACK,
+        collision_free=clearance > 0.0,
+        clearance=clearance,
+        rmse=adaptation.rmse_to_nominal,
+        unmoved=adaptation.unmoved_share,
+        seconds=adaptation.compute_time,
+    )
+
+
+def run_family(skill: Skill, cases: Iterable[Case], method: str = "certified") -> list[Outcome]:
+    """Let one method adapt one skill to every case."""
+    outcomes = []
+    for case in cases:
+        adaptation = adapt(
+            skill, case.scene, method, tool_radius=TOOL_RADIUS, clearance=CLEARANCE, forbidden=case.forbidden
+        )
+        outcomes.append(judge(case, adaptation))
+    return outcomes
+
+
+def _families(path: Array, planar: bool) -> list[tuple[str, bool, Callable[[int], Case]]]:
+    """Return name, whether it can be solved, and the maker of each family."""
+    rows: list[tuple[str, bool, Callable[[int], Case]]] = [
+        (f"{k} on the path", True, lambda s, k=k: sparse_clutter(s, path, n_obstacles=k, planar=planar))  # type: ignore[misc]
+        for k in (1, 2, 3)
+    ]
+    rows.append(("start or goal covered", False, lambda s: covered_end(s, path, planar=planar)))
+    if planar:
+        rows.append(("gap wide enough", True, lambda s: narrow_gap(s, path, solvable=True)))
+        rows.append(("gap too narrow", False, lambda s: narrow_gap(s, path, solvable=False)))
+    return rows
+
+
+def _row(dimension: str, family: str, solvable: bool, method: str, outcomes: Sequence[Outcome]) -> list[str]:
+    right = sum(o.accepted and o.kept if solvable else not o.accepted for o in outcomes)
+    low, high = wilson_interval(right, len(outcomes))
+    done = [o for o in outcomes if o.accepted]
+    return [
+        dimension,
+        family,
+        method,
+        f"{100 * right / len(outcomes):.1f} ({100 * low:.1f} to {100 * high:.1f})",
+        f"{100 * np.mean([o.collision_free for o in outcomes]):.1f}",
+        f"{1e3 * min(o.clearance for o in done):.2f}" if done else "-",
+        f"{1e3 * np.mean([o.rmse for o in done]):.1f}" if done else "-",
+        f"{100 * np.mean([o.unmoved for o in done]):.0f}" if done else "-",
+        f"{1e3 * np.median([o.seconds for o in outcomes]):.1f}",
+    ]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run every method over every family and print the table."""
+    parser = argparse.ArgumentParser(prog="python -m imitarm.benchmark.avoidance", description=__doc__)
+    parser.add_argument("--seeds", type=int, default=200, help="scenes in each family (default 200)")
+    parser.add_argument("--first", type=int, default=2000, help="first seed (default 2000: the test seeds)")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    arguments = parser.parse_args(argv)
+    console = Console()
+    table = Table(
+        title=f"{arguments.seeds} scenes a row, {1e3 * CLEARANCE:.0f} mm asked of a {2e3 * TOOL_RADIUS:.0f} mm tool"
+    )
+    for heading in (
+        "",
+        "scenes",
+        "method",
+        "right answer % (95 %)",
+        "collision-free %",
+        "least mm",
+        "RMSE mm",
+        "unmoved %",
+        "ms",
+    ):
+        table.add_column(heading, justify="left" if heading in ("", "scenes", "method") else "right")
+    for planar in (True, False):
+        skill, path = learn(planar=planar)
+        for family, solvable, make in _families(path, planar):
+            cases = [make(arguments.first + i) for i in range(arguments.seeds)]
+            for method in arguments.methods:
+                label = f"{'2-D' if planar else '3-D'} {family}, {method}"
+                outcomes = run_family(skill, track(cases, label, console=console, transient=True), method)
+                table.add_row(*_row("2-D" if planar else "3-D", family, solvable, method, outcomes))
+    console.print(table)
+    console.print("right answer: solved with the asked clearance (less 0.5 mm), or refused where it can't be solved")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
