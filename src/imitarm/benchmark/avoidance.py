@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -26,6 +27,7 @@ from imitarm.benchmark.families import (
     sparse_clutter,
 )
 from imitarm.policies.adaptation import METHODS, Adaptation, adapt
+from imitarm.skills.gmm import DegenerateAxisWarning
 from imitarm.skills.skill import Skill
 
 Array = NDArray[np.float64]
@@ -74,7 +76,9 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
 
 def learn(*, planar: bool) -> tuple[Skill, Array]:
     """Learn the S-shaped reach with 8 components; return the skill and its path (400, 3) [m]."""
-    skill = Skill(n_components=8).fit(s_shaped_demonstrations(planar=planar))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DegenerateAxisWarning)  # a planar reach has no spread in z: that is meant
+        skill = Skill(n_components=8).fit(s_shaped_demonstrations(planar=planar))
     path, _ = skill.gmr_.predict(np.linspace(0.0, skill.duration_, 400))
     return skill, path
 

@@ -88,8 +88,12 @@ class ComponentPath:
         outside = [p for p in pinned if not 0.0 <= p <= skill.duration_]
         if outside:
             raise InputError(f"pinned instant {outside[0]:g} s is outside the motion (0 to {skill.duration_:g} s)")
-        mean, tolerance = gmr.predict(times)
-        quaternions = gmr.predict_orientation(times)[0] if gmr.has_orientation_ else None
+        quaternions: Array | None = None
+        if gmr.has_orientation_:
+            mean, quaternions, covariance = gmr.predict_pose(times)
+            tolerance = covariance[:, :3, :3]
+        else:
+            mean, tolerance = gmr.predict(times)
         responsibilities = gmr.responsibilities(times)
         means = gmr.position_means_
         if start is not None or goal is not None:
