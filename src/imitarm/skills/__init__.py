@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from imitarm.skills.dmp import DMP, DMPState
 from imitarm.skills.gmm import DegenerateAxisWarning, GaussianMixture, ellipsoid_scale
 from imitarm.skills.gmr import GMR, SingleDemonstrationWarning, UnalignedWarning
+from imitarm.skills.quaternion_dmp import QuaternionDMP
+from imitarm.skills.skill import Skill
+from imitarm.skills.spring import GAINS, Gains
 
 __all__ = [
+    "DMP",
+    "GAINS",
     "GMR",
+    "DMPState",
     "DegenerateAxisWarning",
+    "Gains",
     "GaussianMixture",
+    "QuaternionDMP",
     "SingleDemonstrationWarning",
+    "Skill",
     "UnalignedWarning",
     "ellipsoid_scale",
 ]

@@ -54,7 +54,7 @@ class GMR:
 
     Args:
         n_components: number K of Gaussians, or ``"auto"``: the smallest K whose error on a held-out demonstration is
-            within 1 % (or 0.1 mm) of the best, see :func:`~imitarm.skills.selection.choose`.
+            within 0.5 % (or 0.1 mm) of the best, see :func:`~imitarm.skills.selection.choose`.
         candidates: the numbers that ``"auto"`` tries.
         reg_covar: as in GaussianMixture.
         n_init: as in GaussianMixture.
@@ -163,6 +163,64 @@ class GMR:
                 stacklevel=2,
             )
         return self
+
+    @classmethod
+    def from_mixture(
+        cls,
+        weights: ArrayLike,
+        means: ArrayLike,
+        covariances: ArrayLike,
+        *,
+        duration: float,
+        n_demonstrations: int = 1,
+        reference: RotationReference | None = None,
+        selection: Sequence[Candidate] = (),
+        degenerate_axes: Sequence[int] = (),
+        converged: bool = True,
+        lower_bound: float = np.nan,
+    ) -> GMR:
+        """Build from a mixture that was learnt before.
+
+        Args:
+            weights: priors, shape (K,).
+            means: of [t; x], shape (K, 1 + D), D = 3, or 6 with a reference.
+            covariances: of [t; x], shape (K, 1 + D, 1 + D).
+            duration: demonstrated span [s].
+            n_demonstrations: how many it was learnt from.
+            reference: the rotation near which the last three columns are rotation vectors.
+            selection: what was tried.
+            degenerate_axes: columns of x that don't move.
+            converged: whether the fit converged.
+            lower_bound: mean log-likelihood per sample.
+
+        Raises:
+            InputError: when shapes disagree, the weights don't sum to one, a covariance is not symmetric and positive
+                definite, or the duration is not above 0.
+        """
+        w, mu, sigma = (np.array(a, dtype=float) for a in (weights, means, covariances))
+        columns = 4 if reference is None else 7
+        K = len(w) if w.ndim == 1 else 0
+        if K < 1 or mu.shape != (K, columns) or sigma.shape != (K, columns, columns):
+            raise InputError(
+                f"GMR.from_mixture: shapes (K,), (K, {columns}), (K, {columns}, {columns}) are needed, "
+                f"got {w.shape}, {mu.shape}, {sigma.shape}"
+            )
+        if not (np.all(w > 0.0) and abs(w.sum() - 1.0) < 1e-6):
+            raise InputError("GMR.from_mixture: weights must be above 0 and sum to one")
+        if not (np.all(np.isfinite(mu)) and np.all(np.isfinite(sigma))):
+            raise InputError("GMR.from_mixture: means and covariances must be finite")
+        sizes = np.sqrt(np.maximum(np.diagonal(sigma, axis1=1, axis2=2), 1e-300))
+        scaled = sigma / (sizes[:, :, None] * sizes[:, None, :])  # metres and radians side by side
+        if not np.allclose(scaled, np.swapaxes(scaled, 1, 2)) or np.linalg.eigvalsh(scaled).min() <= 0.0:
+            raise InputError("GMR.from_mixture: every covariance must be symmetric and positive definite")
+        if not (np.isfinite(duration) and duration > 0.0):
+            raise InputError(f"GMR.from_mixture: duration must be above 0 s, got {duration!r}")
+        gmr = cls(K)
+        gmr.duration_, gmr.n_demonstrations_, gmr.reference_ = float(duration), int(n_demonstrations), reference
+        gmr.selection_, gmr.degenerate_axes_ = tuple(selection), tuple(int(i) for i in degenerate_axes)
+        gmr.converged_, gmr.lower_bound_ = converged, float(lower_bound)
+        gmr._learn(w, mu, sigma)
+        return gmr
 
     def _learn(self, weights: Array, means: Array, covariances: Array) -> None:
         """Take the mixture, its components in the order of time, and prepare the regression."""

@@ -106,7 +106,8 @@ class RotationReference:
         worst = int(np.argmax(angles))
         raise InputError(
             f"orientations differ by up to {np.rad2deg(farthest):.0f} degrees at the same instant, most in "
-            f"demonstration {worst}: the demonstrations don't turn the same way. Align them first, or learn them as separate skills"
+            f"demonstration {worst}: the demonstrations don't turn the same way. Align them first, "
+            "or learn them as separate skills"
         )
 
 

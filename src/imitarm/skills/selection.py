@@ -14,7 +14,7 @@ from imitarm.skills.em import Fit, expectation_maximisation, quadratic_features,
 Array = NDArray[np.float64]
 
 _SAMPLES = 100  # a demonstration: neighbouring samples of a fast recorder tell nothing new about K
-_TOLERANCE = 0.01  # share of the best held-out error
+_BIAS = 0.1  # of the best held-out error: what the mean may be off beyond what demonstrations differ anyway
 _SLACK_MM = 0.1  # below the repeatability of industrial arms
 _PATIENCE = 4  # stop after so many numbers in a row without a better one
 
@@ -40,14 +40,16 @@ class Candidate:
 def choose(candidates: Sequence[Candidate]) -> int:
     """Return the number of components to use.
 
-    The smallest K whose held-out error is within 1 % of the best, or within 0.1 mm of it. BIC alone keeps growing
-    with K on data over time, because neighbouring samples are not independent (METHODS C); it decides only when there
-    is one demonstration, so that nothing can be held out.
+    Held-out errors ``e_K`` hold how much demonstrations differ, which no K can mend, and the bias of a mean that is
+    too simple; squares add. Chosen is the smallest K whose bias ``sqrt(e_K^2 - e_best^2)`` is at most a tenth of
+    ``e_best``, that is, ``e_K`` within 0.5 % of the best, or within 0.1 mm of it. BIC alone keeps growing with K on
+    data over time, because neighbouring samples are not independent (METHODS C); it decides only when there is one
+    demonstration, so that nothing can be held out.
     """
     errors = np.array([c.held_out_rmse_mm for c in candidates])
     if np.isnan(errors).any():
         return min(candidates, key=lambda c: (c.bic, c.n_components)).n_components
-    good = errors <= max(errors.min() * (1.0 + _TOLERANCE), errors.min() + _SLACK_MM)
+    good = errors <= max(errors.min() * np.sqrt(1.0 + _BIAS**2), errors.min() + _SLACK_MM)
     return min(c.n_components for c, ok in zip(candidates, good, strict=True) if ok)
 
 
