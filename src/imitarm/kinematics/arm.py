@@ -1,0 +1,429 @@
+"""ArmModel: how a robot arm moves and what it weighs; ArmState: what it does at one instant."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError, UnknownNameError
+from imitarm.kinematics.arm_file import ArmFile, compiled, quiet, read_arm
+from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.spheres import covering_spheres
+
+Array = NDArray[np.float64]
+_COLLISION_GROUP = 3
+
+
+@dataclass(frozen=True, eq=False)
+class ArmState:
+    """What an arm does at one instant.
+
+    Attributes:
+        q: joint positions, shape (n,) [rad].
+        velocity: joint velocities, shape (n,) [rad/s].
+        torque: torques of the joints' drives, shape (n,) [N m].
+        time: when [s].
+    """
+
+    q: Array
+    velocity: Array
+    torque: Array
+    time: float
+
+
+class _Scratch(threading.local):
+    """MuJoCo's working memory, one for each thread, and the posture it holds."""
+
+    def __init__(self, model: mujoco.MjModel, home: Array) -> None:
+        self.data = mujoco.MjData(model)
+        self.data.qpos[:] = home
+        self.posture = b""
+        self.linear = np.zeros((3, model.nv))
+        self.angular = np.zeros((3, model.nv))
+        self.force = np.zeros(model.nv)
+
+
+class ArmModel:
+    r"""A robot arm, with or without a tool: kinematics, dynamics and limits. It never changes once built.
+
+    The equation of motion of the arm's links and tool, which :meth:`inverse_dynamics` evaluates, is
+
+    .. math:: M(q) \ddot q + C(q, \dot q) \dot q + g(q) = \tau
+
+    with the rigid-body inertia :math:`M` alone. Rotor inertia (``armature``), viscous damping and dry friction of
+    the joints, which a simulated arm also has, are no part of it; their values are in ``spec()``.
+
+    All poses are in the base frame, whose origin is that of the file. Jacobians have the linear rows first. Methods
+    take one posture ``q`` of shape (n_joints,) and raise :class:`InputError` when its shape is wrong or a number
+    is not finite. One model can be used by several threads.
+
+    Attributes:
+        name: for example ``"sawyer"``.
+        joint_names: from base to flange; joints of a gripper are not among them.
+        lower: least joint positions, shape (n_joints,) [rad]; -inf where there is no limit.
+        upper: largest joint positions, shape (n_joints,) [rad].
+        max_velocity: shape (n_joints,) [rad/s].
+        max_acceleration: shape (n_joints,) [rad/s^2].
+        max_torque: shape (n_joints,) [N m]; inf where the file names none.
+        home: a comfortable posture, shape (n_joints,) [rad].
+        tool_to_flange: where the tool's tip is; the identity when there is no tool.
+        tool_radius: radius of the cylinder about the tool's axis that holds the tool's head [m]; 0 without a tool.
+        sphere_bodies: for each sphere of :meth:`collision_spheres` the name of its body.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    max_velocity: Array
+    max_acceleration: Array
+    max_torque: Array
+    home: Array
+    tool_to_flange: Pose
+    tool_radius: float
+    sphere_bodies: tuple[str, ...]
+
+    @classmethod
+    def load(
+        cls,
+        name_or_path: str | Path,
+        *,
+        tool: str | Path | None = None,
+        flange: str | None = None,
+        discard_meshes: bool = False,
+    ) -> ArmModel:
+        """Load a packaged arm, or any MJCF or URDF file.
+
+        Limits come from the file. What a format has no place for is looked up in MJCF elements
+        ``<custom><numeric name="max_velocity" data="..."/></custom>`` (and ``max_acceleration``) and in a URDF's
+        ``<limit velocity= effort=>``; where nothing is said, 2 rad/s and 10 rad/s^2 are taken (0.2 m/s and 1 m/s^2
+        for slides), and no limit of torque. ``home`` is the keyframe of that name, else the first keyframe, else the
+        middle of the joints' ranges.
+
+        Args:
+            name_or_path: ``"sawyer"``, ``"panda"`` or a path.
+            tool: ``"gripper"``, ``"brush"``, the path of an MJCF file with a site ``tool`` at its tip, or None.
+            flange: name of the body or site that is the flange; None: a site named ``flange``, else the last body of
+                the longest chain of joints (where two equally long ones part, as fingers do, it ends).
+            discard_meshes: leave out all meshes, for a file whose meshes are elsewhere; links keep only their
+                primitive shapes, so contact and :meth:`collision_spheres` see no more than those.
+
+        Raises:
+            UnknownNameError: when an arm, tool or flange of that name is not known.
+            FileFormatError: when a file can't be read as a robot.
+            InputError: when there is no joint between the base and the flange, or one that is neither hinge nor slide.
+        """
+        file = read_arm(name_or_path, tool, flange, discard_meshes)
+        kept = {"tool": tool, "flange": flange, "discard_meshes": discard_meshes}
+        return cls(file, (name_or_path, kept))
+
+    def __init__(self, file: ArmFile, source: tuple[str | Path, dict[str, Any]]) -> None:
+        """Build from what :func:`~imitarm.kinematics.arm_file.read_arm` returned; use :meth:`load` instead."""
+        whole = compiled(file.spec, file.name)
+        # Shapes without mass are left out of the working model: its kinematics then takes a third of the time.
+        model = compiled(quiet(file.spec, _massless), file.name)
+        model.dof_armature[:] = 0.0
+        joints = [model.joint(name).id for name in file.joints]
+        limited = model.jnt_limited[joints].astype(bool)
+        posture = np.array(model.qpos0)
+        for name, position in file.home.items():
+            posture[model.jnt_qposadr[model.joint(name).id]] = position
+        self._source, self._spec, self._model = source, file.spec, model
+        self._scratch = _Scratch(model, posture)
+        self._qpos = _slice(model.jnt_qposadr[joints])
+        self._dofs = _slice(model.jnt_dofadr[joints])
+        self._joints = np.array(joints)
+        self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
+        self._flange = model.site("flange").id
+        names = [model.site(i).name for i in range(model.nsite)]
+        self._tool = names.index("tool") if "tool" in names else self._flange
+
+        self.name, self.joint_names = file.name, file.joints
+        self.lower = _frozen(np.where(limited, model.jnt_range[joints, 0], -np.inf))
+        self.upper = _frozen(np.where(limited, model.jnt_range[joints, 1], np.inf))
+        self.max_velocity = _frozen(file.max_velocity)
+        self.max_acceleration = _frozen(file.max_acceleration)
+        self.max_torque = _frozen(file.max_torque)
+        self.home = _frozen(posture[self._qpos])
+        self.tool_radius = file.tool_radius
+        self.tool_to_flange = Pose.identity()
+        if self.has_tool:
+            self.tool_to_flange = self.forward_kinematics(self.home).inverse() @ self.tool_pose(self.home)
+        self._cover(whole)
+        self._sealed = True
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if getattr(self, "_sealed", False):
+            raise AttributeError(f"ArmModel never changes; load another one instead of setting {name!r}")
+        object.__setattr__(self, name, value)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        path, options = self._source
+        return partial(ArmModel.load, path, **options), ()
+
+    def __repr__(self) -> str:
+        path, options = self._source
+        return f"ArmModel.load({str(path)!r}, tool={options['tool']!r})"
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints from base to flange."""
+        return len(self.joint_names)
+
+    @property
+    def has_tool(self) -> bool:
+        """Whether a tool is mounted, so that ``tool_pose`` differs from ``forward_kinematics``."""
+        return self._tool != self._flange
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a fresh copy of the arm and its tool, for composing worlds; the base stands at the origin.
+
+        Names are those of the file; those of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
+        The flange is the site ``"flange"``. Geoms of group 3 count for contact, those of group 2 are looks. The arm's
+        joints have no actuators, so that a world adds the ones it needs (joints carry their torque limit as
+        ``actuatorfrcrange``); a gripper has one, ``"tool/opening"``, a position servo of its opening [m].
+        There are no keyframes: take :meth:`posture`.
+        """
+        return self._spec.copy()
+
+    def posture(self, model: mujoco.MjModel, q: ArrayLike | None = None, *, prefix: str = "") -> Array:
+        """Return the whole ``qpos`` of a world that holds this arm: the arm at ``q``, the rest as the world has it.
+
+        Args:
+            model: a compiled world.
+            q: joint positions, shape (n_joints,) [rad]; None: ``home``.
+            prefix: what the world has put before the arm's names.
+
+        Returns:
+            shape (model.nq,).
+        """
+        qpos = np.array(model.qpos0)
+        mine, home = self._model, self._scratch.data.qpos
+        for joint in range(mine.njnt):  # fingers too
+            address = model.jnt_qposadr[model.joint(prefix + mine.joint(joint).name).id]
+            qpos[address] = home[mine.jnt_qposadr[joint]]
+        values = self.home if q is None else self._checked(q, "q")
+        for name, value in zip(self.joint_names, values, strict=True):
+            qpos[model.jnt_qposadr[model.joint(prefix + name).id]] = value
+        return qpos
+
+    def forward_kinematics(self, q: ArrayLike) -> Pose:
+        """Return the pose of the flange: ``flange_to_base``."""
+        return self._site_pose(self._at(q), self._flange)
+
+    def tool_pose(self, q: ArrayLike) -> Pose:
+        """Return the pose of the tool's tip: ``tool_to_base``."""
+        return self._site_pose(self._at(q), self._tool)
+
+    def tool_path(self, joints: ArrayLike) -> tuple[Array, Array]:
+        """Return the poses of the tool's tip for many postures.
+
+        Args:
+            joints: shape (n, n_joints) [rad].
+
+        Returns:
+            positions (n, 3) [m] and quaternions wxyz (n, 4).
+        """
+        poses = [self._site_pose(self._at(q), self._tool) for q in np.atleast_2d(np.asarray(joints, dtype=float))]
+        positions = np.array([pose.position for pose in poses]).reshape(-1, 3)
+        return positions, np.array([pose.quaternion for pose in poses]).reshape(-1, 4)
+
+    def jacobian(self, q: ArrayLike) -> Array:
+        """Return the Jacobian of the flange, shape (6, n_joints), linear rows first, in the base frame."""
+        return self._site_jacobian(self._at(q), self._flange)
+
+    def tool_jacobian(self, q: ArrayLike) -> Array:
+        """Return the Jacobian of the tool's tip, shape (6, n_joints), linear rows first, in the base frame."""
+        return self._site_jacobian(self._at(q), self._tool)
+
+    def point_jacobian(self, q: ArrayLike, body: str, point: ArrayLike) -> Array:
+        """Return the Jacobian of a point that moves with ``body``.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            body: name of the body, as in ``spec()``.
+            point: where it is now in the base frame, shape (3,) [m].
+
+        Returns:
+            shape (3, n_joints) [m/rad].
+
+        Raises:
+            UnknownNameError: when there is no such body.
+        """
+        index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_BODY, body)
+        if index < 0:
+            known = [self._model.body(i).name for i in range(1, self._model.nbody)]
+            raise UnknownNameError.among(f"body of {self.name}:", body, known)
+        scratch = self._at(q)
+        position = np.asarray(point, dtype=float).reshape(3, 1)
+        mujoco.mj_jac(self._model, scratch.data, scratch.linear, None, position, index)
+        return scratch.linear[:, self._dofs].copy()
+
+    def collision_spheres(self, q: ArrayLike) -> tuple[Array, Array]:
+        """Return spheres that together cover all moving collision shapes of arm and tool.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+
+        Returns:
+            centers (m, 3) [m] in the base frame and radii (m,) [m].
+        """
+        data = self._at(q).data
+        turned = data.xmat[self._sphere_body].reshape(-1, 3, 3) @ self._sphere_center[:, :, None]
+        return data.xpos[self._sphere_body] + turned[:, :, 0], self._sphere_radius
+
+    def sphere_jacobians(self, q: ArrayLike) -> Array:
+        """Return the Jacobians of the spheres' centers, shape (m, 3, n_joints) [m/rad]."""
+        centers, _ = self.collision_spheres(q)
+        data = self._scratch.data
+        axes, anchors = data.xaxis[self._joints].T, data.xanchor[self._joints].T
+        x, y, z = axes
+        # Column j is a_j x (c - o_j). All the cross products with c at once: c times the stacked matrices [a_j]x^T.
+        zero = np.zeros_like(x)
+        crosses = np.stack((zero, z, -y, -z, zero, x, y, -x, zero)).reshape(3, -1)
+        offset = np.cross(axes, anchors, axis=0)
+        columns = (centers @ crosses).reshape(-1, 3, self.n_joints) - offset
+        if self._slides.any():
+            columns[:, :, self._slides] = axes[:, self._slides]
+        return np.asarray(columns * self._sphere_moves[:, None, :])
+
+    def gravity_torque(self, q: ArrayLike) -> Array:
+        """Return the torques g(q) that hold arm and tool against gravity, shape (n_joints,) [N m]."""
+        return self._recursive_newton_euler(self._at(q), None, None)
+
+    def inverse_dynamics(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
+        """Return the torques of a motion by the recursive Newton-Euler algorithm.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            qd: joint velocities, shape (n_joints,) [rad/s].
+            qdd: joint accelerations, shape (n_joints,) [rad/s^2].
+
+        Returns:
+            shape (n_joints,) [N m]; without rotor inertia, damping and friction of the joints.
+        """
+        velocity, acceleration = self._checked(qd, "qd"), self._checked(qdd, "qdd")
+        return self._recursive_newton_euler(self._at(q), velocity, acceleration)
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        """Return the rigid-body inertia M(q), shape (n_joints, n_joints) [kg m^2], without rotor inertia."""
+        scratch = self._at(q)
+        full = np.zeros((self._model.nv, self._model.nv))
+        mujoco.mj_crb(self._model, scratch.data)
+        mujoco.mj_fullM(self._model, scratch.data, full)
+        return full[self._dofs][:, self._dofs].copy()
+
+    def check_limits(self, q: ArrayLike, *, tolerance: float = 1e-6) -> None:
+        """Do nothing when ``q`` (n_joints,) is within the joints' limits.
+
+        Raises:
+            InputError: naming the first joint that is outside, its position and its limits.
+        """
+        values = self._checked(q, "q")
+        outside = (values < self.lower - tolerance) | (values > self.upper + tolerance)
+        if outside.any():
+            i = int(np.argmax(outside))
+            raise InputError(
+                f"joint {self.joint_names[i]} at {values[i]:.4f} rad is outside its limits "
+                f"[{self.lower[i]:.4f}, {self.upper[i]:.4f}]"
+            )
+
+    def _checked(self, values: ArrayLike, what: str) -> Array:
+        array = np.asarray(values, dtype=float)
+        if array.shape != self.lower.shape:
+            raise InputError(f"{self.name}: {what} needs {self.n_joints} numbers, got shape {array.shape}")
+        if not math.isfinite(float(array.dot(array))):
+            raise InputError(f"{self.name}: {what} must be finite numbers, got {array}")
+        return array
+
+    def _at(self, q: ArrayLike) -> _Scratch:
+        """Return the working memory with kinematics at ``q``, computed only when the posture is a new one."""
+        values, scratch = self._checked(q, "q"), self._scratch
+        posture = values.tobytes()
+        if posture != scratch.posture:
+            scratch.data.qpos[self._qpos] = values
+            mujoco.mj_kinematics(self._model, scratch.data)
+            mujoco.mj_comPos(self._model, scratch.data)
+            scratch.posture = posture
+        return scratch
+
+    def _site_pose(self, scratch: _Scratch, site: int) -> Pose:
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, scratch.data.site_xmat[site])
+        return _pose(scratch.data.site_xpos[site].copy(), quaternion)
+
+    def _site_jacobian(self, scratch: _Scratch, site: int) -> Array:
+        mujoco.mj_jacSite(self._model, scratch.data, scratch.linear, scratch.angular, site)
+        return np.concatenate((scratch.linear[:, self._dofs], scratch.angular[:, self._dofs]))
+
+    def _recursive_newton_euler(self, scratch: _Scratch, velocity: Array | None, acceleration: Array | None) -> Array:
+        data = scratch.data
+        data.qvel[self._dofs] = 0.0 if velocity is None else velocity
+        data.qacc[self._dofs] = 0.0 if acceleration is None else acceleration
+        mujoco.mj_comVel(self._model, data)
+        mujoco.mj_rne(self._model, data, acceleration is not None, scratch.force)
+        return scratch.force[self._dofs].copy()
+
+    def _cover(self, whole: mujoco.MjModel) -> None:
+        """Cover the moving collision shapes with spheres, in the frames of their bodies."""
+        bodies: list[int] = []
+        centers: list[Array] = [np.zeros((0, 3))]
+        radii: list[float] = []
+        marked = (whole.geom_group == _COLLISION_GROUP).any()
+        for geom in range(whole.ngeom):
+            body = int(whole.geom_bodyid[geom])
+            touches = bool(whole.geom_contype[geom] or whole.geom_conaffinity[geom])
+            counts = touches and (whole.geom_group[geom] == _COLLISION_GROUP or not marked)
+            if counts and whole.body_weldid[body] != 0 and whole.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
+                points, radius = covering_spheres(whole, geom)
+                centers.append(points)
+                bodies += [body] * len(points)
+                radii += [radius] * len(points)
+        self._sphere_body = np.array(bodies, dtype=int)
+        self._sphere_center = _frozen(np.concatenate(centers))
+        self._sphere_radius = _frozen(np.array(radii, dtype=float))
+        self._sphere_moves = np.array([self._moves(body) for body in bodies], dtype=float).reshape(-1, self.n_joints)
+        self.sphere_bodies = tuple(whole.body(body).name for body in bodies)
+
+    def _moves(self, body: int) -> list[bool]:
+        """Return for each joint whether it moves ``body``."""
+        above = set()
+        while body:
+            above.add(body)
+            body = int(self._model.body_parentid[body])
+        return [int(self._model.jnt_bodyid[joint]) in above for joint in self._joints]
+
+
+def _massless(geom: mujoco.MjsGeom) -> bool:
+    """Return whether leaving out ``geom`` changes no link's mass (a mass that was not given is nan)."""
+    return bool(geom.density == 0.0 and not geom.mass > 0.0)
+
+
+def _slice(indices: NDArray[np.int32]) -> slice | NDArray[np.int32]:
+    """Return consecutive indices as a slice, which is several times quicker."""
+    first = int(indices[0])
+    return slice(first, first + len(indices)) if np.all(np.diff(indices) == 1) else indices
+
+
+def _frozen(values: Array) -> Array:
+    array = np.array(values, dtype=float)
+    array.setflags(write=False)
+    return array
+
+
+def _pose(position: Array, quaternion: Array) -> Pose:
+    """Build a pose from numbers that are known to be right: Pose's own checks would take ten times as long."""
+    pose = object.__new__(Pose)
+    position.setflags(write=False)
+    quaternion.setflags(write=False)
+    object.__setattr__(pose, "position", position)
+    object.__setattr__(pose, "quaternion", quaternion)
+    return pose

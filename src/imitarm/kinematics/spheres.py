@@ -1,0 +1,75 @@
+"""Covering the collision shapes of an arm with spheres, so that its whole body can be kept off obstacles."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_SPACING = 0.9  # distance of neighbours on a round bar, in radii: spheres then stand out by a tenth
+_SMALLEST_CELL = 0.025  # [m] a plate thinner than this is not cut finer
+_LONGEST_ROW = 4  # cells along the longest edge of a plate
+
+
+def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:
+    """Cover one geom with equal spheres, conservatively: every point of the geom is in one of them.
+
+    Round bars (capsule, cylinder, ellipsoid) get a row of spheres, everything else (box, the bounding box of a mesh)
+    a grid of them.
+
+    Args:
+        model: the compiled model.
+        geom: index of the geom.
+
+    Returns:
+        centers in the frame of the geom's body (m, 3) [m], and their radius [m].
+    """
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    types = mujoco.mjtGeom
+    offset = np.zeros(3)
+    if kind == types.mjGEOM_SPHERE:
+        centers, radius = np.zeros((1, 3)), float(size[0])
+    elif kind == types.mjGEOM_CAPSULE:
+        centers, radius = _row(2, float(size[1]), float(size[0]))
+    elif kind == types.mjGEOM_CYLINDER:
+        centers, radius = _cylinder(float(size[1]), float(size[0]))
+    elif kind == types.mjGEOM_ELLIPSOID:
+        longest = int(np.argmax(size))
+        second = float(np.sort(size)[1])  # an ellipsoid lies inside the capsule of this radius along its longest axis
+        centers, radius = _row(longest, float(size[longest]) - second, second)
+    else:
+        offset = model.geom_aabb[geom, :3]
+        centers, radius = _grid(model.geom_aabb[geom, 3:])
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+    return np.asarray((centers + offset) @ rotation.reshape(3, 3).T + model.geom_pos[geom]), radius
+
+
+def _row(axis: int, half_length: float, radius: float) -> tuple[Array, float]:
+    """Cover the capsule about a straight axis."""
+    n = max(1, math.ceil(2.0 * half_length / (_SPACING * radius))) + 1 if half_length > 0.0 else 1
+    centers = np.zeros((n, 3))
+    centers[:, axis] = np.linspace(-half_length, half_length, n) if n > 1 else 0.0
+    gap = 2.0 * half_length / (n - 1) if n > 1 else 0.0
+    return centers, math.hypot(radius, 0.5 * gap)
+
+
+def _cylinder(half_length: float, radius: float) -> tuple[Array, float]:
+    """Cover a cylinder about z: slices, each inside the sphere through its two rims."""
+    n = max(1, math.ceil(2.0 * half_length / (_SPACING * radius)))
+    centers = np.zeros((n, 3))
+    centers[:, 2] = half_length * (2.0 * np.arange(n) + 1.0 - n) / n
+    return centers, math.hypot(radius, half_length / n)
+
+
+def _grid(half_size: Array) -> tuple[Array, float]:
+    """Cover a box by cells that are about as long as the box is thin, yet not very many."""
+    cell = max(2.0 * float(np.min(half_size)), _SMALLEST_CELL, 2.0 * float(np.max(half_size)) / _LONGEST_ROW)
+    counts = np.maximum(1, np.ceil(2.0 * half_size / cell - 1e-9)).astype(int)
+    axes = [h * (2.0 * np.arange(n) + 1.0 - n) / n for h, n in zip(half_size, counts, strict=True)]
+    return np.array(list(product(*axes))), float(np.linalg.norm(half_size / counts))
