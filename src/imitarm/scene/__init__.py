@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from imitarm.scene.edged import Box, Cylinder
+from imitarm.scene.edged import Box, Cone, Cylinder
+from imitarm.scene.hull import ConvexHull
 from imitarm.scene.obstacle import Obstacle
 from imitarm.scene.rounded import Capsule, Ellipsoid, Sphere
 from imitarm.scene.scene import Scene
 
-OBSTACLES: dict[str, type[Obstacle]] = {shape.kind: shape for shape in (Sphere, Box, Capsule, Cylinder, Ellipsoid)}
+OBSTACLES: dict[str, type[Obstacle]] = {
+    shape.kind: shape for shape in (Sphere, Box, Capsule, Cylinder, Cone, Ellipsoid, ConvexHull)
+}
 
-__all__ = ["OBSTACLES", "Box", "Capsule", "Cylinder", "Ellipsoid", "Obstacle", "Scene", "Sphere"]
+__all__ = ["OBSTACLES", "Box", "Capsule", "Cone", "ConvexHull", "Cylinder", "Ellipsoid", "Obstacle", "Scene", "Sphere"]

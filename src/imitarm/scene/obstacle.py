@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 MAX_SIZE = 10.0  # [m] nothing in the reach of an arm is larger: such a number is in the wrong unit
 MAX_COORDINATE = 100.0  # [m] nor farther away
 MAX_SPEED = 100.0  # [m/s] nor faster
+BLOCK = 1024  # points at a time: what is worked out on the way stays in the processor's cache
 TINY = 1e-12  # [m] below this length a direction is rounding noise and a fixed one is taken instead
 
 
@@ -140,9 +141,12 @@ class Obstacle(ABC):
             InputError: when the last axis has not length 3.
         """
         p = np.asarray(points, dtype=float)
-        if p.ndim == 2 and p.shape[1] == 3:
-            return self._distance(p)
-        return self._distance(_rows(p)).reshape(p.shape[:-1])
+        rows = p if p.ndim == 2 and p.shape[1] == 3 else _rows(p)
+        if len(rows) <= BLOCK:
+            distance = self._distance(rows)
+        else:
+            distance = np.concatenate([self._distance(rows[i : i + BLOCK]) for i in range(0, len(rows), BLOCK)])
+        return distance if rows is p else distance.reshape(p.shape[:-1])
 
     def gradient(self, points: ArrayLike) -> Array:
         """Return the gradient of :meth:`signed_distance`: unit vectors, shape (..., 3).
@@ -168,10 +172,15 @@ class Obstacle(ABC):
             InputError: when the last axis has not length 3.
         """
         p = np.asarray(points, dtype=float)
-        if p.ndim == 2 and p.shape[1] == 3:
-            return self._distance_and_gradient(p)
-        distance, gradient = self._distance_and_gradient(_rows(p))
-        return distance.reshape(p.shape[:-1]), gradient.reshape(p.shape)
+        rows = p if p.ndim == 2 and p.shape[1] == 3 else _rows(p)
+        if len(rows) <= BLOCK:
+            distance, gradient = self._distance_and_gradient(rows)
+        else:
+            distance, gradient = np.empty(len(rows)), np.empty((len(rows), 3))
+            for i in range(0, len(rows), BLOCK):
+                part = slice(i, i + BLOCK)
+                distance[part], gradient[part] = self._distance_and_gradient(rows[part])
+        return (distance, gradient) if rows is p else (distance.reshape(p.shape[:-1]), gradient.reshape(p.shape))
 
     def support(self, directions: ArrayLike) -> Array:
         """Return the farthest point of the solid in each direction, the one query that GJK needs.
@@ -222,6 +231,11 @@ class Obstacle(ABC):
         """Move this fresh copy by ``offset`` (3,) [m]."""
 
 
+def lengths(vectors: Array) -> Array:
+    """Return the length (n,) of each column of ``vectors`` (k, n)."""
+    return np.sqrt(np.add.reduce(vectors * vectors, axis=0))
+
+
 def _rows(p: Array) -> Array:
     """Return points (..., 3) as (n, 3)."""
     if p.shape[-1:] != (3,):
@@ -238,30 +252,32 @@ class PosedObstacle(Obstacle):
     """
 
     pose: Pose
-    _rotation: Array = field(init=False, repr=False)
-    _center: Array = field(init=False, repr=False)
+    _to_own: Array = field(init=False, repr=False)  # rotation of base vectors into the own frame
+    _own_center: Array = field(init=False, repr=False)  # the base frame's centre of the obstacle, so rotated (3, 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not isinstance(self.pose, Pose):
             raise InputError(f"{self._label}: pose must be a Pose(position, quaternion), got {self.pose!r}")
         checked_vector(self.pose.position, f"{self._label}: position", limit=MAX_COORDINATE, unit="m")
-        self._set(_rotation=self.pose.rotation)
+        self._set(_to_own=np.ascontiguousarray(self.pose.rotation.T))
         self._place()
 
     def _place(self) -> None:
-        self._set(_center=self.pose.position)
+        self._set(_own_center=(self._to_own @ self.pose.position)[:, None])
 
     def _local(self, points: Array) -> Array:
-        """Base coordinates (n, 3) to own coordinates (3, n): one contiguous row for each axis."""
-        return self._rotation.T @ (points - self._center).T
+        """Base coordinates (n, 3) to own coordinates (3, n): one contiguous row for each axis is the fast layout."""
+        own: Array = np.dot(self._to_own, points.T)
+        own -= self._own_center
+        return own
 
     def _to_base(self, vectors: Array) -> Array:
         """Own vectors (3, n) to base vectors (n, 3)."""
-        return vectors.T @ self._rotation.T
+        return np.dot(vectors.T, self._to_own)
 
     def _support(self, directions: Array) -> Array:
-        return self._to_base(self._local_support(self._rotation.T @ directions.T)) + self._center
+        return self._to_base(self._local_support(self._to_own @ directions.T)) + self.pose.position
 
     @abstractmethod
     def _local_support(self, v: Array) -> Array:

@@ -16,23 +16,24 @@ from imitarm.scene.obstacle import (
     checked_length,
     checked_lengths,
     checked_vector,
+    lengths,
 )
 
 _UP = np.array([0.0, 0.0, 1.0])
-_MAX_NEWTON = 100  # far more than any point needs; see Ellipsoid
-
-
-def _length(vectors: Array) -> Array:
-    """Return the length (n,) of each row (n, 3)."""
-    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+_MAX_NEWTON = 100  # far more than any point needs
+_NEWTON_TOLERANCE = 1e-5  # of the last step; the error left is its square, and enters the distance squared again
 
 
 def _unit(vectors: Array, length: Array, instead: Array) -> Array:
-    """Return rows (n, 3) over their length (n,), and ``instead`` (3,) where there is no direction."""
-    at_core = length < TINY
-    if at_core.any():
-        return np.where(at_core[:, None], instead, vectors / np.where(at_core, 1.0, length)[:, None])
-    return vectors / length[:, None]
+    """Return columns (3, n) over their length (n,) as rows (n, 3), and ``instead`` (3,) where there is no direction."""
+    unit = np.empty((len(length), 3))
+    if np.minimum.reduce(length, initial=1.0) < TINY:
+        at_core = length < TINY
+        np.divide(vectors, np.where(at_core, 1.0, length), out=unit.T)
+        unit[at_core] = instead
+    else:
+        np.divide(vectors, length, out=unit.T)
+    return unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,25 +49,27 @@ class Sphere(Obstacle):
 
     center: Array
     radius: float
+    _column: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         center = checked_vector(self.center, f"{self._label}: center", limit=MAX_COORDINATE, unit="m")
-        self._set(center=center, radius=checked_length(self.radius, f"{self._label}: radius"))
+        self._set(center=center, _column=center[:, None], radius=checked_length(self.radius, f"{self._label}: radius"))
 
     def _distance(self, points: Array) -> Array:
-        return _length(points - self.center) - self.radius
+        return lengths(np.subtract(points.T, self._column, order="C")) - self.radius
 
     def _distance_and_gradient(self, points: Array) -> tuple[Array, Array]:
-        v = points - self.center
-        length = _length(v)
+        v = np.subtract(points.T, self._column, order="C")
+        length = lengths(v)
         return length - self.radius, _unit(v, length, _UP)
 
     def _support(self, directions: Array) -> Array:
-        return self.center + self.radius * _unit(directions, _length(directions), _UP)
+        return self.center + self.radius * _unit(directions.T, lengths(directions.T), _UP)
 
     def _shift(self, offset: Array) -> None:
-        self._set(center=self.center + offset)
+        center = self.center + offset
+        self._set(center=center, _column=center[:, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +90,7 @@ class Capsule(Obstacle):
     start: Array
     end: Array
     radius: float
+    _column: Array = field(init=False, repr=False)
     _axis: Array = field(init=False, repr=False)
     _length: float = field(init=False, repr=False)
     _across: Array = field(init=False, repr=False)
@@ -98,29 +102,33 @@ class Capsule(Obstacle):
         length = float(np.linalg.norm(end - start))
         axis = (end - start) / length if length > TINY else _UP
         across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])  # the axis least along: never parallel
-        self._set(start=start, end=end, radius=checked_length(self.radius, f"{self._label}: radius"))
+        self._set(
+            start=start, end=end, _column=start[:, None], radius=checked_length(self.radius, f"{self._label}: radius")
+        )
         checked_length(length + self.radius, f"{self._label}: length")
         self._set(_axis=axis, _length=length, _across=across / np.linalg.norm(across))
 
     def _from_segment(self, points: Array) -> Array:
-        v = points - self.start
-        along = np.minimum(np.maximum(v @ self._axis, 0.0), self._length)
-        return v - along[:, None] * self._axis
+        v = np.subtract(points.T, self._column, order="C")
+        along = np.minimum(np.maximum(self._axis @ v, 0.0), self._length)
+        v -= self._axis[:, None] * along
+        return v
 
     def _distance(self, points: Array) -> Array:
-        return _length(self._from_segment(points)) - self.radius
+        return lengths(self._from_segment(points)) - self.radius
 
     def _distance_and_gradient(self, points: Array) -> tuple[Array, Array]:
         v = self._from_segment(points)
-        length = _length(v)
+        length = lengths(v)
         return length - self.radius, _unit(v, length, self._across)
 
     def _support(self, directions: Array) -> Array:
         ends = np.where((directions @ self._axis > 0.0)[:, None], self.end, self.start)
-        return ends + self.radius * _unit(directions, _length(directions), _UP)
+        return ends + self.radius * _unit(directions.T, lengths(directions.T), _UP)
 
     def _shift(self, offset: Array) -> None:
-        self._set(start=self.start + offset, end=self.end + offset)
+        start = self.start + offset
+        self._set(start=start, end=self.end + offset, _column=start[:, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,20 +173,21 @@ class Ellipsoid(PosedObstacle):
         floor = TINY * self.semi_axes[self._shortest]  # off the plane of symmetry, where s and y vanish together
         y[self._shortest] = np.maximum(y[self._shortest], floor)
         scaled = semi_axes * y
-        s = (scaled - self._beyond).max(axis=0)  # each term alone says F >= 0 here
+        s = np.maximum.reduce(scaled - self._beyond, axis=0)  # each term alone says F >= 0 here
         for _ in range(_MAX_NEWTON):
             shifted = s + self._beyond
             terms = np.square(scaled / shifted)
-            total = terms.sum(axis=0)
-            step = total * (np.sqrt(total) - 1.0) / (terms / shifted).sum(axis=0)
+            total = np.add.reduce(terms, axis=0)  # F + 1
+            terms /= shifted
+            step = total * (np.sqrt(total) - 1.0) / np.add.reduce(terms, axis=0)
             s += step
-            if not (step > 1e-9 * s).any():  # squared below, so exact to rounding
+            if np.maximum.reduce(step / s, initial=0.0) < _NEWTON_TOLERANCE:
                 break
         normal = y / (s + self._beyond)
-        normal /= np.sqrt(np.einsum("in,in->n", normal, normal))
+        normal /= lengths(normal)
         reach = semi_axes * normal
-        return np.einsum("in,in->n", normal, y) - np.sqrt(np.einsum("in,in->n", reach, reach)), normal
+        return np.add.reduce(normal * y, axis=0) - lengths(reach), normal
 
     def _local_support(self, v: Array) -> Array:
         reach = self.semi_axes[:, None] * v
-        return self.semi_axes[:, None] * reach / np.sqrt(np.einsum("in,in->n", reach, reach))
+        return self.semi_axes[:, None] * reach / lengths(reach)
