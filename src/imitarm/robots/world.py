@@ -1,0 +1,136 @@
+"""A MuJoCo world around an arm: floor, pedestal, light, and the obstacles of a scene as solid bodies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.kinematics.pose import Pose, quaternion_exp
+from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Obstacle, Scene, Sphere
+
+if TYPE_CHECKING:
+    from imitarm.kinematics.arm import ArmModel
+
+Array = NDArray[np.float64]
+
+COLLISION_GROUP = 3  # geoms of the arm and its tool that count for contact
+OBSTACLE = "obstacle/"  # bodies and geoms of obstacles are called so, followed by the index in the scene
+
+_COLORS = ((0.20, 0.42, 0.70), (0.78, 0.22, 0.20), (0.93, 0.58, 0.15), (0.45, 0.32, 0.60), (0.30, 0.55, 0.40))
+_FLOOR = (0.55, 0.57, 0.60, 1.0)
+_PEDESTAL = (0.28, 0.30, 0.33, 1.0)
+_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def arm_world(arm: ArmModel, *, floor: float = -0.75, pedestal_radius: float = 0.12) -> mujoco.MjSpec:
+    """Return a world with the arm on a pedestal, base at the origin, ready for more furniture.
+
+    Args:
+        arm: the arm with its tool.
+        floor: height of the floor in the base frame [m]; at 0 or above there is no pedestal.
+        pedestal_radius: [m].
+
+    Returns:
+        A specification that :class:`~imitarm.robots.simulated.SimulatedRobot` takes as ``world``.
+    """
+    spec = arm.spec()
+    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.headlight.diffuse = [0.55, 0.55, 0.55]
+    spec.visual.headlight.specular = [0.1, 0.1, 0.1]
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.86, 0.90, 0.95],
+        rgb2=[0.62, 0.70, 0.80],
+        width=64,
+        height=384,
+    )
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    world = spec.worldbody
+    world.add_light(pos=[0.5, -1.0, 2.5], dir=[0.0, 0.35, -1.0], diffuse=[0.4, 0.4, 0.4])
+    world.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, pos=[0.0, 0.0, floor], size=[3.0, 3.0, 0.05], rgba=_FLOOR
+    )
+    if floor < 0.0:
+        world.add_geom(
+            name="pedestal",
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            pos=[0.0, 0.0, 0.5 * floor],
+            size=[pedestal_radius, -0.5 * floor, 0.0],
+            rgba=_PEDESTAL,
+        )
+    return spec
+
+
+def add_obstacles(spec: mujoco.MjSpec, scene: Scene) -> None:
+    """Add every obstacle of ``scene`` as a solid body that can be moved about but not pushed away.
+
+    Args:
+        spec: the world; changed in place.
+        scene: obstacles in the base frame, which is the world frame.
+    """
+    for index, obstacle in enumerate(scene.obstacles):
+        name = f"{OBSTACLE}{index}"
+        pose, shape, size, vertices = _geometry(obstacle)
+        body = spec.worldbody.add_body(name=name, mocap=True, pos=pose.position, quat=pose.quaternion)
+        color = (*_COLORS[index % len(_COLORS)], 1.0)
+        if vertices is None:
+            body.add_geom(name=name, type=shape, size=size, rgba=color)
+        else:
+            spec.add_mesh(name=name, uservert=np.ascontiguousarray(vertices, dtype=float).ravel())
+            body.add_geom(name=name, type=shape, meshname=name, rgba=color)
+
+
+def obstacle_position(obstacle: Obstacle) -> Array:
+    """Return where the body of ``obstacle`` has its origin in the base frame, shape (3,) [m]."""
+    return _geometry(obstacle)[0].position
+
+
+def _geometry(obstacle: Obstacle) -> tuple[Pose, mujoco.mjtGeom, list[float], Array | None]:
+    """Return the pose of an obstacle's body, the shape and the size of its geom, and the vertices of its mesh."""
+    match obstacle:
+        case Sphere():
+            return Pose(obstacle.center, _UPRIGHT), mujoco.mjtGeom.mjGEOM_SPHERE, [obstacle.radius, 0.0, 0.0], None
+        case Box():
+            return obstacle.pose, mujoco.mjtGeom.mjGEOM_BOX, list(0.5 * obstacle.size), None
+        case Cylinder():
+            size = [obstacle.radius, 0.5 * obstacle.length, 0.0]
+            return obstacle.pose, mujoco.mjtGeom.mjGEOM_CYLINDER, size, None
+        case Ellipsoid():
+            return obstacle.pose, mujoco.mjtGeom.mjGEOM_ELLIPSOID, list(obstacle.semi_axes), None
+        case Capsule():
+            axis = obstacle.end - obstacle.start
+            length = float(np.linalg.norm(axis))
+            pose = Pose(0.5 * (obstacle.start + obstacle.end), _turn_from_z(axis))
+            return pose, mujoco.mjtGeom.mjGEOM_CAPSULE, [obstacle.radius, max(0.5 * length, 1e-6), 0.0], None
+        case _:  # any other convex solid becomes the hull of its vertices, or of points of its surface
+            vertices = np.asarray(obstacle.points if isinstance(obstacle, ConvexHull) else _surface(obstacle))
+            center = vertices.mean(axis=0)
+            return Pose(center, _UPRIGHT), mujoco.mjtGeom.mjGEOM_MESH, [0.0, 0.0, 0.0], vertices - center
+
+
+def _turn_from_z(axis: Array) -> Array:
+    """Return the quaternion wxyz (4,) that turns z into the direction of ``axis`` (3,)."""
+    across = np.cross([0.0, 0.0, 1.0], axis)
+    sine = float(np.linalg.norm(across))
+    if sine < 1e-12:
+        return _UPRIGHT  # along z either way: a capsule has no up and down
+    return quaternion_exp(np.arctan2(sine, axis[2]) / sine * across)
+
+
+def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
+    """Return distinct surface points (m, 3) of a convex obstacle, farthest in directions all around."""
+    azimuth = np.arange(n_around) * (2.0 * np.pi / n_around)
+    height = np.linspace(-1.0, 1.0, n_up)
+    flat = np.sqrt(1.0 - height**2)[:, None]
+    directions = np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), np.broadcast_to(height[:, None], (n_up, n_around))], axis=-1
+    )
+    if hasattr(obstacle, "pose"):
+        directions = directions @ obstacle.pose.rotation.T  # around its own axis
+    points = obstacle.support(directions.reshape(-1, 3))
+    return points[np.unique(np.round(points, 7), axis=0, return_index=True)[1]]
