@@ -1,0 +1,119 @@
+"""Finding a posture in which the tool has a given pose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import UnknownNameError, UnreachableError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.pose import Pose
+
+Array = NDArray[np.float64]
+
+ANGLE_LENGTH = 0.3  # [m/rad] an error of 1 rad counts as much as one of 0.3 m
+_TOLERANCE = 1e-7  # [m], weighted
+_STEPS = 120
+_LONGEST_STEP = 0.4  # [rad] of one joint in one step
+_DRIFT = 0.05  # share of the way to the reference posture that is gone in one step
+
+
+def find_posture(
+    arm: ArmModel,
+    pose: Pose,
+    *,
+    q0: ArrayLike | None = None,
+    frame: str = "tool",
+    restarts: int = 40,
+    seed: int = 0,
+) -> Array:
+    r"""Find joint positions within the limits that bring the tool to ``pose``.
+
+    Levenberg-Marquardt steps :math:`J^T(JJ^T+\mu)^{-1}e` on the joints that are not pressed against a limit, with
+    a drift to the start in the null space; first from ``q0``, then from ``home``, then from random postures.
+
+    Args:
+        arm: the arm.
+        pose: wanted pose in the base frame.
+        q0: posture to start from and to stay near to, shape (n_joints,) [rad]; None: ``home``.
+        frame: what is to be there, ``"tool"`` or ``"flange"``.
+        restarts: how many random postures to try.
+        seed: of the random postures.
+
+    Returns:
+        shape (n_joints,) [rad]; position within 1e-6 m and rotation within 1e-6 rad.
+
+    Raises:
+        UnreachableError: naming the pose and how far off the best posture was.
+        UnknownNameError: when the frame is not known.
+    """
+    if frame not in {"tool", "flange"}:
+        raise UnknownNameError.among("frame", frame, ("tool", "flange"))
+    best, least = arm.home, math.inf
+    for start in _starts(arm, q0, restarts, seed):
+        q, error = _descend(arm, start, pose, frame)
+        if error < least:
+            best, least = q, error
+        if error <= _TOLERANCE:
+            return q
+    missing = _error(arm, best, pose, frame)
+    raise UnreachableError(
+        f"{arm.name} can't bring its {frame} to position {np.round(pose.position, 4).tolist()} m, quaternion "
+        f"{np.round(pose.quaternion, 4).tolist()}: the best posture within its limits is "
+        f"{1e3 * float(np.linalg.norm(missing[:3])):.1f} mm and {math.degrees(float(np.linalg.norm(missing[3:]))):.1f} "
+        "degrees off; move the pose nearer to the arm or turn it"
+    )
+
+
+def _starts(arm: ArmModel, q0: ArrayLike | None, restarts: int, seed: int) -> Iterator[Array]:
+    if q0 is not None:
+        arm.forward_kinematics(q0)  # checks shape and numbers
+        yield np.clip(np.asarray(q0, dtype=float), arm.lower, arm.upper)
+    yield np.array(arm.home)
+    low, high = np.maximum(arm.lower, -math.pi), np.minimum(arm.upper, math.pi)
+    random = np.random.default_rng(seed)
+    for _ in range(restarts):
+        yield random.uniform(low, high)
+
+
+def _error(arm: ArmModel, q: Array, pose: Pose, frame: str) -> Array:
+    now = arm.tool_pose(q) if frame == "tool" else arm.forward_kinematics(q)
+    return now.error_to(pose)
+
+
+def _descend(arm: ArmModel, start: Array, pose: Pose, frame: str) -> tuple[Array, float]:
+    """Return the posture that was reached and its weighted error [m]."""
+    weights = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
+    q, best, least, since = start, start, math.inf, 0
+    for _ in range(_STEPS):
+        error = weights * _error(arm, q, pose, frame)
+        size = float(np.linalg.norm(error))
+        since = 0 if size < 0.99 * least else since + 1
+        if size < least:
+            best, least = q, size
+        if least <= _TOLERANCE or since > 12:
+            break
+        jacobian = weights[:, None] * (arm.tool_jacobian(q) if frame == "tool" else arm.jacobian(q))
+        q = np.clip(q + _step(arm, q, jacobian, error, start), arm.lower, arm.upper)
+    return best, least
+
+
+def _step(arm: ArmModel, q: Array, jacobian: Array, error: Array, reference: Array) -> Array:
+    """One step with the joints that are free to make it: those pressed against a limit stay there."""
+    free = np.ones(len(q), dtype=bool)
+    step = np.zeros(len(q))
+    damping = 1e-3 * float(error @ error) + 1e-12
+    for _ in range(len(q)):
+        part = jacobian * free
+        inverse = part.T @ np.linalg.inv(part @ part.T + damping * np.eye(6))
+        drift = _DRIFT * free * (reference - q)
+        step = inverse @ error + drift - inverse @ (part @ drift)
+        pressed = free & (((q >= arm.upper) & (step > 0.0)) | ((q <= arm.lower) & (step < 0.0)))
+        if not pressed.any():
+            break
+        free &= ~pressed
+    longest = float(np.max(np.abs(step)))
+    return step * min(1.0, _LONGEST_STEP / longest) if longest > 0.0 else step
