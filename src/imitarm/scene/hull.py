@@ -12,6 +12,8 @@ from imitarm.errors import InputError
 from imitarm.scene.obstacle import MAX_COORDINATE, MAX_SIZE, TINY, Array, Obstacle
 
 _FLAT = 1e-6  # a hull thinner than this share of its longest extent is taken as flat
+_BLOCK = 512  # points at a time: tables of points times edges stay in the processor's cache
+_CLOSE = 1e-5  # [m] nearer than this the edges are compared without cancellation
 _SAME_PLANE = 1e-12  # neighbouring triangles whose normals' cosine is this near to one share a face
 
 
@@ -28,6 +30,9 @@ class _Polytope:
         starts: one end of each edge between two faces, shape (3, e) [m].
         directions: unit vectors along the edges, shape (3, e).
         lengths: of the edges, shape (e,) [m].
+        starts_along: ``starts·directions`` of each edge, shape (e,) [m].
+        starts_twice: ``-2 starts``, shape (3, e) [m].
+        starts_squared: ``|starts|²``, shape (e,) [m²].
     """
 
     vertices: Array
@@ -38,6 +43,9 @@ class _Polytope:
     starts: Array
     directions: Array
     lengths: Array
+    starts_along: Array
+    starts_twice: Array
+    starts_squared: Array
 
     @classmethod
     def around(cls, points: Array) -> _Polytope:
@@ -56,6 +64,7 @@ class _Polytope:
         normals = facing[faces]
         starts, ends = _edges(vertices, triangles, facing)
         lengths = np.linalg.norm(ends - starts, axis=1)
+        directions = (ends - starts) / lengths[:, None]
         return cls(
             vertices,
             triangles,
@@ -63,9 +72,51 @@ class _Polytope:
             (vertices @ normals.T).max(axis=0),  # supporting planes to the last digit
             normals @ normals.T,
             np.ascontiguousarray(starts.T),
-            np.ascontiguousarray(((ends - starts) / lengths[:, None]).T),
+            np.ascontiguousarray(directions.T),
             lengths,
+            np.einsum("ij,ij->i", starts, directions),
+            np.ascontiguousarray(-2.0 * starts.T),
+            np.einsum("ij,ij->i", starts, starts),
         )
+
+    def distance_and_normal(self, q: Array) -> tuple[Array, Array]:
+        """Return signed distances (n,) and unit gradients (n, 3) at ``q`` (n, 3), relative to the centroid."""
+        heights = q @ self.normals.T - self.offsets  # (n, m)
+        face = heights.argmax(axis=1)
+        distance = heights[np.arange(len(q)), face]
+        normal = self.normals[face]
+        above = np.flatnonzero(distance > TINY)
+        if len(above):
+            foot_heights = heights[above] - distance[above, None] * self.cosines[face[above]]
+            beside = above[foot_heights.max(axis=1) > TINY]
+            if len(beside):
+                away = self._from_edges(q[beside])
+                distance[beside] = np.sqrt(np.einsum("ij,ij->i", away, away))
+                normal[beside] = away / distance[beside, None]
+        return distance, normal
+
+    def _from_edges(self, q: Array) -> Array:
+        """Return the vectors (n, 3) from the nearest point of any edge to ``q`` (n, 3)."""
+        along = q @ self.directions - self.starts_along  # (n, e), as all below
+        clipped = np.minimum(np.maximum(along, 0.0), self.lengths)
+        along *= -2.0
+        along += clipped
+        along *= clipped
+        along += q @ self.starts_twice
+        along += self.starts_squared  # squared distance less |q|²: enough to compare, but rounded at 1e-16 m²
+        away = self._from_edge(q, along.argmin(axis=1))
+        close = np.flatnonzero(np.einsum("ij,ij->i", away, away) < _CLOSE**2)
+        if len(close):
+            edges = np.arange(len(self.lengths))
+            every = self._from_edge(q[close, None, :], edges)
+            away[close] = every[np.arange(len(close)), np.einsum("ijk,ijk->ij", every, every).argmin(axis=1)]
+        return away
+
+    def _from_edge(self, q: Array, edge: NDArray[np.intp]) -> Array:
+        """Return the vectors (..., 3) from the nearest point of ``edge`` (...) to ``q`` (..., 3)."""
+        v, direction = q - self.starts.T[edge], self.directions.T[edge]
+        along = np.minimum(np.maximum(np.einsum("...j,...j->...", v, direction), 0.0), self.lengths[edge])
+        return v - along[..., None] * direction
 
 
 def _edges(vertices: Array, triangles: NDArray[np.intp], facing: Array) -> tuple[Array, Array]:
@@ -146,34 +197,11 @@ class ConvexHull(Obstacle):
         return self._distance_and_gradient(points)[0]
 
     def _distance_and_gradient(self, points: Array) -> tuple[Array, Array]:
-        polytope = self._polytope
-        q = points - self._centroid
-        heights = q @ polytope.normals.T - polytope.offsets  # (n, m)
-        face = heights.argmax(axis=1)
-        distance = heights[np.arange(len(q)), face]
-        normal = polytope.normals[face]
-        above = np.flatnonzero(distance > TINY)
-        if len(above):
-            foot_heights = heights[above] - distance[above, None] * polytope.cosines[face[above]]
-            beside = above[foot_heights.max(axis=1) > TINY]
-            if len(beside):
-                distance[beside], normal[beside] = self._to_edges(q[beside])
+        distance, normal = np.empty(len(points)), np.empty((len(points), 3))
+        for i in range(0, len(points), _BLOCK):
+            part = slice(i, i + _BLOCK)
+            distance[part], normal[part] = self._polytope.distance_and_normal(points[part] - self._centroid)
         return distance, normal
-
-    def _to_edges(self, q: Array) -> tuple[Array, Array]:
-        """Distances (n,) from the nearest edges to ``q`` (n, 3), relative to the centroid, and directions (n, 3)."""
-        polytope = self._polytope
-        x, y, z = q.T[:, :, None] - polytope.starts[:, None, :]  # (n, e) each
-        u, v, w = polytope.directions
-        along = np.minimum(np.maximum(x * u + y * v + z * w, 0.0), polytope.lengths)
-        x -= along * u
-        y -= along * v
-        z -= along * w
-        squared = x * x + y * y + z * z
-        rows, nearest = np.arange(len(q)), squared.argmin(axis=1)
-        distance = np.sqrt(squared[rows, nearest])
-        away = np.stack([x[rows, nearest], y[rows, nearest], z[rows, nearest]], axis=1)
-        return distance, away / distance[:, None]
 
     def _support(self, directions: Array) -> Array:
         vertices = self._polytope.vertices

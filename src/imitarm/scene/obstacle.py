@@ -22,7 +22,6 @@ Array = NDArray[np.float64]
 MAX_SIZE = 10.0  # [m] nothing in the reach of an arm is larger: such a number is in the wrong unit
 MAX_COORDINATE = 100.0  # [m] nor farther away
 MAX_SPEED = 100.0  # [m/s] nor faster
-BLOCK = 1024  # points at a time: what is worked out on the way stays in the processor's cache
 TINY = 1e-12  # [m] below this length a direction is rounding noise and a fixed one is taken instead
 
 
@@ -141,12 +140,9 @@ class Obstacle(ABC):
             InputError: when the last axis has not length 3.
         """
         p = np.asarray(points, dtype=float)
-        rows = p if p.ndim == 2 and p.shape[1] == 3 else _rows(p)
-        if len(rows) <= BLOCK:
-            distance = self._distance(rows)
-        else:
-            distance = np.concatenate([self._distance(rows[i : i + BLOCK]) for i in range(0, len(rows), BLOCK)])
-        return distance if rows is p else distance.reshape(p.shape[:-1])
+        if p.ndim == 2 and p.shape[1] == 3:
+            return self._distance(p)
+        return self._distance(_rows(p)).reshape(p.shape[:-1])
 
     def gradient(self, points: ArrayLike) -> Array:
         """Return the gradient of :meth:`signed_distance`: unit vectors, shape (..., 3).
@@ -172,15 +168,10 @@ class Obstacle(ABC):
             InputError: when the last axis has not length 3.
         """
         p = np.asarray(points, dtype=float)
-        rows = p if p.ndim == 2 and p.shape[1] == 3 else _rows(p)
-        if len(rows) <= BLOCK:
-            distance, gradient = self._distance_and_gradient(rows)
-        else:
-            distance, gradient = np.empty(len(rows)), np.empty((len(rows), 3))
-            for i in range(0, len(rows), BLOCK):
-                part = slice(i, i + BLOCK)
-                distance[part], gradient[part] = self._distance_and_gradient(rows[part])
-        return (distance, gradient) if rows is p else (distance.reshape(p.shape[:-1]), gradient.reshape(p.shape))
+        if p.ndim == 2 and p.shape[1] == 3:
+            return self._distance_and_gradient(p)
+        distance, gradient = self._distance_and_gradient(_rows(p))
+        return distance.reshape(p.shape[:-1]), gradient.reshape(p.shape)
 
     def support(self, directions: ArrayLike) -> Array:
         """Return the farthest point of the solid in each direction, the one query that GJK needs.

@@ -176,7 +176,8 @@ class Ellipsoid(PosedObstacle):
         s = np.maximum.reduce(scaled - self._beyond, axis=0)  # each term alone says F >= 0 here
         for _ in range(_MAX_NEWTON):
             shifted = s + self._beyond
-            terms = np.square(scaled / shifted)
+            terms = scaled / shifted
+            terms *= terms
             total = np.add.reduce(terms, axis=0)  # F + 1
             terms /= shifted
             step = total * (np.sqrt(total) - 1.0) / np.add.reduce(terms, axis=0)
