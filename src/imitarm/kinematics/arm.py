@@ -46,8 +46,8 @@ class _Scratch(threading.local):
         self.data = mujoco.MjData(model)
         self.data.qpos[:] = home
         self.posture = b""
-        self.linear = np.zeros((3, model.nv))
-        self.angular = np.zeros((3, model.nv))
+        self.jacobian = np.zeros((6, model.nv))
+        self.linear, self.angular = self.jacobian[:3], self.jacobian[3:]
         self.force = np.zeros(model.nv)
 
 
@@ -265,7 +265,7 @@ class ArmModel:
         scratch = self._at(q)
         position = np.asarray(point, dtype=float).reshape(3, 1)
         mujoco.mj_jac(self._model, scratch.data, scratch.linear, None, position, index)
-        return scratch.linear[:, self._dofs].copy()
+        return np.array(scratch.linear[:, self._dofs])
 
     def collision_spheres(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return spheres that together cover all moving collision shapes of arm and tool.
@@ -362,7 +362,7 @@ class ArmModel:
 
     def _site_jacobian(self, scratch: _Scratch, site: int) -> Array:
         mujoco.mj_jacSite(self._model, scratch.data, scratch.linear, scratch.angular, site)
-        return np.concatenate((scratch.linear[:, self._dofs], scratch.angular[:, self._dofs]))
+        return np.array(scratch.jacobian[:, self._dofs])
 
     def _recursive_newton_euler(self, scratch: _Scratch, velocity: Array | None, acceleration: Array | None) -> Array:
         data = scratch.data

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import daqp
 import numpy as np
@@ -48,8 +49,7 @@ class IKStep:
     slack: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
+class _Task(NamedTuple):
     """What the methods see: the weighted task, and the box of admissible joint velocities."""
 
     jacobian: Array  # weighted, (6, n)
@@ -169,17 +169,19 @@ def velocity_box(arm: ArmModel, q: ArrayLike, dt: float, velocity: ArrayLike | N
         lower and upper, each of shape (n_joints,) [rad/s].
     """
     position = np.asarray(q, dtype=float)
-    step = arm.max_acceleration * dt
-    squared, double = step * step, 2.0 * arm.max_acceleration
-    upper = np.sqrt(squared + double * np.maximum(arm.upper - position, 0.0)) - step
-    lower = step - np.sqrt(squared + double * np.maximum(position - arm.lower, 0.0))
-    if velocity is None:
-        return np.maximum(lower, -arm.max_velocity), np.minimum(upper, arm.max_velocity)
-    previous = np.clip(np.asarray(velocity, dtype=float), -arm.max_velocity, arm.max_velocity)
-    slower, faster = previous - step, previous + step
-    upper = np.minimum(np.minimum(arm.max_velocity, faster), np.maximum(upper, slower))
-    lower = np.maximum(np.maximum(-arm.max_velocity, slower), np.minimum(lower, faster))
-    return lower, upper
+    most, step = arm.max_velocity, arm.max_acceleration * dt
+    # both directions at once: row 0 upwards, row 1 downwards, where up is what is down in row 0
+    way = np.empty((2, len(most)))
+    np.subtract(arm.upper, position, out=way[0])
+    np.subtract(position, arm.lower, out=way[1])
+    bound = np.sqrt(step * step + (2.0 * arm.max_acceleration) * np.maximum(way, 0.0)) - step
+    if velocity is not None:
+        before = np.empty_like(way)
+        np.minimum(np.maximum(velocity, -most), most, out=before[0])
+        np.negative(before[0], out=before[1])
+        bound = np.minimum(np.maximum(bound, before - step), before + step)
+    bound = np.minimum(bound, most)
+    return -bound[1], bound[0]
 
 
 def clearance_rows(
@@ -248,7 +250,7 @@ def _task(
     lower, upper = velocity_box(arm, position, dt, previous)
     posture = None
     if q_ref is not None:
-        posture = np.clip(posture_gain * (_joints(arm, q_ref, "q_ref") - position), lower, upper)
+        posture = np.minimum(np.maximum(posture_gain * (_joints(arm, q_ref, "q_ref") - position), lower), upper)
     if rows is not None:
         rows = _checked_rows(arm, rows, method)
     return _Task(jacobian, wanted, lower, upper, arm.max_velocity, previous, posture, rows, small_angle)
@@ -285,9 +287,8 @@ def _quadratic_program(task: _Task) -> Array:
         effort += _POSTURE
         linear -= _POSTURE * task.posture
     hessian.flat[:: n + 1] += effort
-    if task.rows is None:
-        matrix, upper, lower, sense = np.zeros((0, n)), task.upper, task.lower, np.zeros(n, dtype=np.intc)
-    else:
+    matrix, upper, lower, sense = np.empty((0, n)), task.upper, task.lower, np.zeros(n, dtype=np.intc)
+    if task.rows is not None:
         matrix, least = task.rows
         upper = np.concatenate((task.upper, np.full(len(least), 1e30)))
         lower = np.concatenate((task.lower, least))
@@ -298,7 +299,7 @@ def _quadratic_program(task: _Task) -> Array:
         status <= 0
     ):  # the box is never empty and rows are soft: only lost digits can bring us here, and standing is safe
         velocity = np.zeros(n)
-    return np.asarray(np.clip(velocity, task.lower, task.upper))
+    return np.minimum(np.maximum(velocity, task.lower), task.upper)
 
 
 def _damped_least_squares(task: _Task) -> Array:
@@ -337,7 +338,7 @@ def _within_box(task: _Task, result: Array, jacobian: Array, squares: Array, bas
         usable = squares > 1e-8
         used = (basis.T @ (jacobian @ drift))[usable] / squares[usable]
         result = result + scale * (drift - jacobian.T @ (basis[:, usable] @ used))
-    excess = float(np.max(np.abs(result) / task.max_velocity))
+    excess = float((np.abs(result) / task.max_velocity).max())
     if excess > 1.0:
         result = result / excess
     return np.minimum(np.maximum(result, task.lower), task.upper)
