@@ -5,17 +5,29 @@ All three are frozen and their arrays read-only: state comes in as an argument, 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.errors import InputError
+from imitarm.errors import FileFormatError, InputError
 from imitarm.kinematics.pose import Pose, checked_unit_quaternions, continuous_signs, slerp
+from imitarm.table import Table, read_table, write_table
 
 Array = NDArray[np.float64]
+
+FORMAT = "imitarm-demonstration"
+VERSION = 1
+_UNITS = "m s rad"
+_FRAME = "tool_to_base"
+_POSE_COLUMNS = ("t", "x", "y", "z")
+_QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
+_COLUMN_NAME = re.compile(r"[A-Za-z_][\w./:-]*")
+_RESERVED = {*_POSE_COLUMNS, *_QUATERNION_COLUMNS, "nan", "inf", "infinity"}
 
 
 def _frozen(values: ArrayLike, shape: tuple[int | None, ...], what: str) -> Array:
@@ -127,24 +139,30 @@ class Demonstration:
         joints: joint angles (n, n_joints) [rad] of the arm that was guided, None when not recorded.
         task: what was shown, for example ``"sweep"``.
         source: where it came from: a file, a row range, a recorder.
+        joint_names: one name for each column of ``joints``; ``joint_1``, ``joint_2``, ... when not given.
 
     Raises:
-        InputError: when ``joints`` has not one row for each sample.
+        InputError: when ``joints`` has not one row for each sample, or ``joint_names`` not one name for each column.
     """
 
     trajectory: Trajectory
     joints: Array | None = None
     task: str = ""
     source: str = ""
+    joint_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.joints is None:
+            object.__setattr__(self, "joint_names", ())
             return
+        what = f"Demonstration joints of {self.source or self.task}"
         columns = np.shape(self.joints)[1] if np.ndim(self.joints) == 2 else None
-        joints = _frozen(
-            self.joints, (len(self.trajectory), columns), f"Demonstration joints of {self.source or self.task}"
-        )
+        joints = _frozen(self.joints, (len(self.trajectory), columns), what)
+        names = tuple(self.joint_names) or tuple(f"joint_{i + 1}" for i in range(joints.shape[1]))
+        if len(names) != joints.shape[1] or len(set(names)) != len(names):
+            raise InputError(f"{what}: {joints.shape[1]} columns need as many different joint_names, got {names}")
         object.__setattr__(self, "joints", joints)
+        object.__setattr__(self, "joint_names", names)
 
     def __len__(self) -> int:
         return len(self.trajectory)
@@ -152,6 +170,83 @@ class Demonstration:
     def with_trajectory(self, trajectory: Trajectory, joints: Array | None) -> Demonstration:
         """Return a copy that keeps task and source."""
         return replace(self, trajectory=trajectory, joints=joints)
+
+    def save(self, path: str | Path) -> None:
+        """Write a CSV file that says its units and frame and loses no digit; an older file is replaced.
+
+        Columns: ``t`` [s], ``x y z`` [m], ``qw qx qy qz`` when the rotation is known, then the joints by name [rad].
+
+        Raises:
+            InputError: when a joint's name can't be a column name, or the file can't be written.
+        """
+        for name in self.joint_names:
+            if not _COLUMN_NAME.fullmatch(name) or name.lower() in _RESERVED:
+                raise InputError(f"{path}: {name!r} can't be the name of a joint's column; rename that joint")
+        motion = self.trajectory
+        names = [*_POSE_COLUMNS, *(_QUATERNION_COLUMNS if motion.quaternions is not None else ()), *self.joint_names]
+        parts = [motion.times[:, None], motion.positions, motion.quaternions, self.joints]
+        remarks = {
+            "format": FORMAT,
+            "version": VERSION,
+            "units": _UNITS,
+            "frame": _FRAME,
+            "task": self.task,
+            "source": self.source,
+            "samples": len(self),
+        }
+        values = np.hstack([part for part in parts if part is not None])
+        write_table(path, {key: str(value) for key, value in remarks.items()}, names, values)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Demonstration:
+        """Read what :meth:`save` wrote. Other formats: ``imitarm.demonstrations.read``.
+
+        ``source`` becomes the path.
+
+        Raises:
+            InputError: when the file can't be opened.
+            FileFormatError: when it is damaged, cut off, of another format or of a newer version.
+        """
+        table = read_demonstration_table(path)
+        names = table.names or ()
+        n_pose = 8 if "qw" in names else 4
+        quaternions = table.values[:, 4:8] if n_pose == 8 else None
+        joints = table.values[:, n_pose:] if len(names) > n_pose else None
+        try:
+            trajectory = Trajectory(table.values[:, 0], table.values[:, 1:4], quaternions)
+            return cls(trajectory, joints, table.remarks.get("task", ""), str(path), names[n_pose:])
+        except InputError as error:
+            raise FileFormatError(f"{path} (row 0 is line {table.lines[0]}): {error}") from error
+
+
+def read_demonstration_table(path: str | Path) -> Table:
+    """Read the file of a demonstration as a table: the header is checked, the numbers are not.
+
+    Raises:
+        InputError: when the file can't be opened.
+        FileFormatError: when it is damaged, cut off, of another format or of a newer version.
+    """
+    table = read_table(path)
+    if table.remarks.get("format") != FORMAT:
+        raise FileFormatError(
+            f"{path}: no line '# format: {FORMAT}' at its head; read other formats with imitarm.demonstrations.read"
+        )
+    version = table.remarks.get("version", "")
+    if not version.isdecimal() or int(version) > VERSION:
+        raise FileFormatError(f"{path}: format version {version!r}, this imitarm reads up to {VERSION}; update imitarm")
+    for key, wanted in (("units", _UNITS), ("frame", _FRAME)):
+        if table.remarks.get(key, wanted) != wanted:
+            raise FileFormatError(f"{path}: {key} are {table.remarks[key]!r}, must be {wanted!r}; convert the numbers")
+    samples = table.remarks.get("samples", str(len(table.values)))
+    if samples != str(len(table.values)) or not table.ends_in_newline:
+        raise FileFormatError(
+            f"{path}: announces {samples} samples, holds {len(table.values)}; the file was cut off, copy it again"
+        )
+    names = table.names or ()
+    pose = _POSE_COLUMNS + (_QUATERNION_COLUMNS if "qw" in names else ())
+    if names[: len(pose)] != pose:
+        raise FileFormatError(f"{path}: columns must begin {','.join(pose)}, got {','.join(names) or 'no names'}")
+    return table
 
 
 @dataclass(frozen=True, eq=False)

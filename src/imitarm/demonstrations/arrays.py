@@ -1,0 +1,136 @@
+"""Reader of NumPy files: one array (.npy) or several by name (.npz). Nothing is ever unpickled."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.demonstrations.columns import COUNTS, UNNAMED, in_space, unnamed_columns
+from imitarm.demonstrations.raw import RawDemonstration
+from imitarm.demonstrations.reader import Reader, ReadOptions
+from imitarm.errors import FileFormatError
+from imitarm.table import read_bytes
+
+Array = NDArray[np.float64]
+
+_NPY, _NPZ = b"\x93NUMPY", b"PK\x03\x04"
+_FIELDS = ("times", "positions", "quaternions", "joints")
+_DAMAGE = (ValueError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, zlib.error, NotImplementedError)
+
+
+class NumpyReader(Reader):
+    """Arrays of numbers.
+
+    An array (n, columns) is one motion, (n_demonstrations, n, columns) are several; columns as in a plain table
+    without names. An .npz with an array ``positions`` is one set of motions with ``times``, ``quaternions`` and
+    ``joints`` beside it; any other .npz holds motions array by array.
+    """
+
+    name = "NumPy arrays"
+
+    def recognises(self, head: bytes) -> bool:
+        """Tell by the mark at the head of .npy and .npz files."""
+        return head.startswith((_NPY, _NPZ))
+
+    def read(self, path: str, options: ReadOptions) -> list[RawDemonstration]:
+        """Return every motion of the file, in order."""
+        content = read_bytes(path)
+        if content.startswith(_NPY):
+            return _stack(path, _numbers(path, _load(path, content)), options)
+        with _load(path, content) as archive:
+            names = list(archive.files)
+            try:
+                arrays = {name: archive[name] for name in names}
+            except _DAMAGE as error:
+                raise _damaged(path, error) from error
+        if not arrays:
+            raise FileFormatError(f"{path}: the archive holds no arrays; save it again with numpy.savez")
+        arrays = {name: _numbers(f"{path}:{name}", array) for name, array in arrays.items()}
+        if "positions" in arrays:
+            return _by_field(path, arrays, options)
+        return [raw for name, array in arrays.items() for raw in _stack(f"{path}:{name}", array, options)]
+
+
+def _damaged(path: str, error: BaseException) -> FileFormatError:
+    if "pickle" in str(error):
+        return FileFormatError(
+            f"{path}: holds Python objects (a pickle), which are never opened; save numbers as one float array"
+        )
+    return FileFormatError(f"{path}: damaged or cut off ({str(error).splitlines()[0] or type(error).__name__})")
+
+
+def _load(path: str, content: bytes) -> Any:
+    """Open an .npy or .npz that is already in memory; a size that lies in its header is found there, not allocated."""
+    try:
+        if content.startswith(_NPY):
+            stream = io.BytesIO(content)
+            version = np.lib.format.read_magic(stream)
+            header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = header(stream)
+            if not dtype.hasobject and np.prod(shape, dtype=float) * dtype.itemsize > len(content):
+                raise ValueError(f"its header says shape {shape}, the file is too short for it")
+        return np.load(io.BytesIO(content), allow_pickle=False)
+    except _DAMAGE as error:
+        raise _damaged(path, error) from error
+
+
+def _numbers(source: str, array: NDArray[Any]) -> Array:
+    if array.dtype.kind not in "iuf":
+        raise FileFormatError(f"{source}: holds {array.dtype}, not real numbers; save a float array")
+    if array.size == 0:
+        raise FileFormatError(f"{source}: the array is empty, shape {array.shape}")
+    return array.astype(float)
+
+
+def _stack(source: str, array: Array, options: ReadOptions) -> list[RawDemonstration]:
+    if array.ndim not in (2, 3) or array.shape[-1] not in UNNAMED:
+        raise FileFormatError(
+            f"{source}: shape {array.shape}, must be (n, columns) or (n_demonstrations, n, columns); columns: {COUNTS}"
+        )
+    if array.ndim == 2:
+        return [unnamed_columns(source, array, options)]
+    return [unnamed_columns(f"{source}[{i}]", motion, options) for i, motion in enumerate(array)]
+
+
+def _by_field(path: str, arrays: dict[str, Array], options: ReadOptions) -> list[RawDemonstration]:
+    """Put together the arrays ``positions``, ``times``, ``quaternions`` and ``joints`` of one archive."""
+    shape = arrays["positions"].shape
+    if len(shape) not in (2, 3) or shape[-1] not in (2, 3):
+        raise FileFormatError(f"{path}:positions: shape {shape}, must be (n, 3) or (n_demonstrations, n, 3)")
+    lead = shape[:-1]
+    wanted: dict[str, tuple[tuple[int, ...], ...]] = {
+        "times": (lead, lead[-1:]),  # one time axis may serve all motions
+        "quaternions": ((*lead, 4),),
+        "joints": ((*lead, arrays["joints"].shape[-1]),) if "joints" in arrays else (),
+    }
+    for name, shapes in wanted.items():
+        if name in arrays and arrays[name].shape not in shapes:
+            raise FileFormatError(f"{path}:{name}: shape {arrays[name].shape}, must be {shapes[0]} as positions are")
+    if len(shape) == 2:
+        return [_of_fields(path, arrays, options)]
+    fields = [name for name in _FIELDS if name in arrays]
+    each = [
+        {name: arrays[name] if arrays[name].shape == lead[-1:] else arrays[name][i] for name in fields}
+        for i in range(shape[0])
+    ]
+    return [_of_fields(f"{path}[{i}]", motion, options) for i, motion in enumerate(each)]
+
+
+def _of_fields(source: str, fields: dict[str, Array], options: ReadOptions) -> RawDemonstration:
+    positions, times, joints = fields["positions"], fields.get("times"), fields.get("joints")
+    unused = sorted(set(fields) - set(_FIELDS))
+    return RawDemonstration(
+        source,
+        options.even_times(source, len(positions)) if times is None else options.seconds(source, times),
+        in_space(options.metres(source, positions)),
+        options.wxyz(fields["quaternions"]) if "quaternions" in fields else None,
+        joints,
+        () if joints is None else tuple(f"joint_{i + 1}" for i in range(joints.shape[1])),
+        options.task,
+        notes=(f"arrays not used: {', '.join(unused)}",) if unused else (),
+    )

@@ -1,0 +1,200 @@
+"""Tables of numbers in text files: read with the line of every fault, written without ever leaving half a file.
+
+A table is lines of numbers, with or without a row of column names, set apart by comma, semicolon, tab or spaces.
+Lines that start with ``#`` or ``%`` are remarks; those before the numbers that read ``key: value`` are kept.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import FileFormatError, InputError
+
+Array = NDArray[np.float64]
+
+# how a file of another kind begins, so that the message can name it
+SIGNATURES = {
+    b"\x93NUMPY": "a NumPy array (.npy)",
+    b"PK\x03\x04": "a zip archive (.npz, .xlsx or other)",
+    b"\x89HDF": "an HDF5 file",
+    b"#ROSBAG": "a ROS 1 bag",
+    b"\x89MCAP": "an MCAP recording",
+    b"SQLite format 3": "a SQLite database (a ROS 2 bag?)",
+    b"PAR1": "a Parquet file",
+    b"\x1f\x8b": "a gzip archive",
+    b"\x80": "a Python pickle, which is never opened",
+    b"\xff\xfe": "text in UTF-16",
+    b"\xfe\xff": "text in UTF-16",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """What a text file says.
+
+    Attributes:
+        path: the file, as it was named by the caller.
+        remarks: the ``key: value`` remarks before the numbers, keys in lower case.
+        names: the column names, None when the file has none.
+        values: the numbers, shape (n, columns); may hold nan and inf, which are the caller's to judge.
+        lines: the line in the file of each row, from 1, shape (n,).
+        ends_in_newline: False when the last line was perhaps cut off.
+    """
+
+    path: str
+    remarks: Mapping[str, str]
+    names: tuple[str, ...] | None
+    values: Array
+    lines: NDArray[np.int64]
+    ends_in_newline: bool
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return the content of a file.
+
+    Raises:
+        InputError: when it can't be opened.
+        FileFormatError: when it is empty.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: can't be read: {error.strerror or error}") from error
+    if not content.strip():
+        raise FileFormatError(f"{path}: the file is empty; record or copy it again")
+    return content
+
+
+def kind_of(content: bytes) -> str | None:
+    """Name the kind of a binary file by how it begins; None when it looks like text."""
+    for signature, kind in SIGNATURES.items():
+        if content.startswith(signature):
+            return kind
+    return "binary data" if b"\0" in content[:4096] else None
+
+
+def _text_of(path: str | Path, content: bytes) -> str:
+    kind = kind_of(content)
+    if kind is not None:
+        raise FileFormatError(
+            f"{path}: this is {kind}, not a text table; give it its right name or export it as UTF-8 CSV"
+        )
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise FileFormatError(
+            f"{path}, line {line}: byte 0x{content[error.start]:02x} is not UTF-8; save the file as UTF-8"
+        ) from error
+    # not splitlines(): it also breaks at form feeds and the like, and line numbers would differ from an editor's
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _separator(line: str) -> str | None:
+    """Return what sets fields apart in ``line``; None means blanks."""
+    return next((s for s in ";\t," if s in line), None)
+
+
+def _fields(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        return line.split()
+    fields = [field.strip().strip('"') for field in line.split(separator)]
+    return fields[:-1] if fields[-1] == "" else fields  # some recorders end each line with a separator
+
+
+def _number(field: str) -> float | None:
+    try:
+        return None if "_" in field else float(field)  # float() alone would take 1_0 for ten
+    except ValueError:
+        return None
+
+
+def _row(path: str | Path, number: int, fields: Sequence[str], width: int, last: bool) -> list[float]:
+    if len(fields) != width:
+        remedy = "the file was cut off: record it again or remove its last line" if last else "mend that line"
+        raise FileFormatError(f"{path}, line {number}: {len(fields)} values where {width} are expected; {remedy}")
+    numbers = [_number(field) for field in fields]
+    values = [value for value in numbers if value is not None]
+    if len(values) < width:
+        column = numbers.index(None)
+        field = fields[column]
+        what = f"{field[:40]!r} is not a number" if field else "a value is missing"
+        hint = "use a decimal point" if field.replace(",", "", 1).lstrip("+-").isdigit() else "mend or remove that line"
+        raise FileFormatError(f"{path}, line {number}, column {column + 1}: {what}; {hint}")
+    return values
+
+
+def _remarks(lines: Sequence[str]) -> tuple[dict[str, str], str]:
+    """Return the ``key: value`` remarks, and the last remark that is none (perhaps column names)."""
+    remarks: dict[str, str] = {}
+    heading = ""
+    for line in lines:
+        key, colon, value = line.lstrip("#% ").partition(":")
+        if colon:
+            remarks[key.strip().lower()] = value.strip()
+        else:
+            heading = key
+    return remarks, heading
+
+
+def read_table(path: str | Path) -> Table:
+    """Read a table of numbers.
+
+    Raises:
+        InputError: when the file can't be opened.
+        FileFormatError: when it is empty, binary, not UTF-8, holds no rows, a row has another length than the first
+            one, or something is not a number; the message names file and line.
+    """
+    text = _text_of(path, read_bytes(path))
+    stripped = [(number, line.strip(" \f\v")) for number, line in enumerate(text.split("\n"), start=1)]
+    written = [(number, line) for number, line in stripped if line.strip()]
+    body = [(number, line) for number, line in written if line[0] not in "#%"]
+    if not body:
+        raise FileFormatError(f"{path}: holds no rows of numbers; record or export it again")
+    remarks, heading = _remarks([line for number, line in written if number < body[0][0]])
+    separator = _separator(body[0][1])
+    first = _fields(body[0][1], separator)
+    names: tuple[str, ...] | None = None
+    if all(_number(field) is None for field in first):
+        names, body = tuple(first), body[1:]
+        if not body:
+            raise FileFormatError(f"{path}: has column names but no rows; record or export it again")
+    elif (fields := tuple(_fields(heading, _separator(heading)))) and len(fields) == len(first):
+        names = fields if all(_number(field) is None for field in fields) else None  # as numpy.savetxt writes them
+    rows = [_row(path, number, _fields(line, separator), len(first), number == len(stripped)) for number, line in body]
+    lines = np.array([number for number, _ in body], dtype=np.int64)
+    return Table(str(path), remarks, names, np.array(rows), lines, text.endswith("\n"))
+
+
+def write_table(
+    path: str | Path, remarks: Mapping[str, str], names: Sequence[str], values: NDArray[np.float64]
+) -> None:
+    """Write a table that :func:`read_table` gives back to the last bit.
+
+    It is written beside the place it belongs and then renamed: an older file stays whole until the new one is.
+
+    Args:
+        path: where to; an existing file is replaced.
+        remarks: written first, one ``# key: value`` a line; line breaks become blanks.
+        names: the column names.
+        values: the numbers, shape (n, len(names)).
+
+    Raises:
+        InputError: when it can't be written.
+    """
+    head = [f"# {key}: {' '.join(str(value).split())}" for key, value in remarks.items()]
+    body = [",".join(map(repr, row)) for row in np.asarray(values, dtype=float).tolist()]
+    target = Path(path)
+    aside = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        aside.write_text("\n".join([*head, ",".join(names), *body, ""]), encoding="utf-8", newline="\n")
+        aside.replace(target)
+    except OSError as error:
+        aside.unlink(missing_ok=True)
+        raise InputError(f"{path}: can't be written: {error.strerror or error}") from error
