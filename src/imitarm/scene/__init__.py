@@ -7,9 +7,23 @@ from imitarm.scene.hull import ConvexHull
 from imitarm.scene.obstacle import Obstacle
 from imitarm.scene.rounded import Capsule, Ellipsoid, Sphere
 from imitarm.scene.scene import Scene
+from imitarm.scene.scene_file import load_scene, save_scene
 
 OBSTACLES: dict[str, type[Obstacle]] = {
     shape.kind: shape for shape in (Sphere, Box, Capsule, Cylinder, Cone, Ellipsoid, ConvexHull)
 }
 
-__all__ = ["OBSTACLES", "Box", "Capsule", "Cone", "ConvexHull", "Cylinder", "Ellipsoid", "Obstacle", "Scene", "Sphere"]
+__all__ = [
+    "OBSTACLES",
+    "Box",
+    "Capsule",
+    "Cone",
+    "ConvexHull",
+    "Cylinder",
+    "Ellipsoid",
+    "Obstacle",
+    "Scene",
+    "Sphere",
+    "load_scene",
+    "save_scene",
+]

@@ -1,0 +1,270 @@
+"""Scene files: a goal and obstacles as YAML that a person writes (docs/scene.md).
+
+What each shape needs in a file follows from its fields, so a shape added to ``OBSTACLES`` can be read and written at
+once. Only plain YAML is read: numbers, text, lists and mappings; nothing in a file is executed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from reprlib import repr as _shown  # a few items only, however much a file holds
+from typing import Any
+
+import numpy as np
+import yaml
+
+import imitarm.scene  # for its registry, which is complete only once all shapes are imported
+from imitarm.errors import FileFormatError, InputError
+from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
+from imitarm.scene.obstacle import Obstacle
+from imitarm.scene.scene import Scene
+
+FORMAT = "imitarm-scene"
+VERSION = 1
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+_TOP = ("format", "version", "units", "goal", "obstacles")
+_ROTATIONS = ("quaternion", "rpy_degrees", "yaw_degrees")
+_COMMON = ("name", "velocity")
+
+
+def load_scene(path: str | os.PathLike[str]) -> Scene:
+    """Read a scene file.
+
+    Args:
+        path: a YAML file as docs/scene.md describes it.
+
+    Returns:
+        The scene in metres, whatever the file's units.
+
+    Raises:
+        InputError: when there is no such file or it can't be read.
+        FileFormatError: when it is not a scene file or something in it is wrong; the message names the file, the
+            entry and the key, and lists what is known there.
+    """
+    path = Path(path)
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"scene file {path} can't be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path}: not a text file in UTF-8 (byte {error.start}); save it as UTF-8") from error
+    try:
+        return _scene(_parsed(text))
+    except InputError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+
+
+def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
+    """Write a scene file in metres that :func:`load_scene` reads back to the last digit.
+
+    It is written aside and renamed, so a file that was there is kept when something fails.
+
+    Args:
+        scene: of obstacles in ``OBSTACLES``.
+        path: the file; its folder must exist.
+
+    Raises:
+        InputError: when an obstacle's shape is in no registry, or the file can't be written.
+    """
+    path = Path(path)
+    content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "units": "m"}
+    if scene.goal is not None:
+        content["goal"] = _pose_entry(scene.goal)
+    content["obstacles"] = [_obstacle_entry(obstacle) for obstacle in scene.obstacles]
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        aside.write_text(text, encoding="utf-8")
+        aside.replace(path)
+    except OSError as error:
+        aside.unlink(missing_ok=True)
+        raise InputError(f"scene file {path} can't be written: {error.strerror}") from error
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain YAML, where a key can't be given twice and 1e-3 is a number (as YAML 1.2 has it)."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    problem = f'key "{key.value}" is given twice; remove one'
+                    raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def _parsed(text: str) -> object:
+    """Return what the YAML says, in plain Python types."""
+    try:
+        return yaml.load(text, _Loader)  # a SafeLoader
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark is not None else ""
+        raise InputError(f"{where}not readable as YAML: {problem}") from error
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
+        # what PyYAML lets through: the 13th month, an explicit tag that does not fit its value, endless nesting
+        raise InputError(f"not readable as YAML: {error}") from error
+
+
+def _scene(content: object) -> Scene:
+    if content is None:
+        raise InputError(f'the file is empty; a scene file begins with "format: {FORMAT}"')
+    if not isinstance(content, Mapping):
+        raise InputError(f'not a scene file: the top must be keys and values, beginning with "format: {FORMAT}"')
+    if content.get("format") != FORMAT:
+        raise InputError(f'not a scene file: "format: {FORMAT}" is missing (format is {_shown(content.get("format"))})')
+    version = content.get("version")
+    if isinstance(version, bool) or version != VERSION:
+        raise InputError(
+            f"version is {version!r}, but this imitarm reads version {VERSION}; update imitarm or the file"
+        )
+    _check_keys(content, _TOP, "the top level")
+    units = content.get("units", "m")
+    if not isinstance(units, str) or units not in UNITS:
+        raise InputError(f"units: unknown unit {_shown(units)}{_suggestion(units, UNITS)}; known: {', '.join(UNITS)}")
+    goal = content.get("goal")
+    entries = content.get("obstacles")
+    if entries is not None and not isinstance(entries, list):
+        raise InputError("obstacles: must be a list; begin each obstacle with a dash")
+    return Scene(
+        None if goal is None else _goal(goal, UNITS[units]),
+        tuple(_obstacle(entry, i, UNITS[units]) for i, entry in enumerate(entries or [])),
+    )
+
+
+def _goal(entry: object, metres: float) -> Pose:
+    if not isinstance(entry, Mapping):
+        raise InputError(f"goal: must have the keys position and quaternion, got {_shown(entry)}")
+    _check_keys(entry, ("position", *_ROTATIONS), "goal")
+    if not any(key in entry for key in _ROTATIONS):  # an arm's tool seldom points up, so none is assumed
+        raise InputError(f"goal: the rotation of the tool is missing; give one of: {', '.join(_ROTATIONS)}")
+    return _pose(entry, "goal", metres)
+
+
+def _obstacle(entry: object, index: int, metres: float) -> Obstacle:
+    where = f"obstacles[{index}]"
+    known = imitarm.scene.OBSTACLES
+    if not isinstance(entry, Mapping):
+        raise InputError(f"{where}: must have the key type and the shape's own keys, got {_shown(entry)}")
+    kind = entry.get("type")
+    if kind is None:
+        raise InputError(f'{where}: key "type" is missing; known types: {", ".join(known)}')
+    if not isinstance(kind, str) or kind not in known:
+        raise InputError(
+            f"{where}: unknown type {_shown(kind)}{_suggestion(kind, known)}; known types: {', '.join(known)}"
+        )
+    shape = known[kind]
+    name = entry.get("name", "")
+    where += f' ({kind} "{name}")' if name else f" ({kind})"
+    own = _own_keys(shape)
+    posed = "pose" in own
+    lengths = [key for key in own if key != "pose"]
+    _check_keys(entry, ("type", *_COMMON, *(("position", *_ROTATIONS) if posed else ()), *lengths), where)
+    if not isinstance(name, str):
+        raise InputError(f'{where}: name must be text; put it in quotes: "{name}"')
+    values: dict[str, Any] = {key: _scaled(_required(entry, key, where), f"{where}: {key}", metres) for key in lengths}
+    if posed:
+        values["pose"] = _pose(entry, where, metres)
+    if "velocity" in entry:
+        values["velocity"] = _scaled(entry["velocity"], f"{where}: velocity", metres)
+    try:
+        return shape(**values, name=name)
+    except InputError as error:
+        label = f'{shape.__name__} "{name}": ' if name else f"{shape.__name__}: "
+        raise InputError(f"{where}: {str(error).removeprefix(label)}") from error
+
+
+def _own_keys(shape: type[Obstacle]) -> list[str]:
+    """Return the fields that make this shape, without those that all obstacles have."""
+    return [f.name for f in fields(shape) if f.init and f.name not in _COMMON]
+
+
+def _pose(entry: Mapping[Any, Any], where: str, metres: float) -> Pose:
+    given = [key for key in _ROTATIONS if key in entry]
+    if len(given) > 1:
+        raise InputError(f"{where}: {' and '.join(given)} both give the rotation; keep one")
+    position = _scaled(_required(entry, "position", where), f"{where}: position", metres)
+    quaternion: Any = [1.0, 0.0, 0.0, 0.0]
+    if given:
+        value = _scaled(entry[given[0]], f"{where}: {given[0]}", 1.0)
+        quaternion = value if given[0] == "quaternion" else _from_degrees(given[0], value, where)
+    try:
+        return Pose(np.asarray(position), np.asarray(quaternion))
+    except (InputError, ValueError) as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def _from_degrees(key: str, value: Any, where: str) -> Any:
+    """Return the quaternion of roll, pitch and yaw about the fixed x, y and z axes, in this order, or of yaw alone."""
+    angles = np.deg2rad(np.asarray(value, dtype=float)) if not isinstance(value, list) or len(value) == 3 else None
+    if angles is None or angles.shape != ((3,) if key == "rpy_degrees" else ()) or not np.isfinite(angles).all():
+        wanted = "3 finite numbers (roll, pitch, yaw)" if key == "rpy_degrees" else "one finite number"
+        raise InputError(f"{where}: {key} must be {wanted}, got {_shown(value)}")
+    if key == "yaw_degrees":
+        return quaternion_exp([0.0, 0.0, float(angles)])
+    roll, pitch, yaw = quaternion_exp(np.diag(angles))
+    return quaternion_multiply(yaw, quaternion_multiply(pitch, roll))
+
+
+def _required(entry: Mapping[Any, Any], key: str, where: str) -> Any:
+    if entry.get(key) is None:
+        raise InputError(f'{where}: key "{key}" is missing')
+    return entry[key]
+
+
+def _scaled(value: object, where: str, metres: float, depth: int = 2) -> Any:
+    """Return a number, a list of numbers or a list of such lists times ``metres``."""
+    if isinstance(value, list) and depth:
+        return [_scaled(item, f"{where}[{i}]", metres, depth - 1) for i, item in enumerate(value)]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{where} must be a number or a list of numbers, got {_shown(value)}")
+    try:
+        return float(value) * metres
+    except OverflowError:
+        raise InputError(f"{where} is too large for a number") from None
+
+
+def _check_keys(entry: Mapping[Any, Any], known: Iterable[str], where: str) -> None:
+    known = list(known)
+    for key in entry:
+        if key not in known:
+            raise InputError(f'{where}: unknown key "{key}"{_suggestion(key, known)}; known keys: {", ".join(known)}')
+
+
+def _suggestion(word: object, known: Iterable[str]) -> str:
+    """Return ``; did you mean "size"?`` or nothing."""
+    close = difflib.get_close_matches(str(word).lower(), list(known), n=1)
+    return f', did you mean "{close[0]}"?' if close else ""
+
+
+def _pose_entry(pose: Pose) -> dict[str, Any]:
+    return {"position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
+
+
+def _obstacle_entry(obstacle: Obstacle) -> dict[str, Any]:
+    known = imitarm.scene.OBSTACLES
+    if type(obstacle) is not known.get(obstacle.kind):
+        raise InputError(f"no scene file can hold a {type(obstacle).__name__}; known types: {', '.join(known)}")
+    entry: dict[str, Any] = {"type": obstacle.kind}
+    if obstacle.name:
+        entry["name"] = obstacle.name
+    for key in _own_keys(type(obstacle)):
+        value = getattr(obstacle, key)
+        entry.update(_pose_entry(value) if key == "pose" else {key: np.asarray(value).tolist()})
+    if obstacle.velocity.any():
+        entry["velocity"] = obstacle.velocity.tolist()
+    return entry
