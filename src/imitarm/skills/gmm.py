@@ -16,9 +16,8 @@ from imitarm.skills.em import (
     log_densities,
     normalise,
     quadratic_features,
-    responsibilities_by_bins,
-    responsibilities_by_seeds,
 )
+from imitarm.skills.starts import responsibilities_by_seeds, responsibilities_by_segments
 
 Array = NDArray[np.float64]
 
@@ -59,7 +58,8 @@ class GaussianMixture:
     (thesis 2.2.1, METHODS C). The names are those of scikit-learn. What differs:
 
     * Columns are standardised inside, so that the choice of units does not decide the result.
-    * ``init="time"`` starts from equal bins of column 0, deterministic and right for data of the form [t; x].
+    * ``init="time"`` starts from the best cut of column 0 into K segments
+      (:func:`~imitarm.skills.starts.responsibilities_by_segments`), deterministic and right for data [t; x].
     * A column that does not move (a planar task has a constant z) is kept apart: the other columns come out as
       though it were not there. It is named in ``degenerate_axes_`` and in a :class:`DegenerateAxisWarning`.
 
@@ -67,7 +67,7 @@ class GaussianMixture:
         n_components: number K of Gaussians.
         reg_covar: smallest eigenvalue of a covariance, relative to the variances of the columns.
         n_init: number of starts; the best fit is kept. All but the first start from k-means++ seeds.
-        init: how the first start is made: ``"time"`` (equal bins of column 0) or ``"kmeans++"``.
+        init: how the first start is made: ``"time"`` (segments of column 0) or ``"kmeans++"``.
         min_std: smallest standard deviation of a column [the column's unit] that counts as motion, one number or one
             a column; it is also the deviation that a degenerate column is given.
         random_state: seed of the k-means++ starts and of nothing else.
@@ -142,7 +142,7 @@ class GaussianMixture:
         Z = (X[:, moves] - center[moves]) / scale[moves]
         features = quadratic_features(Z)
         fit = expectation_maximisation(
-            features, self._starts(X[:, 0], Z), floor=self.reg_covar, tol=self.tol, max_iter=self.max_iter
+            features, self._starts(features, X[:, 0], Z), floor=self.reg_covar, tol=self.tol, max_iter=self.max_iter
         )
         best = int(np.argmax(fit.log_likelihood))
         self._center, self._scale, self._moves = center, scale, moves
@@ -177,10 +177,10 @@ class GaussianMixture:
             raise InputError("GaussianMixture.fit: no column moves; there is nothing to learn from constant data")
         return center, scale, moves, least
 
-    def _starts(self, column: Array, Z: Array) -> Array:
+    def _starts(self, features: Array, column: Array, Z: Array) -> Array:
         """Return the responsibilities (n_init, K, n) to start from."""
         rng = np.random.default_rng(self.random_state)
-        starts = [responsibilities_by_bins(column, self.n_components)] if self.init == "time" else []
+        starts = responsibilities_by_segments(features, column, [self.n_components]) if self.init == "time" else []
         while len(starts) < self.n_init:
             starts.append(responsibilities_by_seeds(Z, self.n_components, rng))
         return np.stack(starts)

@@ -53,8 +53,8 @@ class GMR:
     linear pieces drift away there.
 
     Args:
-        n_components: number K of Gaussians, or ``"auto"``: the smallest K whose error on a held-out demonstration is
-            within 0.5 % (or 0.1 mm) of the best, see :func:`~imitarm.skills.selection.choose`.
+        n_components: number K of Gaussians, or ``"auto"``: the smallest K that reproduces held-out demonstrations as
+            well as any and rounds off little, see :func:`~imitarm.skills.selection.choose`.
         candidates: the numbers that ``"auto"`` tries.
         reg_covar: as in GaussianMixture.
         n_init: as in GaussianMixture.

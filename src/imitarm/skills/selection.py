@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import InputError
-from imitarm.skills.em import Fit, expectation_maximisation, quadratic_features, responsibilities_by_bins
+from imitarm.skills.em import Fit, expectation_maximisation, quadratic_features
+from imitarm.skills.starts import responsibilities_by_segments
 
 Array = NDArray[np.float64]
 
 _SAMPLES = 100  # a demonstration: neighbouring samples of a fast recorder tell nothing new about K
-_BIAS = 0.1  # of the best held-out error: what the mean may be off beyond what demonstrations differ anyway
+_HELD_OUT = 1.02  # times the best held-out error
+_BIAS = 0.1  # of the best held-out error
 _SLACK_MM = 0.1  # below the repeatability of industrial arms
-_PATIENCE = 4  # stop after so many numbers in a row without a better one
+_PATIENCE = 4  # stop after so many numbers in a row without a smaller held-out error
 
 
 @dataclass(frozen=True)
@@ -29,28 +31,42 @@ class Candidate:
         aic: Akaike's information criterion, lower is better.
         held_out_rmse_mm: distance between a demonstration and the mean learnt from all the others, root mean square
             over samples and over all choices of that demonstration [mm]; nan with one demonstration only.
+        bias_rmse_mm: distance between the learnt mean and the plain mean of the demonstrations at the same instants,
+            root mean square [mm].
     """
 
     n_components: int
     bic: float
     aic: float
     held_out_rmse_mm: float
+    bias_rmse_mm: float
 
 
 def choose(candidates: Sequence[Candidate]) -> int:
     """Return the number of components to use.
 
-    Held-out errors ``e_K`` hold how much demonstrations differ, which no K can mend, and the bias of a mean that is
-    too simple; squares add. Chosen is the smallest K whose bias ``sqrt(e_K^2 - e_best^2)`` is at most a tenth of
-    ``e_best``, that is, ``e_K`` within 0.5 % of the best, or within 0.1 mm of it. BIC alone keeps growing with K on
-    data over time, because neighbouring samples are not independent (METHODS C); it decides only when there is one
-    demonstration, so that nothing can be held out.
+    The smallest K
+
+    * whose held-out error is within 2 % of the best (or 0.1 mm): it generalises as well as any, and
+    * whose bias is at most a tenth of the best held-out error (or 0.1 mm): what the regression rounds off is small
+      beside what demonstrations differ by anyway. The held-out error alone hardly sees such a bias, because squares
+      add.
+
+    If no K does both, the one with the smallest held-out error. BIC alone keeps growing with K on data over time,
+    because neighbouring samples are not independent (METHODS C); it decides only when there is one demonstration, so
+    that nothing can be held out.
     """
-    errors = np.array([c.held_out_rmse_mm for c in candidates])
-    if np.isnan(errors).any():
-        return min(candidates, key=lambda c: (c.bic, c.n_components)).n_components
-    good = errors <= max(errors.min() * np.sqrt(1.0 + _BIAS**2), errors.min() + _SLACK_MM)
-    return min(c.n_components for c, ok in zip(candidates, good, strict=True) if ok)
+    ordered = sorted(candidates, key=lambda c: c.n_components)
+    if any(np.isnan(c.held_out_rmse_mm) for c in ordered):
+        return min(ordered, key=lambda c: c.bic).n_components
+    best = min(ordered, key=lambda c: c.held_out_rmse_mm)
+    least = best.held_out_rmse_mm
+    return next((c.n_components for c in ordered if _good(c, least)), best.n_components)
+
+
+def _good(candidate: Candidate, least: float) -> bool:
+    generalises = candidate.held_out_rmse_mm <= max(_HELD_OUT * least, least + _SLACK_MM)
+    return generalises and candidate.bias_rmse_mm <= max(_BIAS * least, _SLACK_MM)
 
 
 def try_numbers_of_components(
@@ -60,10 +76,10 @@ def try_numbers_of_components(
 
     For each, the fit to all demonstrations and the fits that hold one out run side by side, as rows of the same
     matrix products. At most 100 samples a demonstration are used. Larger numbers are not tried any more when four in
-    a row brought no smaller error.
+    a row brought no smaller held-out error and a good one (:func:`choose`) was found.
 
     Args:
-        tables: samples [t, x, y, z, ...] of each demonstration.
+        tables: samples [t, x, y, z, ...] of each demonstration, over the same span of time.
         numbers: numbers K to try.
         min_std: smallest deviations that count as motion, one a column.
         reg_covar: smallest eigenvalue of a covariance relative to the variances of the columns.
@@ -77,30 +93,53 @@ def try_numbers_of_components(
     numbers = sorted({int(k) for k in numbers})
     possible = [k for k in numbers if 2 * k <= fewest] or numbers[:1]
     if possible[0] > fewest:
-        raise InputError(f"GMR: {fewest} samples are too few for {possible[0]} components")
+        raise InputError(
+            f"GMR: {fewest} samples are too few for {possible[0]} components; record more, or ask for less"
+        )
     moves = samples.std(axis=0) > min_std
     moves[0] = True
     center, scale = samples[:, moves].mean(axis=0), samples[:, moves].std(axis=0)
-    features = quadratic_features((samples[:, moves] - center) / scale)
+    Z = (samples[:, moves] - center) / scale
+    features = quadratic_features(Z)
     owner = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
     seen = np.ones((1, len(samples)))
     if len(tables) > 1:
         seen = np.concatenate([seen, owner != np.arange(len(tables))[:, None]])
-    d = int(moves.sum())
+    places = np.flatnonzero(np.flatnonzero(moves) <= 3)[1:]  # columns of Z that hold positions
+    grid = np.linspace(Z[:, 0].min(), Z[:, 0].max(), _SAMPLES)
+    plain_mean = np.mean([_resampled(Z[owner == i], places, grid) for i in range(len(tables))], axis=0)
+    still = float(np.sum(samples[:, 1:4][:, ~moves[1:4]].var(axis=0)))
+    size = 1e3 * scale[places]  # back to mm
     judged: list[Candidate] = []
-    for k in possible:
-        start = np.repeat(responsibilities_by_bins(samples[:, 0], k)[None], len(seen), axis=0)
+    for k, cut in zip(possible, responsibilities_by_segments(features, samples[:, 0], possible), strict=True):
+        start = np.repeat(cut[None], len(seen), axis=0)
         fit = expectation_maximisation(features, start, seen, floor=reg_covar, tol=1e-3, max_iter=100)
         likelihood = len(samples) * float(fit.log_likelihood[0] - np.log(scale).sum())
+        d = Z.shape[1]
         parameters = k - 1 + k * d + k * d * (d + 1) // 2
         error = np.nan
         if len(tables) > 1:
-            error = 1e3 * _held_out_error(fit, samples, moves, center, scale, owner)
-        bic = -2.0 * likelihood + parameters * np.log(len(samples))
-        judged.append(Candidate(k, float(bic), float(-2.0 * likelihood + 2.0 * parameters), float(error)))
-        if len(tables) > 1 and len(judged) - int(np.argmin([c.held_out_rmse_mm for c in judged])) > _PATIENCE:
+            held_out = (_regression(fit, owner + 1, Z[:, 0], places) - Z[:, places]) * size
+            error = np.sqrt(np.mean(np.sum(held_out**2, axis=1)) + 1e6 * still)
+        bias = (_regression(fit, np.zeros(len(grid), dtype=np.intp), grid, places) - plain_mean) * size
+        judged.append(
+            Candidate(
+                k,
+                bic=-2.0 * likelihood + parameters * float(np.log(len(samples))),
+                aic=-2.0 * likelihood + 2.0 * parameters,
+                held_out_rmse_mm=float(error),
+                bias_rmse_mm=float(np.sqrt(np.mean(np.sum(bias**2, axis=1)))),
+            )
+        )
+        if len(tables) > 1 and _enough(judged):
             break
     return tuple(judged)
+
+
+def _enough(judged: Sequence[Candidate]) -> bool:
+    errors = [c.held_out_rmse_mm for c in judged]
+    stale = len(errors) - 1 - int(np.argmin(errors)) >= _PATIENCE
+    return stale and any(_good(c, min(errors)) for c in judged)
 
 
 def _thinned(table: Array) -> Array:
@@ -109,24 +148,18 @@ def _thinned(table: Array) -> Array:
     return table[np.round(np.linspace(0, len(table) - 1, _SAMPLES)).astype(int)]
 
 
-def _held_out_error(
-    fit: Fit, samples: Array, moves: NDArray[np.bool_], center: Array, scale: Array, owner: NDArray[np.intp]
-) -> float:
-    """Return the root mean square distance [m] of each demonstration from the regression that did not see it."""
-    t = (samples[:, 0] - center[0]) / scale[0]
-    fold = owner + 1  # fold 0 sees everything
+def _resampled(Z: Array, places: NDArray[np.intp], grid: Array) -> Array:
+    return np.stack([np.interp(grid, Z[:, 0], Z[:, c]) for c in places], axis=1)
+
+
+def _regression(fit: Fit, which: NDArray[np.intp], t: Array, places: NDArray[np.intp]) -> Array:
+    """Return the mean of some columns at standardised times (n,), each from the fit numbered ``which`` (n,)."""
     means, covariances = fit.means, fit.covariances
-    position = np.flatnonzero(moves[1:4]) + 1
-    column = np.flatnonzero(np.isin(np.flatnonzero(moves), position))
     variance = covariances[:, :, 0, 0]
     slopes = covariances[:, :, 0, :] / variance[..., None]
-    offset = t[:, None] - means[fold, :, 0]
-    log_h = np.log(fit.weights[fold]) - 0.5 * (np.log(variance[fold]) + offset**2 / variance[fold])
+    offset = t[:, None] - means[which, :, 0]
+    log_h = np.log(fit.weights[which]) - 0.5 * (np.log(variance[which]) + offset**2 / variance[which])
     h = np.exp(log_h - log_h.max(axis=1, keepdims=True))
     h /= h.sum(axis=1, keepdims=True)
-    predicted = np.einsum("nk,nkd->nd", h, means[fold][..., column] + offset[..., None] * slopes[fold][..., column])
-    still = ~moves[1:4]
-    errors = np.zeros((len(samples), 3))
-    errors[:, position - 1] = predicted * scale[column] + center[column] - samples[:, position]
-    errors[:, still] = samples[:, 1:4][:, still] - samples[:, 1:4][:, still].mean(axis=0)
-    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+    pieces = means[which][..., places] + offset[..., None] * slopes[which][..., places]
+    return np.asarray((h[:, None, :] @ pieces)[:, 0])

@@ -228,8 +228,8 @@ def _gmr_content(gmr: GMR) -> dict[str, Any]:
     if gmr.reference_ is not None:
         content["reference"] = {"times": gmr.reference_.times, "quaternions": gmr.reference_.quaternions}
     if gmr.selection_:
-        rows = [[c.n_components, c.bic, c.aic] for c in gmr.selection_]
-        content["selection"] = {"n_components, bic, aic": rows}
+        rows = [[c.n_components, c.bic, c.aic, c.bias_rmse_mm] for c in gmr.selection_]
+        content["selection"] = {"n_components, bic, aic, bias_rmse_mm": rows}
         if not np.isnan(gmr.selection_[0].held_out_rmse_mm):
             content["selection"]["held_out_rmse_mm"] = [c.held_out_rmse_mm for c in gmr.selection_]
     return content
@@ -243,11 +243,14 @@ def _read_gmr(fields: Fields) -> GMR:
     selection: list[Candidate] = []
     if fields.has("selection"):
         group = fields.group("selection")
-        rows = group.array("n_components, bic, aic", 2)
+        rows = group.array("n_components, bic, aic, bias_rmse_mm", 2)
         errors = group.array("held_out_rmse_mm", 1) if group.has("held_out_rmse_mm") else np.full(len(rows), np.nan)
-        if rows.shape[1] != 3 or len(rows) != len(errors):
-            raise FileFormatError("gmr, selection: rows of 3 numbers needed, with one error each")
-        selection = [Candidate(int(k), b, a, e) for (k, b, a), e in zip(rows.tolist(), errors.tolist(), strict=True)]
+        if rows.shape[1] != 4 or len(rows) != len(errors):
+            raise FileFormatError("gmr, selection: rows of 4 numbers needed, with one error each")
+        selection = [
+            Candidate(int(k), bic, aic, error, bias)
+            for (k, bic, aic, bias), error in zip(rows.tolist(), errors.tolist(), strict=True)
+        ]
     return GMR.from_mixture(
         fields.array("weights", 1),
         fields.array("means", 2),
