@@ -1,0 +1,177 @@
+"""The report's figures over time, over components and over their number; see :mod:`~imitarm.viewer.plots`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from imitarm.viewer import palette
+from imitarm.viewer.canvas import INK, MM, canvas, thin_extremes
+
+
+def clearance(times: ArrayLike, distances: ArrayLike, asked: float, *, name: str = "clearance") -> str:
+    """Draw the measured distance to the nearest obstacle over time, and the one that was asked for.
+
+    Args:
+        times: shape (n_steps,) [s].
+        distances: smallest distance of arm and tool to an obstacle, shape (n_steps,) [m].
+        asked: the clearance that was asked for [m].
+        name: unique in the page.
+
+    Returns:
+        An SVG element; empty text when no distance is finite, because there was no obstacle.
+    """
+    t, d = np.asarray(times, dtype=float), MM * np.asarray(distances, dtype=float)
+    finite = np.isfinite(d)
+    if not finite.any():
+        return ""
+    t, d = t[finite], d[finite]
+    least = int(np.argmin(d))
+    text = f"Clearance over time: at least {d[least]:.1f} mm, asked {MM * asked:.0f} mm"
+    with canvas(name, text, (5.5, 2.2)) as drawing:
+        axes = drawing.axes(0.74, 0.48, 5.4, 2.1)
+        kept = thin_extremes(d)
+        axes.plot(t[kept], d[kept], color=palette.ADAPTED, lw=1.6)
+        axes.fill_between(t[kept], d[kept], 0.0, color=palette.ADAPTED, alpha=0.08, lw=0)
+        axes.axhline(MM * asked, color=palette.LIMIT, lw=1.1, ls="--")
+        axes.axhline(0.0, color=INK, lw=1.0)
+        axes.plot(t[least], d[least], "o", color=palette.LIMIT if d[least] < MM * asked else palette.ADAPTED, ms=5)
+        right = t[least] > 0.6 * t[-1]
+        place = {"xytext": (-6 if right else 6, 9), "textcoords": "offset points", "ha": "right" if right else "left"}
+        axes.annotate(f"smallest: {d[least]:.1f} mm", (t[least], d[least]), **place)
+        top = max(4.0 * MM * asked, 2.0 * d[least], 60.0)
+        axes.set_ylim(min(0.0, 1.15 * d[least]), min(1.08 * d.max(), 2.0 * top) if d.max() > 0.0 else top)
+        axes.annotate(
+            f"asked: {MM * asked:.0f} mm", (t[-1], MM * asked), xytext=(0, 3), textcoords="offset points", ha="right"
+        )
+        axes.set_xlim(t[0], t[-1])
+        axes.set_xlabel("time [s]")
+        axes.set_ylabel("distance to the\nnearest obstacle [mm]")
+    return drawing.svg
+
+
+def torques(
+    times: ArrayLike,
+    values: ArrayLike,
+    limits: ArrayLike,
+    *,
+    joint_names: Sequence[str] = (),
+    name: str = "torques",
+) -> str:
+    """Draw the torque of every joint over time between its rated limits.
+
+    Args:
+        times: shape (n_steps,) [s].
+        values: shape (n_steps, n_joints) [N m].
+        limits: rated torque, shape (n_joints,) [N m].
+        joint_names: shown above each chart; numbered when left out.
+        name: unique in the page.
+
+    Returns:
+        An SVG element.
+    """
+    t, tau, rated = np.asarray(times, float), np.asarray(values, float), np.asarray(limits, float)
+    n_joints = tau.shape[1]
+    names = list(joint_names) or [f"joint {i + 1}" for i in range(n_joints)]
+    columns = min(n_joints, 4)
+    rows = -(-n_joints // columns)
+    size = (5.5, 0.4 + 1.1 * rows)
+    wide = (size[0] - 0.2) / columns
+    peak = np.abs(tau).max(axis=0)
+    with canvas(name, f"Torques of {n_joints} joints over time, with the rated torques", size) as drawing:
+        for i in range(n_joints):
+            row, column = divmod(i, columns)
+            left, top = 0.2 + wide * column, size[1] - 0.02 - 1.1 * row
+            axes = drawing.axes(left + 0.35, top - 0.9, left + wide - 0.08, top - 0.22)
+            kept = thin_extremes(tau[:, i], 160)
+            axes.plot(t[kept], tau[kept, i], color=palette.ADAPTED, lw=1.1)
+            axes.hlines([-rated[i], rated[i]], t[0], t[-1], color=palette.LIMIT, lw=1.0, ls="--")
+            most = 1.15 * max(rated[i], peak[i])
+            share = f"{names[i]}: {100.0 * peak[i] / rated[i]:.0f} %".replace("$", r"\$")
+            axes.set_title(share, fontsize=8.0, loc="left", pad=3)
+            axes.set(ylim=(-most, most), xlim=(t[0], t[-1]), yticks=[-rated[i], 0.0, rated[i]])
+            axes.set_yticks(axes.get_yticks(), [f"{tick:.3g}" for tick in axes.get_yticks()])
+            axes.locator_params(axis="x", nbins=4)
+            axes.tick_params(labelsize=7.5, labelbottom=i >= n_joints - columns)
+        drawing.figure.text(0.5, 0.01, "time [s]", ha="center")
+        drawing.figure.text(0.005, 0.5, "torque [N m]", va="center", rotation=90)
+    return drawing.svg
+
+
+def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacement") -> str:
+    """Draw how far every Gaussian component was moved.
+
+    Args:
+        lengths: of the displacements, in the order of time, shape (n_components,) [m].
+        moved: which components were displaced, shape (n_components,).
+        name: unique in the page.
+
+    Returns:
+        An SVG element.
+    """
+    far, went = MM * np.asarray(lengths, dtype=float), np.asarray(moved, dtype=bool)
+    text = f"{int(went.sum())} of {len(far)} components were moved, by at most {far.max(initial=0.0):.0f} mm"
+    with canvas(name, text, (5.5, 1.8)) as drawing:
+        axes = drawing.axes(0.64, 0.48, 5.4, 1.7)
+        numbers = np.arange(1, len(far) + 1)
+        axes.bar(numbers, far, width=0.62, color=[palette.MOVED if m else palette.UNMOVED for m in went])
+        for number, length, was_moved in zip(numbers, far, went, strict=True):
+            label = f"{length:.0f}" if was_moved else "unmoved"
+            axes.annotate(label, (number, length), xytext=(0, 2), textcoords="offset points", ha="center", fontsize=7.5)
+        axes.set_ylim(0.0, max(1.22 * far.max(initial=0.0), 5.0))
+        axes.set_xticks(numbers)
+        axes.grid(axis="x", visible=False)
+        axes.set_xlabel("Gaussian component, in the order of time")
+        axes.set_ylabel("moved by [mm]")
+    return drawing.svg
+
+
+def selection(
+    n_components: ArrayLike,
+    bic: ArrayLike,
+    aic: ArrayLike,
+    held_out_error: ArrayLike,
+    chosen: int,
+    *,
+    name: str = "selection",
+) -> str:
+    """Draw what speaks for each number of components: information criteria and the error on held-out demonstrations.
+
+    Args:
+        n_components: the numbers that were tried, shape (n,).
+        bic: Bayesian information criterion, less is better, shape (n,); may be empty.
+        aic: Akaike information criterion, less is better, shape (n,); may be empty.
+        held_out_error: root mean square distance to demonstrations that were left out, shape (n,) [m]; may be empty.
+        chosen: the number that was taken.
+        name: unique in the page.
+
+    Returns:
+        An SVG element.
+    """
+    k = np.asarray(n_components, dtype=float)
+    with canvas(
+        name, f"{chosen} Gaussian components were chosen out of {k.min():.0f} to {k.max():.0f}", (5.5, 2.4)
+    ) as drawing:
+        left, right = drawing.axes(0.74, 0.48, 2.65, 2.3), drawing.axes(3.45, 0.48, 5.4, 2.3)
+        for values, label, colour, style in ((bic, "BIC", palette.ADAPTED, "o-"), (aic, "AIC", palette.UNMOVED, "s--")):
+            if len(np.asarray(values)):
+                left.plot(k, np.asarray(values, dtype=float), style, color=colour, ms=3.5, lw=1.4, label=label)
+        left.set_ylabel("information criterion [-]")
+        left.legend()
+        if len(np.asarray(held_out_error)):
+            right.plot(k, MM * np.asarray(held_out_error, dtype=float), "o-", color=palette.MOVED, ms=3.5, lw=1.4)
+        right.set_ylabel("error on left-out\ndemonstrations [mm]")
+        for axes in (left, right):
+            axes.axvline(chosen, color=INK, lw=0.9, ls=":")
+            axes.set_xlabel("number of components K")
+            axes.xaxis.get_major_locator().set_params(integer=True)
+        right.annotate(
+            f"K = {chosen}",
+            (chosen, 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(4, -9),
+            textcoords="offset points",
+        )
+    return drawing.svg

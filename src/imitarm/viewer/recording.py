@@ -1,0 +1,94 @@
+"""What a simulation looked like: the poses of all bodies, some times a second."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Where every body of a model was, frame by frame.
+
+    Attributes:
+        model: the MuJoCo model whose bodies these are.
+        times: when, strictly increasing, shape (n_frames,) [s].
+        positions: body positions in the world frame, shape (n_frames, n_bodies, 3) [m].
+        quaternions: body rotations wxyz in the world frame, shape (n_frames, n_bodies, 4).
+
+    Raises:
+        InputError: when shapes disagree, a number is not finite or the times do not increase.
+    """
+
+    model: mujoco.MjModel
+    times: Array
+    positions: Array
+    quaternions: Array
+
+    def __post_init__(self) -> None:
+        n, bodies = len(np.atleast_1d(self.times)), self.model.nbody
+        for name, shape in (("times", (n,)), ("positions", (n, bodies, 3)), ("quaternions", (n, bodies, 4))):
+            array = np.array(getattr(self, name), dtype=float)
+            if array.shape != shape or not np.isfinite(array).all():
+                raise InputError(f"Recording {name}: needs finite numbers of shape {shape}, got {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if n < 1 or np.any(np.diff(self.times) <= 0.0):
+            raise InputError("Recording times: needs at least one frame, each later than the one before")
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last frame [s]."""
+        return float(self.times[-1] - self.times[0])
+
+
+class FrameRecorder:
+    """Notes the bodies' poses while a simulation runs, at most ``rate`` times a second."""
+
+    def __init__(self, model: mujoco.MjModel, *, rate: float = 25.0) -> None:
+        """Start without frames.
+
+        Args:
+            model: the model that will be simulated.
+            rate: frames a second of simulated time [1/s].
+
+        Raises:
+            InputError: when ``rate`` is not positive.
+        """
+        if not rate > 0.0:
+            raise InputError(f"FrameRecorder: rate must be positive [1/s], got {rate!r}")
+        self.model = model
+        self._period = 1.0 / rate
+        self._frames: list[tuple[float, Array, Array]] = []
+
+    def note(self, data: mujoco.MjData, time: float | None = None) -> None:
+        """Keep this instant when a frame is due; call it after every step.
+
+        Args:
+            data: the simulation's state, its kinematics up to date.
+            time: simulated time [s]; None takes ``data.time``.
+        """
+        now = float(data.time if time is None else time)
+        if not self._frames or now >= self._frames[-1][0] + self._period - 1e-9:
+            self._frames.append((now, np.array(data.xpos), np.array(data.xquat)))
+
+    def recording(self) -> Recording:
+        """Return what was noted.
+
+        Raises:
+            InputError: when nothing was noted.
+        """
+        if not self._frames:
+            raise InputError("FrameRecorder: nothing was noted; call note(data) after every simulated step")
+        times, positions, quaternions = zip(*self._frames, strict=True)
+        return Recording(self.model, np.array(times), np.array(positions), np.array(quaternions))

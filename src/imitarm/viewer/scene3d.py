@@ -1,0 +1,346 @@
+"""Interactive 3-D playback of a rollout in a browser, as one HTML page that asks nothing of the network.
+
+:func:`playback_html` draws the model of a :class:`~imitarm.viewer.recording.Recording`, paths and Gaussian components
+around it, and lets the bodies move as they were noted. The drawing is done by viser in the reader's browser; here it
+only needs a server on this machine for as long as the page is being written.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import rich
+from mujoco import MjModel
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError, TaskFailedError
+from imitarm.kinematics.pose import matrix_to_quaternion, quaternion_to_matrix
+from imitarm.viewer import palette
+from imitarm.viewer.geometry import Mesh, geom_mesh, geom_rgba, merge, visible_geoms
+from imitarm.viewer.recording import Recording
+
+Array = NDArray[np.float64]
+
+_STEP: Final = 2.0**-13  # [m], [-] poses are rounded to this (0.12 mm): a file of round numbers is a third as large
+_REST: Final = 1.5  # [s] how long the last picture stands before the playback starts again
+_CHI2_95: Final = 7.815  # 95 % of a 3-D Gaussian is within sqrt(7.815) sigma
+_VIEW: Final = (1.0, -0.95, 0.62)  # from where the camera looks: in front, from the right, from above
+_ROOM: Final = 3.0  # [m] larger things are floors and walls: the camera does not step back for them
+_MANY: Final = 4  # so many equal bodies are drawn as one batch
+_PATH_POINTS: Final = 160
+_EXPOSURE: Final = 0.7
+_BACKDROP: Final = {False: ((246, 247, 249), (221, 225, 231)), True: ((38, 42, 50), (20, 22, 27))}  # dark: top, bottom
+
+
+@dataclass(frozen=True, eq=False)
+class PathMark:
+    """A path to draw: ``positions`` (n, 3) [m] in the world frame, ``thickness`` of the line [m]."""
+
+    name: str
+    positions: Array
+    colour: str = palette.ADAPTED
+    thickness: float = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class ComponentMark:
+    """A Gaussian component to draw as its 95 % ellipsoid: ``mean`` (3,) [m] and ``covariance`` (3, 3) [m^2]."""
+
+    name: str
+    mean: Array
+    covariance: Array
+    colour: str = palette.UNMOVED
+    opacity: float = 0.22
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where the view begins: ``position`` and ``look_at`` [m] in the world frame, vertical ``field_of_view`` [rad]."""
+
+    position: tuple[float, float, float]
+    look_at: tuple[float, float, float]
+    field_of_view: float = 0.62
+
+    @classmethod
+    def around(cls, points: ArrayLike, *, direction: ArrayLike = _VIEW, aspect: float = 16 / 9) -> Camera:
+        """Return the nearest camera, looking from ``direction``, that has all ``points`` (n, 3) [m] in the picture.
+
+        Args:
+            points: what must be seen, in the world frame.
+            direction: from the middle of the points towards the camera.
+            aspect: width of the picture divided by its height.
+        """
+        p = np.asarray(points, dtype=float)
+        back = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        up = np.cross(back, right)
+        middle = 0.5 * (p.min(axis=0) + p.max(axis=0))
+        x, y, z = (p - middle) @ right, (p - middle) @ up, (p - middle) @ back
+        # seen from an angle, the middle of the picture is not the middle of the points
+        middle = middle + 0.5 * (x.min() + x.max()) * right + 0.5 * (y.min() + y.max()) * up
+        x, y = x - 0.5 * (x.min() + x.max()), y - 0.5 * (y.min() + y.max())
+        tangent = np.tan(0.5 * cls.field_of_view)
+        distance = 1.04 * np.max(z + np.maximum(np.abs(y) / tangent, np.abs(x) / (aspect * tangent)))
+        position = middle + distance * back
+        return cls(tuple(map(float, position)), tuple(map(float, middle)))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """The triangles of one colour of one body, in the body's frame."""
+
+    mesh: Mesh
+    rgba: tuple[float, float, float, float]
+
+
+def _body_parts(model: MjModel) -> dict[int, list[_Part]]:
+    """Return what is to be drawn of every body that has looks: one mesh for each colour."""
+    found: dict[int, dict[tuple[float, ...], list[Mesh]]] = {}
+    for geom in visible_geoms(model):
+        mesh = geom_mesh(model, geom)
+        if mesh is None:
+            continue
+        colour = tuple(np.round(geom_rgba(model, geom), 3).tolist())
+        placed = mesh.moved(model.geom_pos[geom], quaternion_to_matrix(model.geom_quat[geom]))
+        found.setdefault(int(model.geom_bodyid[geom]), {}).setdefault(colour, []).append(placed)
+    return {
+        body: [_Part(merge(meshes), colour) for colour, meshes in colours.items()]  # type: ignore[arg-type]
+        for body, colours in found.items()
+    }
+
+
+def _points_to_see(recording: Recording, parts: Mapping[int, list[_Part]]) -> Array:
+    """Return points (n, 3) [m] of everything drawn, in the first, the middle and the last frame."""
+    seen = [np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.1]])]
+    for frame in sorted({0, len(recording) // 2, len(recording) - 1}):
+        rotations = quaternion_to_matrix(recording.quaternions[frame])
+        for body, body_parts in parts.items():
+            for part in body_parts:
+                if np.ptp(part.mesh.vertices, axis=0).max() < _ROOM:
+                    thinned = part.mesh.vertices[:: max(1, len(part.mesh.vertices) // 100)]
+                    seen.append(thinned @ rotations[body].T + recording.positions[frame, body])
+    return np.concatenate(seen)
+
+
+class _Mover:
+    """Something drawn whose poses follow those of bodies of the recording."""
+
+    def __init__(self, handle: Any, poses: Mapping[str, NDArray[Any]]) -> None:
+        self._handle, self._poses = handle, poses
+        self._changed = {
+            name: np.any(values[1:] != values[:-1], axis=tuple(range(1, values.ndim))).tolist()
+            for name, values in poses.items()
+        }
+
+    def show(self, frame: int) -> None:
+        """Send the poses of a frame, not the first, where they differ from the frame before."""
+        for name, values in self._poses.items():
+            if self._changed[name][frame - 1]:
+                setattr(self._handle, name, values[frame])
+
+
+def _node(kind: str, *names: object) -> str:
+    """Return a name for viser's tree, where a slash means a child and would split a body's name."""
+    return f"/{kind}/" + " ".join(str(name).replace("/", "|") for name in names)
+
+
+def _lit(rgba: Sequence[float], *, linear: bool = False) -> tuple[float, float, float]:
+    """Return the colour that looks like ``rgba`` under viser's lights, which are brighter than MuJoCo's.
+
+    Batches take ``linear`` light where meshes take sRGB.
+    """
+    srgb = np.asarray(rgba[:3], dtype=float)
+    light = _EXPOSURE * np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    shown = light if linear else np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return float(shown[0]), float(shown[1]), float(shown[2])
+
+
+def _add_mesh(server: Any, name: str, part: _Part) -> None:
+    opacity = part.rgba[3]
+    server.scene.add_mesh_simple(
+        name,
+        part.mesh.vertices,
+        part.mesh.faces,
+        color=_lit(part.rgba),
+        opacity=opacity if opacity < 1.0 else None,
+        side="double" if opacity < 1.0 or not np.ptp(part.mesh.vertices, axis=0).all() else "front",
+        cast_shadow=opacity >= 1.0,
+    )
+
+
+def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[_Part]]) -> list[_Mover]:
+    """Draw every body at its first pose and return those that move.
+
+    Many equal things (crumbs, parts in a box) become one batch, or they would fill the page with messages.
+    """
+    positions = np.round(recording.positions / _STEP) * _STEP
+    quaternions = np.round(recording.quaternions / _STEP) * _STEP
+    alike: dict[tuple[bytes, tuple[float, ...]], list[int]] = {}
+    for body, body_parts in parts.items():
+        if len(body_parts) == 1:
+            alike.setdefault((body_parts[0].mesh.vertices.tobytes(), body_parts[0].rgba), []).append(body)
+    batches = [bodies for bodies in alike.values() if len(bodies) >= _MANY]
+    movers = []
+    for number, bodies in enumerate(batches):
+        part = parts[bodies[0]][0]
+        poses = {
+            "batched_positions": positions[:, bodies].astype(np.float32),
+            "batched_wxyzs": quaternions[:, bodies].astype(np.float32),
+        }
+        handle = server.scene.add_batched_meshes_simple(
+            _node("bodies", "batch", number, recording.model.body(bodies[0]).name),
+            part.mesh.vertices,
+            part.mesh.faces,
+            poses["batched_wxyzs"][0],
+            poses["batched_positions"][0],
+            batched_colors=_lit(part.rgba, linear=True),
+            lod="off",
+        )
+        movers.append(_Mover(handle, poses))
+    for body in set(parts).difference(*batches):
+        name = _node("bodies", body, recording.model.body(body).name)
+        handle = server.scene.add_frame(name, show_axes=False, position=positions[0, body], wxyz=quaternions[0, body])
+        for number, part in enumerate(parts[body]):
+            _add_mesh(server, f"{name}/{number}", part)
+        movers.append(_Mover(handle, {"position": positions[:, body], "wxyz": quaternions[:, body]}))
+    return movers
+
+
+def _draw_stage(server: Any, lowest: float, camera: Camera, *, dark: bool) -> None:
+    """Set camera, lights, backdrop and a quiet grid on the floor, at height ``lowest`` [m]."""
+    view = server.initial_camera
+    view.position, view.look_at, view.fov = camera.position, camera.look_at, camera.field_of_view
+    top, bottom = (np.array(colour, dtype=float) for colour in _BACKDROP[dark])
+    shade = top + np.linspace(0.0, 1.0, 128)[:, None] * (bottom - top)
+    server.scene.set_background_image(np.repeat(np.round(shade).astype(np.uint8)[:, None], 2, axis=1), format="png")
+    line = (70, 76, 88) if dark else (196, 201, 209)
+    server.scene.add_grid(
+        "/floor",
+        width=6.0,
+        height=6.0,
+        cell_size=0.25,
+        section_size=1.0,
+        cell_color=line,
+        section_color=line,
+        cell_thickness=0.6,
+        section_thickness=1.0,
+        fade_distance=9.0,
+        fade_from="origin",
+        shadow_opacity=0.25,
+        position=(0.0, 0.0, lowest),
+    )
+
+
+def _draw_paths(server: Any, paths: Sequence[PathMark]) -> None:
+    for path in paths:
+        points = np.asarray(path.positions, dtype=float)
+        points = points[np.unique(np.linspace(0, len(points) - 1, min(len(points), _PATH_POINTS)).round().astype(int))]
+        server.scene.add_line_segments(
+            _node("paths", path.name),
+            np.stack([points[:-1], points[1:]], axis=1),
+            palette.rgb(path.colour),
+            thickness=path.thickness,
+        )
+
+
+def _draw_components(server: Any, components: Sequence[ComponentMark]) -> None:
+    for component in components:
+        variances, axes = np.linalg.eigh(np.asarray(component.covariance, dtype=float))
+        axes[:, 0] *= np.linalg.det(axes)  # a rotation, not a mirror
+        semi_axes = np.sqrt(_CHI2_95 * np.maximum(variances, 0.0))
+        server.scene.add_icosphere(
+            _node("components", component.name),
+            1.0,
+            palette.rgb(component.colour),
+            opacity=component.opacity,
+            scale=tuple(np.maximum(semi_axes, 1e-3).tolist()),  # a plane task has flat components: keep them visible
+            position=np.asarray(component.mean, dtype=float),
+            wxyz=matrix_to_quaternion(axes),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+
+def _free_port() -> int:
+    """Return a port that is free on this machine, or say that none can be opened (viser would wait for ever)."""
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            return int(listener.getsockname()[1])
+    except OSError as error:
+        raise TaskFailedError(f"3-D playback: no port on 127.0.0.1 can be opened ({error}); allow it") from error
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Let rich print nothing: viser prints the address of its server, and nobody is to go there."""
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+@contextmanager
+def _server() -> Iterator[Any]:
+    """Run viser where only this machine sees it, and stop it afterwards."""
+    try:
+        import viser  # noqa: PLC0415 (heavy, and an extra)
+    except ImportError as error:
+        raise InputError(
+            "3-D playback needs viser, which is not installed; install it with: pip install 'imitarm[report]'"
+        ) from error
+    with _quiet():
+        server = viser.ViserServer(host="127.0.0.1", port=_free_port(), verbose=False)
+    try:
+        yield server
+    finally:
+        with _quiet():
+            server.stop()
+
+
+def playback_html(
+    recording: Recording,
+    *,
+    paths: Sequence[PathMark] = (),
+    components: Sequence[ComponentMark] = (),
+    camera: Camera | None = None,
+    dark: bool = False,
+) -> str:
+    """Draw a recording and return one self-contained HTML page that plays it.
+
+    Args:
+        recording: what moves, and the model it moves in. Geoms of the groups 0 to 2 are drawn.
+        paths: lines to draw.
+        components: Gaussian components to draw as translucent ellipsoids.
+        camera: where the view begins; None shows the whole model.
+        dark: dark controls and background.
+
+    Returns:
+        The page; it can be saved, opened from disk without a network, or put in an iframe.
+
+    Raises:
+        InputError: when viser is not installed.
+        TaskFailedError: when no port on this machine could be opened.
+    """
+    parts = _body_parts(recording.model)
+    seen = _points_to_see(recording, parts)
+    with _server() as server:
+        _draw_stage(server, float(seen[:, 2].min()), camera or Camera.around(seen), dark=dark)
+        movers = _draw_bodies(server, recording, parts)
+        _draw_paths(server, paths)
+        _draw_components(server, components)
+        serializer = server.get_scene_serializer()
+        for frame in range(1, len(recording)):
+            serializer.insert_sleep(float(recording.times[frame] - recording.times[frame - 1]))
+            for mover in movers:
+                mover.show(frame)
+        serializer.insert_sleep(_REST if len(recording) > 1 else 0.0)
+        page: str = serializer.as_html(dark_mode=dark)
+    return page
