@@ -130,7 +130,7 @@ def _scene(content: object) -> Scene:
     version = content.get("version")
     if isinstance(version, bool) or version != VERSION:
         raise InputError(
-            f"version is {version!r}, but this imitarm reads version {VERSION}; update imitarm or the file"
+            f"version is {_shown(version)}, but this imitarm reads version {VERSION}; update imitarm or the file"
         )
     _check_keys(content, _TOP, "the top level")
     units = content.get("units", "m")
@@ -157,17 +157,10 @@ def _goal(entry: object, metres: float) -> Pose:
 
 def _obstacle(entry: object, index: int, metres: float) -> Obstacle:
     where = f"obstacles[{index}]"
-    known = imitarm.scene.OBSTACLES
     if not isinstance(entry, Mapping):
         raise InputError(f"{where}: must have the key type and the shape's own keys, got {_shown(entry)}")
-    kind = entry.get("type")
-    if kind is None:
-        raise InputError(f'{where}: key "type" is missing; known types: {", ".join(known)}')
-    if not isinstance(kind, str) or kind not in known:
-        raise InputError(
-            f"{where}: unknown type {_shown(kind)}{_suggestion(kind, known)}; known types: {', '.join(known)}"
-        )
-    shape = known[kind]
+    shape = _shape(entry.get("type"), where)
+    kind = shape.kind
     name = entry.get("name", "")
     where += f' ({kind} "{name}")' if name else f" ({kind})"
     own = _own_keys(shape)
@@ -186,6 +179,16 @@ def _obstacle(entry: object, index: int, metres: float) -> Obstacle:
     except InputError as error:
         label = f'{shape.__name__} "{name}": ' if name else f"{shape.__name__}: "
         raise InputError(f"{where}: {str(error).removeprefix(label)}") from error
+
+
+def _shape(kind: object, where: str) -> type[Obstacle]:
+    known = imitarm.scene.OBSTACLES
+    names = f"known types: {', '.join(known)}"
+    if kind is None:
+        raise InputError(f'{where}: key "type" is missing; {names}')
+    if not isinstance(kind, str) or kind not in known:
+        raise InputError(f"{where}: unknown type {_shown(kind)}{_suggestion(kind, known)}; {names}")
+    return known[kind]
 
 
 def _own_keys(shape: type[Obstacle]) -> list[str]:
