@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.kinematics.pose import Pose, quaternion_exp
+from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_to_matrix
 from imitarm.policies.adaptation import HORIZONTAL_ONLY
 from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Obstacle, Scene, Sphere
 from imitarm.trajectory import Demonstration, Trajectory
@@ -115,7 +115,7 @@ def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool) ->
 
 
 def narrow_gap(seed: int, path: Array, *, solvable: bool) -> Case:
-    """Family S4: a wall across a planar path with one gap, wide enough by 5 to 30 mm or too narrow by as much.
+    """Family S4: a wall square across a planar path with one gap, wide enough by 5 to 30 mm or too narrow by as much.
 
     Args:
         seed: number of the scene.
@@ -127,11 +127,14 @@ def narrow_gap(seed: int, path: Array, *, solvable: bool) -> Case:
     slack = rng.uniform(0.005, 0.03)
     width = need + slack if solvable else need - slack
     middle = path[len(path) // 2]
-    centre = middle[1] + rng.uniform(-0.04, 0.04)
+    ahead = path[len(path) // 2 + 5] - path[len(path) // 2 - 5]
+    heading = np.array([0.0, 0.0, np.arctan2(ahead[1], ahead[0])])
+    across = quaternion_to_matrix(quaternion_exp(heading))[:, 1]
+    centre = middle + rng.uniform(-0.04, 0.04) * across
     thick = rng.uniform(0.02, 0.05)
     walls = [
         Box(
-            Pose(np.array([middle[0], centre + side * 0.5 * (width + _WALL), middle[2]]), np.array([1.0, 0, 0, 0])),
+            Pose(centre + side * 0.5 * (width + _WALL) * across, quaternion_exp(heading)),
             np.array([thick, _WALL, 0.3]),
             name=name,
         )

@@ -14,7 +14,7 @@ from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose
 from imitarm.policies.certificate import Detour, distances, measured_detour
 from imitarm.policies.certified import find_detour
-from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.component_path import STILL, ComponentPath
 from imitarm.policies.potential_components import push_components
 from imitarm.scene.scene import Scene
 from imitarm.trajectory import Trajectory
@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 METHODS = ("certified", "mapf", "literal")
 HORIZONTAL_ONLY = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))  # stay in the plane of the table: 2-D avoidance
 NOT_DOWN = ((0.0, 0.0, -1.0),)  # never into the table
-_MOVED = 1e-6  # [m] a mean that moved less than this has not moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +128,7 @@ def adapt(
         nominal=path.nominal,
         trajectory=Trajectory(path.nominal.times, detour.positions, path.nominal.quaternions),
         displacement=detour.displacement,
-        moved=np.linalg.norm(detour.displacement, axis=1) > _MOVED,
+        moved=np.linalg.norm(detour.displacement, axis=1) > STILL,
         means=path.means,
         covariances=path.covariances,
         responsibilities=path.responsibilities,

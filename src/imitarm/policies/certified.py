@@ -69,13 +69,19 @@ def find_detour(
         normal: gradients there, shape (n_obstacles, n, 3).
         forbidden: directions in which no component may move, unit rows, shape (m, 3); each displacement has
             ``Delta . f <= 0``. A direction and its opposite forbid the axis.
-        max_choices: how many choices of a side before giving up.
+        max_choices: how many choices of a side before giving up, once with the components near the obstacles and
+            once with all of them.
 
     Returns:
         The detour; when it is not feasible, the best attempt with its bounds.
     """
     search = _Search(path, obstacles, margin, forbidden)
-    return search.run(max_choices, distance, normal)
+    detour = search.run(max_choices, distance, normal)
+    if not detour.feasible:  # moving the components next to the obstacle was not enough: let all of them help
+        search.everywhere = True
+        wider = search.run(max_choices, distance, normal)
+        detour = wider if wider.bounds.min() > detour.bounds.min() else detour
+    return detour
 
 
 class _Search:
@@ -85,6 +91,7 @@ class _Search:
         self.path, self.obstacles, self.margin, self.forbidden = path, obstacles, margin, forbidden
         self.least = LeastDetour(path, obstacles, margin, forbidden)
         self.wanted = self.least.wanted
+        self.everywhere = False  # whether components far from the obstacle may move too
 
     def run(self, max_choices: int, distance: Array, normal: Array) -> Detour:
         """Follow the cheapest choice of sides until one is feasible; begin at the nominal path."""
@@ -231,10 +238,12 @@ class _Search:
         spread = np.sqrt(np.einsum("kd,kde,ke->k", normal, self.path.covariances, normal))
         near = centre - spread - self.margin <= AFFECTED_DISTANCE
         in_charge = self.path.responsibilities[rows].max(axis=0) > 0.25
-        return np.flatnonzero((near | in_charge) & (self.path.basis[rows].max(axis=0) > NEGLIGIBLE_LEVER))
+        return np.flatnonzero(
+            (near | in_charge | self.everywhere) & (self.path.basis[rows].max(axis=0) > NEGLIGIBLE_LEVER)
+        )
 
     def _amplitudes(self, lever: Array, lift: Array, u: Array, affected: Index) -> Array | None:
-        """Return amplitudes a >= 0 of least ``sum a_k^2 / (u^T Sigma_k u)`` with ``lever @ a >= lift``, or None.
+        """Return amplitudes a >= 0 of least ``sum a_k^2 / (u^T Y_k u)`` with ``lever @ a >= lift``, or None.
 
         Args:
             lever: basis of the violated samples and affected components, shape (p, k).
@@ -245,7 +254,7 @@ class _Search:
         Returns:
             Amplitudes (k,) [m].
         """
-        spread = np.sqrt(np.einsum("d,kde,e->k", u, self.path.covariances[affected], u))
+        spread = np.sqrt(np.einsum("d,kde,e->k", u, self.path.yields[affected], u))
         upper = np.concatenate([2.0 * MAX_LIFT / spread, np.full(len(lift), UNBOUNDED)])
         lower = np.concatenate([np.zeros(len(spread)), lift])
         z = least_norm(lever * spread, lower, upper)

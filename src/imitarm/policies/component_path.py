@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 PIN_WIDTH = 0.06  # share of the duration over which a pinned instant lets go of the path (METHODS D.2.3)
 NEGLIGIBLE_RESPONSIBILITY = 1e-6  # below this a component's influence is cut, so that "unmoved" is bit-identical
+STILL = 1e-6  # [m] a mean that would move less than this stays exactly where it is
 TOLERANCE_FLOOR = 0.005  # [m] nobody demonstrates more precisely than this: keeps planar covariances invertible
 
 
@@ -47,7 +48,10 @@ class ComponentPath:
         responsibilities: h, shape (n, n_components).
         basis: w h, shape (n, n_components).
         means: centres of the components on the nominal path, shape (n_components, 3) [m].
-        covariances: position covariances of the components, floored at (5 mm)^2, (n_components, 3, 3) [m^2].
+        covariances: position covariances of the components, floored at (5 mm)^2, (n_components, 3, 3) [m^2]. They
+            hold the motion itself too: a component is long along the path.
+        yields: how much the teacher varied at the instant of each component's centre, floored as well: GMR's
+            covariance there, (n_components, 3, 3) [m^2]. It is what a displacement is measured against.
         tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
     """
 
@@ -56,6 +60,7 @@ class ComponentPath:
     basis: Array
     means: Array
     covariances: Array
+    yields: Array
     tolerance: Array
 
     @classmethod
@@ -110,6 +115,7 @@ class ComponentPath:
             basis=window[:, None] * influence,
             means=means,
             covariances=gmr.position_covariances_ + TOLERANCE_FLOOR**2 * np.eye(3),
+            yields=gmr.predict(gmr.time_means_)[1] + TOLERANCE_FLOOR**2 * np.eye(3),
             tolerance=tolerance,
         )
 
@@ -124,7 +130,7 @@ class ComponentPath:
 
     def deviation(self, displacement: Array) -> float:
         """Return the largest Mahalanobis length of a mean's displacement: how many demonstrated sigmas it moved."""
-        solved = np.linalg.solve(self.covariances, displacement[..., None])[..., 0]
+        solved = np.linalg.solve(self.yields, displacement[..., None])[..., 0]
         return float(np.sqrt(np.max(np.sum(displacement * solved, axis=-1), initial=0.0)))
 
 

@@ -2,7 +2,7 @@
 
 With one tangent plane for each sample and obstacle, "keep the clearance" is a set of linear inequalities in the
 displacements, and because the planes under-estimate the distance, each of their solutions truly keeps it (an inner
-convex approximation). Minimising ``sum_k Delta_k^T Sigma_k^-1 Delta_k`` under them and renewing the planes never leaves
+convex approximation). Minimising ``sum_k Delta_k^T Y_k^-1 Delta_k`` under them and renewing the planes never leaves
 the feasible set and never gets worse.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.policies.certificate import Detour, distances, measured_detour
-from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.component_path import STILL, ComponentPath
 from imitarm.scene.obstacle import Obstacle
 
 Array = NDArray[np.float64]
@@ -25,6 +25,7 @@ NEGLIGIBLE_LEVER = 1e-3  # a sample that no component can move has no row
 UNBOUNDED = 1e30  # daqp's infinity
 _INFLUENCE = 0.06  # [m] obstacles farther from a sample than this get no row
 _STEPS = 6
+_SLACK_SCALE = 1e-4  # [m] missing the tangents by this costs as much as one demonstrated sigma
 _GAIN = 0.97  # stop when a step saves less than 3 %
 _SOLVED = 1  # daqp's exit flag of an optimal solution
 
@@ -50,7 +51,7 @@ class LeastDetour:
 
     Attributes:
         wanted: distance planned for at the samples: the margin, and what a chord may sag between two of them [m].
-        precisions: inverse covariances of the components, shape (n_components, 3, 3) [1/m^2].
+        precisions: inverse of the components' yields, shape (n_components, 3, 3) [1/m^2].
         movable: which samples some component can move, shape (n,).
     """
 
@@ -59,8 +60,8 @@ class LeastDetour:
         step = float(np.linalg.norm(np.diff(path.nominal.positions, axis=0), axis=1).max())
         # A chord of a circle of radius `margin` sags by step^2 / 8 margin.
         self.wanted = margin + 1e-4 + 1.5 * step**2 / (8.0 * max(margin, 1e-3))
-        self.factors = np.linalg.cholesky(path.covariances)
-        self.precisions = np.linalg.inv(path.covariances)
+        self.factors = np.linalg.cholesky(path.yields)
+        self.precisions = np.linalg.inv(path.yields)
         self.movable = path.basis.max(axis=1) > NEGLIGIBLE_LEVER
 
     def shrink(self, detour: Detour, distance: Array, normal: Array) -> Detour:
@@ -91,9 +92,11 @@ class LeastDetour:
         return float(np.einsum("kd,kde,ke->", displacement, self.precisions, displacement))
 
     def _least(self, moved: Index, positions: Array, distance: Array, normal: Array, wanted: float) -> Array | None:
-        """Minimise ``sum Delta_k^T Sigma_k^-1 Delta_k`` under the tangents at ``positions``; None: no solution.
+        """Minimise ``sum Delta_k^T Y_k^-1 Delta_k`` under the tangents at ``positions``; None: no solution.
 
-        With ``Sigma_k = L_k L_k^T`` and ``Delta_k = L_k y_k`` the cost is ``|y|^2``, so it is a least-norm problem.
+        With the yields ``Y_k = L_k L_k^T`` and ``Delta_k = L_k y_k`` the cost is ``|y|^2``: a least-norm problem. Where
+        it has no solution, one more unknown lets all tangents be missed by the same, smallest length; from the path
+        that comes of it the renewed tangents may have one.
         """
         o, j = np.nonzero((distance < wanted + _INFLUENCE) & self.movable)
         n = normal[o, j]
@@ -102,15 +105,24 @@ class LeastDetour:
         offset = np.einsum("rd,rd->r", n, positions[j] - self.path.nominal.positions[j])
         lower = wanted - distance[o, j] + offset
         size = 3 * len(moved)
+        n_tangents = len(rows)
         if len(self.forbidden):
             blocks = np.zeros((len(self.forbidden), len(moved), len(moved), 3))
             index = np.arange(len(moved))
             blocks[:, index, index] = np.swapaxes(self.forbidden @ factors, 0, 1)
             rows = np.vstack([rows.reshape(-1, size), -blocks.reshape(-1, size)])
             lower = np.concatenate([lower, np.zeros(len(self.forbidden) * len(moved))])
-        y = least_norm(rows.reshape(-1, size), lower, np.full(len(lower), UNBOUNDED))
+        rows, upper = rows.reshape(-1, size), np.full(len(lower), UNBOUNDED)
+        y = least_norm(rows, lower, upper)
         if y is None:
-            return None
+            slack = np.where(np.arange(len(rows)) < n_tangents, _SLACK_SCALE, 0.0)[:, None]
+            y = least_norm(np.hstack([rows, slack]), lower, upper)
+            if y is None:
+                return None
+            y = y[:-1]
         displacement = np.zeros((self.path.n_components, 3))
         displacement[moved] = (factors @ y.reshape(-1, 3, 1))[..., 0]
+        for f in self.forbidden:  # the solver keeps them to its tolerance; here they hold exactly
+            displacement -= np.maximum(displacement @ f, 0.0)[:, None] * f
+        displacement[np.linalg.norm(displacement, axis=1) < STILL] = 0.0
         return displacement
