@@ -14,6 +14,7 @@ from imitarm.scene.obstacle import MAX_COORDINATE, MAX_SIZE, TINY, Array, Obstac
 _FLAT = 1e-6  # a hull thinner than this share of its longest extent is taken as flat
 _BLOCK = 512  # points at a time: tables of points times edges stay in the processor's cache
 _CLOSE = 1e-5  # [m] nearer than this the edges are compared without cancellation
+_ON_PLANE = 1e-12  # [m] rounding of a height over a face
 _SAME_PLANE = 1e-12  # neighbouring triangles whose normals' cosine is this near to one share a face
 
 
@@ -85,14 +86,15 @@ class _Polytope:
         face = heights.argmax(axis=1)
         distance = heights[np.arange(len(q)), face]
         normal = self.normals[face]
-        above = np.flatnonzero(distance > TINY)
+        above = np.flatnonzero(distance > _ON_PLANE)
         if len(above):
             foot_heights = heights[above] - distance[above, None] * self.cosines[face[above]]
-            beside = above[foot_heights.max(axis=1) > TINY]
+            beside = above[foot_heights.max(axis=1) > _ON_PLANE]
             if len(beside):
                 away = self._from_edges(q[beside])
                 distance[beside] = np.sqrt(np.einsum("ij,ij->i", away, away))
-                normal[beside] = away / distance[beside, None]
+                clear = distance[beside] > TINY  # nearer, the face's normal is the better one
+                normal[beside[clear]] = away[clear] / distance[beside[clear], None]
         return distance, normal
 
     def _from_edges(self, q: Array) -> Array:

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 MAX_SIZE = 10.0  # [m] nothing in the reach of an arm is larger: such a number is in the wrong unit
 MAX_COORDINATE = 100.0  # [m] nor farther away
 MAX_SPEED = 100.0  # [m/s] nor faster
-TINY = 1e-12  # [m] below this length a direction is rounding noise and a fixed one is taken instead
+TINY = 1e-9  # [m] below this length a direction is mostly rounding noise and a fixed one is taken instead
 
 
 def checked_vector(value: object, what: str, *, limit: float, unit: str) -> Array:

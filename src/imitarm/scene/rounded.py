@@ -20,6 +20,7 @@ from imitarm.scene.obstacle import (
 )
 
 _UP = np.array([0.0, 0.0, 1.0])
+_FLOOR = 1e-12  # of the shortest semi-axis: changes no distance by more
 _MAX_NEWTON = 100  # far more than any point needs
 _NEWTON_TOLERANCE = 1e-5  # of the last step; the error left is its square, and enters the distance squared again
 
@@ -170,7 +171,7 @@ class Ellipsoid(PosedObstacle):
     def _solve(self, y: Array) -> tuple[Array, Array]:
         """Distances (n,) and unit normals (3, n) of points (3, n) with no negative coordinate."""
         semi_axes = self.semi_axes[:, None]
-        floor = TINY * self.semi_axes[self._shortest]  # off the plane of symmetry, where s and y vanish together
+        floor = _FLOOR * self.semi_axes[self._shortest]  # off the plane of symmetry, where s and y vanish together
         y[self._shortest] = np.maximum(y[self._shortest], floor)
         scaled = semi_axes * y
         s = np.maximum.reduce(scaled - self._beyond, axis=0)  # each term alone says F >= 0 here
