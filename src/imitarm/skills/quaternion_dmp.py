@@ -192,10 +192,10 @@ class QuaternionDMP:
             step: share of the duration.
             acceleration: T^2 times an angular acceleration (3,) [rad] in the base frame, held during the step.
         """
-        E, G = propagator(self.gains_, step)
+        E, _, push = propagator(self.gains_, step)
         offset = E @ turn.offset
         if acceleration is not None:
-            offset = offset + G.sum(axis=1)[:, None] * (acceleration / self.gains_.stiffness)
+            offset = offset + push[:, None] * acceleration
         share = turn.share + step
         q = quaternion_multiply(quaternion_exp(offset[0]), self.target(turn, np.array([share]))[0])
         q = -q if q @ turn.quaternion < 0.0 else q

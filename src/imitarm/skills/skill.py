@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 import imitarm
 from imitarm.errors import FileFormatError, InputError
 from imitarm.kinematics.pose import Pose
-from imitarm.skills.dmp import DMP, Adjustment
+from imitarm.skills.course import Adjustment
+from imitarm.skills.dmp import DMP
 from imitarm.skills.gmr import GMR
 from imitarm.skills.quaternion_dmp import QuaternionDMP
 from imitarm.skills.rotation_reference import RotationReference

@@ -54,10 +54,12 @@ class Propagator(NamedTuple):
     Attributes:
         transition: shape (2, 2).
         drive: shape (2, 3).
+        push: what an acceleration of 1 in units of the duration adds when held during the step, shape (2,).
     """
 
     transition: Array
     drive: Array
+    push: Array
 
 
 @lru_cache(maxsize=256)
@@ -70,13 +72,14 @@ def propagator(gains: Gains, step: float) -> Propagator:
     A[1, :3] = -K, -D, K
     whole = expm(A * step)
     parabola = np.array([[1.0, 0.0, 0.0], [-3.0 / step, 4.0 / step, -1.0 / step], np.array([4.0, -8.0, 4.0]) / step**2])
-    return Propagator(whole[:2, :2], whole[:2, 2:] @ parabola)
+    drive = whole[:2, 2:] @ parabola
+    return Propagator(whole[:2, :2], drive, drive.sum(axis=1) / K)
 
 
 def roll_out(step: Propagator, start: Array, target: Array) -> Array:
     """Return the states at all steps at once.
 
-    The recursion ``z_k = E z_(k-1) + q_k`` is summed by doubling: after j passes each row holds the sum of its last
+    The recursion ``z_k = E z_(k-1) + q_k`` is summed by doubling: after j passes each state holds the sum of its last
     2^j terms, so n steps take log2(n) passes over whole arrays instead of a loop.
 
     Args:
@@ -85,13 +88,14 @@ def roll_out(step: Propagator, start: Array, target: Array) -> Array:
         target: y at the beginning, middle and end of the steps in turn, shape (2 n + 1, C).
 
     Returns:
-        Shape (n + 1, 2, C).
+        x and tau x', shape (2, n + 1, C).
     """
-    E, G = step
-    parts = np.stack([target[:-1:2], target[1::2], target[2::2]], axis=1)
-    z = np.concatenate([start[None], G @ parts])
-    reach = 1
-    while reach < len(z):
-        z[reach:] = z[reach:] + E @ z[:-reach]
+    E = step.transition
+    C = target.shape[1]
+    parts = np.stack([target[:-1:2], target[1::2], target[2::2]]).reshape(3, -1)
+    z = np.concatenate([start, step.drive @ parts], axis=1)  # time runs along the columns, C of them a step
+    reach = C
+    while reach < z.shape[1]:
+        z[:, reach:] += E @ z[:, :-reach]
         E, reach = E @ E, 2 * reach
-    return z
+    return z.reshape(2, -1, C)
