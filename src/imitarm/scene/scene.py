@@ -56,8 +56,8 @@ class Scene:
         """
         p = _points(points)
         distances = np.empty((len(self.obstacles), *p.shape[:-1]))
-        for row, obstacle in zip(distances.reshape(len(distances), -1), self.obstacles, strict=True):
-            row[:] = obstacle.signed_distance(p).reshape(-1)
+        for i, obstacle in enumerate(self.obstacles):
+            distances[i] = obstacle.signed_distance(p)
         return distances
 
     def clearance(self, points: ArrayLike) -> Array:

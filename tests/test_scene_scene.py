@@ -1,0 +1,103 @@
+"""Scene: clearance to the nearest obstacle, names, motion, a goal that is in the way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from imitarm.errors import InputError
+from imitarm.kinematics.pose import Pose
+from imitarm.scene import Box, Scene, Sphere
+from scene_shapes import KINDS, random_obstacle
+
+GOAL = Pose([0.5, 0.0, 0.3], [0, 1, 0, 0])
+
+
+@pytest.fixture
+def scene():
+    rng = np.random.default_rng(0)
+    return Scene(GOAL, [random_obstacle(kind, rng, velocity=rng.normal(size=3) * 0.1) for kind in KINDS])
+
+
+@pytest.mark.parametrize("shape", [(), (40,), (4, 10), (0,)])
+def test_distances_clearance_and_nearest_belong_together(scene, shape):
+    points = np.random.default_rng(1).normal(size=(*shape, 3)) * 0.5
+    distances = scene.distances(points)
+    assert distances.shape == (len(scene.obstacles), *shape)
+    for row, obstacle in zip(distances, scene.obstacles, strict=True):
+        np.testing.assert_array_equal(row, obstacle.signed_distance(points))
+    assert scene.clearance(points).shape == shape
+    assert scene.nearest(points).shape == shape
+    np.testing.assert_array_equal(scene.clearance(points), distances.min(axis=0))
+    np.testing.assert_array_equal(
+        np.take_along_axis(distances, scene.nearest(points)[None], axis=0)[0], scene.clearance(points)
+    )
+
+
+def test_without_obstacles_everything_is_clear():
+    empty = Scene()
+    assert empty.goal is None
+    np.testing.assert_array_equal(empty.clearance(np.zeros((2, 5, 3))), np.full((2, 5), np.inf))
+    np.testing.assert_array_equal(empty.nearest(np.zeros((5, 3))), np.full(5, -1))
+    assert empty.distances(np.zeros((5, 3))).shape == (0, 5)
+    assert empty.after(1.0).obstacles == ()
+    empty.check(0.1)
+
+
+def test_after_moves_the_obstacles_and_not_the_goal(scene):
+    points = np.random.default_rng(2).normal(size=(30, 3))
+    later = scene.after(2.0)
+    assert later.goal is scene.goal
+    for before, after in zip(scene.obstacles, later.obstacles, strict=True):
+        np.testing.assert_allclose(
+            after.signed_distance(points + 2.0 * before.velocity), before.signed_distance(points), atol=1e-12
+        )
+
+
+def test_names():
+    ball = Sphere([0, 0, 0], 0.1)
+    box = Box(Pose.identity(), [0.1, 0.1, 0.1])
+    tin = Box(Pose.identity(), [0.1, 0.1, 0.1], name="tin")
+    scene = Scene(None, (box, ball, tin, box, ball))
+    assert [scene.name_of(i) for i in range(5)] == ["box 1", "sphere 1", 'box "tin"', "box 2", "sphere 2"]
+    assert scene.name_of(scene.nearest([[9.0, 0, 0]])[0]) == "sphere 1"
+    for wrong in (5, -1):
+        with pytest.raises(InputError, match=f"obstacle {wrong} does not exist; the scene has 5"):
+            scene.name_of(wrong)
+
+
+def test_check_tells_a_goal_that_is_in_the_way():
+    scene = Scene(GOAL, [Sphere([0, 0, 0], 0.1), Sphere([0.55, 0.0, 0.3], 0.06, name="post")])
+    with pytest.raises(InputError, match=r'the goal \[0\.5, 0\.0, 0\.3\] overlaps sphere "post" by 10\.0 mm') as caught:
+        scene.check()
+    assert "move the goal or the obstacle" in str(caught.value)
+    free = Scene(GOAL, [Sphere([0.6, 0.0, 0.3], 0.06)])
+    free.check()
+    free.check(0.04 - 1e-9)
+    with pytest.raises(InputError, match=r"overlaps sphere 1 by 10\.0 mm"):
+        free.check(0.05)
+    Scene(None, scene.obstacles).check(1.0)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Scene([0, 0, 0]), r"goal must be a Pose or None, got \[0, 0, 0\]"),
+        (lambda: Scene(None, 3), "obstacles must be a list of obstacles, got 3"),
+        (lambda: Scene(None, [Sphere([0, 0, 0], 1), "box"]), r"obstacles\[1\] must be an obstacle .* got 'box'"),
+        (lambda: Scene(None, Sphere([0, 0, 0], 1)), "obstacles must be a list"),
+        (lambda: Scene().clearance([0, 0]), r"points must have shape \(\.\.\., 3\), got \(2,\)"),
+        (lambda: Scene().nearest(np.zeros((3, 2))), "points must have shape"),
+    ],
+)
+def test_bad_input_is_refused(build, message):
+    with pytest.raises(InputError, match=message):
+        build()
+
+
+def test_list_becomes_a_tuple():
+    obstacles = [Sphere([0, 0, 0], 1)]
+    scene = Scene(None, obstacles)
+    obstacles.clear()
+    assert len(scene.obstacles) == 1
+    assert isinstance(scene.obstacles, tuple)
