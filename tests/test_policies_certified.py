@@ -16,7 +16,7 @@ from imitarm.benchmark.avoidance import SLACK, judge, learn, run_family, wilson_
 from imitarm.benchmark.families import CLEARANCE, TOOL_RADIUS
 from imitarm.kinematics.pose import Pose, quaternion_exp
 from imitarm.policies import HORIZONTAL_ONLY, NOT_DOWN, adapt
-from imitarm.policies.certificate import distances, segment_bounds
+from imitarm.policies.certificate import Pair, distances, segment_bounds
 from imitarm.policies.least_detour import UNBOUNDED, least_norm
 from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Scene, Sphere
 
@@ -216,8 +216,9 @@ def test_the_certificate_is_a_lower_bound_on_the_whole_polyline(seed):
     rng = np.random.default_rng(seed)
     polyline = np.cumsum(rng.normal(size=(8, 3)) * 0.1, axis=0)
     obstacles = [families.random_obstacle(rng, rng.normal(size=3) * 0.1, planar=False) for _ in range(3)]
-    distance, normal = distances(obstacles, polyline)
-    bounds = segment_bounds(distance, normal, polyline)
+    pairs = [Pair(obstacle, i, 0.0, None, 0.0) for i, obstacle in enumerate(obstacles)]
+    distance, normal = distances(pairs, polyline)
+    bounds = segment_bounds(pairs, distance, normal, polyline)
     u = np.linspace(0.0, 1.0, 200)[:, None, None]
     dense = polyline[:-1] * (1 - u) + polyline[1:] * u  # (200, 7, 3)
     for i, obstacle in enumerate(obstacles):

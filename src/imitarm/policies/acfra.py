@@ -41,6 +41,7 @@ class ACFRA(Policy):
         *,
         method: str = "certified",
         tool_radius: float = 0.0,
+        tool_spheres: ArrayLike | None = None,
         clearance: float = 0.02,
         forbidden: ArrayLike = (),
         pinned: Sequence[float] = (),
@@ -54,6 +55,7 @@ class ACFRA(Policy):
         self._options = {
             "method": method,
             "tool_radius": tool_radius,
+            "tool_spheres": tool_spheres,
             "clearance": clearance,
             "forbidden": forbidden,
             "pinned": pinned,

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose
-from imitarm.policies.certificate import Detour, distances, measured_detour
+from imitarm.policies.certificate import Detour, distances, judged
 from imitarm.policies.certified import find_detour
 from imitarm.policies.component_path import STILL, ComponentPath
 from imitarm.policies.potential_components import push_components
@@ -42,7 +42,7 @@ class Adaptation:
         covariances: position covariances of the components, shape (n_components, 3, 3) [m^2].
         responsibilities: of each component for each sample, shape (n, n_components).
         tolerance: covariance of the demonstrations along the path, shape (n, 3, 3) [m^2].
-        min_clearance: smallest distance from the tool's sphere to an obstacle, at the samples [m]; inf without any.
+        min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without any.
         certified_clearance: proven lower bound of it on the whole polyline through the samples [m].
         deviation: how many demonstrated sigmas the farthest mean moved (Mahalanobis).
         feasible: whether ``certified_clearance`` reaches what was asked.
@@ -84,6 +84,7 @@ def adapt(
     method: str = "certified",
     *,
     tool_radius: float = 0.0,
+    tool_spheres: ArrayLike | None = None,
     clearance: float = 0.02,
     forbidden: ArrayLike = (),
     pinned: Sequence[float] = (),
@@ -101,7 +102,9 @@ def adapt(
         scene: goal (None: the learnt one) and obstacles.
         method: ``"certified"``, ``"mapf"`` or ``"literal"``.
         tool_radius: radius of a sphere about the tool's tip that holds the tool [m].
-        clearance: asked distance from that sphere to every obstacle [m].
+        tool_spheres: instead of one radius, spheres that hold the tool: rows x y z r in the tool's frame, shape
+            (m, 4) [m], as ``ArmModel.tool_spheres`` gives them. They turn as the skill turns the tool.
+        clearance: asked distance from them to every obstacle [m].
         forbidden: directions in which nothing may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
         pinned: instants [s] at which the path must not move, for example where the dirt lies.
         start: where the motion begins; None: where it was learnt.
@@ -118,12 +121,15 @@ def adapt(
         raise UnknownNameError.among("method", method, METHODS)
     if not (0.0 <= tool_radius < np.inf and 0.0 <= clearance < np.inf):
         raise InputError(f"tool_radius and clearance must be >= 0 m, got {tool_radius} and {clearance}")
+    if tool_spheres is not None and tool_radius > 0.0:
+        raise InputError("give tool_radius or tool_spheres, not both")
+    spheres = ((0.0, 0.0, 0.0, tool_radius),) if tool_spheres is None else tool_spheres
     axes = _unit_rows(forbidden)
     began = time.perf_counter()
-    path = ComponentPath.of_skill(skill, n_samples=n_samples, start=start, goal=scene.goal, pinned=pinned)
-    margin = tool_radius + clearance
-    detour = _detour(path, scene, margin, method, axes)
-    certified = float(np.min(detour.bounds, initial=np.inf)) - tool_radius
+    path = ComponentPath.of_skill(
+        skill, spheres=spheres, n_samples=n_samples, start=start, goal=scene.goal, pinned=pinned
+    )
+    detour = _detour(path, scene, clearance, method, axes)
     return Adaptation(
         nominal=path.nominal,
         trajectory=Trajectory(path.nominal.times, detour.positions, path.nominal.quaternions),
@@ -133,11 +139,11 @@ def adapt(
         covariances=path.covariances,
         responsibilities=path.responsibilities,
         tolerance=path.tolerance,
-        min_clearance=float(np.min(detour.nearest, initial=np.inf)) - tool_radius,
-        certified_clearance=certified,
+        min_clearance=float(np.min(detour.nearest, initial=np.inf)),
+        certified_clearance=float(np.min(detour.bounds, initial=np.inf)),
         deviation=path.deviation(detour.displacement),
         feasible=detour.feasible,
-        reason="" if detour.feasible else _reason(path, scene, detour, method, tool_radius, clearance, len(axes)),
+        reason="" if detour.feasible else _reason(path, scene, detour, method, clearance, len(axes)),
         method=method,
         compute_time=time.perf_counter() - began,
     )
@@ -152,22 +158,24 @@ def _unit_rows(directions: ArrayLike) -> Array:
     return np.asarray(rows / length)
 
 
-def _detour(path: ComponentPath, scene: Scene, margin: float, method: str, axes: Array) -> Detour:
+def _detour(path: ComponentPath, scene: Scene, clearance: float, method: str, axes: Array) -> Detour:
     """Return the detour of the method; nothing is searched when nothing is in the way or a pinned point is covered."""
     still = np.zeros((path.n_components, 3))
     if not scene.obstacles:
         return Detour(still, path.nominal.positions, np.empty(0), np.empty(0), True, 0)
+    pairs = path.pairs(scene.obstacles)
     positions = path.nominal.positions
-    distance, normal = distances(scene.obstacles, positions)
-    unmoved = measured_detour(still, positions, distance, normal, margin)
+    distance, normal = distances(pairs, positions)
+    unmoved = judged(pairs, still, positions, distance, normal, clearance)
     if unmoved.feasible:
         return unmoved
     if method == "certified":
-        covered = bool(distance[:, _pins(path)].min() < margin)
-        return unmoved if covered else find_detour(path, scene.obstacles, margin, distance, normal, forbidden=axes)
-    pushed = push_components(path, scene.obstacles, margin, method=method, forbidden=axes)
+        covered = bool(distance[:, _pins(path)].min() < clearance)
+        return unmoved if covered else find_detour(path, pairs, clearance, distance, normal, forbidden=axes)
+    reach = float(np.max(np.linalg.norm(path.spheres[:, :3], axis=1) + path.spheres[:, 3]))
+    pushed = push_components(path, scene.obstacles, reach + clearance, method=method, forbidden=axes)
     positions = path.displaced(pushed)
-    return measured_detour(pushed, positions, *distances(scene.obstacles, positions), margin)
+    return judged(pairs, pushed, positions, *distances(pairs, positions), clearance)
 
 
 def _pins(path: ComponentPath) -> NDArray[np.intp]:
@@ -175,46 +183,38 @@ def _pins(path: ComponentPath) -> NDArray[np.intp]:
     return np.flatnonzero(path.basis.max(axis=1) == 0.0)
 
 
-def _reason(
-    path: ComponentPath,
-    scene: Scene,
-    detour: Detour,
-    method: str,
-    tool_radius: float,
-    clearance: float,
-    n_forbidden: int,
-) -> str:
+def _reason(path: ComponentPath, scene: Scene, detour: Detour, method: str, clearance: float, n_forbidden: int) -> str:
     """Say which obstacle can't be avoided and why, in words that tell what to change."""
     asked = f"{1e3 * clearance:.0f} mm asked"
+    pairs = path.pairs(scene.obstacles)
     pins = _pins(path)
-    at_pins = scene.clearance(path.nominal.positions[pins]) - tool_radius
+    at_pins = distances(pairs, detour.positions)[0][:, pins]
     if at_pins.min() < clearance:
-        pin = pins[int(np.argmin(at_pins))]
-        name = scene.name_of(int(scene.nearest(path.nominal.positions[pin])))
-        share = path.nominal.times[pin] / path.nominal.times[-1]
-        middle = f"pinned point at {path.nominal.times[pin]:.2f} s"
-        where = "start" if share < 0.02 else "goal" if share > 0.98 else middle
-        lies = (
-            f"covers the {where}"
-            if at_pins.min() <= 0.0
-            else f"leaves {1e3 * at_pins.min():.0f} mm at the {where} ({asked})"
-        )
-        return f"{name} {lies}, which must not move: move the obstacle, or ask for another {where.split()[0]}"
+        pair, pin = np.unravel_index(int(np.argmin(at_pins)), at_pins.shape)
+        return _at_pin(path, scene.name_of(pairs[pair].index), int(pins[pin]), float(at_pins.min()), asked)
     worst = int(np.argmin(detour.bounds))
-    left = f"{1e3 * (float(detour.bounds[worst]) - tool_radius) + 0.0:.1f} mm"
+    name = scene.name_of(pairs[worst].index)
+    left = f"{1e3 * float(detour.bounds[worst]) + 0.0:.1f} mm"
     if method != "certified":
         return (
-            f"the path passes {scene.name_of(worst)} at {left} ({asked}): method {method!r} pushes components and does "
+            f"the path passes {name} at {left} ({asked}): method {method!r} pushes components and does "
             "not look at the path between them; try method 'certified'"
         )
-    distance = scene.obstacles[worst].signed_distance(detour.positions)
-    sample = int(np.argmin(distance))
-    others = [scene.name_of(i) for i in np.flatnonzero(detour.bounds < tool_radius + clearance) if i != worst]
+    near = {pairs[i].index for i in np.flatnonzero(detour.bounds < clearance)} - {pairs[worst].index}
+    sample = int(np.argmin(pairs[worst].distance(detour.positions)))
     held = path.basis[sample].sum() < 0.5
     return (
-        f"no way round {scene.name_of(worst)} with {asked}: the best attempt leaves {left}"
-        + (f", and {', '.join(others)} too near as well" if others else "")
+        f"no way round {name} with {asked}: the best attempt leaves {left}"
+        + (f", and {', '.join(map(scene.name_of, sorted(near)))} too near as well" if near else "")
         + ("; it stands too close to a point that must not move" if held else "")
         + (f"; {n_forbidden} forbidden direction(s) were kept" if n_forbidden else "")
         + ": move an obstacle, allow another direction, or ask for less clearance"
     )
+
+
+def _at_pin(path: ComponentPath, name: str, sample: int, left: float, asked: str) -> str:
+    """Say that an obstacle is too near to a point that must not move."""
+    moment, end = path.nominal.times[sample], path.nominal.times[-1]
+    where = "start" if moment < 0.02 * end else "goal" if moment > 0.98 * end else f"pinned point at {moment:.2f} s"
+    lies = f"covers the {where}" if left <= 0.0 else f"leaves {1e3 * left:.0f} mm at the {where} ({asked})"
+    return f"{name} {lies}, which must not move: move the obstacle, or ask for another {where.split(maxsplit=1)[0]}"

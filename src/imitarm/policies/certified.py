@@ -20,10 +20,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.policies.certificate import Detour, distances
+from imitarm.policies.certificate import Detour, Pair, distances
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.least_detour import NEGLIGIBLE_LEVER, UNBOUNDED, LeastDetour, least_norm
-from imitarm.scene.obstacle import Obstacle
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -51,22 +50,22 @@ class _Node:
 
 def find_detour(
     path: ComponentPath,
-    obstacles: Sequence[Obstacle],
-    margin: float,
+    pairs: Sequence[Pair],
+    clearance: float,
     distance: Array,
     normal: Array,
     *,
     forbidden: Array,
     max_choices: int = 60,
 ) -> Detour:
-    """Move components so that the path stays ``margin`` away from every obstacle.
+    """Move components so that every sphere of the tool keeps the clearance to every obstacle.
 
     Args:
         path: the nominal path and its components.
-        obstacles: convex obstacles.
-        margin: tool radius plus asked clearance [m].
-        distance: of the nominal path's samples to each obstacle, shape (n_obstacles, n) [m].
-        normal: gradients there, shape (n_obstacles, n, 3).
+        pairs: spheres of the tool and convex obstacles.
+        clearance: asked [m].
+        distance: clearance of each pair at the nominal path's samples, shape (n_pairs, n) [m].
+        normal: gradients there, shape (n_pairs, n, 3).
         forbidden: directions in which no component may move, unit rows, shape (m, 3); each displacement has
             ``Delta . f <= 0``. A direction and its opposite forbid the axis.
         max_choices: how many choices of a side before giving up, once with the components near the obstacles and
@@ -75,7 +74,7 @@ def find_detour(
     Returns:
         The detour; when it is not feasible, the best attempt with its bounds.
     """
-    search = _Search(path, obstacles, margin, forbidden)
+    search = _Search(path, pairs, clearance, forbidden)
     detour = search.run(max_choices, distance, normal)
     if not detour.feasible:  # moving the components next to the obstacle was not enough: let all of them help
         search.everywhere = True
@@ -87,9 +86,9 @@ def find_detour(
 class _Search:
     """One call's arrays: the state of the best-first search over sides, and the polish."""
 
-    def __init__(self, path: ComponentPath, obstacles: Sequence[Obstacle], margin: float, forbidden: Array) -> None:
-        self.path, self.obstacles, self.margin, self.forbidden = path, obstacles, margin, forbidden
-        self.least = LeastDetour(path, obstacles, margin, forbidden)
+    def __init__(self, path: ComponentPath, pairs: Sequence[Pair], clearance: float, forbidden: Array) -> None:
+        self.path, self.pairs, self.clearance, self.forbidden = path, pairs, clearance, forbidden
+        self.least = LeastDetour(path, pairs, clearance, forbidden)
         self.wanted = self.least.wanted
         self.everywhere = False  # whether components far from the obstacle may move too
 
@@ -102,7 +101,7 @@ class _Search:
             node = heapq.heappop(heap)
             positions = self.path.displaced(node.displacement)
             if node.order > 0:
-                distance, normal = distances(self.obstacles, positions)
+                distance, normal = distances(self.pairs, positions)
             bounds = distance.min(axis=1)
             detour = Detour(node.displacement, positions, bounds, bounds, False, expanded)
             if bounds.min() >= self.wanted - _REPAIRABLE:
@@ -130,12 +129,12 @@ class _Search:
         directions = self._directions(positions, normal[worst], int(np.argmin(distance[worst])))
         affected = self._affected(rows, displacement, worst)
         lever = self.path.basis[np.ix_(rows, affected)]
-        lifts = self._exits(self.obstacles[worst], positions[rows], directions)
+        lifts = self._exits(self.pairs[worst], positions, rows, directions)
         children, costs, entered = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
         if entered:  # the best way out of this obstacle runs into another one: also try to go beyond all of them
-            for i in range(len(self.obstacles)):
+            for i, pair in enumerate(self.pairs):
                 if i != worst:
-                    lifts = np.maximum(lifts, self._exits(self.obstacles[i], positions[rows], directions))
+                    lifts = np.maximum(lifts, self._exits(pair, positions, rows, directions))
             more, prices, _ = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
             children, costs = children + more, costs + prices
         return list(zip(costs, children, strict=True))
@@ -179,11 +178,12 @@ class _Search:
         """Rate displacements (c, n_components, 3): demonstrated variance they use up, and clearance still violated.
 
         Returns:
-            costs (c,) and, by obstacle, the violation summed over every second sample (n_obstacles, c) [m].
+            costs (c,) and, by pair, the violation summed over every second sample (n_pairs, c) [m].
         """
         style = np.einsum("ckd,kde,cke->c", displacements, self.least.precisions, displacements)
         sampled = self.path.nominal.positions[::_THINNED] + self.path.basis[::_THINNED] @ displacements
-        lacking = [np.maximum(0.0, self.wanted - o.signed_distance(sampled)).sum(axis=1) for o in self.obstacles]
+        every = slice(None, None, _THINNED)
+        lacking = [np.maximum(0.0, self.wanted - pair.distance(sampled, every)).sum(axis=1) for pair in self.pairs]
         violation = np.stack(lacking)
         return _STYLE_COST * style + _THINNED * _VIOLATION_COST * violation.sum(axis=0), violation
 
@@ -204,24 +204,26 @@ class _Search:
         candidates = candidates[length > 0.25] / length[length > 0.25, None]
         return np.unique(np.round(candidates, 9) + 0.0, axis=0) if len(self.forbidden) else candidates
 
-    def _exits(self, obstacle: Obstacle, points: Array, directions: Array) -> Array:
-        """Return how far each point has to go along each direction to be clear for good.
+    def _exits(self, pair: Pair, positions: Array, rows: Index, directions: Array) -> Array:
+        """Return how far each sample has to go along each direction to be clear of the obstacle for good.
 
         Newton's method from ``MAX_LIFT`` inwards: the signed distance along a ray is convex, so it comes down to the
         largest root without passing it. A ray that is still inside at ``MAX_LIFT`` gets inf.
 
         Args:
-            obstacle: the one to leave.
-            points: shape (p, 3).
+            pair: sphere and obstacle.
+            positions: of the tip, shape (n, 3).
+            rows: which samples, shape (p,).
             directions: unit, shape (m, 3).
 
         Returns:
             Lifts, shape (m, p) [m].
         """
+        points = pair.centres(positions[rows], rows)
         lift = np.full((len(directions), len(points)), MAX_LIFT)
         blocked = np.zeros(lift.shape, dtype=bool)
         for iteration in range(_NEWTON_STEPS):
-            d, n = obstacle.distance_and_gradient(points + lift[..., None] * directions[:, None, :])
+            d, n = pair.distance_and_normal(points + lift[..., None] * directions[:, None, :])
             gap = d - self.wanted
             if iteration == 0:
                 blocked = gap < 0.0
@@ -234,9 +236,11 @@ class _Search:
 
     def _affected(self, rows: Index, displacement: Array, worst: int) -> Index:
         """Return the indices of the components near the obstacle or in charge of a violated sample (METHODS D.2.4)."""
-        centre, normal = self.obstacles[worst].distance_and_gradient(self.path.means + displacement)
+        pair = self.pairs[worst]
+        beside = 0.0 if pair.offset is None else float(np.linalg.norm(pair.offset[0]))
+        centre, normal = pair.distance_and_normal(self.path.means + displacement)
         spread = np.sqrt(np.einsum("kd,kde,ke->k", normal, self.path.covariances, normal))
-        near = centre - spread - self.margin <= AFFECTED_DISTANCE
+        near = centre - spread - beside - self.clearance <= AFFECTED_DISTANCE
         in_charge = self.path.responsibilities[rows].max(axis=0) > 0.25
         return np.flatnonzero(
             (near | in_charge | self.everywhere) & (self.path.basis[rows].max(axis=0) > NEGLIGIBLE_LEVER)

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
-from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.pose import Pose, rotate
+from imitarm.policies.certificate import Pair
+from imitarm.scene.obstacle import Obstacle
 from imitarm.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -53,6 +55,7 @@ class ComponentPath:
         yields: how much the teacher varied at the instant of each component's centre, floored as well: GMR's
             covariance there, (n_components, 3, 3) [m^2]. It is what a displacement is measured against.
         tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
+        spheres: that hold the tool: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
     """
 
     nominal: Trajectory
@@ -62,12 +65,14 @@ class ComponentPath:
     covariances: Array
     yields: Array
     tolerance: Array
+    spheres: Array
 
     @classmethod
     def of_skill(
         cls,
         skill: Skill,
         *,
+        spheres: ArrayLike = ((0.0, 0.0, 0.0, 0.0),),
         n_samples: int = 200,
         start: Pose | None = None,
         goal: Pose | None = None,
@@ -77,6 +82,7 @@ class ComponentPath:
 
         Args:
             skill: a fitted skill.
+            spheres: that hold the tool, rows x y z r in the tool's frame, shape (n_spheres, 4) [m].
             n_samples: samples along the path.
             start: where the motion begins; None: where it was learnt.
             goal: where the motion ends; None: where it was learnt. A moved start or goal bends the nominal path by
@@ -84,7 +90,8 @@ class ComponentPath:
             pinned: further instants [s] at which the path must not move, for example a contact point.
 
         Raises:
-            InputError: when there are fewer than 10 samples or a pinned instant is outside the motion.
+            InputError: when there are fewer than 10 samples, a pinned instant is outside the motion, or a sphere lies
+                beside the tip of a tool whose orientation was not learnt.
         """
         if n_samples < 10:
             raise InputError(f"n_samples must be at least 10, got {n_samples}")
@@ -117,12 +124,26 @@ class ComponentPath:
             covariances=gmr.position_covariances_ + TOLERANCE_FLOOR**2 * np.eye(3),
             yields=gmr.predict(gmr.time_means_)[1] + TOLERANCE_FLOOR**2 * np.eye(3),
             tolerance=tolerance,
+            spheres=_checked_spheres(spheres, quaternions is not None),
         )
 
     @property
     def n_components(self) -> int:
         """Number of components."""
         return len(self.means)
+
+    def pairs(self, obstacles: Sequence[Obstacle]) -> list[Pair]:
+        """Return every sphere of the tool with every obstacle; the tool turns as on the nominal path."""
+        q = self.nominal.quaternions
+        sides: list[tuple[float, Array | None, Array | float]] = []
+        for x, y, z, radius in self.spheres:
+            centre = np.array([x, y, z])
+            if q is None or not centre.any():
+                sides.append((radius, None, 0.0))
+                continue
+            half_turn = np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=1)), 0.0, 1.0))
+            sides.append((radius, rotate(q, centre), np.linalg.norm(centre) * (1.0 - np.cos(half_turn))))
+        return [Pair(obstacle, i, *side) for i, obstacle in enumerate(obstacles) for side in sides]
 
     def displaced(self, displacement: Array) -> Array:
         """Return the positions (..., n, 3) when the means move by ``displacement`` (..., n_components, 3) [m]."""
@@ -132,6 +153,18 @@ class ComponentPath:
         """Return the largest Mahalanobis length of a mean's displacement: how many demonstrated sigmas it moved."""
         solved = np.linalg.solve(self.yields, displacement[..., None])[..., 0]
         return float(np.sqrt(np.max(np.sum(displacement * solved, axis=-1), initial=0.0)))
+
+
+def _checked_spheres(spheres: ArrayLike, turns_known: bool) -> Array:
+    rows = np.asarray(spheres, dtype=float)
+    if rows.ndim != 2 or rows.shape[1] != 4 or not len(rows) or not np.isfinite(rows).all() or np.any(rows[:, 3] < 0.0):
+        raise InputError(f"tool spheres must be rows x y z r, finite and r >= 0 [m], got shape {rows.shape}")
+    if not turns_known and np.any(rows[:, :3] != 0.0):
+        raise InputError(
+            "tool spheres beside the tip need the tool's orientation, which was not learnt: "
+            "record quaternions, or give one tool_radius"
+        )
+    return rows
 
 
 def _window(times: Array, pins: Sequence[float]) -> Array:

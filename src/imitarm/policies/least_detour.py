@@ -14,9 +14,8 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.policies.certificate import Detour, distances, measured_detour
+from imitarm.policies.certificate import Detour, Pair, distances, judged
 from imitarm.policies.component_path import STILL, ComponentPath
-from imitarm.scene.obstacle import Obstacle
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -47,26 +46,28 @@ def least_norm(rows: Array, lower: Array, upper: Array) -> Array | None:
 
 
 class LeastDetour:
-    """Shrinks detours of one path among one set of obstacles.
+    """Shrinks detours of one path among one set of obstacles, for all spheres of the tool.
 
     Attributes:
-        wanted: distance planned for at the samples: the margin, and what a chord may sag between two of them [m].
+        wanted: distance planned for at the samples: the clearance, and what a chord may sag between two of them [m].
         precisions: inverse of the components' yields, shape (n_components, 3, 3) [1/m^2].
         movable: which samples some component can move, shape (n,).
     """
 
-    def __init__(self, path: ComponentPath, obstacles: Sequence[Obstacle], margin: float, forbidden: Array) -> None:
-        self.path, self.obstacles, self.margin, self.forbidden = path, obstacles, margin, forbidden
+    def __init__(self, path: ComponentPath, pairs: Sequence[Pair], clearance: float, forbidden: Array) -> None:
+        self.path, self.pairs, self.clearance, self.forbidden = path, pairs, clearance, forbidden
         step = float(np.linalg.norm(np.diff(path.nominal.positions, axis=0), axis=1).max())
-        # A chord of a circle of radius `margin` sags by step^2 / 8 margin.
-        self.wanted = margin + 1e-4 + 1.5 * step**2 / (8.0 * max(margin, 1e-3))
+        # Round a corner of an obstacle the centre of a sphere passes on an arc of this radius; its chord sags by
+        # step^2 / 8 radius.
+        radius = clearance + min(pair.radius for pair in pairs)
+        self.wanted = clearance + 1e-4 + 1.5 * step**2 / (8.0 * max(radius, 1e-3))
         self.factors = np.linalg.cholesky(path.yields)
         self.precisions = np.linalg.inv(path.yields)
         self.movable = path.basis.max(axis=1) > NEGLIGIBLE_LEVER
 
     def shrink(self, detour: Detour, distance: Array, normal: Array) -> Detour:
         """Shrink a displacement to the least one that its tangents allow; where a segment dips, ask for more there."""
-        best = measured_detour(detour.displacement, detour.positions, distance, normal, self.margin, detour.expanded)
+        best = self._judged(detour.displacement, detour.positions, distance, normal, detour.expanded)
         moved = np.flatnonzero(np.any(detour.displacement != 0.0, axis=1))
         positions, wanted = detour.positions, self.wanted
         cost = self._cost(detour.displacement)
@@ -75,18 +76,21 @@ class LeastDetour:
             if displacement is None:
                 break
             positions = self.path.displaced(displacement)
-            distance, normal = distances(self.obstacles, positions)
-            trial = measured_detour(displacement, positions, distance, normal, self.margin, detour.expanded)
+            distance, normal = distances(self.pairs, positions)
+            trial = self._judged(displacement, positions, distance, normal, detour.expanded)
             if not trial.feasible:
                 if trial.bounds.min() > best.bounds.min():
                     best = trial
-                wanted += 1.2 * (self.margin - float(trial.bounds.min())) + 1e-6
+                wanted += 1.2 * (self.clearance - float(trial.bounds.min())) + 1e-6
                 continue
             best = trial
             previous, cost = cost, self._cost(displacement)
             if cost > _GAIN * previous:
                 break
         return best
+
+    def _judged(self, displacement: Array, positions: Array, distance: Array, normal: Array, expanded: int) -> Detour:
+        return judged(self.pairs, displacement, positions, distance, normal, self.clearance, expanded)
 
     def _cost(self, displacement: Array) -> float:
         return float(np.einsum("kd,kde,ke->", displacement, self.precisions, displacement))
