@@ -280,6 +280,16 @@ class ArmModel:
         turned = data.xmat[self._sphere_body].reshape(-1, 3, 3) @ self._sphere_center[:, :, None]
         return data.xpos[self._sphere_body] + turned[:, :, 0], self._sphere_radius
 
+    @property
+    def tool_spheres(self) -> Array:
+        """Spheres that hold all that moves rigidly with the tool: last link, hand, fingers as they are at home.
+
+        Rows x y z r in the tool's frame, shape (m, 4) [m]; what a policy keeps clear of obstacles.
+        """
+        centers, radii = self.collision_spheres(self.home)
+        rigid = self._sphere_moves[:, -1] > 0.0
+        return np.column_stack([self.tool_pose(self.home).inverse().apply(centers[rigid]), radii[rigid]])
+
     def sphere_jacobians(self, q: ArrayLike) -> Array:
         """Return the Jacobians of the spheres' centers, shape (m, 3, n_joints) [m/rad]."""
         centers, _ = self.collision_spheres(q)
