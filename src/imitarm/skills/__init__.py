@@ -6,6 +6,7 @@ from imitarm.skills.dmp import DMP, DMPState
 from imitarm.skills.gmm import DegenerateAxisWarning, GaussianMixture, ellipsoid_scale
 from imitarm.skills.gmr import GMR, SingleDemonstrationWarning, UnalignedWarning
 from imitarm.skills.quaternion_dmp import QuaternionDMP
+from imitarm.skills.rhythmic_dmp import RhythmicDMP
 from imitarm.skills.skill import Skill
 from imitarm.skills.spring import GAINS, Gains
 
@@ -18,6 +19,7 @@ __all__ = [
     "Gains",
     "GaussianMixture",
     "QuaternionDMP",
+    "RhythmicDMP",
     "SingleDemonstrationWarning",
     "Skill",
     "UnalignedWarning",

@@ -227,9 +227,21 @@ class GMR:
         order = np.argsort(means[:, 0], kind="stable")
         self.weights_, self.means_, self.covariances_ = weights[order], means[order], covariances[order]
         self.n_components_ = len(order)
-        self._time_variances = self.covariances_[:, 0, 0]
-        self._slopes = self.covariances_[:, 1:, 0] / self._time_variances[:, None]
-        self._within = self.covariances_[:, 1:, 1:] - self._slopes[:, :, None] * self.covariances_[:, None, 0, 1:]
+        # m_k is linear and m_k m_k^T quadratic in u_k = t - mu_k^t, so that both sums over the components are products
+        # of [h, h u, h u^2] with a table. Taken about the centre of the motion nothing is lost by cancellation.
+        self._center = self.weights_ @ self.means_[:, 1:]
+        mu = self.means_[:, 1:] - self._center
+        beta = self.covariances_[:, 1:, 0] / self.covariances_[:, 0, :1]
+        within = self.covariances_[:, 1:, 1:] - beta[:, :, None] * self.covariances_[:, None, 0, 1:]
+        mixed = mu[:, :, None] * beta[:, None, :]
+        self._first = np.concatenate([mu, beta])
+        self._second = np.concatenate(
+            [
+                within + mu[:, :, None] * mu[:, None, :],
+                mixed + np.swapaxes(mixed, 1, 2),
+                beta[:, :, None] * beta[:, None, :],
+            ]
+        )
 
     @property
     def has_orientation_(self) -> bool:
@@ -261,29 +273,28 @@ class GMR:
 
     def responsibilities(self, times: ArrayLike) -> Array:
         """Return h_k(t), how much each component has to say at ``times`` (n,) [s], shape (n, K), rows sum to one."""
-        return self._responsibilities(self._clamped(times))
+        return self._responsibilities(self._clamped(times)[:, None] - self.time_means_)
 
-    def _responsibilities(self, t: Array) -> Array:
-        constant = np.log(self.weights_) - 0.5 * np.log(self._time_variances)
-        log_h = constant[:, None] - (t - self.time_means_[:, None]) ** 2 * (0.5 / self._time_variances)[:, None]
-        h = np.exp(log_h - log_h.max(axis=0))
-        return (h / h.sum(axis=0)).T
+    def _responsibilities(self, u: Array) -> Array:
+        """Return h (n, K) for times since the components' own, u (n, K)."""
+        variances = self.covariances_[:, 0, 0]
+        h = u * u * (-0.5 / variances) + (np.log(self.weights_) - 0.5 * np.log(variances))
+        np.exp(h - h.max(axis=1, keepdims=True), out=h)
+        return np.asarray(h / h.sum(axis=1, keepdims=True))
 
-    def _regress(self, t: Array, columns: slice) -> tuple[Array, Array]:
-        """Return mean (n, D) and covariance (n, D, D) of some columns of x at clamped times."""
-        h = self._responsibilities(t)
-        offsets = t[:, None] - self.time_means_
-        component_means = self.means_[:, 1:][:, columns] + offsets[..., None] * self._slopes[:, columns]
-        mean = (h[:, None, :] @ component_means)[:, 0]
-        spread = component_means - mean[:, None]
-        within = self._within[:, columns, columns]
-        covariance = (h @ within.reshape(len(within), -1)).reshape(len(t), *within.shape[1:])
-        covariance += np.swapaxes(spread * h[..., None], 1, 2) @ spread
-        return mean, covariance
+    def _regress(self, t: Array, n_columns: int) -> tuple[Array, Array]:
+        """Return mean (n, D) and covariance (n, D, D) of the first columns of x at clamped times."""
+        u = t[:, None] - self.time_means_
+        h = self._responsibilities(u)
+        powers = np.concatenate([h, h * u, h * u * u], axis=1)
+        mean = powers[:, : len(self._first)] @ self._first[:, :n_columns]
+        second = powers @ self._second[:, :n_columns, :n_columns].reshape(len(self._second), -1)
+        covariance = second.reshape(-1, n_columns, n_columns) - mean[:, :, None] * mean[:, None, :]
+        return mean + self._center[:n_columns], covariance
 
     def predict(self, times: ArrayLike) -> tuple[Array, Array]:
         """Return mean position (n, 3) [m] and its covariance (n, 3, 3) [m^2] at ``times`` (n,) [s]."""
-        return self._regress(self._clamped(times), slice(0, 3))
+        return self._regress(self._clamped(times), 3)
 
     def predict_orientation(self, times: ArrayLike) -> tuple[Array, Array]:
         """Return the mean rotation and its covariance at ``times`` (n,) [s].
@@ -311,7 +322,7 @@ class GMR:
         t = self._clamped(times)
         if self.reference_ is None:
             raise InputError("GMR: the demonstrations had no quaternions, so no orientation was learnt")
-        mean, covariance = self._regress(t, slice(0, 6))
+        mean, covariance = self._regress(t, 6)
         transport = np.zeros_like(covariance)
         transport[:, :3, :3] = np.eye(3)
         transport[:, 3:, 3:] = left_jacobian(mean[:, 3:])
