@@ -95,8 +95,7 @@ class Obstacle(ABC):
     point is not unique (the centre of a sphere, the medial axis of a box) one of them is taken, always the same
     for the same input. To keep a distance ``r`` from an obstacle, ask for ``sd(x) >= r``: no inflated copy is needed.
 
-    Points have any leading shape and one call treats them all; coordinates that are not finite give results that
-    are not finite.
+    Points have any leading shape and one call treats them all. They must be finite: a nan gives a distance of nan.
 
     Attributes:
         velocity: of all its points, in the base frame, shape (3,) [m/s].
@@ -113,10 +112,9 @@ class Obstacle(ABC):
     name: str = ""
 
     def __post_init__(self) -> None:
-        velocity = checked_vector(self.velocity, f"{self._label}: velocity", limit=MAX_SPEED, unit="m/s")
-        if not isinstance(self.name, str):
-            raise InputError(f"{self._label}: name must be text, got {self.name!r}")
-        self._set(velocity=velocity)
+        if not isinstance(self.name, str) or not self.name.isprintable():
+            raise InputError(f"{type(self).__name__}: name must be one line of text, got {self.name!r}")
+        self._set(velocity=checked_vector(self.velocity, f"{self._label}: velocity", limit=MAX_SPEED, unit="m/s"))
 
     @property
     def _label(self) -> str:

@@ -7,6 +7,7 @@ once. Only plain YAML is read: numbers, text, lists and mappings; nothing in a f
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import re
 from collections.abc import Iterable, Mapping
@@ -77,7 +78,7 @@ def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     if scene.goal is not None:
         content["goal"] = _pose_entry(scene.goal)
     content["obstacles"] = [_obstacle_entry(obstacle) for obstacle in scene.obstacles]
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
     aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         aside.write_text(text, encoding="utf-8")
@@ -101,9 +102,14 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-)
+class _Dumper(yaml.SafeDumper):
+    """Writes quotes around text that the loader would take for a number."""
+
+
+for _either in (_Loader, _Dumper):
+    _either.add_implicit_resolver(
+        "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+    )
 
 
 def _parsed(text: str) -> object:
@@ -213,12 +219,14 @@ def _pose(entry: Mapping[Any, Any], where: str, metres: float) -> Pose:
 
 def _from_degrees(key: str, value: Any, where: str) -> Any:
     """Return the quaternion of roll, pitch and yaw about the fixed x, y and z axes, in this order, or of yaw alone."""
-    angles = np.deg2rad(np.asarray(value, dtype=float)) if not isinstance(value, list) or len(value) == 3 else None
-    if angles is None or angles.shape != ((3,) if key == "rpy_degrees" else ()) or not np.isfinite(angles).all():
+    numbers = value if isinstance(value, list) else [value]
+    plain = all(isinstance(number, float) and math.isfinite(number) for number in numbers)
+    if not plain or np.shape(value) != ((3,) if key == "rpy_degrees" else ()):
         wanted = "3 finite numbers (roll, pitch, yaw)" if key == "rpy_degrees" else "one finite number"
         raise InputError(f"{where}: {key} must be {wanted}, got {_shown(value)}")
+    angles = np.deg2rad(numbers)
     if key == "yaw_degrees":
-        return quaternion_exp([0.0, 0.0, float(angles)])
+        return quaternion_exp([0.0, 0.0, angles[0]])
     roll, pitch, yaw = quaternion_exp(np.diag(angles))
     return quaternion_multiply(yaw, quaternion_multiply(pitch, roll))
 
@@ -249,9 +257,9 @@ def _check_keys(entry: Mapping[Any, Any], known: Iterable[str], where: str) -> N
 
 
 def _suggestion(word: object, known: Iterable[str]) -> str:
-    """Return ``; did you mean "size"?`` or nothing."""
-    close = difflib.get_close_matches(str(word).lower(), list(known), n=1)
-    return f', did you mean "{close[0]}"?' if close else ""
+    """Return `` (did you mean "size"?)`` or nothing."""
+    close = difflib.get_close_matches(str(word).lower(), list(known), n=1, cutoff=0.5)
+    return f' (did you mean "{close[0]}"?)' if close else ""
 
 
 def _pose_entry(pose: Pose) -> dict[str, Any]:
