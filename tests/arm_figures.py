@@ -44,7 +44,7 @@ SAWYER = [
 SAWYER_HEAD = Link((0, 0, 0.2965), (0, 0, 0), 1.5795, (0.0053207, -2.6549e-05, 0.1021),
                    (0.011833, 0.0082709, 0.0049661, -4.4669e-06, 4.9425e-05, 4.2124e-07))  # fmt: skip
 
-# Geometry: Franka Emika, franka_description. Masses and inertias: Gaz et al., IEEE RA-L 4(4), 2019, as in its inertial.yaml.
+# Geometry: Franka Emika, franka_description. Masses and inertias: Gaz et al., IEEE RA-L 4(4), 2019.
 PANDA = [
     Link((0, 0, 0.333), (0, 0, 0), 4.970684, (3.875e-3, 2.081e-3, -4.762e-2),
          (0.70337, 0.70661, 9.1170e-3, -1.3900e-4, 6.7720e-3, 1.9169e-2)),
@@ -90,7 +90,7 @@ SAWYER_DH = [
     (0.0, -PI / 2, 0.1363, 3.1416),
     (0.0, 0.0, 0.110 + 0.0245, -0.17453 + 1.570796),
 ]
-# Panda, modified D-H (Craig), Franka Control Interface documentation: a(i-1), alpha(i-1), d(i); the last row is the flange.
+# Panda, modified D-H (Craig), Franka Control Interface: a(i-1), alpha(i-1), d(i); the last row is the flange.
 PANDA_DH = [
     (0.0, 0.0, 0.333),
     (0.0, -PI / 2, 0.0),

@@ -7,10 +7,10 @@ import threading
 import mujoco
 import numpy as np
 import pytest
-from arm_figures import LIMITS, chain, newton_euler, panda_flange, potential_energy, sawyer_flange
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from arm_figures import LIMITS, chain, newton_euler, panda_flange, potential_energy, sawyer_flange
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
@@ -305,7 +305,7 @@ def test_a_joint_past_its_limit_is_named():
     arm.check_limits(arm.home)
     q = arm.home.copy()
     q[3] = 0.2
-    with pytest.raises(InputError, match="panda_joint4 at 0.2000 rad is outside its limits \\[-3.0718, -0.0698\\]"):
+    with pytest.raises(InputError, match=r"panda_joint4 at 0\.2000 rad is outside its limits \[-3\.0718, -0\.0698\]"):
         arm.check_limits(q)
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from imitarm.errors import InputError
 from imitarm.kinematics import pose as p
@@ -130,8 +130,6 @@ def test_continuous_signs_leave_no_jump():
 
 
 def test_slerp_agrees_with_scipy_and_holds_the_ends():
-    from scipy.spatial.transform import Slerp
-
     rng = np.random.default_rng(1)
     keys = np.array([0.0, 0.4, 1.0, 1.7])
     rotations = Rotation.random(4, rng=rng)

@@ -25,6 +25,7 @@ __all__ = ["METHODS", "IKStep", "clearance_rows", "find_posture", "solve_ik", "s
 Array = NDArray[np.float64]
 Rows = tuple[ArrayLike, ArrayLike]
 
+_MAX_SPEED = {"dls": 0.6, "qp": 2.0, "svd": 0.6}  # [m/s] clamp of the weighted twist
 _NULL = 1e-12  # squared singular values below this belong to directions that the arm can't move in
 _FILTER = 0.06  # [m/rad] SVD filter: directions with a smaller singular value are damped, up to this much
 _EFFORT, _POSTURE, _CHANGE = 1e-5, 1e-4, 1e-6  # weights of the QP beside a task of weight 1
@@ -75,7 +76,7 @@ def solve_ik(
     q_ref: ArrayLike | None = None,
     posture_gain: float = 1.0,
     rows: Rows | None = None,
-    max_speed: float = 0.6,
+    max_speed: float | None = None,
     small_angle: str | None = None,
 ) -> Array:
     r"""Return the joint velocity that moves the tool with ``twist``, as far as the arm's limits let it.
@@ -107,7 +108,8 @@ def solve_ik(
         posture_gain: how quickly, [1/s].
         rows: ``(A, lower)`` with shapes (m, n_joints) and (m,): more inequalities ``A v >= lower`` on the joint
             velocity, for ``"qp"`` only. They give way at a high price when they contradict the limits of the joints.
-        max_speed: the twist is scaled down to this weighted norm [m/s].
+        max_speed: the twist is scaled down to this weighted norm [m/s]; None: 0.6 for ``"dls"`` and ``"svd"``, which
+            need it, and 2.0 for ``"qp"``.
         small_angle: ``"thesis"`` subtracts half the least singular value from d in ``"dls"``, as the thesis prints
             it (METHODS A.8: that weakens the damping; for comparison only).
 
@@ -146,7 +148,7 @@ _DEFAULTS: dict[str, object] = {
     "q_ref": None,
     "posture_gain": 1.0,
     "rows": None,
-    "max_speed": 0.6,
+    "max_speed": None,
     "small_angle": None,
 }
 
@@ -224,7 +226,7 @@ def _task(
     q_ref: ArrayLike | None,
     posture_gain: float,
     rows: Rows | None,
-    max_speed: float,
+    max_speed: float | None,
     small_angle: str | None,
 ) -> _Task:
     """Check the input and weight the task."""
@@ -243,9 +245,9 @@ def _task(
     jacobian = arm.tool_jacobian(position) if frame == "tool" else arm.jacobian(position)
     jacobian[3:] *= ANGLE_LENGTH
     wanted[3:] *= ANGLE_LENGTH
-    speed = math.sqrt(float(wanted.dot(wanted)))
-    if speed > max_speed:
-        wanted *= max_speed / speed
+    speed, most = math.sqrt(float(wanted.dot(wanted))), _MAX_SPEED[method] if max_speed is None else max_speed
+    if speed > most:
+        wanted *= most / speed
     previous = None if velocity is None else _joints(arm, velocity, "velocity")
     lower, upper = velocity_box(arm, position, dt, previous)
     posture = None
