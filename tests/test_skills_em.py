@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import multivariate_normal
+
+from imitarm.skills import em
+
+Array = NDArray[np.float64]
+
+
+def two_blobs(seed: int, n: int = 300) -> Array:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((3, 3)) * 0.3
+    first = rng.standard_normal((n, 3)) @ A + [1.0, 0.0, -1.0]
+    X = np.concatenate([first, 0.5 * rng.standard_normal((n // 2, 3)) - [1.0, 0.5, 0.0]])
+    return (X - X.mean(axis=0)) / X.std(axis=0)
+
+
+def start(n: int, k: int, seed: int = 0) -> Array:
+    r = np.random.default_rng(seed).random((1, k, n))
+    return r / r.sum(axis=1, keepdims=True)
+
+
+def run(Z: Array, r: Array, **options: float) -> em.Fit:
+    return em.expectation_maximisation(
+        em.quadratic_features(Z), r, floor=1e-6, tol=options.get("tol", 0.0), max_iter=int(options.get("max_iter", 50))
+    )
+
+
+def test_log_densities_are_those_of_gaussians() -> None:
+    Z = two_blobs(0)
+    fit = run(Z, start(len(Z), 3), max_iter=3)
+    expected = [
+        np.log(fit.weights[0, k]) + multivariate_normal(fit.means[0, k], fit.covariances[0, k]).logpdf(Z)
+        for k in range(3)
+    ]
+    np.testing.assert_allclose(em.log_densities(fit.theta, em.quadratic_features(Z))[0], expected, atol=1e-9)
+
+
+def test_one_component_is_mean_and_covariance() -> None:
+    Z = two_blobs(1)
+    fit = run(Z, np.ones((1, 1, len(Z))), max_iter=2)
+    np.testing.assert_allclose(fit.means[0, 0], Z.mean(axis=0), atol=1e-8)
+    np.testing.assert_allclose(fit.covariances[0, 0], np.cov(Z.T, bias=True), atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_likelihood_never_falls(seed: int) -> None:
+    Z = two_blobs(seed)
+    likelihood = [run(Z, start(len(Z), 3, seed), max_iter=n).log_likelihood[0] for n in range(1, 30)]
+    assert np.diff(likelihood).min() > -1e-6
+
+
+def test_side_by_side_is_the_same_as_one_after_another() -> None:
+    Z = two_blobs(2)
+    a, b = start(len(Z), 3, 1), start(len(Z), 3, 2)
+    both = run(Z, np.concatenate([a, b]), max_iter=20)
+    for i, alone in enumerate((run(Z, a, max_iter=20), run(Z, b, max_iter=20))):
+        np.testing.assert_allclose(both.means[i], alone.means[0], atol=1e-6)
+        np.testing.assert_allclose(both.log_likelihood[i], alone.log_likelihood[0], atol=1e-8)
+
+
+def test_a_weight_of_zero_holds_a_sample_out() -> None:
+    Z = two_blobs(3)
+    seen = np.ones((1, len(Z)))
+    seen[0, ::3] = 0.0
+    r = start(len(Z), 2)
+    weighted = em.expectation_maximisation(em.quadratic_features(Z), r, seen, floor=1e-6, tol=0.0, max_iter=15)
+    kept = seen[0] > 0.0
+    alone = run(Z[kept], r[:, :, kept], max_iter=15)
+    np.testing.assert_allclose(weighted.means, alone.means, atol=1e-6)
+    np.testing.assert_allclose(weighted.log_likelihood, alone.log_likelihood, atol=1e-6)
+
+
+def test_eigenvalues_do_not_fall_below_the_floor() -> None:
+    rng = np.random.default_rng(4)
+    line = np.linspace(-1.7, 1.7, 200)
+    Z = np.column_stack([line, line, rng.standard_normal(200)])  # two columns say the same
+    fit = em.expectation_maximisation(em.quadratic_features(Z), start(200, 2), floor=1e-4, tol=0.0, max_iter=20)
+    assert np.linalg.eigvalsh(fit.covariances).min() > 0.99e-4
+    assert np.isfinite(fit.log_likelihood).all()
+
+
+def test_a_component_without_samples_stays_finite() -> None:
+    Z = two_blobs(5)
+    r = np.zeros((1, 3, len(Z)))
+    r[0, 0] = 1.0
+    fit = run(Z, r, max_iter=10)
+    assert np.isfinite(fit.log_likelihood).all()
+    assert np.isfinite(fit.means).all()
