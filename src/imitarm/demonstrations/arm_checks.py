@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _OVER = 0.01  # [rad] beyond a limit that measured joints may show
+_SPEED_WINDOW = 0.06  # [s] encoders have little noise
 _MARGIN = 5e-3  # [m] beyond the reach that measured positions may show
 _DEGREES = 2.5 * np.pi  # [rad] no arm turns a joint further, so these are degrees
 
@@ -54,7 +55,7 @@ def check_arm(motion: Usable, arm: ArmModel) -> Iterator[Finding]:
             f"show it within the limits of {arm.name}, or name the arm that was recorded",
             int(row),
         )
-    speed = np.abs(smooth_slope(motion.times, q)[0]) / arm.max_velocity
+    speed = np.abs(smooth_slope(motion.times, q, _SPEED_WINDOW)[0]) / arm.max_velocity
     if speed.max() > 1.0:
         row, joint = np.unravel_index(np.argmax(speed), speed.shape)
         yield motion.finding(

@@ -79,9 +79,10 @@ def _load(path: str, content: bytes) -> Any:
         raise _damaged(path, error) from error
 
 
-def _numbers(source: str, array: NDArray[Any]) -> Array:
-    if array.dtype.kind not in "iuf":
-        raise FileFormatError(f"{source}: holds {array.dtype}, not real numbers; save a float array")
+def _numbers(source: str, array: Any) -> Array:
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
+        held = array.dtype if isinstance(array, np.ndarray) else "no array"
+        raise FileFormatError(f"{source}: holds {held}, not real numbers; save a float array")
     if array.size == 0:
         raise FileFormatError(f"{source}: the array is empty, shape {array.shape}")
     return array.astype(float)

@@ -21,14 +21,15 @@ _NOISE_FACTOR = 4.0  # standard deviations of noise that are taken for standing
 
 
 def noise_level(values: Array) -> float:
-    """Return the standard deviation of white noise on smooth samples (n, d), from their second differences.
+    """Return the standard deviation of white noise on smooth samples (n, d), from their third differences.
 
-    For white noise of deviation s a second difference has 6 s^2; the median keeps the motion itself out.
+    For white noise of deviation s the variance of a third difference is 20 s^2; the median keeps out what is left of
+    the motion itself. Fewer than 20 samples can't tell the two apart: 0.
     """
-    if len(values) < 5:
+    if len(values) < 20:
         return 0.0
-    second = np.diff(values, n=2, axis=0)
-    return float(np.max(1.4826 * np.median(np.abs(second - np.median(second, axis=0)), axis=0)) / np.sqrt(6.0))
+    third = np.diff(values, n=3, axis=0)
+    return float(np.max(1.4826 * np.median(np.abs(third), axis=0)) / np.sqrt(20.0))
 
 
 def turns(quaternions: Array) -> Array:
@@ -67,13 +68,13 @@ def _moving(times: Array, values: Array, still: float, place: float) -> tuple[in
     window = float(np.clip(quiet, _WINDOW, max(_WINDOW, _LONGEST_WINDOW * (times[-1] - times[0]))))
     slope, mean, n = smooth_slope(times, values, window)
     speed = np.linalg.norm(slope, axis=1)
-    fast = np.maximum(fast, _NOISE_FACTOR * noise * np.sqrt(12.0 / n**3) / step)
+    limit = np.maximum(fast, _NOISE_FACTOR * noise * np.sqrt(12.0 / n**3) / step)
     radius = np.maximum(
         max(place, _PLACE_SHARE * float(np.ptp(mean, axis=0).max())), _NOISE_FACTOR * noise / np.sqrt(n)
     )
     left = np.linalg.norm(mean - mean[0], axis=1) > radius
     not_yet = np.linalg.norm(mean - mean[-1], axis=1) > radius
-    after_start, before_end = np.flatnonzero((speed > fast) | left), np.flatnonzero((speed > fast) | not_yet)
+    after_start, before_end = np.flatnonzero((speed > limit) | left), np.flatnonzero((speed > limit) | not_yet)
     if not len(after_start):
         return None
     return int(after_start[0]), int(before_end[-1])

@@ -53,10 +53,10 @@ def check_idle(motion: Usable) -> Iterator[Finding]:
     head, tail = motion.times[rows[0]], motion.duration - motion.times[rows[1]]
     if head > enough:
         message = f"stands for {head:.2f} s at the start, rows {motion.rows[0]} to {motion.rows[rows[0]]}"
-        yield motion.finding("warning", "idle-head", message, "nothing: align trims it", 0)
+        yield motion.finding("note", "idle-head", message, "nothing: align trims it", 0)
     if tail > enough:
         message = f"stands for {tail:.2f} s at the end, rows {motion.rows[rows[1]]} to {motion.rows[-1]}"
-        yield motion.finding("warning", "idle-tail", message, "nothing: align trims it", rows[1])
+        yield motion.finding("note", "idle-tail", message, "nothing: align trims it", rows[1])
 
 
 def check_jumps(motion: Usable) -> Iterator[Finding]:

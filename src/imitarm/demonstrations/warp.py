@@ -24,7 +24,7 @@ from imitarm.trajectory import Trajectory
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-_FROM_A, _FROM_B = 1, 2  # 0 is the diagonal
+_BACK, _ASIDE = np.array([2, 1, 1, 0]), np.array([0, -1, 1, 0])  # steps: both, a only, b only, arrived
 _LEVER = 0.1  # [m] distance that a turn of 1 rad counts for
 _SMOOTHING = 0.04  # half width of the window that smooths a warp, as a share of the duration
 _SLOWEST = 0.1  # pace of a demonstration's clock, at least, as a share of the common one
@@ -40,53 +40,47 @@ def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, In
         price: of a step that is not diagonal, in units of the cost.
 
     Returns:
-        distance: root of the mean squared distance along each path, shape (pairs,).
-        path: (pairs, 2 n - 1, 2) index pairs (i, j) from the end to the start; the start is repeated.
+        cost: D(n-1, n-1) of each pair, shape (pairs,).
+        path: index pairs (i, j) from the end to the start, which is repeated, shape (pairs, 2 n - 1, 2).
     """
-    pairs, n, _ = a.shape
-    width = 2 * band + 3  # offsets i - j from -band to band, and a wall on either side
-    blocked = np.full((pairs, width), np.inf)
-    one_back, two_back = blocked.copy(), blocked.copy()
-    choices = np.zeros((2 * n - 1, pairs, width), dtype=np.int8)
-    for diagonal in range(2 * n - 1):
-        offsets = np.arange(-band, band + 1)
-        offsets = offsets[(offsets + diagonal) % 2 == 0]
-        i, j = (diagonal + offsets) // 2, (diagonal - offsets) // 2
-        inside = (i >= 0) & (i < n) & (j >= 0) & (j < n)
-        i, j, columns = i[inside], j[inside], offsets[inside] + band + 1
-        cost = np.sum((a[:, i] - b[:, j]) ** 2, axis=2)
-        here = blocked.copy()
-        if diagonal == 0:
-            here[:, columns] = cost
-        else:
-            options = np.stack(
-                [two_back[:, columns] + cost, one_back[:, columns - 1] + price, one_back[:, columns + 1] + price]
-            )
-            choice = np.argmin(options, axis=0)
-            here[:, columns] = cost + np.take_along_axis(options, choice[None], axis=0)[0]
-            choices[diagonal][:, columns] = choice
-        one_back, two_back = here, one_back
-    path = _trace(choices, n, band)
-    steps = np.arange(pairs)[:, None]
-    matched = np.sum((a[steps, path[..., 0]] - b[steps, path[..., 1]]) ** 2, axis=2)
-    first_start = np.argmax(path.sum(axis=2) == 0, axis=1) + 1  # the path's own length
-    on_path = np.arange(2 * n - 1) < first_start[:, None]
-    return np.sqrt(np.sum(matched * on_path, axis=1) / first_start), path
+    n = a.shape[1]
+    # one row an anti-diagonal i + j, one column an offset i - j; what is outside the grid or the band costs inf
+    diagonal, offset = np.arange(2 * n - 1)[:, None], np.arange(-band - 1, band + 2)
+    i, j = (diagonal + offset) // 2, (diagonal - offset) // 2
+    inside = ((diagonal + offset) % 2 == 0) & (i >= 0) & (i < n) & (j >= 0) & (j < n) & (np.abs(offset) <= band)
+    squares = np.sum(a**2, axis=2)[:, :, None] + np.sum(b**2, axis=2)[:, None] - 2.0 * a @ np.swapaxes(b, 1, 2)
+    cost = np.where(inside, np.maximum(squares, 0.0)[:, i.clip(0, n - 1), j.clip(0, n - 1)], np.inf)
+    cost = np.ascontiguousarray(np.moveaxis(cost, 1, 0))  # (2 n - 1, pairs, offsets)
+    total = np.full_like(cost, np.inf)
+    total[0] = cost[0]
+    for k in range(1, 2 * n - 1):
+        straight = np.minimum(total[k - 1, :, :-2], total[k - 1, :, 2:]) + price
+        if k > 1:
+            straight = np.minimum(straight, total[k - 2, :, 1:-1] + cost[k, :, 1:-1])
+        total[k, :, 1:-1] = cost[k, :, 1:-1] + straight
+    return total[-1, :, band + 1], _trace(total, cost, price)
 
 
-def _trace(choices: NDArray[np.int8], n: int, band: int) -> Indices:
+def _trace(total: Array, cost: Array, price: float) -> Indices:
     """Walk back from the last pair of samples to the first, for all pairs of motions together."""
-    pairs = choices.shape[1]
+    length, pairs, width = total.shape
     every = np.arange(pairs)
-    i = np.full(pairs, n - 1)
-    j = np.full(pairs, n - 1)
-    path = np.zeros((pairs, 2 * n - 1, 2), dtype=np.int64)
-    for step in range(2 * n - 1):
-        path[:, step, 0], path[:, step, 1] = i, j
-        choice = choices[i + j, every, i - j + band + 1]
-        moving = (i + j) > 0
-        i = i - (moving & (choice != _FROM_B))
-        j = j - (moving & (choice != _FROM_A))
+    diagonal, column = np.full(pairs, length - 1), np.full(pairs, width // 2)
+    path = np.zeros((pairs, length, 2), dtype=np.int64)
+    for step in range(length):
+        offset = column - width // 2
+        path[:, step, 0], path[:, step, 1] = (diagonal + offset) // 2, (diagonal - offset) // 2
+        one, two = np.maximum(diagonal - 1, 0), np.maximum(diagonal - 2, 0)
+        options = np.stack(
+            [
+                np.where(diagonal > 1, total[two, every, column] + cost[diagonal, every, column], np.inf),
+                total[one, every, column - 1] + price,
+                total[one, every, column + 1] + price,
+            ]
+        )
+        choice = np.where(diagonal > 0, np.argmin(options, axis=0), 3)
+        diagonal = diagonal - _BACK[choice]
+        column = column + _ASIDE[choice]
     return path
 
 
@@ -146,12 +140,13 @@ def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0
     even = np.linspace(0.0, 1.0, n)
     warps = identity_warps(m, n)
     barycentre = values[medoid(values)]
+    warped = values
     for _ in range(n_iterations):
-        warped = _at(values, warps)
         price = stiffness * float(np.median(np.sum((warped - barycentre) ** 2, axis=2)))
         _, path = dtw(values, np.repeat(barycentre[None], m, axis=0), band=max(2, round(band * n)), price=price)
         before, warps = warps, _centred(np.stack([_smooth_warp(one, n) for one in path]), even)
-        barycentre = _at(values, warps).mean(axis=0)
+        warped = _at(values, warps)
+        barycentre = warped.mean(axis=0)
         if np.abs(warps - before).max() < 0.5 / n:
             break
     return warps

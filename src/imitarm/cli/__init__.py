@@ -1,0 +1,95 @@
+"""The ``imitarm`` command: one file a subcommand, each with ``add_arguments(parser)`` and ``run(arguments)``.
+
+A module is imported only when its command is asked for, so ``imitarm --help`` answers at once. A new command is a
+file in this folder and a line in ``COMMANDS``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from imitarm import __version__
+from imitarm.errors import ImitarmError
+
+COMMANDS = {
+    "lint": "check demonstrations and say what is wrong with them",
+    "learn": "learn a skill from demonstrations",
+    "reproduce": "let a simulated arm do what a skill has learnt, around obstacles",
+    "demo": "learn a sweep, do it around obstacles, write a report",
+    "robots": "list the known arms and tools, or inspect one",
+}
+
+_EXAMPLES = """\
+examples:
+  imitarm lint recordings/ --units cm --duration 10
+  imitarm learn recordings/ --task pour --out pour.json --units cm --duration 10
+  imitarm robots sawyer
+
+Say 'imitarm COMMAND --help' for what a command takes. Exit status: 0 when done, 1 when it could not be done,
+2 when the input is wrong, 130 when interrupted.
+"""
+
+_INTERRUPTED, _PIPE_CLOSED = 130, 141  # 128 and the number of the signal, as shells count
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status; a failure is one message, never a traceback.
+
+    Args:
+        argv: the arguments without the program's name; None: those of this process.
+    """
+    words = sys.argv[1:] if argv is None else list(argv)
+    status: int
+    try:
+        arguments = _parser(words).parse_args(words)
+        status = arguments.run(arguments)
+        sys.stdout.flush()
+    except SystemExit as stop:  # argparse has said why
+        status = stop.code if isinstance(stop.code, int) else ImitarmError.exit_status
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nobody reads on: let the exit be quiet
+        status = _PIPE_CLOSED
+    except (Exception, KeyboardInterrupt) as error:
+        if os.environ.get("IMITARM_DEBUG"):
+            raise
+        message, status = _explained(error)
+        sys.stderr.write(f"imitarm: error: {message}\n")
+    return status
+
+
+def _explained(error: BaseException) -> tuple[str, int]:
+    """Return what to tell about an error, and the exit status."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", _INTERRUPTED
+    if isinstance(error, ImitarmError):
+        return str(error), error.exit_status
+    if isinstance(error, OSError):
+        return str(error), ImitarmError.exit_status
+    what = f"{type(error).__name__}: {error}".removesuffix(": ")
+    return f"this is a bug in imitarm, please report it ({what}); IMITARM_DEBUG=1 shows where", 1
+
+
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Build the parser; only the command that ``words`` name gets its arguments."""
+    parser = argparse.ArgumentParser(
+        prog="imitarm",
+        description="Teach industrial robot arms by showing: learn a motion from demonstrations and reproduce it "
+        "safely around obstacles.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"imitarm {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, title="commands")
+    asked = next((word for word in words if not word.startswith("-")), None)
+    for name, summary in COMMANDS.items():
+        command = commands.add_parser(name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter)
+        if name == asked:
+            module = importlib.import_module(f"imitarm.cli.{name}")
+            command.description, command.epilog = summary.capitalize() + ".", module.EPILOG
+            module.add_arguments(command)
+            command.set_defaults(run=module.run)
+    return parser

@@ -1,0 +1,28 @@
+"""``imitarm lint``: say what is wrong with demonstrations."""
+
+from __future__ import annotations
+
+import argparse
+
+from imitarm.cli.reading import add_reading_arguments, arm_of, read_and_lint, show_findings
+
+EPILOG = """\
+examples:
+  imitarm lint demo_1.csv demo_2.csv
+  imitarm lint pouring.npy --units cm --duration 10
+  imitarm lint recordings/ --robot sawyer --tool gripper
+
+Exit status 2 when there is an error among the findings; warnings and notes leave it 0.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what the command takes."""
+    add_reading_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the findings; return 2 when one is an error."""
+    raw, findings = read_and_lint(arguments, arm_of(arguments))
+    show_findings(raw, findings)
+    return 2 if any(finding.severity == "error" for finding in findings) else 0

@@ -1,0 +1,124 @@
+"""``imitarm reproduce``: let a simulated arm do what a skill has learnt, around what stands in the way."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.cli.demo import show_results
+from imitarm.cli.screen import progress_bar, say
+from imitarm.cli.trial import provenance, try_scene
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_file import ARMS, TOOLS
+from imitarm.kinematics.ik import find_posture
+from imitarm.kinematics.pose import Pose
+from imitarm.policies import ACFRA, HORIZONTAL_ONLY, METHODS, NOT_DOWN
+from imitarm.robots import SimulatedRobot
+from imitarm.scene import Scene, load_scene
+from imitarm.skills import Skill
+from imitarm.trajectory import Demonstration
+from imitarm.viewer import Report, write_report
+
+EPILOG = """\
+examples:
+  imitarm reproduce sweep.json --robot sawyer --tool brush --keep-height
+  imitarm reproduce pour.json --robot panda --tool gripper --scene bottles.yaml --report pour.html
+  imitarm reproduce pour.json --robot panda --scene bottles.yaml --clearance 30 --goal 40 -30 25
+
+The arm is simulated with its inertias and limits; the clearance is measured by the simulator between its own shapes.
+Exit status 1 when there is no way with the asked clearance, or the motion touched something or did not finish.
+"""
+
+FORBIDDEN = {"keep_height": HORIZONTAL_ONLY, "not_down": NOT_DOWN}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what the command takes."""
+    parser.add_argument("skill", metavar="SKILL", type=Path, help="a skill file, as 'imitarm learn' writes it")
+    parser.add_argument("--robot", required=True, metavar="NAME", help=f"{', '.join(ARMS)} or an MJCF or URDF file")
+    parser.add_argument("--tool", metavar="NAME", help=f"{', '.join(TOOLS)} or an MJCF file")
+    parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles and goal (YAML); default: nothing")
+    way = parser.add_argument_group("the way round")
+    way.add_argument("--method", choices=METHODS, default="certified", help="how to adapt; default: certified")
+    way.add_argument("--clearance", type=float, default=20.0, metavar="MM", help="to every obstacle; default: 20 mm")
+    way.add_argument("--tool-radius", type=float, metavar="MM", help="of a sphere; default: the tool's own shape")
+    held = way.add_mutually_exclusive_group()
+    held.add_argument("--keep-height", action="store_true", help="give way only sideways, as on a table")
+    held.add_argument("--not-down", action="store_true", help="never give way downwards")
+    moved = parser.add_argument_group("from and to somewhere else")
+    triple = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
+    moved.add_argument("--start", **triple, help="where the motion begins [cm]; default: as learnt")  # type: ignore[arg-type]
+    moved.add_argument("--goal", **triple, help="where it ends [cm]; default: as the scene says, else as learnt")  # type: ignore[arg-type]
+    parser.add_argument("--control", choices=("position", "torque"), default="position", help="of the simulated drives")
+    output = parser.add_argument_group("output")
+    output.add_argument("--out", type=Path, metavar="FILE", help="the measured motion, as a demonstration (CSV)")
+    output.add_argument("--report", type=Path, metavar="FILE", help="a page with 3-D playback and figures (HTML)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Reproduce the skill once; return 1 when it failed.
+
+    Raises:
+        InputError: when a file or an option is wrong.
+        UnreachableError: when the arm can't reach the start.
+    """
+    for path in (arguments.out, arguments.report):
+        if path is not None and not path.absolute().parent.is_dir():
+            raise InputError(f"{path}: there is no folder {path.parent}; make it first")
+    skill = Skill.load(arguments.skill)
+    arm = ArmModel.load(arguments.robot, tool=arguments.tool)
+    scene = Scene() if arguments.scene is None else load_scene(arguments.scene)
+    if arguments.goal is not None:
+        scene = Scene(Pose(0.01 * np.array(arguments.goal), skill.goal_.quaternion), scene.obstacles)
+    start = _start(skill, arm, arguments.start)
+    robot = SimulatedRobot(arm, scene=scene, control=arguments.control, q=find_posture(arm, start))
+    spheres = _tool(skill, arm, arguments.tool_radius)
+    radius = float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]))
+    policy = ACFRA(
+        skill,
+        method=arguments.method,
+        tool_spheres=spheres,
+        clearance=1e-3 * arguments.clearance,
+        forbidden=next((FORBIDDEN[key] for key in FORBIDDEN if getattr(arguments, key)), ()),
+    )
+    with progress_bar() as progress:
+        moving = progress.add_task("reproducing", total=1.0)
+        result = try_scene(
+            "scene",
+            f"{skill.task_ or 'skill'} on {arm.name}",
+            robot,
+            policy,
+            clearance=1e-3 * arguments.clearance,
+            tool_radius=radius if len(spheres) == 1 else 0.0,
+            progress=lambda share: progress.update(moving, completed=share),
+        )
+    report = Report(title=f"{skill.task_ or 'A skill'} on {arm.name}", scenes=[result], provenance=provenance())
+    if arguments.out is not None and result.rollout is not None:
+        source = f"{arm.name}, simulated, from {arguments.skill.name}"
+        Demonstration(result.rollout.trajectory, result.rollout.joints, skill.task_, source).save(arguments.out)
+        say(f"wrote {arguments.out}")
+    if arguments.report is not None:
+        say(f"wrote {write_report(report, arguments.report)}")
+    show_results(report)
+    return 0 if report.passed else 1
+
+
+def _start(skill: Skill, arm: ArmModel, centimetres: Sequence[float] | None) -> Pose:
+    """Return where the tool begins; a skill without orientation keeps the tool as it is at the arm's home."""
+    learnt = skill.start_
+    position = learnt.position if centimetres is None else 0.01 * np.array(centimetres)
+    return Pose(position, learnt.quaternion if skill.gmr_.has_orientation_ else arm.tool_pose(arm.home).quaternion)
+
+
+def _tool(skill: Skill, arm: ArmModel, millimetres: float | None) -> NDArray[np.float64]:
+    """Return the spheres that hold the tool, rows x y z r [m]."""
+    if millimetres is not None:
+        return np.array([[0.0, 0.0, 0.0, 1e-3 * millimetres]])
+    if skill.gmr_.has_orientation_:
+        return arm.tool_spheres
+    return np.array([[0.0, 0.0, 0.0, arm.tool_radius]])

@@ -1,0 +1,104 @@
+"""``imitarm robots``: which arms and tools are known, and what they can do."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from imitarm.cli.screen import say, show_table
+from imitarm.demonstrations.arm_checks import reach
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_file import ARMS, TOOLS
+
+EPILOG = """\
+examples:
+  imitarm robots
+  imitarm robots sawyer --tool brush
+  imitarm robots my_arm.urdf --flange tool0
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what the command takes."""
+    parser.add_argument(
+        "arm", nargs="?", metavar="ARM", help="a known name, or an MJCF or URDF file; default: list all"
+    )
+    parser.add_argument("--tool", metavar="NAME", help=f"tool at the flange: {', '.join(TOOLS)} or an MJCF file")
+    parser.add_argument("--flange", metavar="NAME", help="body or site that is the flange; default: the last one")
+    parser.add_argument(
+        "--discard-meshes", action="store_true", help="read a file whose meshes are elsewhere; only shapes count"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print one arm, or the list of all."""
+    if arguments.arm is None:
+        _list(arguments.tool)
+    else:
+        _inspect(
+            ArmModel.load(
+                arguments.arm,
+                tool=arguments.tool,
+                flange=arguments.flange,
+                discard_meshes=arguments.discard_meshes,
+            )
+        )
+    return 0
+
+
+def _list(tool: str | None) -> None:
+    arms = [ArmModel.load(name, tool=tool) for name in sorted(ARMS)]
+    show_table(
+        ["arm", "joints>", "reach from the shoulder [m]>", "largest torque [N m]>", "fastest joint [deg/s]>"],
+        [
+            (
+                arm.name,
+                str(arm.n_joints),
+                f"{reach(arm)[1]:.2f}",
+                _figure(float(arm.max_torque.max())),
+                f"{np.degrees(arm.max_velocity.max()):.0f}",
+            )
+            for arm in arms
+        ],
+    )
+    say(f"tools: {', '.join(sorted(TOOLS))}", "any MJCF or URDF file is an arm too; its name or path shows its joints")
+
+
+def _inspect(arm: ArmModel) -> None:
+    show_table(
+        [
+            "joint",
+            "from [deg]>",
+            "to [deg]>",
+            "home [deg]>",
+            "speed [deg/s]>",
+            "acceleration [deg/s2]>",
+            "torque [N m]>",
+        ],
+        [
+            (name, *(_figure(float(np.degrees(x))) for x in degrees), _figure(torque))
+            for name, *degrees, torque in zip(
+                arm.joint_names,
+                arm.lower,
+                arm.upper,
+                arm.home,
+                arm.max_velocity,
+                arm.max_acceleration,
+                arm.max_torque.tolist(),
+                strict=True,
+            )
+        ],
+        title=arm.name,
+    )
+    shoulder, distance = reach(arm)
+    tip = "tool" if arm.has_tool else "flange"
+    place = " ".join(f"{100 * x:.1f}" for x in shoulder.round(3) + 0.0)
+    say(f"the {tip} reaches {100 * distance:.1f} cm from the shoulder, which is at {place} cm in the base frame")
+    if arm.has_tool:
+        offset = " ".join(f"{100 * x:.1f}" for x in arm.tool_to_flange.position.round(3) + 0.0)
+        say(f"the tool's tip is at {offset} cm from the flange")
+
+
+def _figure(value: float) -> str:
+    return "none" if np.isinf(value) else f"{value:.4g}"

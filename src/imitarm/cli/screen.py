@@ -1,0 +1,63 @@
+"""What commands print with: results go to stdout, progress and remarks to stderr."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from typing import TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.status import Status
+from rich.table import Table
+
+_WIDTH_IN_FILES = 160  # columns when nobody watches: a path must not be broken
+
+
+def _console(stream: TextIO) -> Console:
+    fixed = not stream.isatty() and "COLUMNS" not in os.environ
+    # no markup: "pouring.npy[2]" is a name, not a colour
+    return Console(file=stream, width=_WIDTH_IN_FILES if fixed else None, markup=False, emoji=False, highlight=False)
+
+
+def say(*lines: str) -> None:
+    """Print lines to stdout."""
+    for line in lines:
+        _console(sys.stdout).print(line)
+
+
+def remark(line: str) -> None:
+    """Print a line to stderr."""
+    _console(sys.stderr).print(line)
+
+
+def show_table(
+    columns: Sequence[str], rows: Iterable[Sequence[str]], *, title: str = "", styles: Iterable[str] = ()
+) -> None:
+    """Print a table to stdout.
+
+    Args:
+        columns: headings; one that ends in ``>`` is right-aligned.
+        rows: the cells.
+        title: above the table.
+        styles: one colour a row; empty: none.
+    """
+    table = Table(title=title or None, title_justify="left", header_style="bold")
+    for column in columns:
+        table.add_column(column.removesuffix(">"), justify="right" if column.endswith(">") else "left", overflow="fold")
+    colours = list(styles)
+    for i, row in enumerate(rows):
+        table.add_row(*row, style=colours[i] if colours else None)
+    _console(sys.stdout).print(table)
+
+
+def working(what: str) -> Status:
+    """Show that something goes on, while the ``with`` block runs; silent when stderr is no terminal."""
+    return _console(sys.stderr).status(what)
+
+
+def progress_bar() -> Progress:
+    """Show how much is done and how long it will still take, while the ``with`` block runs."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=_console(sys.stderr), transient=True)

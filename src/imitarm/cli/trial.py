@@ -1,0 +1,166 @@
+"""One reproduction of a skill in one scene, from the policy to what a report says of it."""
+
+from __future__ import annotations
+
+import platform
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm import __version__
+from imitarm.demonstrations import Alignment, Finding
+from imitarm.errors import InfeasibleError
+from imitarm.policies import ACFRA
+from imitarm.reproduce import Step, reproduce
+from imitarm.robots import SimulatedRobot
+from imitarm.skills import Skill
+from imitarm.trajectory import Demonstration, Rollout, Trajectory
+from imitarm.viewer import FrameRecorder, LearningSummary, SceneResult
+
+Array = NDArray[np.float64]
+
+CONTROL_PERIOD = 0.01  # [s]
+PATIENCE = 4.0  # a reproduction may take this many times as long as the demonstrations
+_LIBRARIES = ("numpy", "scipy", "mujoco", "daqp", "pyyaml", "rich", "viser", "matplotlib")
+
+Judge = Callable[[SimulatedRobot, Rollout], Rollout]
+
+
+def try_scene(
+    name: str,
+    title: str,
+    robot: SimulatedRobot,
+    policy: ACFRA,
+    *,
+    clearance: float,
+    tool_radius: float = 0.0,
+    demonstrations: Sequence[Demonstration] = (),
+    judge: Judge | None = None,
+    caption: str = "",
+    progress: Callable[[float], None] | None = None,
+) -> SceneResult:
+    """Let a policy reproduce its skill on a simulated robot, and put together what came of it.
+
+    Args:
+        name: short and unique.
+        title: what people read.
+        robot: at its start posture, in its scene.
+        policy: not yet reset.
+        clearance: that is asked for [m].
+        tool_radius: for the drawing [m].
+        demonstrations: aligned, to measure the distance to.
+        judge: the task's own verdict over the rollout.
+        caption: a sentence about what is to be seen.
+        progress: called with the share of the motion that is done, 0 to 1.
+
+    Returns:
+        The result; when the policy refuses, one without a rollout and with the reason.
+    """
+    scene = robot.scene_at_start
+    frames = FrameRecorder(robot.model)
+    frames.note(robot.data)
+    phases: list[float] = []
+
+    def on_step(step: Step) -> None:
+        frames.note(robot.data)
+        phases.append(policy.phase)
+        if progress is not None:
+            progress(policy.phase / policy.skill.duration_)
+
+    rollout: Rollout | None = None
+    try:
+        done = reproduce(
+            policy,
+            robot,
+            scene.after,
+            dt=CONTROL_PERIOD,
+            timeout=PATIENCE * policy.skill.duration_,
+            on_step=on_step,
+        )
+    except InfeasibleError as refusal:
+        reason = str(refusal)
+    else:
+        rollout = done if judge is None else judge(robot, done)
+        reason = rollout.reason
+    return SceneResult(
+        name=name,
+        title=title,
+        scene=scene,
+        success=rollout is not None and rollout.success,
+        asked_clearance=clearance,
+        rollout=rollout,
+        adaptation=policy.adaptation,
+        rmse=_distance_to(demonstrations, rollout, phases),
+        reason=reason,
+        tool_radius=tool_radius,
+        recording=frames.recording(),
+        torque_limits=robot.arm.max_torque,
+        joint_names=tuple(robot.arm.joint_names),
+        caption=caption,
+        details=_details(rollout, policy),
+    )
+
+
+def _details(rollout: Rollout | None, policy: ACFRA) -> dict[str, object]:
+    """Return what else the table shows."""
+    details: dict[str, object] = {}
+    if rollout is not None:
+        if "swept_share" in rollout.details:
+            details["dirt in the pan"] = f"{100 * rollout.details['swept_share']:.0f} %"
+        details["contact steps"] = rollout.details.get("contact_steps", 0)
+    if policy.adaptation is not None:
+        details["demonstrated sigmas moved"] = f"{policy.adaptation.deviation:.1f}"
+    return details
+
+
+def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | None, phases: Sequence[float]) -> float:
+    """Return the root mean square distance [m] of the measured tool to all demonstrations at the same phase.
+
+    It is thesis Eq 4.9 with its root, which the print lacks. Comparing at the same phase, not at the same time, keeps a
+    robot that waits from being called inaccurate.
+    """
+    if rollout is None or not demonstrations or not phases:
+        return float("nan")
+    positions = rollout.trajectory.positions
+    n = min(len(phases), len(positions) - 1)
+    done, at = positions[1 : n + 1], np.asarray(phases[:n])
+    squares = [np.sum((done - one.trajectory.at(at)[0]) ** 2, axis=1).mean() for one in demonstrations]
+    return float(np.sqrt(np.mean(squares)))
+
+
+def learning_summary(
+    skill: Skill, demonstrations: Sequence[Demonstration], findings: Sequence[Finding], alignment: Alignment | None
+) -> LearningSummary:
+    """Return what a report says of the learning."""
+    gmr = skill.gmr_
+    predicted: Trajectory = gmr.trajectory(200)
+    return LearningSummary(
+        demonstrations=demonstrations,
+        means=gmr.position_means_,
+        covariances=gmr.position_covariances_,
+        predicted=predicted,
+        candidates=gmr.selection_,
+        findings=findings,
+        alignment=alignment,
+    )
+
+
+def provenance(**facts: object) -> Mapping[str, object]:
+    """Return what is needed to do it again: command, versions, platform, and the ``facts`` given."""
+    return {
+        "command": shlex.join(["imitarm", *sys.argv[1:]]),
+        **facts,
+        "platform": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+        "versions": {"imitarm": __version__, **{name: _version(name) for name in _LIBRARIES}},
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"

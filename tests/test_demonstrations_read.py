@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from demonstration_samples import motion, path
+from imitarm.demonstrations import READERS, Reader, files_of, read, read_raw
+from imitarm.errors import FileFormatError, InputError, UnknownNameError
+
+
+def rows(n=6):
+    return np.column_stack([np.linspace(0.0, 1.0, n), path(np.linspace(0.0, 1.0, n))])
+
+
+def write(file, table, header="t,x,y,z"):
+    np.savetxt(file, table, delimiter=",", header=header, comments="")
+    return file
+
+
+def test_every_reader_has_a_name_of_its_own():
+    assert all(isinstance(reader, Reader) and reader.name == name for name, reader in READERS.items())
+    assert len(READERS) == 4
+
+
+def test_a_file_a_list_and_a_folder(tmp_path):
+    for number in (10, 2, 1):
+        write(tmp_path / f"demo_{number}.csv", rows())
+    np.save(tmp_path / "stack.npy", np.zeros((2, 5, 4)) + np.arange(5)[:, None])
+    (tmp_path / "notes.md").write_text("not a demonstration")
+    (tmp_path / ".demo.csv").write_text("hidden")
+    (tmp_path / "inner.csv").mkdir()
+    assert [Path(f).name for f in files_of(tmp_path)] == [
+        "demo_1.csv",
+        "demo_2.csv",
+        "demo_10.csv",
+        "stack.npy",
+    ]
+    assert len(read(tmp_path / "demo_1.csv")) == 1
+    assert len(read([tmp_path / "demo_1.csv", str(tmp_path / "demo_2.csv")])) == 2
+    everything = read(tmp_path, task="reach")
+    assert [Path(one.source).name for one in everything][2:] == ["demo_10.csv", "stack.npy[0]", "stack.npy[1]"]
+    assert {one.task for one in everything} == {"reach"}
+
+
+def test_nothing_to_read(tmp_path):
+    (tmp_path / "notes.md").write_text("")
+    with pytest.raises(InputError, match=r"holds no demonstrations; known endings: \.csv, \.dat"):
+        read(tmp_path)
+    with pytest.raises(InputError, match="name at least one"):
+        read([])
+    with pytest.raises(InputError, match="can't be read"):
+        read(tmp_path / "missing.csv")
+
+
+def test_the_content_decides_and_a_name_must_not_lie(tmp_path):
+    np.save(tmp_path / "a.npy", rows())
+    (tmp_path / "a.npy").rename(tmp_path / "array.csv")
+    with pytest.raises(FileFormatError, match=r"array\.csv: named \.csv, but it is a NumPy array"):
+        read(tmp_path / "array.csv")
+    write(tmp_path / "text.npy", rows())
+    with pytest.raises(FileFormatError, match=r"text\.npy: named \.npy, but it is text"):
+        read(tmp_path / "text.npy")
+    write(tmp_path / "recording", rows())  # no ending at all
+    assert len(read(tmp_path / "recording")) == 1
+    (tmp_path / "bag.bag").write_bytes(b"#ROSBAG V2.0\n\x00\x00")
+    with pytest.raises(FileFormatError, match=r"this is a ROS 1 bag; known formats: NumPy arrays, imitarm CSV"):
+        read(tmp_path / "bag.bag")
+    (tmp_path / "model.npy").write_bytes(pickle.dumps([1, 2]))
+    with pytest.raises(FileFormatError, match="Python pickle, which is never opened"):
+        read(tmp_path / "model.npy")
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"units": "inch"}, UnknownNameError, "unknown unit of length 'inch'; known: cm, m, mm"),
+        ({"time_units": "h"}, UnknownNameError, "unknown unit of time"),
+        ({"quaternion_order": "zyxw"}, UnknownNameError, "unknown quaternion order"),
+        ({"duration": 0.0}, InputError, "duration must be a positive number"),
+        ({"rate": float("nan")}, InputError, "rate must be a positive number"),
+        ({"duration": 1.0, "rate": 2.0}, InputError, "not both"),
+        ({"duration": 1.0}, InputError, "time stamps of its own"),
+    ],
+)
+def test_options_that_can_not_be(tmp_path, options, error, message):
+    file = write(tmp_path / "a.csv", rows())
+    with pytest.raises(error, match=message):
+        read(file, **options)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t[[0, 1, 3, 2, 4, 5]], r"line 5 is not later than the row before; .*repair=True"),
+        (lambda t: np.where(np.arange(6)[:, None] == 2, np.nan, t), "line 4 holds a number that is not finite"),
+        (lambda t: t * [1, np.inf, 1, 1], "line 2 holds a number that is not finite"),
+        (lambda t: t * [1, 1e9, 1, 1], r"line 2: position .* is no place"),
+        (lambda t: t[:1], "1 rows|of 1 rows"),
+    ],
+)
+def test_rows_that_can_not_be_used(tmp_path, change, message):
+    file = write(tmp_path / "a.csv", change(rows()))
+    with pytest.raises(FileFormatError, match=message) as caught:
+        read(file)
+    assert str(file) in str(caught.value)
+
+
+def test_repair_drops_a_few_rows_and_says_so(tmp_path):
+    table = rows(50)
+    table[7, 2] = np.nan
+    table[20, 0] = table[19, 0]
+    file = write(tmp_path / "a.csv", table)
+    (one,) = read(file, repair=True)
+    assert len(one) == 48
+    assert one.source == f"{file} (2 of 50 rows dropped)"
+    assert np.allclose(one.trajectory.positions, np.delete(table, [7, 20], axis=0)[:, 1:])
+    table[::3, 1] = np.nan
+    with pytest.raises(FileFormatError, match="rows can't be used; record it again"):
+        read(write(file, table), repair=True)
+
+
+def test_raw_reading_judges_nothing(tmp_path):
+    (raw,) = read_raw(write(tmp_path / "a.csv", rows()[::-1]))
+    assert raw.late().tolist() == [False] + 5 * [True]
+    assert raw.line(0) == 2
+
+
+def test_a_round_trip_through_our_own_format(tmp_path):
+    original = motion(rotations=True, joints=True)
+    original.save(tmp_path / "a.csv")
+    (one,) = read(tmp_path / "a.csv")
+    assert np.array_equal(one.trajectory.positions, original.trajectory.positions)
+    assert np.allclose(one.trajectory.quaternions, original.trajectory.quaternions, rtol=0, atol=1e-15)
+    assert np.array_equal(one.joints, original.joints)
+    assert (one.task, one.joint_names) == ("reach", ("joint_1", "joint_2"))
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "columns"),
+    [("bottle2shelf", 9, 7), ("pouring", 9, 7), *((f"letter_{c}", 8, 2) for c in "ehlo")],
+)
+def test_real_recordings_of_a_guided_panda(real_data, name, n, columns):
+    file = real_data / "panda_kinesthetic" / f"{name}.npy"
+    demonstrations = read(file, units="cm", duration=10.0, task=name)
+    content = np.load(file)
+    assert len(demonstrations) == n
+    for one, table in zip(demonstrations, content, strict=True):
+        assert len(one) == 1000
+        assert one.trajectory.duration == 10.0
+        assert np.allclose(one.trajectory.positions[:, : min(columns, 3)], table[:, :3] / 100.0)
+        if columns == 2:
+            assert one.trajectory.quaternions is None
+            assert np.all(one.trajectory.positions[:, 2] == 0.0)
+        else:
+            same = np.abs(np.sum(one.trajectory.quaternions * table[:, 3:], axis=1))
+            assert np.allclose(same, 1.0)
+    with pytest.raises(FileFormatError, match=r"no time stamps; say how long the motion took, duration=10\.0"):
+        read(file, units="cm")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("kinect_gestures/Ges01_wavehand.csv", "101 columns without names; known are 2"),
+        ("mocap_arm/recording.tsv", "recording.tsv, line "),
+        ("mocap_trolley/mid.csv", "mid.csv, line 2: 8 values where 7 are expected"),
+    ],
+)
+def test_real_recordings_of_other_things_are_refused(real_data, name, message):
+    with pytest.raises(FileFormatError, match=message):
+        read(real_data / name, duration=10.0)
