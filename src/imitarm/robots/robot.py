@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _TOUCHED = 1e-9  # relative change of a velocity above which a limit is said to have changed it
+_FOLLOWING_ERROR = 0.1  # [rad] a joint so far from its set-point is held by something
 
 
 def limit_velocity(
@@ -73,11 +74,13 @@ class Robot(ABC):
         set_point: commanded joint angles, shape (n_joints,) [rad].
         velocity: commanded joint velocity, shape (n_joints,) [rad/s].
         clamped: which limits changed the last command: any of ``"velocity"``, ``"acceleration"``, ``"position"``.
+        fault: why the robot has stopped to protect itself and what is near it, in words; empty when all is well.
     """
 
     def __init__(self, arm: ArmModel, q: ArrayLike) -> None:
         self.arm = arm
         self.clamped: tuple[str, ...] = ()
+        self.fault = ""
         self._begin(q)
 
     def _begin(self, q: ArrayLike) -> None:
@@ -99,6 +102,8 @@ class Robot(ABC):
 
         A velocity that the limits forbid is replaced by the nearest one they allow, see :func:`limit_velocity`;
         ``clamped`` says so. A velocity that is no velocity stops the robot before the error is raised.
+        A joint that is more than 0.1 rad from its set-point is held by something: the robot stops where it is and
+        sets ``fault``; from then on it does not move.
 
         Args:
             velocity: of the joints, shape (n_joints,) [rad/s].
@@ -118,11 +123,19 @@ class Robot(ABC):
             )
         if not 0.0 < dt < np.inf:
             raise InputError(f"move: dt must be a positive time [s], got {dt!r}")
+        if self.fault:
+            return self.state()
         allowed, self.clamped = limit_velocity(self.arm, self.set_point, self.velocity, asked, dt)
         self._send(self.velocity, allowed, dt)
         self.set_point = self.set_point + 0.5 * dt * (self.velocity + allowed)
         self.velocity = allowed
-        return self.state()
+        state = self.state()
+        behind = np.abs(self.set_point - state.q)
+        if behind.max() > _FOLLOWING_ERROR:
+            i = int(behind.argmax())
+            self._begin(state.q)
+            self.fault = f"protective stop: {self.arm.joint_names[i]} was held {behind[i]:.2f} rad from its set-point"
+        return state
 
     def clearance(self) -> float:
         """Return the measured distance from arm and tool to the nearest obstacle [m]; nan for a body that can't."""

@@ -139,7 +139,7 @@ class SimulatedRobot(Robot):
         start = self._q_start if q is None else _checked_start(self.arm, q)
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = self.arm.posture(self.model, start)
-        self.contacts, self.contact_steps = set(), 0
+        self.contacts, self.contact_steps, self.fault = set(), 0, ""
         self._begin(start)
         self._use_servos(self.control == "position")
         mujoco.mj_forward(self.model, self.data)

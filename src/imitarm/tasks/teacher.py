@@ -1,0 +1,159 @@
+"""A made-up teacher, seeded, who guides the compliant simulated arm by hand through the sweep.
+
+``python -m imitarm.tasks.teacher --out DIR`` writes the packaged demonstrations anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, make_interp_spline
+
+from imitarm.errors import TaskFailedError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
+from imitarm.robots.simulated import SimulatedRobot
+from imitarm.tasks.sweep import SweepTask
+from imitarm.trajectory import Demonstration, Trajectory
+
+Array = NDArray[np.float64]
+
+SEEDS = tuple(range(8))  # of the packaged demonstrations
+RECORDED_EVERY = 0.03  # [s]
+_DIGITS = 5  # decimals that are recorded: 0.01 mm and 0.01 mrad, finer than any encoder sees
+
+# How firmly the hand holds the tool: along x, y, z, then about them. It minds the height most.
+_STIFFNESS = np.array([1200.0, 1200.0, 4000.0, 40.0, 40.0, 40.0])  # [N/m], [N m/rad]
+_DAMPING = np.array([90.0, 90.0, 150.0, 2.5, 2.5, 2.5])  # [N s/m], [N m s/rad]
+_TREMOR_BAND = (4.0, 9.0)  # [Hz] physiological tremor of a hand
+
+
+@dataclass(frozen=True, eq=False)
+class Teacher:
+    """One person's way to sweep: where the hand goes, how fast, how steadily.
+
+    The hand follows the minimum-jerk path through S, two points the person favours, T and G: the quintic spline
+    that starts and ends at rest (Flash and Hogan 1985). It is habits that make people differ: the time taken and its
+    share before the dirt, how far the path bows to a side on the way, how exactly the dirt and the pan are met, how
+    high the brush is carried, how the wrist turns, a tremor, a rest before and after.
+
+    Attributes:
+        seed: of all habits.
+        duration: of the motion [s].
+        rest: time at rest before and after the motion, shape (2,) [s].
+    """
+
+    seed: int
+    duration: float
+    rest: Array
+    _path: BSpline
+    _wrist: BSpline
+    _tremor: Array  # (3, n) amplitude [m], frequency [rad/s] and phase for each of n waves and axes
+
+    @classmethod
+    def from_seed(cls, seed: int) -> Teacher:
+        """Make up the person number ``seed``."""
+        rng = np.random.default_rng([20240, seed])
+        start, dirt, goal = (pose.position for pose in (SweepTask.start, SweepTask.dirt, SweepTask.goal))
+        duration = rng.uniform(9.0, 12.0)
+        share = rng.uniform(0.44, 0.50)
+        bow = rng.normal(0.0, [0.012, 0.009])  # [m] sideways, halfway to the dirt and halfway to the pan
+        halfway = [0.5 * (start + dirt) + [bow[0], 0.0, 0.0], 0.5 * (dirt + goal) + [bow[1], 0.0, 0.0]]
+        points = np.array([start, halfway[0], dirt, halfway[1], goal])
+        points += rng.normal(0.0, 1.0, (5, 3)) * np.array([0.002, 0.004, 0.0])
+        points[:, 2] += rng.normal(0.0, 0.0006, 5)
+        moments = duration * np.array([0.0, 0.53 * share, share, share + 0.47 * (1.0 - share), 1.0])
+        turns = rng.normal(0.0, 0.02, (5, 3))  # [rad]
+        n = 6
+        waves = np.stack(
+            [
+                rng.uniform(0.1e-3, 0.5e-3, (n, 3)) * [1.0, 1.0, 0.3],
+                2.0 * np.pi * rng.uniform(*_TREMOR_BAND, (n, 3)),
+                rng.uniform(0.0, 2.0 * np.pi, (n, 3)),
+            ]
+        )
+        return cls(
+            seed,
+            duration,
+            rng.uniform(0.3, 0.7, 2),
+            _minimum_jerk(moments, points),
+            _minimum_jerk(moments, turns),
+            waves,
+        )
+
+    def hand(self, time: float) -> tuple[Pose, Array]:
+        """Return where the hand wants the tool, and the twist (6,) it moves with, at ``time`` [s]."""
+        t = float(np.clip(time - self.rest[0], 0.0, self.duration))
+        amplitude, frequency, phase = self._tremor
+        position = self._path(t) + (amplitude * np.sin(frequency * time + phase)).sum(axis=0)
+        quaternion = quaternion_multiply(quaternion_exp(self._wrist(t)), SweepTask.dirt.quaternion)
+        return Pose(position, quaternion), np.concatenate([self._path(t, 1), self._wrist(t, 1)])
+
+    def demonstrate(self, arm: ArmModel | None = None) -> tuple[Demonstration, SimulatedRobot]:
+        """Guide the arm through the sweep, and return what was recorded and the robot with its crumbs.
+
+        The hand pulls with a spring and a damper, ``f = K (x_hand - x) + D (v_hand - v)``, likewise in rotation; the
+        arm carries its own weight and follows. Recorded are the joint angles every 30 ms, and the poses
+        of the tool that belong to them.
+
+        Args:
+            arm: the Sawyer with the brush, when it is loaded already.
+
+        Raises:
+            TaskFailedError: when the dirt did not end in the pan.
+        """
+        task = SweepTask(seed=self.seed)
+        robot = task.robot(arm=arm)
+        dt = robot.model.opt.timestep
+        every = round(RECORDED_EVERY / dt)
+        n = int((self.duration + self.rest.sum()) / RECORDED_EVERY)
+        joints = np.empty((n, robot.arm.n_joints))
+        for k in range(n):
+            joints[k] = robot.state().q
+            for i in range(every):
+                robot.guide(self._pull(robot, k * RECORDED_EVERY + i * dt), dt)
+        if not task.swept(robot).all():
+            raise TaskFailedError(
+                f"teacher {self.seed} lost {int((~task.swept(robot)).sum())} crumbs; choose another seed"
+            )
+        positions, quaternions = robot.arm.tool_path(joints)
+        times = np.round(np.arange(n) * RECORDED_EVERY, _DIGITS)
+        trajectory = Trajectory(times, np.round(positions, _DIGITS), np.round(quaternions, _DIGITS))
+        source, names = f"synthetic teacher, seed {self.seed}", robot.arm.joint_names
+        return Demonstration(
+            trajectory, np.round(joints, _DIGITS), task="sweep", source=source, joint_names=names
+        ), robot
+
+    def _pull(self, robot: SimulatedRobot, time: float) -> Array:
+        """Return the wrench (6,) of the hand on the tool."""
+        target, wanted = self.hand(time)
+        state = robot.state()
+        error = robot.tool_to_base.error_to(target)
+        rate = wanted - robot.arm.tool_jacobian(state.q) @ state.velocity
+        return np.asarray(_STIFFNESS * error + _DAMPING * rate)
+
+
+def _minimum_jerk(times: Array, points: Array) -> BSpline:
+    """Return the smoothest quintic through ``points`` (n, d) at ``times`` (n,), at rest at both ends."""
+    still = [(1, np.zeros(points.shape[1])), (2, np.zeros(points.shape[1]))]
+    return make_interp_spline(times, points, k=5, bc_type=(still, still))
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Write one demonstration for each of :data:`SEEDS` into a folder."""
+    parser = argparse.ArgumentParser(prog="python -m imitarm.tasks.teacher", description=main.__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the files; made when it is missing")
+    folder = parser.parse_args(arguments).out
+    folder.mkdir(parents=True, exist_ok=True)
+    arm = SweepTask.arm()
+    for seed in SEEDS:
+        demonstration, _ = Teacher.from_seed(seed).demonstrate(arm)
+        demonstration.save(folder / f"sweep_{seed}.csv")
+
+
+if __name__ == "__main__":
+    main()
