@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from imitarm.demonstrations import Finding, compute_alignment
 from imitarm.kinematics.pose import Pose
 from imitarm.scene import Box, Cylinder, Scene
 from imitarm.trajectory import Demonstration, Rollout, Trajectory
@@ -176,8 +177,8 @@ def make_learning() -> LearningSummary:
         adaptation.covariances,
         adaptation.nominal,
         tried,
-        findings=["sweep_2.csv row 0 to 31: the arm stands still for 0.31 s; trim it (align does)"],
-        alignment=["idle head and tail trimmed: 0.31 s", "warped in time by at most 0.12 s"],
+        [Finding("note", "idle", "the arm stands still for 0.31 s", "sweep_2.csv", 0, remedy="align cuts it off")],
+        compute_alignment(shown, n=50),
     )
 
 

@@ -1,1 +1,29 @@
-"""Drawing: 3-D playback, plots and the report."""
+"""Drawing: 3-D playback, figures, and the report, one HTML page that opens offline.
+
+``FrameRecorder`` notes a simulation while it runs, ``SceneResult``, ``LearningSummary`` and ``Report`` say what came
+of it, ``write_report`` writes the page. viser and matplotlib are only imported when something is drawn.
+"""
+
+from __future__ import annotations
+
+from imitarm.viewer.content import LearningSummary, Report, SceneResult
+from imitarm.viewer.data import as_data
+from imitarm.viewer.recording import FrameRecorder, Recording
+from imitarm.viewer.report import report_html, write_report
+from imitarm.viewer.scene3d import ComponentMark, PathMark, playback_html
+from imitarm.viewer.stage import Camera
+
+__all__ = [
+    "Camera",
+    "ComponentMark",
+    "FrameRecorder",
+    "LearningSummary",
+    "PathMark",
+    "Recording",
+    "Report",
+    "SceneResult",
+    "as_data",
+    "playback_html",
+    "report_html",
+    "write_report",
+]

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from imitarm.viewer import palette
 from imitarm.viewer.canvas import INK, MM, canvas, thin_extremes
+
+Array = NDArray[np.float64]
 
 
 def clearance(times: ArrayLike, distances: ArrayLike, asked: float, *, name: str = "clearance") -> str:
@@ -77,27 +81,52 @@ def torques(
     names = list(joint_names) or [f"joint {i + 1}" for i in range(n_joints)]
     columns = min(n_joints, 4)
     rows = -(-n_joints // columns)
-    size = (5.5, 0.4 + 1.1 * rows)
-    wide = (size[0] - 0.2) / columns
-    peak = np.abs(tau).max(axis=0)
+    size = (5.5, 0.3 + 1.15 * rows)
     with canvas(name, f"Torques of {n_joints} joints over time, with the rated torques", size) as drawing:
+        paper = drawing.axes(0.0, 0.0, *size, xlim=(0.0, size[0]), ylim=(0.0, size[1]))  # its units are inches
+        paper.set_axis_off()
         for i in range(n_joints):
             row, column = divmod(i, columns)
-            left, top = 0.2 + wide * column, size[1] - 0.02 - 1.1 * row
-            axes = drawing.axes(left + 0.35, top - 0.9, left + wide - 0.08, top - 0.22)
-            kept = thin_extremes(tau[:, i], 160)
-            axes.plot(t[kept], tau[kept, i], color=palette.ADAPTED, lw=1.1)
-            axes.hlines([-rated[i], rated[i]], t[0], t[-1], color=palette.LIMIT, lw=1.0, ls="--")
-            most = 1.15 * max(rated[i], peak[i])
-            share = f"{names[i]}: {100.0 * peak[i] / rated[i]:.0f} %".replace("$", r"\$")
-            axes.set_title(share, fontsize=8.0, loc="left", pad=3)
-            axes.set(ylim=(-most, most), xlim=(t[0], t[-1]), yticks=[-rated[i], 0.0, rated[i]])
-            axes.set_yticks(axes.get_yticks(), [f"{tick:.3g}" for tick in axes.get_yticks()])
-            axes.locator_params(axis="x", nbins=4)
-            axes.tick_params(labelsize=7.5, labelbottom=i >= n_joints - columns)
-        drawing.figure.text(0.5, 0.01, "time [s]", ha="center")
-        drawing.figure.text(0.005, 0.5, "torque [N m]", va="center", rotation=90)
+            left = 0.58 + (size[0] - 0.26) / columns * column
+            bottom = size[1] - 1.15 * row - 0.94
+            panel = _Panel(left, bottom, (size[0] - 0.26) / columns - 0.42, 0.68)
+            panel.draw(paper, names[i], t, tau[:, i], rated[i])
+        paper.text(size[0] / 2, 0.06, "time [s]", ha="center")
+        paper.text(0.08, size[1] / 2, "torque [N m]", ha="center", va="center", rotation=90)
     return drawing.svg
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """A small chart on a paper whose units are inches: matplotlib's own axes take ten times as long, for each joint."""
+
+    left: float
+    bottom: float
+    width: float
+    height: float
+
+    def draw(self, paper: Any, title: str, times: Array, torque: Array, rated: float) -> None:
+        """Draw the torque of one joint [N m] over ``times`` [s], between its rated limits."""
+        peak = float(np.abs(torque).max())
+        most = 1.12 * max(rated, peak)
+        middle, right = self.bottom + 0.5 * self.height, self.left + self.width
+        kept = thin_extremes(torque, 160)
+        span = max(float(times[-1] - times[0]), 1e-9)
+        across = self.left + self.width * (times[kept] - times[0]) / span
+        paper.plot(across, middle + 0.5 * self.height * torque[kept] / most, color=palette.ADAPTED, lw=1.1)
+        small = {"fontsize": 7.5}
+        for value in (-rated, 0.0, rated):
+            y = middle + 0.5 * self.height * value / most
+            look = {"color": palette.LIMIT, "lw": 1.0, "ls": "--"} if value else {"color": INK, "lw": 0.6, "alpha": 0.3}
+            paper.plot([self.left, right], [y, y], **look)
+            paper.text(self.left - 0.04, y, f"{value:.3g}", ha="right", va="center", **small)
+        paper.plot(
+            [self.left, self.left, right], [self.bottom + self.height, self.bottom, self.bottom], color=INK, lw=0.6
+        )
+        for x, value in ((self.left, times[0]), (right, times[-1])):
+            paper.text(x, self.bottom - 0.04, f"{value:.3g}", ha="center", va="top", **small)
+        share = f"{title}: {100.0 * peak / rated:.0f} %".replace("$", r"\$")
+        paper.text(self.left, self.bottom + self.height + 0.05, share, fontsize=8.0)
 
 
 def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacement") -> str:

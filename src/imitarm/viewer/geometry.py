@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 _AROUND: Final = 28  # edges of a circle
 _RINGS: Final = 7  # rings of half a sphere
 _MAX_FACES: Final = 3000  # triangles of one mesh file; a nicer mesh is thinned to about this
+_FLOOR: Final = 1.0  # [m] half of a plane's width: larger ones, and endless ones (0), are floors
 _NO_COLOUR: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that was given none
 
 
@@ -117,7 +118,7 @@ def _thinned(mesh: Mesh) -> Mesh:
 
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
-    """Return the triangles of a geom in its own frame; None for an endless plane and for height fields.
+    """Return the triangles of a geom in its own frame; None for floors (large planes) and for height fields.
 
     Args:
         model: any compiled MuJoCo model.
@@ -126,7 +127,7 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
     kind, size = int(model.geom_type[geom]), np.array(model.geom_size[geom])
     if kind in _PRIMITIVES:
         return _PRIMITIVES[kind](size)
-    if kind == mujoco.mjtGeom.mjGEOM_PLANE and size[:2].min() > 0.0:
+    if kind == mujoco.mjtGeom.mjGEOM_PLANE and 0.0 < size[:2].min() <= _FLOOR:
         return Mesh(box([size[0], size[1], 0.0]).vertices[-4:], np.array([[0, 1, 2], [0, 2, 3]]))
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]

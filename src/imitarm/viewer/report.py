@@ -19,16 +19,13 @@ import numpy as np
 
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.viewer import palette
-from imitarm.viewer.content import Report, SceneResult, as_data
+from imitarm.viewer.background import learning_section, provenance_section
+from imitarm.viewer.content import Report, SceneResult
+from imitarm.viewer.data import as_data
+from imitarm.viewer.markup import script_text
 from imitarm.viewer.scene3d import ComponentMark, PathMark, playback_html
-from imitarm.viewer.sections import (
-    header,
-    learning_section,
-    provenance_section,
-    scenes_section,
-    script_text,
-    table_section,
-)
+from imitarm.viewer.scene_sections import scenes_section
+from imitarm.viewer.sections import header, table_section
 
 _POLICY: Final = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "
@@ -167,7 +164,7 @@ def _replace(target: Path, text: str) -> None:
     """Write ``text`` beside ``target`` and rename it at the end; nothing is left behind when that fails."""
     aside = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        aside.write_text(text, encoding="utf-8", newline="\n")
+        aside.write_bytes(text.encode("utf-8", "replace"))  # a file name may hold what is no text
         aside.replace(target)
     except BaseException:
         aside.unlink(missing_ok=True)

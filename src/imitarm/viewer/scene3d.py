@@ -15,22 +15,21 @@ from typing import Any, Final
 
 import numpy as np
 import rich
-from mujoco import MjModel
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from imitarm.errors import InputError, TaskFailedError
-from imitarm.kinematics.pose import matrix_to_quaternion, quaternion_to_matrix
+from imitarm.kinematics.pose import matrix_to_quaternion
 from imitarm.viewer import palette
-from imitarm.viewer.geometry import Mesh, geom_mesh, geom_rgba, merge, visible_geoms
 from imitarm.viewer.recording import Recording
+from imitarm.viewer.stage import Camera, Part, body_parts, floor_height, points_to_see
 
 Array = NDArray[np.float64]
 
 _STEP: Final = 2.0**-13  # [m], [-] poses are rounded to this (0.12 mm): a file of round numbers is a third as large
 _REST: Final = 1.5  # [s] how long the last picture stands before the playback starts again
 _CHI2_95: Final = 7.815  # 95 % of a 3-D Gaussian is within sqrt(7.815) sigma
-_VIEW: Final = (1.0, -0.95, 0.62)  # from where the camera looks: in front, from the right, from above
-_ROOM: Final = 3.0  # [m] larger things are floors and walls: the camera does not step back for them
+# viser warns of slow drawing with a note over the picture, which then hides the arm
+_NO_TOAST: Final = "<style>.mantine-Notifications-root{display:none!important}</style>"
 _MANY: Final = 4  # so many equal bodies are drawn as one batch
 _PATH_POINTS: Final = 160
 _EXPOSURE: Final = 0.7
@@ -56,76 +55,6 @@ class ComponentMark:
     covariance: Array
     colour: str = palette.UNMOVED
     opacity: float = 0.22
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Where the view begins: ``position`` and ``look_at`` [m] in the world frame, vertical ``field_of_view`` [rad]."""
-
-    position: tuple[float, float, float]
-    look_at: tuple[float, float, float]
-    field_of_view: float = 0.62
-
-    @classmethod
-    def around(cls, points: ArrayLike, *, direction: ArrayLike = _VIEW, aspect: float = 16 / 9) -> Camera:
-        """Return the nearest camera, looking from ``direction``, that has all ``points`` (n, 3) [m] in the picture.
-
-        Args:
-            points: what must be seen, in the world frame.
-            direction: from the middle of the points towards the camera.
-            aspect: width of the picture divided by its height.
-        """
-        p = np.asarray(points, dtype=float)
-        back = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
-        right = np.cross([0.0, 0.0, 1.0], back)
-        right /= np.linalg.norm(right)
-        up = np.cross(back, right)
-        middle = 0.5 * (p.min(axis=0) + p.max(axis=0))
-        x, y, z = (p - middle) @ right, (p - middle) @ up, (p - middle) @ back
-        # seen from an angle, the middle of the picture is not the middle of the points
-        middle = middle + 0.5 * (x.min() + x.max()) * right + 0.5 * (y.min() + y.max()) * up
-        x, y = x - 0.5 * (x.min() + x.max()), y - 0.5 * (y.min() + y.max())
-        tangent = np.tan(0.5 * cls.field_of_view)
-        distance = 1.04 * np.max(z + np.maximum(np.abs(y) / tangent, np.abs(x) / (aspect * tangent)))
-        position = middle + distance * back
-        return cls(tuple(map(float, position)), tuple(map(float, middle)))  # type: ignore[arg-type]
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """The triangles of one colour of one body, in the body's frame."""
-
-    mesh: Mesh
-    rgba: tuple[float, float, float, float]
-
-
-def _body_parts(model: MjModel) -> dict[int, list[_Part]]:
-    """Return what is to be drawn of every body that has looks: one mesh for each colour."""
-    found: dict[int, dict[tuple[float, ...], list[Mesh]]] = {}
-    for geom in visible_geoms(model):
-        mesh = geom_mesh(model, geom)
-        if mesh is None:
-            continue
-        colour = tuple(np.round(geom_rgba(model, geom), 3).tolist())
-        placed = mesh.moved(model.geom_pos[geom], quaternion_to_matrix(model.geom_quat[geom]))
-        found.setdefault(int(model.geom_bodyid[geom]), {}).setdefault(colour, []).append(placed)
-    return {
-        body: [_Part(merge(meshes), colour) for colour, meshes in colours.items()]  # type: ignore[arg-type]
-        for body, colours in found.items()
-    }
-
-
-def _points_to_see(recording: Recording, parts: Mapping[int, list[_Part]]) -> Array:
-    """Return points (n, 3) [m] of everything drawn, in the first, the middle and the last frame."""
-    seen = [np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.1]])]
-    for frame in sorted({0, len(recording) // 2, len(recording) - 1}):
-        rotations = quaternion_to_matrix(recording.quaternions[frame])
-        for body, body_parts in parts.items():
-            for part in body_parts:
-                if np.ptp(part.mesh.vertices, axis=0).max() < _ROOM:
-                    thinned = part.mesh.vertices[:: max(1, len(part.mesh.vertices) // 100)]
-                    seen.append(thinned @ rotations[body].T + recording.positions[frame, body])
-    return np.concatenate(seen)
 
 
 class _Mover:
@@ -161,7 +90,7 @@ def _lit(rgba: Sequence[float], *, linear: bool = False) -> tuple[float, float, 
     return float(shown[0]), float(shown[1]), float(shown[2])
 
 
-def _add_mesh(server: Any, name: str, part: _Part) -> None:
+def _add_mesh(server: Any, name: str, part: Part) -> None:
     opacity = part.rgba[3]
     server.scene.add_mesh_simple(
         name,
@@ -174,7 +103,7 @@ def _add_mesh(server: Any, name: str, part: _Part) -> None:
     )
 
 
-def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[_Part]]) -> list[_Mover]:
+def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[Part]]) -> list[_Mover]:
     """Draw every body at its first pose and return those that move.
 
     Many equal things (crumbs, parts in a box) become one batch, or they would fill the page with messages.
@@ -182,9 +111,9 @@ def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[_Pa
     positions = np.round(recording.positions / _STEP) * _STEP
     quaternions = np.round(recording.quaternions / _STEP) * _STEP
     alike: dict[tuple[bytes, tuple[float, ...]], list[int]] = {}
-    for body, body_parts in parts.items():
-        if len(body_parts) == 1:
-            alike.setdefault((body_parts[0].mesh.vertices.tobytes(), body_parts[0].rgba), []).append(body)
+    for body, its_parts in parts.items():
+        if len(its_parts) == 1:
+            alike.setdefault((its_parts[0].mesh.vertices.tobytes(), its_parts[0].rgba), []).append(body)
     batches = [bodies for bodies in alike.values() if len(bodies) >= _MANY]
     movers = []
     for number, bodies in enumerate(batches):
@@ -203,7 +132,7 @@ def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[_Pa
             lod="off",
         )
         movers.append(_Mover(handle, poses))
-    for body in set(parts).difference(*batches):
+    for body in sorted(set(parts).difference(*batches)):
         name = _node("bodies", body, recording.model.body(body).name)
         handle = server.scene.add_frame(name, show_axes=False, position=positions[0, body], wxyz=quaternions[0, body])
         for number, part in enumerate(parts[body]):
@@ -329,10 +258,10 @@ def playback_html(
         InputError: when viser is not installed.
         TaskFailedError: when no port on this machine could be opened.
     """
-    parts = _body_parts(recording.model)
-    seen = _points_to_see(recording, parts)
+    parts = body_parts(recording.model)
+    view = camera or Camera.around(points_to_see(recording, parts, [path.positions for path in paths]))
     with _server() as server:
-        _draw_stage(server, float(seen[:, 2].min()), camera or Camera.around(seen), dark=dark)
+        _draw_stage(server, floor_height(recording, parts), view, dark=dark)
         movers = _draw_bodies(server, recording, parts)
         _draw_paths(server, paths)
         _draw_components(server, components)
@@ -343,4 +272,4 @@ def playback_html(
                 mover.show(frame)
         serializer.insert_sleep(_REST if len(recording) > 1 else 0.0)
         page: str = serializer.as_html(dark_mode=dark)
-    return page
+    return page.replace("</head>", _NO_TOAST + "</head>", 1)

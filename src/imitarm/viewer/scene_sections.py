@@ -1,0 +1,143 @@
+"""The part of the report's page that shows scene by scene: 3-D playback, figures, numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from imitarm.viewer import charts, palette, plots
+from imitarm.viewer.content import Report, SceneResult
+from imitarm.viewer.markup import MM, facts, figure, mark, number, scene_id, script_text
+
+
+def scenes_section(report: Report, players: Mapping[str, str]) -> str:
+    """Return one tab for each scene: 3-D playback, figures, numbers.
+
+    Args:
+        report: what to show.
+        players: for each scene's name, what makes its 3-D page different from the others'.
+    """
+    if not report.scenes:
+        return ""
+    first = next((i for i, scene in enumerate(report.scenes) if scene.scene.obstacles), 0)
+    tabs, panels = [], []
+    for i, scene in enumerate(report.scenes):
+        anchor, chosen = scene_id(i, scene.name), "true" if i == first else "false"
+        tabs.append(
+            f'<button type="button" role="tab" id="tab-{anchor}" aria-controls="{anchor}" aria-selected="{chosen}">'
+            f"{escape(scene.title)}</button>"
+        )
+        panels.append(
+            f'<section class="scene" role="tabpanel" id="{anchor}" aria-labelledby="tab-{anchor}">'
+            f"{_scene(i, scene, players.get(scene.name))}</section>"
+        )
+    return (
+        '<section id="scenes"><h2>Scene by scene</h2>'
+        f'<div role="tablist" aria-label="Scenes">{"".join(tabs)}</div>{"".join(panels)}</section>'
+    )
+
+
+def _scene(index: int, scene: SceneResult, player: str | None) -> str:
+    verdict = mark(scene.success and not scene.contact, "done", "contact" if scene.contact else "not done")
+    words = " ".join(text for text in (scene.caption, scene.reason) if text)
+    parts = [f"<h3>{escape(scene.title)} {verdict}</h3>", f"<p>{escape(words)}</p>" if words else ""]
+    if player is not None:
+        parts.append(_player(scene, player))
+    parts.append(f'<div class="columns">{"".join(_scene_figures(index, scene))}</div>')
+    return "".join(parts)
+
+
+def _player(scene: SceneResult, player: str) -> str:
+    legend = (
+        ("", palette.NOMINAL, "learnt path"),
+        ("", palette.ADAPTED, "adapted path"),
+        ("", palette.MEASURED, "path of the robot's tool, measured"),
+        ("blob", palette.UNMOVED, "component, unmoved"),
+        ("blob", palette.MOVED, "component, moved"),
+    )
+    items = "".join(
+        f'<li><i class="{kind}" style="{"background" if kind else "color"}:{colour}"></i>{label}</li>'
+        for kind, colour, label in legend
+    )
+    return (
+        f'<div class="card player" data-title="{escape(f"3-D playback: {scene.title}", quote=True)}">'
+        '<button type="button">Show in 3-D</button>'
+        "<noscript>The 3-D playback needs JavaScript.</noscript>"
+        f'<script type="application/json">{script_text(player)}</script></div>'
+        f'<ul class="legend">{items}</ul><p class="caption">Drag to turn, right-drag to shift, scroll to come nearer. '
+        "The bar below the picture stops, winds and slows down the playback.</p>"
+    )
+
+
+def _scene_figures(index: int, scene: SceneResult) -> Iterable[str]:
+    adaptation, rollout, key = scene.adaptation, scene.rollout, f"s{index + 1}"
+    if adaptation is not None:
+        svg = plots.adaptation(
+            adaptation.nominal,
+            adaptation.trajectory,
+            scene=scene.scene,
+            keep_away=scene.asked_clearance + scene.tool_radius,
+            tolerance=adaptation.tolerance,
+            means=adaptation.means,
+            covariances=adaptation.covariances,
+            displacement=adaptation.displacement,
+            moved=adaptation.moved,
+            measured=rollout.trajectory if rollout is not None else None,
+            name=f"{key}-paths",
+        )
+        if scene.scene.obstacles:
+            yield figure(
+                svg,
+                "Around the obstacles",
+                "The path of the middle of the tool. It stays outside of the dashed lines: the asked clearance plus "
+                "the tool's radius. Arrows show where components were moved.",
+            )
+            lengths = np.linalg.norm(adaptation.displacement, axis=1)
+            svg = charts.displacement(lengths, adaptation.moved, name=f"{key}-moved")
+            yield figure(svg, "Which components were moved", "Each bar is one piece of the motion, from start to end.")
+        else:
+            yield figure(svg, "The learnt path", "The path of the middle of the tool: nothing is in the way.")
+    if rollout is not None:
+        times = rollout.trajectory.times - rollout.trajectory.times[0]
+        svg = charts.clearance(times, rollout.clearance, scene.asked_clearance, name=f"{key}-clearance")
+        yield figure(
+            svg, "Clearance over time", "Measured by the simulator between the shapes of arm, tool and obstacles."
+        )
+        if scene.torque_limits is not None:
+            names, limits = scene.joint_names, scene.torque_limits
+            svg = charts.torques(times, rollout.torques, limits, joint_names=names, name=f"{key}-torques")
+            yield figure(
+                svg, "Joint torques", "Dashed: the rated torque. The number is the highest torque as a share of it."
+            )
+    yield f'<div class="card"><h3>All numbers</h3>{facts(_scene_facts(scene))}</div>'
+
+
+def _scene_facts(scene: SceneResult) -> dict[str, Any]:
+    values: dict[str, Any] = {
+        "Obstacles": "; ".join(o.name or o.kind for o in scene.scene.obstacles) or "none",
+        "Smallest clearance, measured": number(MM * scene.min_clearance, 2, "mm"),
+        "Asked clearance": number(MM * scene.asked_clearance, 1, "mm"),
+        "RMSE to the demonstrations": number(MM * scene.rmse, 2, "mm"),
+    }
+    if scene.adaptation is not None:
+        a = scene.adaptation
+        farthest = float(np.linalg.norm(a.displacement, axis=1).max(initial=0.0))
+        values |= {
+            "Method": a.method,
+            "Certified clearance of the plan": number(MM * a.certified_clearance, 2, "mm"),
+            "Tool radius in the plan": number(MM * scene.tool_radius, 1, "mm"),
+            "Components moved": f"{int(np.sum(a.moved))} of {len(a.moved)}",
+            "Farthest component": number(MM * farthest, 1, "mm"),
+            "Adaptation time": number(MM * a.compute_time, 3, "ms"),
+        }
+    if scene.rollout is not None:
+        values["Motion time"] = number(scene.rollout.trajectory.duration, 2, "s")
+        values["Path length of the tool"] = number(scene.rollout.trajectory.path_length, 3, "m")
+        values["Highest torque, of the rated"] = number(100 * scene.peak_torque_share, 1, "%")
+        values["How the motion ended"] = scene.rollout.reason or (
+            "finished" if scene.rollout.success else "not finished"
+        )
+    return values | dict(scene.details)
