@@ -121,6 +121,7 @@ def test_rotations_are_about_fixed_axes_in_order(tmp_path):
     np.testing.assert_allclose(yawed @ [1, 0, 0], [0, -1, 0], atol=1e-12)
     np.testing.assert_allclose(given_ @ [0, 0, 1], [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(straight, np.eye(3))
+    np.testing.assert_allclose(pitched @ [0, 1, 0], [1, 0, 0], atol=1e-12)  # rolls up to z, and pitch takes z to x
 
 
 @pytest.mark.parametrize(
