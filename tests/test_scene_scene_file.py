@@ -113,9 +113,9 @@ def test_rotations_are_about_fixed_axes_in_order(tmp_path):
     scene = read(
         tmp_path,
         HEAD + f"obstacles:\n{entry}rpy_degrees: [90, 0, 90]}}\n{entry}yaw_degrees: -90}}\n"
-        f"{entry}quaternion: [0.7071, 0, 0.7071, 0]}}\n{entry[:-2]}}}\n",
+        f"{entry}quaternion: [0.7071, 0, 0.7071, 0]}}\n{entry[:-2]}}}\n{entry}rpy_degrees: [90, 90, 0]}}\n",
     )
-    turned, yawed, given_, straight = (obstacle.pose.rotation for obstacle in scene.obstacles)
+    turned, yawed, given_, straight, pitched = (obstacle.pose.rotation for obstacle in scene.obstacles)
     np.testing.assert_allclose(turned @ [0, 1, 0], [0, 0, 1], atol=1e-12)  # y rolls up to z, and yaw leaves it there
     np.testing.assert_allclose(turned @ [1, 0, 0], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(yawed @ [1, 0, 0], [0, -1, 0], atol=1e-12)
