@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -404,3 +406,14 @@ def test_an_outlier_in_rotation_such_as_another_quaternion_order():
     finding = find("rotation-outlier", lint(family))
     assert finding.source == "odd"
     assert "wxyz or xyzw" in finding.remedy
+
+
+def test_every_code_is_in_the_documentation():
+    root = Path(__file__).resolve().parents[1]
+    sources = [*(root / "src/imitarm/demonstrations").glob("*checks.py"), root / "src/imitarm/demonstrations/lint.py"]
+    text = " ".join(file.read_text() for file in sources)
+    used = set(re.findall(r'"(?:error|warning|note)",\s+"([a-z-]+)",', text))
+    used |= set(re.findall(r'"(mixed-[a-z]+)"', text))
+    documented = set(re.findall(r"`([a-z-]+)`", (root / "docs/demonstrations.md").read_text()))
+    assert len(used) > 25
+    assert used <= documented

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from demonstration_samples import motion, path
-from imitarm.demonstrations import READERS, Reader, files_of, read, read_raw
+from imitarm.demonstrations import READERS, Reader, files_of, lint, read, read_raw
 from imitarm.errors import FileFormatError, InputError, UnknownNameError
 
 
@@ -172,3 +174,36 @@ def test_real_recordings_of_a_guided_panda(real_data, name, n, columns):
 def test_real_recordings_of_other_things_are_refused(real_data, name, message):
     with pytest.raises(FileFormatError, match=message):
         read(real_data / name, duration=10.0)
+
+
+@settings(max_examples=150)
+@given(
+    kind=st.sampled_from(["own.csv", "plain.txt", "a.npy", "a.npz", "b.npz"]),
+    changes=st.lists(st.tuples(st.floats(0.0, 1.0), st.binary(min_size=0, max_size=4)), max_size=4),
+    keep=st.one_of(st.just(1.0), st.floats(0.0, 1.0)),
+)
+def test_whatever_is_done_to_a_file_it_is_read_or_refused(tmp_path_factory, kind, changes, keep):
+    """Bytes changed and the end cut off: either demonstrations come back or an error that names the file."""
+    file = tmp_path_factory.mktemp("fuzz") / kind
+    one = motion(n=20, rotations=True, joints=True)
+    poses = np.column_stack([one.trajectory.positions, one.trajectory.quaternions])
+    if kind == "own.csv":
+        one.save(file)
+    elif kind == "plain.txt":
+        np.savetxt(file, poses)
+    elif kind == "a.npy":
+        np.save(file, poses)
+    else:
+        (np.savez if kind == "a.npz" else np.savez_compressed)(file, one=poses, two=poses[None])
+    content = bytearray(file.read_bytes())
+    for where, new in changes:
+        start = int(where * len(content))
+        content[start : start + len(new)] = new
+    file.write_bytes(content[: int(keep * len(content))])
+    options = {} if kind == "own.csv" else {"duration": 2.0}
+    try:
+        for demonstration in read(file, **options):
+            assert np.isfinite(demonstration.trajectory.positions).all()
+        lint(read_raw(file, **options))
+    except FileFormatError as error:
+        assert kind in str(error)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-import zipfile
-import zlib
+import warnings
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ Array = NDArray[np.float64]
 
 _NPY, _NPZ = b"\x93NUMPY", b"PK\x03\x04"
 _FIELDS = ("times", "positions", "quaternions", "joints")
-_DAMAGE = (ValueError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 
 class NumpyReader(Reader):
@@ -42,12 +40,7 @@ class NumpyReader(Reader):
         content = read_bytes(path)
         if content.startswith(_NPY):
             return _stack(path, _numbers(path, _load(path, content)), options)
-        with _load(path, content) as archive:
-            names = list(archive.files)
-            try:
-                arrays = {name: archive[name] for name in names}
-            except _DAMAGE as error:
-                raise _damaged(path, error) from error
+        arrays = _load(path, content)
         if not arrays:
             raise FileFormatError(f"{path}: the archive holds no arrays; save it again with numpy.savez")
         arrays = {name: _numbers(f"{path}:{name}", array) for name, array in arrays.items()}
@@ -65,18 +58,27 @@ def _damaged(path: str, error: BaseException) -> FileFormatError:
 
 
 def _load(path: str, content: bytes) -> Any:
-    """Open an .npy or .npz that is already in memory; a size that lies in its header is found there, not allocated."""
+    """Return the array of an .npy, or the arrays of an .npz by name, of a file that is already in memory."""
     try:
-        if content.startswith(_NPY):
-            stream = io.BytesIO(content)
-            version = np.lib.format.read_magic(stream)
-            header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = header(stream)
-            if not dtype.hasobject and np.prod(shape, dtype=float) * dtype.itemsize > len(content):
-                raise ValueError(f"its header says shape {shape}, the file is too short for it")
-        return np.load(io.BytesIO(content), allow_pickle=False)
-    except _DAMAGE as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # NumPy warns of headers that old versions wrote
+            if content.startswith(_NPY):
+                _check_size(content)
+                return np.load(io.BytesIO(content), allow_pickle=False)
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                return {name: archive[name] for name in archive.files}
+    except Exception as error:  # damaged headers raise whatever zipfile, zlib and Python's own tokenizer raise
         raise _damaged(path, error) from error
+
+
+def _check_size(content: bytes) -> None:
+    """Find a header that promises more than the file holds before anything of that size is allocated."""
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = header(stream)
+    if not dtype.hasobject and np.prod(shape, dtype=float) * dtype.itemsize > len(content):
+        raise ValueError(f"its header says shape {shape}, the file is too short for it")
 
 
 def _numbers(source: str, array: Any) -> Array:

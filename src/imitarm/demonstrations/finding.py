@@ -78,7 +78,8 @@ class Usable:
         bad = raw.not_finite() | raw.late()
         quaternions = raw.quaternions
         if quaternions is not None:
-            length = np.linalg.norm(np.nan_to_num(quaternions), axis=1)
+            quaternions = np.where(bad[:, None], 0.0, quaternions)
+            length = np.linalg.norm(quaternions, axis=1)
             bad |= length < 0.1
             quaternions = quaternions / np.maximum(length, 0.1)[:, None]
         rows = np.flatnonzero(~bad)

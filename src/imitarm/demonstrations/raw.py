@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 _LENGTH_TOLERANCE = 0.05  # files with two decimals hold quaternions this far from length one
 _ABSURD_DISTANCE = 1e5  # [m] no unit of length makes a reach of this
+_BOUND = 1e30  # larger numbers come from damaged files, and overflow when squared
 _MAX_DROPPED = 0.1  # share of rows that `repair` may drop before the file counts as broken
 
 
@@ -108,16 +109,16 @@ class RawDemonstration:
                 f"{self.source}: holds joint angles only; name the arm that was recorded, arm=ArmModel.load('sawyer')"
             )
         q = self.joints_of(arm)
-        known = np.isfinite(q).all(axis=1)
+        known = (np.abs(q) < _BOUND).all(axis=1)
         positions, quaternions = np.full((len(self), 3), np.nan), np.full((len(self), 4), np.nan)
         positions[known], quaternions[known] = arm.tool_path(q[known])
         return replace(self, positions=positions, quaternions=quaternions, joints=q, joint_names=arm.joint_names)
 
     def not_finite(self) -> NDArray[np.bool_]:
-        """Tell which rows hold a number that is not finite, shape (n,)."""
+        """Tell which rows hold nan, inf or a number beyond all bounds (1e30), shape (n,)."""
         columns = [self.times[:, None], self.positions, self.quaternions, self.joints]
         table = np.hstack([part for part in columns if part is not None])
-        return np.asarray(~np.isfinite(table).all(axis=1))
+        return np.asarray(~(np.abs(table) < _BOUND).all(axis=1))
 
     def late(self) -> NDArray[np.bool_]:
         """Tell which rows are not later than all rows before them, shape (n,)."""

@@ -45,11 +45,11 @@ def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
             "error",
             "non-monotonic-stamps",
             f"{len(late)} time stamps are not later than those before; the first is {raw.times[row]:.6g} s "
-            f"after {np.max(raw.times[:row]):.6g} s",
+            f"after {np.nanmax(raw.times[:row]):.6g} s",
             "record again, or read it with repair=True to drop those rows",
             row,
         )
-    times = raw.times[np.isfinite(raw.times)]
+    times = raw.times[~raw.not_finite()]
     if len(times) < 3:
         return
     if np.abs(times).max() > _EPOCH:
@@ -77,8 +77,8 @@ def check_quaternions(raw: RawDemonstration) -> Iterator[Finding]:
     """Find quaternions that are none, that are not of length one, and signs that flip."""
     if raw.quaternions is None:
         return
-    q = raw.quaternions
-    length = np.where(np.isfinite(q).all(axis=1), np.linalg.norm(np.nan_to_num(q), axis=1), 1.0)
+    q = np.where(raw.not_finite()[:, None], np.nan, raw.quaternions)
+    length = np.nan_to_num(np.linalg.norm(q, axis=1), nan=1.0)
     off = np.abs(length - 1.0)
     worst = int(np.argmax(off))
     if off[worst] > 0.05:
