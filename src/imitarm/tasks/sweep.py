@@ -64,6 +64,7 @@ class SweepTask:
     start: ClassVar[Pose] = Pose(np.array([0.58, -0.48, HOVER]), np.array(SWEEPING))  # S
     dirt: ClassVar[Pose] = Pose(np.array([0.61, -0.08, HOVER]), np.array(SWEEPING))  # T
     goal: ClassVar[Pose] = Pose(np.array([0.65, 0.40, HOVER]), np.array(SWEEPING))  # G
+    tool_radius: ClassVar[float] = 0.058  # [m] the brush's own 55 mm, and 3 mm for its tilt and for lag
     clearance: ClassVar[float] = 0.02  # [m] that a reproduction should keep
 
     def __post_init__(self) -> None:

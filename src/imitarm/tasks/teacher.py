@@ -24,11 +24,12 @@ Array = NDArray[np.float64]
 
 SEEDS = tuple(range(8))  # of the packaged demonstrations
 RECORDED_EVERY = 0.03  # [s]
+_HAND_EVERY = 0.006  # [s] how often the hand changes its pull
 _DIGITS = 5  # decimals that are recorded: 0.01 mm and 0.01 mrad, finer than any encoder sees
 
 # How firmly the hand holds the tool: along x, y, z, then about them. It minds the height most.
-_STIFFNESS = np.array([1200.0, 1200.0, 4000.0, 40.0, 40.0, 40.0])  # [N/m], [N m/rad]
-_DAMPING = np.array([90.0, 90.0, 150.0, 2.5, 2.5, 2.5])  # [N s/m], [N m s/rad]
+_STIFFNESS = np.array([1200.0, 1200.0, 4000.0, 150.0, 150.0, 150.0])  # [N/m], [N m/rad]
+_DAMPING = np.array([90.0, 90.0, 150.0, 5.0, 5.0, 5.0])  # [N s/m], [N m s/rad]
 _TREMOR_BAND = (4.0, 9.0)  # [Hz] physiological tremor of a hand
 
 
@@ -67,7 +68,7 @@ class Teacher:
         points += rng.normal(0.0, 1.0, (5, 3)) * np.array([0.002, 0.004, 0.0])
         points[:, 2] += rng.normal(0.0, 0.0006, 5)
         moments = duration * np.array([0.0, 0.53 * share, share, share + 0.47 * (1.0 - share), 1.0])
-        turns = rng.normal(0.0, 0.02, (5, 3))  # [rad]
+        turns = rng.normal(0.0, 0.015, (5, 3))  # [rad]
         n = 6
         waves = np.stack(
             [
@@ -108,14 +109,12 @@ class Teacher:
         """
         task = SweepTask(seed=self.seed)
         robot = task.robot(arm=arm)
-        dt = robot.model.opt.timestep
-        every = round(RECORDED_EVERY / dt)
         n = int((self.duration + self.rest.sum()) / RECORDED_EVERY)
         joints = np.empty((n, robot.arm.n_joints))
         for k in range(n):
             joints[k] = robot.state().q
-            for i in range(every):
-                robot.guide(self._pull(robot, k * RECORDED_EVERY + i * dt), dt)
+            for i in range(round(RECORDED_EVERY / _HAND_EVERY)):
+                robot.guide(self._pull(robot, k * RECORDED_EVERY + i * _HAND_EVERY), _HAND_EVERY)
         if not task.swept(robot).all():
             raise TaskFailedError(
                 f"teacher {self.seed} lost {int((~task.swept(robot)).sum())} crumbs; choose another seed"
