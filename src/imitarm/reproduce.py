@@ -14,6 +14,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import Pose
+from imitarm.policies.barrier import clearance_rows
 from imitarm.policies.policy import Observation, Policy
 from imitarm.robots.robot import Robot
 from imitarm.scene import Scene
@@ -51,6 +52,7 @@ def reproduce(
     dt: float = 0.01,
     timeout: float = 60.0,
     method: str = "qp",
+    link_clearance: float | None = None,
     on_step: Callable[[Step], None] | None = None,
 ) -> Rollout:
     """Let ``policy`` reproduce its skill on ``robot``, and note what happens.
@@ -67,6 +69,9 @@ def reproduce(
         dt: control period [s]; a simulated robot needs a multiple of its timestep.
         timeout: longest duration [s].
         method: of :func:`solve_ik`.
+        link_clearance: distance that every link must keep to every obstacle [m], held by
+            :func:`~imitarm.policies.barrier.clearance_rows` in the inverse kinematics (``method="qp"``); the tool then
+            leaves its path where a link would not get by. None: only the policy looks after obstacles.
         on_step: called after each step, for progress or drawing; what it raises stops the robot and is passed on.
 
     Returns:
@@ -92,7 +97,10 @@ def reproduce(
             twist = np.asarray(policy.step(observation, dt), dtype=float)
             if twist.shape != (6,) or not np.isfinite(twist).all():
                 raise InputError(f"{type(policy).__name__}.step must answer 6 finite numbers, got {twist!r}")
-            velocity = solve_ik(robot.arm, notes.state.q, twist, method=method, dt=dt, velocity=robot.velocity)
+            q, rows = notes.state.q, None
+            if link_clearance is not None:
+                rows = clearance_rows(robot.arm, q, observation.scene, link_clearance)
+            velocity = solve_ik(robot.arm, q, twist, method=method, dt=dt, velocity=robot.velocity, rows=rows)
             robot.move(velocity, dt)
             step = notes.take(robot, observation.scene, twist)
             if on_step is not None:

@@ -47,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--method", choices=METHODS, default="certified", help="how to adapt; default: certified")
     way.add_argument("--clearance", type=float, default=20.0, metavar="MM", help="to every obstacle; default: 20 mm")
     way.add_argument("--tool-radius", type=float, metavar="MM", help="of a sphere; default: the tool's own shape")
+    way.add_argument("--tool-only", action="store_true", help="do not keep the other links clear (to compare)")
     held = way.add_mutually_exclusive_group()
     held.add_argument("--keep-height", action="store_true", help="give way only sideways, as on a table")
     held.add_argument("--not-down", action="store_true", help="never give way downwards")
@@ -94,6 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
             robot,
             policy,
             clearance=1e-3 * arguments.clearance,
+            link_clearance=None if arguments.tool_only else 1e-3 * arguments.clearance,
             tool_radius=radius if len(spheres) == 1 else 0.0,
             progress=lambda share: progress.update(moving, completed=share),
         )

@@ -37,6 +37,7 @@ def try_scene(
     policy: ACFRA,
     *,
     clearance: float,
+    link_clearance: float | None = None,
     tool_radius: float = 0.0,
     demonstrations: Sequence[Demonstration] = (),
     judge: Judge | None = None,
@@ -51,6 +52,7 @@ def try_scene(
         robot: at its start posture, in its scene.
         policy: not yet reset.
         clearance: that is asked for [m].
+        link_clearance: that every link must keep [m]; None: only the tool is looked after.
         tool_radius: for the drawing [m].
         demonstrations: aligned, to measure the distance to.
         judge: the task's own verdict over the rollout.
@@ -78,6 +80,7 @@ def try_scene(
             robot,
             scene.after,
             dt=CONTROL_PERIOD,
+            link_clearance=link_clearance,
             timeout=PATIENCE * policy.skill.duration_,
             on_step=on_step,
         )

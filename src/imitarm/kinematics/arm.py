@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError, UnknownNameError
-from imitarm.kinematics.arm_file import ArmFile, compiled, quiet, read_arm
+from imitarm.kinematics.arm_file import ArmFile, quiet, read_arm
+from imitarm.kinematics.arm_limits import compiled
 from imitarm.kinematics.pose import Pose
-from imitarm.kinematics.spheres import covering_spheres
+from imitarm.kinematics.spheres import SphereCover
 
 Array = NDArray[np.float64]
-_COLLISION_GROUP = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,6 @@ class ArmModel:
         self._qpos = _slice(model.jnt_qposadr[joints])
         self._dofs = _slice(model.jnt_dofadr[joints])
         self._joints = np.array(joints)
-        self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
         self._flange = model.site("flange").id
         names = [model.site(i).name for i in range(model.nsite)]
         self._tool = names.index("tool") if "tool" in names else self._flange
@@ -157,7 +156,8 @@ class ArmModel:
         self.tool_to_flange = Pose.identity()
         if self.has_tool:
             self.tool_to_flange = self.forward_kinematics(self.home).inverse() @ self.tool_pose(self.home)
-        self._cover(whole)
+        self._cover = SphereCover(whole, self._joints)
+        self.sphere_bodies = self._cover.bodies
         self._sealed = True
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -187,7 +187,8 @@ class ArmModel:
         """Return a fresh copy of the arm and its tool, for composing worlds; the base stands at the origin.
 
         Names are those of the file; those of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
-        The flange is the site ``"flange"``. Geoms of group 3 count for contact, those of group 2 are looks. The arm's
+        The flange is the site ``"flange"``. Geoms of group 3 count for contact, all others are looks (a
+        file that does not part the two is put in order so). The arm's
         joints have no actuators, so that a world adds the ones it needs (joints carry their torque limit as
         ``actuatorfrcrange``); a gripper has one, ``"tool/opening"``, a position servo of its opening [m].
         There are no keyframes: take :meth:`posture`.
@@ -276,9 +277,7 @@ class ArmModel:
         Returns:
             centers (m, 3) [m] in the base frame and radii (m,) [m].
         """
-        data = self._at(q).data
-        turned = data.xmat[self._sphere_body].reshape(-1, 3, 3) @ self._sphere_center[:, :, None]
-        return data.xpos[self._sphere_body] + turned[:, :, 0], self._sphere_radius
+        return self._cover.centers(self._at(q).data), self._cover.radii
 
     @property
     def tool_spheres(self) -> Array:
@@ -287,23 +286,12 @@ class ArmModel:
         Rows x y z r in the tool's frame, shape (m, 4) [m]; what a policy keeps clear of obstacles.
         """
         centers, radii = self.collision_spheres(self.home)
-        rigid = self._sphere_moves[:, -1] > 0.0
+        rigid = self._cover.follows_last_joint
         return np.column_stack([self.tool_pose(self.home).inverse().apply(centers[rigid]), radii[rigid]])
 
     def sphere_jacobians(self, q: ArrayLike) -> Array:
         """Return the Jacobians of the spheres' centers, shape (m, 3, n_joints) [m/rad]."""
-        centers, _ = self.collision_spheres(q)
-        data = self._scratch.data
-        axes, anchors = data.xaxis[self._joints].T, data.xanchor[self._joints].T
-        x, y, z = axes
-        # Column j is a_j x (c - o_j). All the cross products with c at once: c times the stacked matrices [a_j]x^T.
-        zero = np.zeros_like(x)
-        crosses = np.stack((zero, z, -y, -z, zero, x, y, -x, zero)).reshape(3, -1)
-        offset = np.cross(axes, anchors, axis=0)
-        columns = (centers @ crosses).reshape(-1, 3, self.n_joints) - offset
-        if self._slides.any():
-            columns[:, :, self._slides] = axes[:, self._slides]
-        return np.asarray(columns * self._sphere_moves[:, None, :])
+        return self._cover.jacobians(self._at(q).data)
 
     def gravity_torque(self, q: ArrayLike) -> Array:
         """Return the torques g(q) that hold arm and tool against gravity, shape (n_joints,) [N m]."""
@@ -381,35 +369,6 @@ class ArmModel:
         mujoco.mj_comVel(self._model, data)
         mujoco.mj_rne(self._model, data, acceleration is not None, scratch.force)
         return scratch.force[self._dofs].copy()
-
-    def _cover(self, whole: mujoco.MjModel) -> None:
-        """Cover the moving collision shapes with spheres, in the frames of their bodies."""
-        bodies: list[int] = []
-        centers: list[Array] = [np.zeros((0, 3))]
-        radii: list[float] = []
-        marked = (whole.geom_group == _COLLISION_GROUP).any()
-        for geom in range(whole.ngeom):
-            body = int(whole.geom_bodyid[geom])
-            touches = bool(whole.geom_contype[geom] or whole.geom_conaffinity[geom])
-            counts = touches and (whole.geom_group[geom] == _COLLISION_GROUP or not marked)
-            if counts and whole.body_weldid[body] != 0 and whole.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
-                points, radius = covering_spheres(whole, geom)
-                centers.append(points)
-                bodies += [body] * len(points)
-                radii += [radius] * len(points)
-        self._sphere_body = np.array(bodies, dtype=int)
-        self._sphere_center = _frozen(np.concatenate(centers))
-        self._sphere_radius = _frozen(np.array(radii, dtype=float))
-        self._sphere_moves = np.array([self._moves(body) for body in bodies], dtype=float).reshape(-1, self.n_joints)
-        self.sphere_bodies = tuple(whole.body(body).name for body in bodies)
-
-    def _moves(self, body: int) -> list[bool]:
-        """Return for each joint whether it moves ``body``."""
-        above = set()
-        while body:
-            above.add(body)
-            body = int(self._model.body_parentid[body])
-        return [int(self._model.jnt_bodyid[joint]) in above for joint in self._joints]
 
 
 def _massless(geom: mujoco.MjsGeom) -> bool:

@@ -11,9 +11,66 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+COLLISION_GROUP = 3
+"""Group of the geoms that count for contact; looks are in groups 0 to 2."""
 _SPACING = 0.9  # distance of neighbours on a round bar, in radii: spheres then stand out by a tenth
 _SMALLEST_CELL = 0.025  # [m] a plate thinner than this is not cut finer
 _LONGEST_ROW = 4  # cells along the longest edge of a plate
+
+
+class SphereCover:
+    """Spheres that cover all moving collision shapes (group 3) of a model, and how joints move them.
+
+    Attributes:
+        bodies: for each sphere the name of the body that carries it.
+        radii: shape (m,) [m].
+        follows_last_joint: which spheres move rigidly with the flange, shape (m,).
+    """
+
+    def __init__(self, model: mujoco.MjModel, joints: NDArray[np.int_]) -> None:
+        """Cover the shapes of ``model``; columns of the Jacobians belong to ``joints``."""
+        owners: list[int] = []
+        centers, radii = [np.zeros((0, 3))], [np.zeros(0)]
+        for geom in np.flatnonzero(model.geom_group == COLLISION_GROUP):
+            body = int(model.geom_bodyid[geom])
+            if model.body_weldid[body] != 0:  # the base never moves
+                points, radius = covering_spheres(model, int(geom))
+                centers.append(points)
+                radii.append(np.full(len(points), radius))
+                owners += [body] * len(points)
+        self.bodies = tuple(model.body(body).name for body in owners)
+        self.radii = np.concatenate(radii)
+        self.radii.setflags(write=False)
+        self._joints, self._owners = joints, np.array(owners, dtype=int)
+        self._centers = np.concatenate(centers)[:, :, None]
+        self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
+        moves = [[_carries(model, int(model.jnt_bodyid[joint]), body) for joint in joints] for body in owners]
+        self._moves = np.array(moves, dtype=float).reshape(len(owners), 1, len(joints))
+        self.follows_last_joint = self._moves[:, 0, -1] > 0.0
+
+    def centers(self, data: mujoco.MjData) -> Array:
+        """Return where the spheres are, shape (m, 3) [m]; ``data`` holds the kinematics of a posture."""
+        turned = data.xmat[self._owners].reshape(-1, 3, 3) @ self._centers
+        return np.asarray(data.xpos[self._owners] + turned[:, :, 0])
+
+    def jacobians(self, data: mujoco.MjData) -> Array:
+        """Return the Jacobians of the centers, shape (m, 3, n_joints) [m/rad]."""
+        axes, anchors = data.xaxis[self._joints].T, data.xanchor[self._joints].T
+        x, y, z = axes
+        # Column j is a_j x (c - o_j). All the cross products with c at once: c times the stacked matrices [a_j]x^T.
+        zero = np.zeros_like(x)
+        crosses = np.stack((zero, z, -y, -z, zero, x, y, -x, zero)).reshape(3, -1)
+        columns = (self.centers(data) @ crosses).reshape(-1, *axes.shape) - np.cross(axes, anchors, axis=0)
+        if self._slides.any():
+            columns[:, :, self._slides] = axes[:, self._slides]
+        return np.asarray(columns * self._moves)
+
+
+def _carries(model: mujoco.MjModel, carrier: int, body: int) -> bool:
+    """Return whether ``carrier`` is ``body`` or above it."""
+    while body > carrier:  # parents have smaller indices
+        body = int(model.body_parentid[body])
+    return body == carrier
 
 
 def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:

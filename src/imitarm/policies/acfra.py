@@ -86,6 +86,11 @@ class ACFRA(Policy):
         self._hold = observation.tool_to_base
         self._phase = 0.0
 
+    @property
+    def phase(self) -> float:
+        """How far along the demonstrated time the motion is [s]."""
+        return self._phase
+
     def _target(self, adaptation: Adaptation) -> tuple[Pose, Array]:
         """Return the desired pose and the twist (6,) that belongs to it at the present phase."""
         path = adaptation.trajectory
