@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics import ik
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik import METHODS, clearance_rows, solve_ik, solve_ik_step, velocity_box
+from imitarm.kinematics.ik import METHODS, clearance_rows, solve_ik, solve_ik_step
 from imitarm.kinematics.pose import Pose
 
 ARMS = {name: ArmModel.load(name, tool="brush") for name in ("sawyer", "panda")}
@@ -142,44 +142,6 @@ def test_svd_filter_is_the_pseudo_inverse_away_from_singularities_and_bounded_at
     assert np.all(np.abs(solve_ik(SAWYER, straight, [0.5, 0, 0, 0, 0, 0], method="svd")) <= SAWYER.max_velocity)
 
 
-@settings(deadline=None, max_examples=100)
-@given(seeds, st.sampled_from([0.001, 0.01, 0.05]), st.sampled_from(list(ARMS)))
-def test_the_box_is_never_empty_and_its_worst_corner_can_still_stop(seed, dt, name):
-    """METHODS A.9: walk on the box's own corners; no limit of position, velocity or acceleration is ever passed."""
-    arm, rng = ARMS[name], np.random.default_rng(seed)
-    q, velocity = rng.uniform(arm.lower, arm.upper), np.zeros(7)
-    for _ in range(300):
-        lower, upper = velocity_box(arm, q, dt, velocity)
-        assert np.all(lower <= upper)
-        assert np.all(upper <= arm.max_velocity) and np.all(lower >= -arm.max_velocity)
-        chosen = np.where(rng.random(7) < 0.9, np.where(rng.random() < 0.5, upper, lower), rng.uniform(lower, upper))
-        assert np.all(np.abs(chosen - velocity) <= arm.max_acceleration * dt + 1e-12)
-        velocity = chosen
-        q = q + dt * velocity
-        assert np.all(q <= arm.upper + 1e-9) and np.all(q >= arm.lower - 1e-9)
-
-
-def test_the_box_leads_back_from_outside_the_limits():
-    q = SAWYER.upper + 0.05
-    lower, upper = velocity_box(SAWYER, q, DT)
-    assert np.all(upper == 0.0) and np.all(lower < 0.0)
-    velocity = SAWYER.max_velocity  # and running further out: then it brakes as hard as it may
-    lower, upper = velocity_box(SAWYER, q, DT, velocity)
-    assert np.allclose(upper, velocity - SAWYER.max_acceleration * DT)
-    assert np.all(lower <= upper)
-
-
-def test_joints_without_limits_have_only_the_velocity(tmp_path):
-    file = tmp_path / "turntable.xml"
-    file.write_text(
-        "<mujoco><worldbody><body name='plate'><joint name='turn'/><geom size='.1'/></body></worldbody></mujoco>"
-    )
-    arm = ArmModel.load(file)
-    assert arm.lower[0] == -np.inf and arm.upper[0] == np.inf
-    lower, upper = velocity_box(arm, [400.0], DT)
-    assert upper[0] == arm.max_velocity[0] == -lower[0]
-
-
 @settings(deadline=None, max_examples=40)
 @given(seeds)
 def test_the_quadratic_program_finds_the_least_cost(seed):
@@ -239,16 +201,6 @@ def test_extra_rows_keep_the_arm_off_a_wall():
     assert nearest > clearance - 0.002
     assert nearest < clearance + 0.005  # it does come as near as it may
     assert np.linalg.norm(step.error) > 0.1  # and reports what it could not do
-
-
-def test_a_moving_obstacle_pushes_its_rows():
-    jacobians = np.zeros((1, 3, 7))
-    still = clearance_rows(jacobians, np.array([[1.0, 0, 0]]), np.array([0.1]), clearance=0.02, gain=5.0)
-    coming = clearance_rows(
-        jacobians, np.array([[1.0, 0, 0]]), np.array([0.1]), clearance=0.02, gain=5.0, obstacle_velocity=[0.3, 0, 0]
-    )
-    assert still[1] == pytest.approx([-0.4])
-    assert coming[1] == pytest.approx([-0.1])
 
 
 def test_rows_that_contradict_the_limits_give_way_and_are_reported():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -14,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import FileFormatError, InputError, UnknownNameError
+from imitarm.kinematics.arm_limits import HINGE, SLIDE, compiled, completed_home, explained, read_limits, taken_keyframe
+from imitarm.kinematics.spheres import COLLISION_GROUP
 
 Array = NDArray[np.float64]
 
@@ -25,9 +26,7 @@ TOOLS: Mapping[str, str] = {"brush": "brush.xml", "gripper": "gripper.xml"}
 TOOL_PREFIX = "tool/"
 """Stands before every name that comes from a tool's file, except its site ``tool``."""
 
-DEFAULT_MAX_VELOCITY = 2.0  # [rad/s] or, for a slide, a tenth of it [m/s]: where a file says nothing
-DEFAULT_MAX_ACCELERATION = 10.0  # [rad/s^2] or a tenth of it [m/s^2]: where a file says nothing
-_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_MESHES = {mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF, mujoco.mjtGeom.mjGEOM_HFIELD}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,27 +70,15 @@ def read_arm(source: str | Path, tool: str | Path | None, flange: str | None, di
     """
     path = _located(source, ARMS, "robot")
     spec = _read_spec(path, discard_meshes)
-    spec_home = _keyframe(spec)
+    spec_home = taken_keyframe(spec)
     chain = _flange_and_joints(spec, flange, path)
-    limits = _limits(spec, path, chain)
+    limits = read_limits(spec, path, chain)
     tool_radius = 0.0
     if tool is not None:
         tool_radius = _attach(spec, _located(tool, TOOLS, "tool"))
-    home = _home(spec, spec_home)
+    home = completed_home(spec, spec_home, TOOL_PREFIX)
     name = Path(source).stem if str(source) not in ARMS else str(source)
     return ArmFile(name, spec, chain, *limits, home, tool_radius)
-
-
-def compiled(spec: mujoco.MjSpec, what: object) -> mujoco.MjModel:
-    """Compile a copy of ``spec``.
-
-    Raises:
-        FileFormatError: with MuJoCo's own words and what to do about the usual cause.
-    """
-    try:
-        return spec.copy().compile()
-    except ValueError as error:
-        raise FileFormatError(f"{what}: {_explained(str(error))}") from error
 
 
 def _located(source: str | Path, packaged: Mapping[str, str], kind: str) -> Path:
@@ -120,26 +107,53 @@ def _read_spec(path: Path, discard_meshes: bool) -> mujoco.MjSpec:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise FileFormatError(f"{path}: {_explained(str(error))}") from error
+        raise FileFormatError(f"{path}: {explained(str(error))}") from error
     spec.compiler.fusestatic = False
-    if discard_meshes:
-        for geom in list(spec.geoms):
-            if geom.type in {mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF, mujoco.mjtGeom.mjGEOM_HFIELD}:
-                spec.delete(geom)
-        for asset in [*spec.meshes, *spec.hfields, *spec.skins]:
-            spec.delete(asset)
+    for geom in list(spec.geoms):
+        unwanted = spec.compiler.discardvisual and not _touches(geom)  # a URDF's, unless it says otherwise
+        if unwanted or (discard_meshes and geom.type in _MESHES):
+            spec.delete(geom)
+    spec.compiler.discardvisual = False  # else a tool would lose its looks too
+    used = {geom.meshname for geom in spec.geoms}
+    for asset in [*spec.hfields, *spec.skins] if discard_meshes else []:
+        spec.delete(asset)
+    for mesh in list(spec.meshes):
+        if mesh.name not in used:
+            spec.delete(mesh)
+        elif mesh.file.startswith("package:"):
+            mesh.file = _in_package(mesh.file, path)
+    _part_contact_from_looks(spec)
     compiled(spec, path)
     return spec
 
 
-def _explained(message: str) -> str:
-    """Add the remedy to MuJoCo's message."""
-    message = " ".join(message.split())
-    if "opening file" in message or "mesh" in message.lower():
-        return f"{message}; a mesh is missing or unreadable: put it there, or load with discard_meshes=True"
-    if "mass" in message or "inertia" in message:
-        return f"{message}; every moving link needs a mass and an inertia"
-    return message
+def _in_package(file: str, path: Path) -> str:
+    """Find ``package://name/rest`` in a folder ``name`` above the URDF at ``path``; else return it as it is."""
+    name, _, rest = file.removeprefix("package:").lstrip("/").partition("/")
+    for folder in path.resolve().parents:
+        for root in (folder, folder / name):
+            if root.name == name and (root / rest).is_file():
+                return str(root / rest)
+    return file
+
+
+def _touches(geom: mujoco.MjsGeom) -> bool:
+    return bool(geom.contype or geom.conaffinity)
+
+
+def _part_contact_from_looks(spec: mujoco.MjSpec) -> None:
+    """Put every shape that can touch into group 3; a link that would then look like nothing gets a copy in group 2."""
+    for body in spec.bodies:
+        touching = [geom for geom in body.geoms if _touches(geom)]
+        unseen = len(touching) == len(body.geoms)
+        for geom in touching:
+            if geom.group == COLLISION_GROUP:
+                continue
+            geom.group = COLLISION_GROUP
+            if unseen:
+                shape = {key: getattr(geom, key) for key in ("type", "size", "pos", "quat", "fromto", "rgba")}
+                names = {"meshname": geom.meshname, "material": geom.material}
+                body.add_geom(**shape, **names, group=2, contype=0, conaffinity=0, density=0.0)
 
 
 def _flange_and_joints(spec: mujoco.MjSpec, flange: str | None, path: Path) -> tuple[str, ...]:
@@ -161,7 +175,7 @@ def _flange_and_joints(spec: mujoco.MjSpec, flange: str | None, path: Path) -> t
     if not joints:
         raise InputError(f"{path}: no joint between the base and the flange; name another one with flange=...")
     for index, joint in enumerate(joints):
-        if int(joint.type) not in {_HINGE, _SLIDE}:
+        if int(joint.type) not in {HINGE, SLIDE}:
             raise InputError(f"{path}: joint {joint.name!r} is neither a hinge nor a slide; fix the base of the arm")
         joint.name = joint.name or f"joint{index + 1}"
     return tuple(joint.name for joint in joints)
@@ -189,76 +203,6 @@ def _last_body(spec: mujoco.MjSpec) -> mujoco.MjsBody | None:
             return None if body.name == "world" else body
         else:
             body = jointed[0]
-
-
-def _limits(spec: mujoco.MjSpec, path: Path, joints: tuple[str, ...]) -> tuple[Array, Array, Array]:
-    """Return the limits of velocity, acceleration and torque, from wherever the format keeps them."""
-    model = compiled(spec, path)
-    scale = np.array([1.0 if model.joint(j).type[0] == _HINGE else 0.1 for j in joints])
-    velocity, acceleration = DEFAULT_MAX_VELOCITY * scale, DEFAULT_MAX_ACCELERATION * scale
-    torque = np.array([_torque_limit(model, joint) for joint in joints])
-    for name, values in (("max_velocity", velocity), ("max_acceleration", acceleration)):
-        numeric = spec.numeric(name)
-        if numeric is None:
-            continue
-        if len(numeric.data) != len(joints) or not np.all(np.asarray(numeric.data) > 0.0):
-            raise FileFormatError(f"{path}: numeric {name!r} needs {len(joints)} positive values, one for each joint")
-        values[:] = numeric.data
-    for joint in ElementTree.parse(path).getroot().iter("joint"):  # what MuJoCo drops from a URDF
-        limit, name = joint.find("limit"), joint.get("name", "")
-        if limit is not None and name in joints:
-            for key, values in (("velocity", velocity), ("effort", torque)):
-                if float(limit.get(key, 0.0)) > 0.0:
-                    values[joints.index(name)] = float(limit.get(key, 0.0))
-    return velocity, acceleration, torque
-
-
-def _torque_limit(model: mujoco.MjModel, name: str) -> float:
-    """Return the joint's own force range, else that of its actuator, else inf."""
-    joint = model.joint(name).id
-    if model.jnt_actfrclimited[joint]:
-        return float(np.max(np.abs(model.jnt_actfrcrange[joint])))
-    for actuator in range(model.nu):
-        transmission = model.actuator_trntype[actuator]
-        if transmission == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[actuator, 0] == joint:
-            gear = abs(float(model.actuator_gear[actuator, 0]))
-            if model.actuator_forcelimited[actuator]:
-                return gear * float(np.max(np.abs(model.actuator_forcerange[actuator])))
-            if model.actuator_ctrllimited[actuator] and not model.actuator_biastype[actuator]:  # a plain motor
-                gain = abs(float(model.actuator_gainprm[actuator, 0]))
-                return gear * gain * float(np.max(np.abs(model.actuator_ctrlrange[actuator])))
-    return math.inf
-
-
-def _keyframe(spec: mujoco.MjSpec) -> dict[str, float]:
-    """Return joint positions by name of the keyframe ``home``, else of the first one, and remove all keyframes."""
-    keys = list(spec.keys)
-    chosen = next((key for key in keys if key.name == "home"), keys[0] if keys else None)
-    home: dict[str, float] = {}
-    if chosen is not None:
-        model = spec.copy().compile()
-        qpos = model.key(chosen.name).qpos if chosen.name else model.key_qpos[0]
-        for joint in range(model.njnt):
-            if int(model.jnt_type[joint]) in {_HINGE, _SLIDE}:
-                home[model.joint(joint).name] = float(qpos[model.jnt_qposadr[joint]])
-    for key in keys:  # their lengths would be wrong once a tool with joints is attached
-        spec.delete(key)
-    return home
-
-
-def _home(spec: mujoco.MjSpec, given: Mapping[str, float]) -> dict[str, float]:
-    """Complete a posture: joints without a value stand in the middle of their range, fingers are open."""
-    model = spec.copy().compile()
-    home: dict[str, float] = {}
-    for index in range(model.njnt):
-        name, (low, high) = model.joint(index).name, model.jnt_range[index]
-        if name in given:
-            home[name] = given[name]
-        elif not model.jnt_limited[index]:
-            home[name] = 0.0
-        else:
-            home[name] = float(high) if name.startswith(TOOL_PREFIX) else 0.5 * float(low + high)
-    return home
 
 
 def _attach(spec: mujoco.MjSpec, path: Path) -> float:

@@ -18,6 +18,7 @@ from scipy.linalg import lapack
 
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.bounds import clearance_rows, velocity_box
 from imitarm.kinematics.posture import ANGLE_LENGTH, find_posture
 
 __all__ = ["METHODS", "IKStep", "clearance_rows", "find_posture", "solve_ik", "solve_ik_step", "velocity_box"]
@@ -151,68 +152,6 @@ _DEFAULTS: dict[str, object] = {
     "max_speed": None,
     "small_angle": None,
 }
-
-
-def velocity_box(arm: ArmModel, q: ArrayLike, dt: float, velocity: ArrayLike | None = None) -> tuple[Array, Array]:
-    r"""Return the joint velocities from which the limits of position can still be kept; never empty (METHODS A.9).
-
-    With D the way left to the upper limit, a joint that is to stop in time may have at most
-    :math:`v_b(D)=-a\,dt+\sqrt{a^2 dt^2+2aD}`, the solution of :math:`v^2/(2a)+v\,dt=D`. The upper bound is
-    :math:`\min(v_{max},\; v_p+a\,dt,\; \max(v_b(D),\, v_p-a\,dt))`, the lower one its mirror image: when the velocity
-    before, :math:`v_p`, kept this bound, then braking with a keeps it now.
-
-    Args:
-        arm: the arm.
-        q: joint positions, shape (n_joints,) [rad]; outside the limits a joint can only move back.
-        dt: length of the control step [s].
-        velocity: of the step before, shape (n_joints,) [rad/s]; None: from any velocity, at any acceleration.
-
-    Returns:
-        lower and upper, each of shape (n_joints,) [rad/s].
-    """
-    position = np.asarray(q, dtype=float)
-    most, step = arm.max_velocity, arm.max_acceleration * dt
-    # both directions at once: row 0 upwards, row 1 downwards, where up is what is down in row 0
-    way = np.empty((2, len(most)))
-    np.subtract(arm.upper, position, out=way[0])
-    np.subtract(position, arm.lower, out=way[1])
-    bound = np.sqrt(step * step + (2.0 * arm.max_acceleration) * np.maximum(way, 0.0)) - step
-    if velocity is not None:
-        before = np.empty_like(way)
-        np.minimum(np.maximum(velocity, -most), most, out=before[0])
-        np.negative(before[0], out=before[1])
-        bound = np.minimum(np.maximum(bound, before - step), before + step)
-    bound = np.minimum(bound, most)
-    return -bound[1], bound[0]
-
-
-def clearance_rows(
-    jacobians: Array,
-    normals: Array,
-    distances: Array,
-    *,
-    clearance: float,
-    gain: float = 5.0,
-    obstacle_velocity: ArrayLike = 0.0,
-) -> tuple[Array, Array]:
-    r"""Return rows for :func:`solve_ik` that keep points of the arm off obstacles (METHODS A.9, D.3.4).
-
-    A point at distance d may come nearer only as fast as :math:`n^T J v \ge n^T v_o - \xi (d - d_{safe})`.
-
-    Args:
-        jacobians: of the points, shape (m, 3, n_joints), as from ``ArmModel.sphere_jacobians``.
-        normals: unit outward normals of the nearest obstacle, shape (m, 3).
-        distances: from the point (the sphere's surface) to the obstacle, shape (m,) [m].
-        clearance: distance to keep [m].
-        gain: xi [1/s].
-        obstacle_velocity: of the nearest obstacle, shape (m, 3) or (3,) [m/s].
-
-    Returns:
-        ``(A, lower)`` of shapes (m, n_joints) and (m,).
-    """
-    approach = np.sum(normals * np.broadcast_to(np.asarray(obstacle_velocity, dtype=float), normals.shape), axis=1)
-    rows = np.einsum("mi,mij->mj", normals, jacobians)
-    return rows, approach - gain * (np.asarray(distances, dtype=float) - clearance)
 
 
 def _task(
