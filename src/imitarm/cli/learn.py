@@ -97,13 +97,13 @@ def _show(skill: Skill, alignment: Alignment) -> None:
     gmr = skill.gmr_
     if gmr.selection_:
         show_table(
-            ["components>", "BIC>", "AIC>", "held-out error [mm]>", ""],
+            ["components>", "BIC>", "AIC>", "held-out error [mm]>", "bias [mm]>", ""],
             [
                 (
                     str(tried.n_components),
                     f"{tried.bic:.0f}",
                     f"{tried.aic:.0f}",
-                    "" if np.isnan(tried.held_out_rmse_mm) else f"{tried.held_out_rmse_mm:.2f}",
+                    *("" if np.isnan(x) else f"{x:.2f}" for x in (tried.held_out_rmse_mm, tried.bias_rmse_mm)),
                     "chosen" if tried.n_components == gmr.n_components_ else "",
                 )
                 for tried in gmr.selection_
