@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 LOG_2PI = float(np.log(2.0 * np.pi))
+_NOTHING = -45.0  # exp(-45) is lost beside 1 in double precision; numbers far below make np.exp slow
 
 
 class Fit(NamedTuple):
@@ -140,23 +141,12 @@ def normalise(log_density: Array) -> tuple[Array, Array]:
         Responsibilities (B, K, n) and log-likelihoods of the samples (B, n).
     """
     top = log_density.max(axis=1)
-    ratio = np.exp(log_density - top[:, None])
+    ratio = log_density - top[:, None]
+    np.maximum(ratio, _NOTHING, out=ratio)
+    np.exp(ratio, out=ratio)
     total = ratio.sum(axis=1)
     ratio *= (1.0 / total)[:, None]
     return ratio, np.log(total) + top
-
-
-def _normalise_quickly(log_density: Array) -> tuple[Array, Array]:
-    """As :func:`normalise`, with exponentials in single precision: three times as fast, right to 1e-7.
-
-    That is far below what one iteration changes; the likelihood that is reported at the end is computed in double.
-    """
-    top = log_density.max(axis=1)
-    ratio = np.subtract(log_density, top[:, None], dtype=np.float32, casting="same_kind")
-    np.exp(ratio, out=ratio)
-    total = ratio.sum(axis=1)
-    ratio *= (np.float32(1.0) / total)[:, None]
-    return ratio.astype(np.float64), np.log(total) + top
 
 
 def expectation_maximisation(
@@ -179,10 +169,6 @@ def expectation_maximisation(
         max_iter: most iterations.
     """
     share = None if sample_weights is None else sample_weights / sample_weights.sum(axis=1, keepdims=True)
-
-    def mean(by_sample: Array) -> Array:
-        return np.asarray(by_sample.mean(axis=1) if share is None else (by_sample * share).sum(axis=1))
-
     last = np.full(len(responsibilities), -np.inf)
     n_iter = 0
     while True:
@@ -190,10 +176,9 @@ def expectation_maximisation(
         if sample_weights is not None:
             responsibilities = responsibilities * sample_weights[:, None]
         weights, moments, theta = _maximise(features, responsibilities, floor)
-        log_density = log_densities(theta, features)
-        responsibilities, by_sample = _normalise_quickly(log_density)
-        likelihood = mean(by_sample)
+        responsibilities, by_sample = normalise(log_densities(theta, features))
+        likelihood = by_sample.mean(axis=1) if share is None else (by_sample * share).sum(axis=1)
         converged = np.abs(likelihood - last) < tol
         if converged.all() or n_iter >= max_iter:
-            return Fit(weights, moments, theta, mean(normalise(log_density)[1]), converged, n_iter)
+            return Fit(weights, moments, theta, likelihood, converged, n_iter)
         last = likelihood

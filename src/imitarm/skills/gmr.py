@@ -18,6 +18,7 @@ from imitarm.trajectory import Demonstration, Trajectory
 Array = NDArray[np.float64]
 
 _SAME_DURATION = 0.01  # demonstrations whose durations differ by a larger share were not aligned
+_CLOCK_DIGITS = 6  # microseconds: epoch stamps have no finer ones, so that they give the same skill as others
 _AXES = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
 
 
@@ -362,7 +363,7 @@ def _tables(
             UnalignedWarning,
             stacklevel=3,
         )
-    times = [(k.times - k.times[0]) * (duration / k.duration) for k in trajectories]
+    times = [np.round(k.times - k.times[0], _CLOCK_DIGITS) * (duration / k.duration) for k in trajectories]
     tables = [np.column_stack([t, k.positions]) for t, k in zip(times, trajectories, strict=True)]
     if without:
         return tables, None, duration

@@ -12,16 +12,19 @@ from imitarm.skills.em import packing
 Array = NDArray[np.float64]
 
 _SLOTS = 40  # equal time slots that segments are made of, at least; four times as many as components if that is more
+_EDGE = 1e-4  # of a slot: a time that falls on an edge must not change sides by rounding (of epoch stamps, too)
 _SOFT = 1e-6  # variance added to a segment, relative to the columns', so that a straight one costs a finite amount
+_EVEN = 0.2  # cost of the squared lengths, beside about 10 that a sample costs: equal lengths where data don't care
 
 
 def responsibilities_by_segments(features: Array, column: Array, numbers: Sequence[int]) -> list[Array]:
     """Cut time into the K segments that Gaussians describe best, for several K at once.
 
     The span of ``column`` is divided into slots of equal length. A segment with n of the N samples and covariance Sigma
-    costs ``n (log det Sigma / 2 - log(n / N))``, what a Gaussian of its own would leave over in
-    log-likelihood; dynamic programming over the slots finds the cheapest cut into K segments for every K up to the
-    largest. It is deterministic, and expectation maximisation needs fewer iterations from there than from equal bins.
+    costs ``n (log det Sigma / 2 - log(n / N))``, what a Gaussian of its own would leave over in log-likelihood, and a
+    little for its squared length, so that lengths are equal where the data don't care. Dynamic programming over the
+    slots finds the cheapest cut into K segments for every K up to the largest. It is deterministic, and expectation
+    maximisation needs fewer iterations from there than from equal bins.
 
     Args:
         features: of the standardised samples, shape (F, n).
@@ -35,12 +38,14 @@ def responsibilities_by_segments(features: Array, column: Array, numbers: Sequen
     most = max(numbers)
     n_slots = max(_SLOTS, 4 * most)
     low, high = column.min(), column.max()
-    slot = np.minimum(((column - low) * (n_slots / max(high - low, 1e-300))).astype(np.intp), n_slots - 1)
+    slots = (column - low) * (n_slots / max(high - low, 1e-300)) + _EDGE
+    slot = np.minimum(slots.astype(np.intp), n_slots - 1)
     sums = np.asarray(slot == np.arange(n_slots)[:, None], dtype=float) @ features.T
     cumulative = np.concatenate([np.zeros((1, len(features))), np.cumsum(sums, axis=0)])
     first, last = np.triu_indices(n_slots + 1, 1)
     cost = np.full((n_slots + 1, n_slots + 1), np.inf)
-    cost[first, last] = _segment_costs(cumulative[last] - cumulative[first], len(column))
+    evenly = _EVEN * len(column) * ((last - first) / n_slots) ** 2
+    cost[first, last] = _segment_costs(cumulative[last] - cumulative[first], len(column)) + evenly
     cheapest = cost[0]
     came_from: list[NDArray[np.intp]] = []
     answers: dict[int, Array | None] = {}
@@ -81,7 +86,7 @@ def responsibilities_by_bins(column: Array, n_bins: int) -> Array:
     Bins of equal width; of equal number when one of those would hold fewer than two samples.
     """
     low, high = column.min(), column.max()
-    labels = np.minimum(((column - low) * (n_bins / max(high - low, 1e-300))).astype(np.intp), n_bins - 1)
+    labels = np.minimum(((column - low) * (n_bins / max(high - low, 1e-300)) + _EDGE).astype(np.intp), n_bins - 1)
     if np.bincount(labels, minlength=n_bins).min() < 2:
         order = np.argsort(column, kind="stable")
         labels = np.empty(len(column), dtype=np.intp)
