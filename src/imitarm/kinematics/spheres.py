@@ -60,7 +60,9 @@ class SphereCover:
         # Column j is a_j x (c - o_j). All the cross products with c at once: c times the stacked matrices [a_j]x^T.
         zero = np.zeros_like(x)
         crosses = np.stack((zero, z, -y, -z, zero, x, y, -x, zero)).reshape(3, -1)
-        columns = (self.centers(data) @ crosses).reshape(-1, *axes.shape) - np.cross(axes, anchors, axis=0)
+        u, v, w = anchors
+        offsets = np.stack((y * w - z * v, z * u - x * w, x * v - y * u))
+        columns = (self.centers(data) @ crosses).reshape(-1, *axes.shape) - offsets
         if self._slides.any():
             columns[:, :, self._slides] = axes[:, self._slides]
         return np.asarray(columns * self._moves)
