@@ -87,7 +87,7 @@ def mjcf(custom="", inside="", outside=""):
 
 
 def test_every_packaged_file_is_named_and_every_name_has_its_file():
-    assert {*ARMS.values(), *TOOLS.values()} == {f.name for f in MODELS.iterdir() if f.name.endswith(".xml")}
+    assert {*ARMS.values(), *TOOLS.values()} == {file.name for file in MODELS.iterdir()}
 
 
 def test_a_urdf_keeps_its_limits_and_its_fixed_flange(write):
