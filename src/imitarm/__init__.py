@@ -9,19 +9,121 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from imitarm.errors import ImitarmError
+    from imitarm.demonstrations import Finding, align, lint, read
+    from imitarm.errors import ImitarmError, InfeasibleError, InputError, TaskFailedError, UnreachableError
+    from imitarm.kinematics.arm import ArmModel, ArmState
+    from imitarm.kinematics.ik import find_posture, solve_ik
     from imitarm.kinematics.pose import Pose
+    from imitarm.policies import ACFRA, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Adaptation, Observation, Policy, adapt
+    from imitarm.reproduce import reproduce
+    from imitarm.robots import Robot, SimulatedRobot
+    from imitarm.scene import (
+        Box,
+        Capsule,
+        Cone,
+        ConvexHull,
+        Cylinder,
+        Ellipsoid,
+        Obstacle,
+        Scene,
+        Sphere,
+        load_scene,
+        save_scene,
+    )
+    from imitarm.skills import DMP, GMR, GaussianMixture, Skill
     from imitarm.trajectory import Demonstration, Rollout, Trajectory
 
 __version__ = "0.1.0"
-__all__ = ["Demonstration", "ImitarmError", "Pose", "Rollout", "Trajectory"]
+__all__ = [
+    "ACFRA",
+    "DMP",
+    "GMR",
+    "HORIZONTAL_ONLY",
+    "NOT_DOWN",
+    "POLICIES",
+    "Adaptation",
+    "ArmModel",
+    "ArmState",
+    "Box",
+    "Capsule",
+    "Cone",
+    "ConvexHull",
+    "Cylinder",
+    "Demonstration",
+    "Ellipsoid",
+    "Finding",
+    "GaussianMixture",
+    "ImitarmError",
+    "InfeasibleError",
+    "InputError",
+    "Observation",
+    "Obstacle",
+    "Policy",
+    "Pose",
+    "Robot",
+    "Rollout",
+    "Scene",
+    "SimulatedRobot",
+    "Skill",
+    "Sphere",
+    "TaskFailedError",
+    "Trajectory",
+    "UnreachableError",
+    "adapt",
+    "align",
+    "find_posture",
+    "lint",
+    "load_scene",
+    "read",
+    "reproduce",
+    "save_scene",
+    "solve_ik",
+]
 
 _HOME = {
+    "ACFRA": "imitarm.policies",
+    "Adaptation": "imitarm.policies",
+    "ArmModel": "imitarm.kinematics.arm",
+    "ArmState": "imitarm.kinematics.arm",
+    "Box": "imitarm.scene",
+    "Capsule": "imitarm.scene",
+    "Cone": "imitarm.scene",
+    "ConvexHull": "imitarm.scene",
+    "Cylinder": "imitarm.scene",
+    "DMP": "imitarm.skills",
     "Demonstration": "imitarm.trajectory",
+    "Ellipsoid": "imitarm.scene",
+    "Finding": "imitarm.demonstrations",
+    "GMR": "imitarm.skills",
+    "GaussianMixture": "imitarm.skills",
+    "HORIZONTAL_ONLY": "imitarm.policies",
     "ImitarmError": "imitarm.errors",
+    "InfeasibleError": "imitarm.errors",
+    "InputError": "imitarm.errors",
+    "NOT_DOWN": "imitarm.policies",
+    "Observation": "imitarm.policies",
+    "Obstacle": "imitarm.scene",
+    "POLICIES": "imitarm.policies",
+    "Policy": "imitarm.policies",
     "Pose": "imitarm.kinematics.pose",
+    "Robot": "imitarm.robots",
     "Rollout": "imitarm.trajectory",
+    "Scene": "imitarm.scene",
+    "SimulatedRobot": "imitarm.robots",
+    "Skill": "imitarm.skills",
+    "Sphere": "imitarm.scene",
+    "TaskFailedError": "imitarm.errors",
     "Trajectory": "imitarm.trajectory",
+    "UnreachableError": "imitarm.errors",
+    "adapt": "imitarm.policies",
+    "align": "imitarm.demonstrations",
+    "find_posture": "imitarm.kinematics.ik",
+    "lint": "imitarm.demonstrations",
+    "load_scene": "imitarm.scene",
+    "read": "imitarm.demonstrations",
+    "reproduce": "imitarm.reproduce",
+    "save_scene": "imitarm.scene",
+    "solve_ik": "imitarm.kinematics.ik",
 }
 
 

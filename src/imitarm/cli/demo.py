@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from importlib.resources import files
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from imitarm.demonstrations import compute_alignment, lint
 from imitarm.errors import InputError
 from imitarm.policies import ACFRA, HORIZONTAL_ONLY, METHODS
 from imitarm.skills import Skill
-from imitarm.tasks.sweep import SweepTask
+from imitarm.tasks.sweep import DEMONSTRATIONS, SCENES, SweepTask
 from imitarm.trajectory import Demonstration
 from imitarm.viewer import Report, SceneResult, as_data, write_report
 
@@ -34,9 +34,9 @@ Exit status 1 when a scene fails or something is touched.
 
 _SUMMARY = (
     "A Sawyer learns to sweep crumbs into a dustpan from eight demonstrations, then does it on tables where things "
-    "stand in the way that were not there before. Only the parts of the learnt path near an obstacle move, by the least that "
-    "keeps the asked clearance. The demonstrations were made by a synthetic teacher who hand-guides the simulated arm; "
-    "clearance, torques and crumbs are measured by the simulator, not by the planner."
+    "stand in the way that were not there before. Only the parts of the learnt path near an obstacle move, by the "
+    "least that keeps the asked clearance. The demonstrations were made by a synthetic teacher who hand-guides the "
+    "simulated arm; clearance, torques and crumbs are measured by the simulator, not by the planner."
 )
 
 
@@ -55,9 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
     except OSError as error:
         raise InputError(f"--out {folder}: can't be made ({error.strerror}); name another folder") from error
     task = SweepTask(seed=arguments.seed)
-    names = task.scene_names()
     with progress_bar() as progress:
-        whole = progress.add_task("learning", total=len(names) + 2.0)
+        whole = progress.add_task("learning", total=len(SCENES) + 2.0)
         arm = task.arm()
         shown = packaged_demonstrations()
         findings = lint(shown, arm=arm)
@@ -66,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         skill.save(folder / "skill.json")
         progress.advance(whole)
         results = [
-            _sweep(task, name, skill, alignment.demonstrations, arguments.method, progress, whole) for name in names
+            _sweep(task, name, skill, alignment.demonstrations, arguments.method, progress, whole) for name in SCENES
         ]
         progress.update(whole, description="writing the report")
         report = Report(
@@ -86,9 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def packaged_demonstrations() -> list[Demonstration]:
     """Return the demonstrations of the sweep that come with the package."""
-    folder = files("imitarm.tasks") / "data" / "sweep"
-    names = sorted(path.name for path in folder.iterdir() if path.name.endswith(".csv"))
-    return [Demonstration.load(str(folder / name)) for name in names]
+    paths = sorted(DEMONSTRATIONS.glob("*.csv"))
+    return [replace(Demonstration.load(path), source=path.name) for path in paths]  # a skill file names no folders
 
 
 def _sweep(
@@ -108,10 +106,10 @@ def _sweep(
     policy = ACFRA(
         skill,
         method=method,
-        tool_radius=robot.arm.tool_radius,
+        tool_radius=task.tool_radius,
         clearance=task.clearance,
         forbidden=HORIZONTAL_ONLY,  # the bristles stay on the table
-        pinned=[_moment_at(skill, task.dirt.position)],
+        pinned=[task.dirt_time(skill.gmr_.trajectory(1000))],
     )
     result = try_scene(
         name,
@@ -119,19 +117,13 @@ def _sweep(
         robot,
         policy,
         clearance=task.clearance,
-        tool_radius=robot.arm.tool_radius,
+        tool_radius=task.tool_radius,
         demonstrations=demonstrations,
         judge=task.judge,
         progress=lambda share: progress.update(whole, completed=before + share),
     )
     progress.update(whole, completed=before + 1.0)
     return result
-
-
-def _moment_at(skill: Skill, position: np.ndarray) -> float:
-    """Return when the learnt path comes nearest to ``position`` (3,): that instant must not move [s]."""
-    path = skill.gmr_.trajectory(1000)
-    return float(path.times[np.argmin(np.linalg.norm(path.positions - position, axis=1))])
 
 
 def show_results(report: Report) -> None:
