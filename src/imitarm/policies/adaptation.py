@@ -54,7 +54,7 @@ class Adaptation:
     nominal: Trajectory
     trajectory: Trajectory
     displacement: Array
-    moved: Array
+    moved: NDArray[np.bool_]
     means: Array
     covariances: Array
     responsibilities: Array
