@@ -38,9 +38,11 @@ def test_torques_show_each_joint_with_its_share_of_the_rated_torque() -> None:
 
 
 def test_displacement_says_which_components_stayed() -> None:
-    svg = charts.displacement([0.0, 0.031, 0.0], [False, True, False])
-    assert text_of(svg).count("unmoved") == 2 and "31" in text_of(svg)
-    assert palette.MOVED in svg
+    svg = charts.displacement([0.0, 0.031, 0.0002, 0.0], [False, True, True, False])
+    assert "31" in text_of(svg) and "<1" in text_of(svg) and "2 of 4 components" in svg
+    markers = [use for use in ElementTree.fromstring(svg).iter("use") if palette.UNMOVED in (use.get("style") or "")]
+    assert len(markers) == 2 + 1  # and one in the legend
+    assert svg.count(f"fill: {palette.MOVED}") == 2 + 1
 
 
 def test_selection_marks_the_chosen_number_and_bears_missing_values() -> None:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from imitarm.scene import Scene, Sphere
-from imitarm.trajectory import Trajectory
+from imitarm.trajectory import Demonstration, Trajectory
 from imitarm.viewer import palette, plots
-from imitarm.viewer.plots import View
+from imitarm.viewer.views import Grid, View
 from viewer_samples import make_adaptation, make_learning, make_path, make_scene
 
 
@@ -51,7 +51,8 @@ def test_adaptation_shows_obstacles_paths_and_what_moved() -> None:
         a.nominal,
         a.trajectory,
         scene=make_scene(),
-        keep_away=0.05,
+        clearance=0.05,
+        tool_spheres=[[0.0, 0.0, 0.0, 0.02]],
         tolerance=a.tolerance,
         means=a.means,
         covariances=a.covariances,
@@ -86,20 +87,29 @@ def test_a_path_in_space_shows_the_obstacles_shadow_where_the_path_is() -> None:
     u = np.linspace(0.0, 1.0, 50)
     path = Trajectory(u, np.stack([0.3 + 0.5 * u, 0.0 * u, 0.2 + 0.5 * u], axis=1))
     ball = Scene(None, (Sphere((0.55, 0.02, 0.45), 0.06, name="ball"),))
-    svg = plots.adaptation(path, path, scene=ball, keep_away=0.03)
+    svg = plots.adaptation(path, path, scene=ball, clearance=0.03)
     assert "seen from the side" in text_of(svg) and "ball" in text_of(svg)
     far = Scene(None, (Sphere((0.55, 0.9, 0.45), 0.06, name="ball"),))
-    assert "ball" not in text_of(plots.adaptation(path, path, scene=far, keep_away=0.03))
+    assert "ball" not in text_of(plots.adaptation(path, path, scene=far, clearance=0.03))
 
 
 def test_the_footprint_is_the_cut_at_the_paths_height() -> None:
     ball = Scene(None, (Sphere((0.0, 0.0, 0.05), 0.05),))
-    corners = np.array([[-0.1, -0.1], [0.1, 0.1]])
-    first, second, distance = plots._footprint(ball, 0, View(0, 1), corners, np.array([0.08]))
+    grid = Grid(View(0, 1), np.linspace(-0.1, 0.1, 161), np.linspace(-0.08, 0.08, 129))
+    distance = grid.distance(ball, 0, np.array([0.08]))
     inside = distance < 0.0
-    radius = np.hypot(first[None, :], second[:, None])
+    radius = np.hypot(grid.across[None, :], grid.up[:, None])
     assert radius[inside].max() == pytest.approx(0.04, abs=0.002)
     assert radius[~inside].min() == pytest.approx(0.04, abs=0.002)
+
+
+def test_the_tools_spheres_turn_with_the_tool() -> None:
+    half = np.sqrt(0.5)
+    turned = np.array([[1.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half]])  # a quarter turn about z
+    path = Trajectory([0.0, 1.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], turned)
+    centres, radii = plots._tool_along(path, [[0.1, 0.0, 0.0, 0.03]])
+    np.testing.assert_allclose(centres[:, 0], [[0.1, 0.0, 0.0], [1.0, 0.1, 0.0]], atol=1e-12)
+    np.testing.assert_array_equal(radii, [0.03])
 
 
 def test_the_band_is_two_sigma_wide_across_the_path() -> None:
@@ -107,6 +117,13 @@ def test_the_band_is_two_sigma_wide_across_the_path() -> None:
     band = plots._band(path, np.repeat(np.diag([9e-4, 4e-4, 1.0])[None], 20, axis=0), View(0, 1))
     np.testing.assert_allclose(np.abs(band[:, 1]), 0.04)
     np.testing.assert_allclose(band[:20, 0], path[:, 0])
+
+
+def test_a_flat_map_is_stretched_and_says_so_only_where_distances_do_not_matter() -> None:
+    flat = Trajectory([0.0, 1.0, 2.0], [[0.0, 0.0, 0.0], [0.5, 0.01, 0.0], [1.0, 0.0, 0.0]])
+    shown = plots.demonstrations([Demonstration(flat)], np.zeros((1, 3)), 1e-4 * np.eye(3)[None])
+    assert re.search(r"seen from above; y is stretched \d\.\d times", text_of(shown))
+    assert "stretched" not in text_of(plots.adaptation(flat, flat))
 
 
 def test_an_obstacles_hostile_name_stays_text() -> None:

@@ -154,7 +154,7 @@ def make_result(name: str = "two obstacles", *, recording: Recording | None = No
         "rollout": make_rollout(adaptation.trajectory),
         "adaptation": adaptation,
         "rmse": 0.0312,
-        "tool_radius": 0.03,
+        "tool_spheres": np.array([[0.0, 0.0, 0.0, 0.03], [0.02, 0.0, 0.05, 0.02]]),
         "recording": recording,
         "torque_limits": np.array([80.0, 80.0, 40.0, 40.0, 9.0, 9.0, 9.0]),
         "details": {"Crumbs in the pan": "6 of 6"},

@@ -81,7 +81,8 @@ def _alignment(alignment: Alignment) -> str:
     columns = (alignment.kept_rows, alignment.durations, alignment.largest_shift)
     for i, (kept, took, shift) in enumerate(zip(*columns, strict=True)):
         cells = f"<td>{int(kept[0])} to {int(kept[1])}</td><td>{took:.2f}</td><td>{shift:.2f}</td>"
-        rows.append(f'<tr><th scope="row">{i + 1}</th>{cells}</tr>')
+        title = f' title="{escape(alignment.demonstrations[i].source, quote=True)}"'
+        rows.append(f'<tr><th scope="row"{title}>{i + 1}</th>{cells}</tr>')
     head = "".join(f'<th scope="col">{escape(text)}</th>' for text in heads)
     return (
         f'<div class="card"><h3>Brought to one time</h3><div class="scroll"><table class="small">'

@@ -107,6 +107,7 @@ def _inline(svg: str, name: str, description: str) -> str:
     svg = re.sub(
         r'<svg [^>]*?viewBox="([^"]*)"[^>]*>', r'<svg class="figure" viewBox="\1" role="img"__LABEL__>', svg, count=1
     )
+    svg = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", svg, count=1, flags=re.DOTALL)  # it is for the whole page
     svg = svg.replace("xlink:href", "href").replace(INK, "currentColor")
     svg = re.sub(r"font: ([^;\"]*?)'DejaVu Sans'(, sans-serif)?", r"font: \1system-ui, 'DejaVu Sans', sans-serif", svg)
     svg = re.sub(r' d="[^"]*"', lambda path: _LONG.sub(r"\1", path[0]), svg)

@@ -43,7 +43,11 @@ def clearance(times: ArrayLike, distances: ArrayLike, asked: float, *, name: str
         axes.axhline(0.0, color=INK, lw=1.0)
         axes.plot(t[least], d[least], "o", color=palette.LIMIT if d[least] < MM * asked else palette.ADAPTED, ms=5)
         right = t[least] > 0.6 * t[-1]
-        place = {"xytext": (-6 if right else 6, 9), "textcoords": "offset points", "ha": "right" if right else "left"}
+        place = {
+            "xytext": (-6 if right else 6, -14 if d[least] > 2.0 * MM * asked else 9),
+            "textcoords": "offset points",
+        }
+        place["ha"] = "right" if right else "left"
         axes.annotate(f"smallest: {d[least]:.1f} mm", (t[least], d[least]), **place)
         top = max(4.0 * MM * asked, 2.0 * d[least], 60.0)
         axes.set_ylim(min(0.0, 1.15 * d[least]), min(1.08 * d.max(), 2.0 * top) if d.max() > 0.0 else top)
@@ -142,13 +146,23 @@ def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacem
     """
     far, went = MM * np.asarray(lengths, dtype=float), np.asarray(moved, dtype=bool)
     text = f"{int(went.sum())} of {len(far)} components were moved, by at most {far.max(initial=0.0):.0f} mm"
-    with canvas(name, text, (5.5, 1.8)) as drawing:
+    with canvas(name, text, (5.5, 1.9)) as drawing:
         axes = drawing.axes(0.64, 0.48, 5.4, 1.7)
         numbers = np.arange(1, len(far) + 1)
-        axes.bar(numbers, far, width=0.62, color=[palette.MOVED if m else palette.UNMOVED for m in went])
-        for number, length, was_moved in zip(numbers, far, went, strict=True):
-            label = f"{length:.0f}" if was_moved else "unmoved"
+        axes.bar(numbers[went], far[went], width=0.62, color=palette.MOVED, label="moved")
+        axes.plot(
+            numbers[~went],
+            np.zeros(int((~went).sum())),
+            "o",
+            color=palette.UNMOVED,
+            ms=5,
+            label="unmoved",
+            clip_on=False,
+        )
+        for number, length in zip(numbers[went], far[went], strict=True):
+            label = f"{length:.0f}" if length >= 0.5 else "<1"
             axes.annotate(label, (number, length), xytext=(0, 2), textcoords="offset points", ha="center", fontsize=7.5)
+        drawing.figure.legend(loc="upper right", ncols=2, borderaxespad=0.0)
         axes.set_ylim(0.0, max(1.22 * far.max(initial=0.0), 5.0))
         axes.set_xticks(numbers)
         axes.grid(axis="x", visible=False)
@@ -183,11 +197,12 @@ def selection(
     with canvas(
         name, f"{chosen} Gaussian components were chosen out of {k.min():.0f} to {k.max():.0f}", (5.5, 2.4)
     ) as drawing:
-        left, right = drawing.axes(0.74, 0.48, 2.65, 2.3), drawing.axes(3.45, 0.48, 5.4, 2.3)
+        left, right = drawing.axes(0.88, 0.48, 2.75, 2.3), drawing.axes(3.45, 0.48, 5.4, 2.3)
         for values, label, colour, style in ((bic, "BIC", palette.ADAPTED, "o-"), (aic, "AIC", palette.UNMOVED, "s--")):
             if len(np.asarray(values)):
                 left.plot(k, np.asarray(values, dtype=float), style, color=colour, ms=3.5, lw=1.4, label=label)
         left.set_ylabel("information criterion [-]")
+        left.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
         left.legend()
         if len(np.asarray(held_out_error)):
             right.plot(k, MM * np.asarray(held_out_error, dtype=float), "o-", color=palette.MOVED, ms=3.5, lw=1.4)
@@ -196,11 +211,7 @@ def selection(
             axes.axvline(chosen, color=INK, lw=0.9, ls=":")
             axes.set_xlabel("number of components K")
             axes.xaxis.get_major_locator().set_params(integer=True)
-        right.annotate(
-            f"K = {chosen}",
-            (chosen, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(4, -9),
-            textcoords="offset points",
-        )
+        late = chosen > 0.5 * (k.min() + k.max())
+        side = {"xytext": (-4 if late else 4, -9), "textcoords": "offset points", "ha": "right" if late else "left"}
+        right.annotate(f"K = {chosen}", (chosen, 1.0), xycoords=("data", "axes fraction"), **side)
     return drawing.svg

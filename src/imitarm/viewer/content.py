@@ -84,7 +84,8 @@ class SceneResult:
         adaptation: the planned path; None when nothing was adapted.
         rmse: root mean square distance of the measured path to the demonstrations [m]; nan when not known.
         reason: why it ended as it did, in words.
-        tool_radius: radius of the sphere that holds the tool [m].
+        tool_radius: radius of the sphere that held the tool in the plan [m].
+        tool_spheres: instead of one radius, rows of x, y, z, radius in the tool's frame, shape (m, 4) [m].
         recording: for the 3-D playback.
         torque_limits: rated torques, shape (n_joints,) [N m].
         joint_names: names for the charts of the torques.
@@ -105,6 +106,7 @@ class SceneResult:
     rmse: float = math.nan
     reason: str = ""
     tool_radius: float = 0.0
+    tool_spheres: Array | None = None
     recording: Recording | None = None
     torque_limits: Array | None = None
     joint_names: tuple[str, ...] = ()
@@ -114,6 +116,13 @@ class SceneResult:
     def __post_init__(self) -> None:
         if not self.name.strip():
             raise InputError(f"SceneResult {self.title!r}: needs a name that is not empty")
+
+    @property
+    def tool(self) -> Array:
+        """Spheres that held the tool in the plan: rows of x, y, z, radius in the tool's frame, shape (m, 4) [m]."""
+        if self.tool_spheres is None:
+            return np.array([[0.0, 0.0, 0.0, self.tool_radius]])
+        return np.asarray(self.tool_spheres, dtype=float).reshape(-1, 4)
 
     @property
     def min_clearance(self) -> float:

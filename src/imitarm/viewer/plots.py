@@ -6,86 +6,22 @@ Every function returns one ``<svg>`` element. Figures over time and over compone
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from imitarm.kinematics.pose import rotate
 from imitarm.scene import Scene
 from imitarm.trajectory import Demonstration, Trajectory
 from imitarm.viewer import palette
-from imitarm.viewer.canvas import POINTS, Canvas, canvas, thin
+from imitarm.viewer.canvas import POINTS, thin
+from imitarm.viewer.views import Grid, View, corners_of, drawn_map
 
 Array = NDArray[np.float64]
 
-_WIDTH: Final = 5.5  # [inch]
 _CHI_95: Final = 2.448  # 95 % of a plane Gaussian is within 2.448 sigma
-
-
-@dataclass(frozen=True)
-class View:
-    """The two axes of the base frame that a figure shows, and the one it looks along.
-
-    Attributes:
-        across: axis that is shown across: 0, 1, 2 for x, y, z.
-        up: axis that is shown upwards.
-    """
-
-    across: int = 0
-    up: int = 1
-
-    @property
-    def depth(self) -> int:
-        """The axis that is looked along."""
-        return 3 - self.across - self.up
-
-    @property
-    def title(self) -> str:
-        """How people call it."""
-        return {2: "seen from above", 1: "seen from the side", 0: "seen from the front"}[self.depth]
-
-    @property
-    def leftwards(self) -> bool:
-        """Whether ``across`` grows to the left: from above with x upwards, y does."""
-        return (self.across, self.up) == (1, 0)
-
-    @classmethod
-    def best(cls, positions: ArrayLike) -> View:
-        """Return the view that loses least of ``positions`` (n, 3) [m]: from above when that is nearly as good."""
-        spans = np.ptp(np.asarray(positions, dtype=float), axis=0)
-        if spans[2] <= 1.25 * spans[:2].min():
-            return cls(0, 1) if spans[0] >= spans[1] else cls(1, 0)
-        return cls(0, 2) if spans[0] >= spans[1] else cls(1, 2)
-
-    def of(self, positions: ArrayLike) -> Array:
-        """Return the two coordinates that are shown, shape (..., 2) [m]."""
-        return np.asarray(positions, dtype=float)[..., [self.across, self.up]]
-
-
-@contextmanager
-def _map(name: str, text: str, view: View, corners: Array, legend_rows: int) -> Iterator[tuple[Canvas, Any]]:
-    """Give axes of equal scale that show ``corners`` (2, 2) [m], in a figure that is as high as they need."""
-    span = np.maximum(corners[1] - corners[0], 1e-3)
-    width = _WIDTH - 0.72
-    height = float(np.clip(width * span[1] / span[0], 1.6, 4.4))
-    below = 0.48 + 0.2 * legend_rows
-    with canvas(name, text, (_WIDTH, below + height + 0.3)) as drawing:
-        axes = drawing.axes(0.64, below, 0.64 + width, below + height)
-        scale = max(span[0] / width, span[1] / height)  # [m/inch]
-        for i, (limits, inches) in enumerate(((axes.set_xlim, width), (axes.set_ylim, height))):
-            middle, half = corners[:, i].mean(), 0.5 * scale * inches
-            limits(middle - half, middle + half)
-        if view.leftwards:
-            axes.invert_xaxis()
-        axes.set_aspect("equal")
-        axes.locator_params(nbins=8)
-        axes.set_xlabel(f"{'xyz'[view.across]} of the base [m]")
-        axes.set_ylabel(f"{'xyz'[view.up]} of the base [m]")
-        yield drawing, axes
-        drawing.legend(3)
 
 
 def _ellipses(axes: Any, means: ArrayLike, covariances: ArrayLike, view: View, **style: Any) -> None:
@@ -123,8 +59,8 @@ def demonstrations(
     text = (
         f"{len(shown)} demonstrations, {len(np.asarray(means))} Gaussian components and the learnt path, {view.title}"
     )
-    corners = _corners(view.of(np.concatenate([d.trajectory.positions for d in shown])), 0.06)
-    with _map(name, text, view, corners, legend_rows=1) as (drawing, axes):
+    corners = corners_of(view.of(np.concatenate([d.trajectory.positions for d in shown])), 0.06)
+    with drawn_map(name, text, view, corners, legend_rows=1, stretched=True) as (axes, drawing):
         for i, demonstration in enumerate(shown):
             path = view.of(demonstration.trajectory.positions)[thin(len(demonstration))]
             axes.plot(
@@ -135,45 +71,57 @@ def demonstrations(
         axes.plot(*view.of(means).T, ".", color=palette.UNMOVED, ms=5, label="Gaussian component, 95 %", zorder=3)
         if predicted is not None:
             path = view.of(predicted.positions)[thin(len(predicted))]
-            axes.plot(*path.T, color=palette.ADAPTED, lw=2.0, label="learnt path", zorder=4)
-        axes.set_title(view.title, loc="left")
+            axes.plot(*path.T, color=palette.ADAPTED, lw=1.6, label="learnt path", zorder=4)
     return drawing.svg
 
 
-def _footprint(scene: Scene, obstacle: int, view: View, corners: Array, depths: Array) -> tuple[Array, Array, Array]:
-    """Return a grid (two axes) and how far an obstacle is from it, the nearest over ``depths``.
-
-    For a path at one height it is the cut at that height, for a path in space the obstacle's shadow where the path is.
-    """
-    step = float(np.ptp(corners, axis=0).max()) / 150.0
-    first, second = (np.arange(corners[0, i], corners[1, i] + step, step) for i in range(2))
-    points = np.empty((len(depths), len(second), len(first), 3))
-    points[..., view.across] = first
-    points[..., view.up] = second[:, None]
-    points[..., view.depth] = depths[:, None, None]
-    return first, second, scene.obstacles[obstacle].signed_distance(points).min(axis=0)
+def _tool_along(path: Trajectory, spheres: ArrayLike | None) -> tuple[Array, Array]:
+    """Return where the tool's spheres are at some instants of a path, (n, m, 3) [m], and their radii (m,) [m]."""
+    rows = np.zeros((1, 4)) if spheres is None else np.asarray(spheres, dtype=float).reshape(-1, 4)
+    some = thin(len(path), 80)
+    centres = np.broadcast_to(rows[:, :3], (len(some), len(rows), 3))
+    if path.quaternions is not None:
+        centres = rotate(path.quaternions[some][:, None], centres)
+    return centres + path.positions[some][:, None], rows[:, 3]
 
 
-def _corners(points: Array, margin: float) -> Array:
-    """Return the lower and the upper corner (2, 2) of what holds all ``points``, with a margin [m]."""
-    return np.array([points.min(axis=0) - margin, points.max(axis=0) + margin])
+def _draw_swept(axes: Any, grid: Grid, centres: Array, radii: Array) -> None:
+    """Fill the area that spheres with ``centres`` (n, m, 2) sweep over, as one area with one outline."""
+    distance = np.full((len(grid.up), len(grid.across)), np.inf)
+    for instant in centres:
+        for (across, up), radius in zip(instant, radii, strict=True):
+            np.minimum(distance, np.hypot(grid.across - across, (grid.up - up)[:, None]) - radius, out=distance)
+    axes.contourf(grid.across, grid.up, distance, levels=[-1e3, 0.0], colors=[palette.ADAPTED], alpha=0.07, zorder=0.5)
+    look = {"colors": [palette.ADAPTED], "linewidths": 0.7, "linestyles": "dotted", "zorder": 3}
+    axes.contour(grid.across, grid.up, distance, levels=[0.0], **look)
+    axes.plot([], [], ":", color=palette.ADAPTED, lw=0.9, label="swept by the tool")
 
 
-def _draw_obstacles(axes: Any, scene: Scene, view: View, depth: Array, keep_away: float) -> None:
-    """Fill the obstacles and dash the line that the tool's middle must stay outside of."""
-    corners = np.sort(np.array([axes.get_xlim(), axes.get_ylim()]), axis=1).T
+def _draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance: float, path: Array) -> None:
+    """Fill the obstacles and dash the line that the tool must stay outside of."""
     depths = np.linspace(depth.min(), depth.max(), 9) if np.ptp(depth) > 2e-3 else np.array([depth.mean()])
     for i, obstacle in enumerate(scene.obstacles):
-        first, second, distance = _footprint(scene, i, view, corners, depths)
+        distance = grid.distance(scene, i, depths)
         if distance.min() < 0.0:
-            axes.contourf(first, second, distance, levels=[-1e3, 0.0], colors=[palette.OBSTACLE], alpha=0.8, zorder=2)
-            row, column = np.unravel_index(np.argmin(distance), distance.shape)
+            look = {"levels": [-1e3, 0.0], "colors": [palette.OBSTACLE], "alpha": 0.85, "zorder": 2}
+            axes.contourf(grid.across, grid.up, distance, **look)
             if obstacle.name:
-                place, look = (first[column], second[row]), {"color": "white", "fontsize": 7.5, "zorder": 2.5}
-                axes.annotate(obstacle.name.replace("$", r"\$"), place, ha="center", va="center", **look)
-        if distance.min() < keep_away:
-            look = {"colors": [palette.LIMIT], "linewidths": 0.9, "linestyles": "dashed", "zorder": 2}
-            axes.contour(first, second, distance, levels=[keep_away], **look)
+                _name(axes, grid, distance, obstacle.name, path)
+        if distance.min() < clearance:
+            look = {"levels": [clearance], "colors": [palette.LIMIT], "linewidths": 0.9, "linestyles": "dashed"}
+            axes.contour(grid.across, grid.up, distance, zorder=2, **look)
+    axes.plot([], [], "--", color=palette.LIMIT, lw=0.9, label="asked distance")
+
+
+def _name(axes: Any, grid: Grid, distance: Array, name: str, path: Array) -> None:
+    """Write an obstacle's name beside it, on the side where the path (n, 2) [m] is not."""
+    rows, columns = np.nonzero(distance < 0.0)
+    across = float(grid.across[columns].mean())
+    beside = path[np.argmin(np.abs(path[:, 0] - across)), 1]
+    below = float(grid.up[rows].mean()) < beside
+    place = (across, float(grid.up[rows].min() if below else grid.up[rows].max()))
+    look = {"textcoords": "offset points", "ha": "center", "va": "top" if below else "bottom", "fontsize": 7.5}
+    axes.annotate(name.replace("$", r"\$"), place, xytext=(0, -2 if below else 2), zorder=6, **look)
 
 
 def _band(path: Array, covariances: Array, view: View) -> Array:
@@ -193,7 +141,8 @@ def adaptation(
     adapted: Trajectory,
     *,
     scene: Scene | None = None,
-    keep_away: float = 0.02,
+    clearance: float = 0.02,
+    tool_spheres: ArrayLike | None = None,
     tolerance: ArrayLike | None = None,
     means: ArrayLike | None = None,
     covariances: ArrayLike | None = None,
@@ -208,7 +157,8 @@ def adaptation(
         nominal: the learnt path.
         adapted: the path around the obstacles.
         scene: the obstacles, in the base frame.
-        keep_away: asked clearance plus the tool's radius [m]: the path of the tool's middle stays this far away.
+        clearance: asked distance of the tool to every obstacle [m].
+        tool_spheres: that hold the tool, rows of x, y, z, radius in the tool's frame, shape (m, 4) [m].
         tolerance: spread of the demonstrations along the path, shape (n_steps, 3, 3) [m^2].
         means: of the components before they were moved, shape (n_components, 3) [m].
         covariances: of the components, shape (n_components, 3, 3) [m^2].
@@ -222,19 +172,21 @@ def adaptation(
     """
     everything = np.concatenate([nominal.positions, adapted.positions])
     view = View.best(everything)
-    obstacles = len(scene.obstacles) if scene is not None else 0
-    text = f"The learnt and the adapted path around {obstacles} obstacles, {view.title}"
-    corners = _corners(view.of(everything), 0.06)
-    if scene is not None:
-        for obstacle in scene.obstacles:
-            bounds = np.clip(
-                view.of(obstacle.bounds()), corners[0] - 0.15, corners[1] + 0.15
-            )  # [m] far is of no interest
-            corners = _corners(np.concatenate([corners, _corners(bounds, keep_away + 0.01)]), 0.0)
-    with _map(name, text, view, corners, legend_rows=3) as (drawing, axes):
-        if scene is not None:
-            _draw_obstacles(axes, scene, view, everything[:, view.depth], keep_away)
-            axes.plot([], [], "--", color=palette.LIMIT, lw=0.9, label="asked distance") if obstacles else None
+    tool, radii = _tool_along(adapted, tool_spheres)
+    obstacles = scene.obstacles if scene is not None else ()
+    text = f"The learnt and the adapted path around {len(obstacles)} obstacles, {view.title}"
+    shown = view.of(tool)
+    swept = np.concatenate([shown - radii[:, None], shown + radii[:, None]]).reshape(-1, 2)
+    corners = corners_of(np.concatenate([view.of(everything), swept]), 0.04)
+    for obstacle in obstacles:
+        bounds = np.clip(view.of(obstacle.bounds()), corners[0] - 0.15, corners[1] + 0.15)  # [m] far is of no interest
+        corners = corners_of(np.concatenate([corners, corners_of(bounds, clearance + 0.01)]), 0.0)
+    with drawn_map(name, text, view, corners, legend_rows=3, note="; ● start, ■ end") as (axes, drawing):
+        grid = Grid.of(axes, view)
+        if radii.max() > 0.0:
+            _draw_swept(axes, grid, shown, radii)
+        if scene is not None and obstacles:
+            _draw_obstacles(axes, scene, grid, tool[..., view.depth], clearance, view.of(nominal.positions))
         if means is not None and covariances is not None:
             _draw_components(axes, view, means, covariances, displacement, moved)
         if tolerance is not None:
@@ -251,7 +203,6 @@ def adaptation(
                 axes.plot(*view.of(path.positions)[thin(len(path))].T, label=label, zorder=4, **look)
         axes.plot(*view.of(adapted.positions[0]), "o", color=palette.ADAPTED, ms=6, zorder=5)
         axes.plot(*view.of(adapted.positions[-1]), "s", color=palette.ADAPTED, ms=6, zorder=5)
-        axes.set_title(f"{view.title}; ● start, ■ end", loc="left")
     return drawing.svg
 
 

@@ -71,7 +71,9 @@ def report_html(report: Report) -> str:
     Raises:
         InputError: when the libraries that draw are not installed.
     """
-    head, middles, tail = _shared({scene.name: _playback(scene) for scene in report.scenes if scene.recording})
+    head, middles, tail = _shared(
+        {scene.name: _playback(scene) for scene in report.scenes if scene.recording is not None}
+    )
     data = json.dumps(as_data(report), indent=2, allow_nan=False).encode()
     link = base64.b64encode(data).decode()
     download = (

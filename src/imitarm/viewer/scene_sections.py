@@ -79,7 +79,8 @@ def _scene_figures(index: int, scene: SceneResult) -> Iterable[str]:
             adaptation.nominal,
             adaptation.trajectory,
             scene=scene.scene,
-            keep_away=scene.asked_clearance + scene.tool_radius,
+            clearance=scene.asked_clearance,
+            tool_spheres=scene.tool,
             tolerance=adaptation.tolerance,
             means=adaptation.means,
             covariances=adaptation.covariances,
@@ -92,14 +93,14 @@ def _scene_figures(index: int, scene: SceneResult) -> Iterable[str]:
             yield figure(
                 svg,
                 "Around the obstacles",
-                "The path of the middle of the tool. It stays outside of the dashed lines: the asked clearance plus "
-                "the tool's radius. Arrows show where components were moved.",
+                "The path of the tool's point. What the tool sweeps over, dotted, must stay outside of the dashed "
+                "lines. Arrows show where components were moved.",
             )
             lengths = np.linalg.norm(adaptation.displacement, axis=1)
             svg = charts.displacement(lengths, adaptation.moved, name=f"{key}-moved")
             yield figure(svg, "Which components were moved", "Each bar is one piece of the motion, from start to end.")
         else:
-            yield figure(svg, "The learnt path", "The path of the middle of the tool: nothing is in the way.")
+            yield figure(svg, "The learnt path", "The path of the tool's point: nothing is in the way.")
     if rollout is not None:
         times = rollout.trajectory.times - rollout.trajectory.times[0]
         svg = charts.clearance(times, rollout.clearance, scene.asked_clearance, name=f"{key}-clearance")
@@ -128,7 +129,7 @@ def _scene_facts(scene: SceneResult) -> dict[str, Any]:
         values |= {
             "Method": a.method,
             "Certified clearance of the plan": number(MM * a.certified_clearance, 2, "mm"),
-            "Tool radius in the plan": number(MM * scene.tool_radius, 1, "mm"),
+            "Tool in the plan": _tool(scene),
             "Components moved": f"{int(np.sum(a.moved))} of {len(a.moved)}",
             "Farthest component": number(MM * farthest, 1, "mm"),
             "Adaptation time": number(MM * a.compute_time, 3, "ms"),
@@ -141,3 +142,13 @@ def _scene_facts(scene: SceneResult) -> dict[str, Any]:
             "finished" if scene.rollout.success else "not finished"
         )
     return values | dict(scene.details)
+
+
+def _tool(scene: SceneResult) -> str:
+    """Say in words how the plan saw the tool."""
+    spheres = scene.tool
+    reach = float((np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]).max())
+    if reach == 0.0:
+        return "a point"
+    many = "one sphere" if len(spheres) == 1 else f"{len(spheres)} spheres"
+    return f"{many}, at most {number(MM * reach, 0, 'mm')} from its point"

@@ -42,12 +42,14 @@ class Camera:
         right /= np.linalg.norm(right)
         up = np.cross(back, right)
         middle = 0.5 * (p.min(axis=0) + p.max(axis=0))
-        x, y, z = (p - middle) @ right, (p - middle) @ up, (p - middle) @ back
-        # seen from an angle, the middle of the picture is not the middle of the points
-        middle = middle + 0.5 * (x.min() + x.max()) * right + 0.5 * (y.min() + y.max()) * up
-        x, y = x - 0.5 * (x.min() + x.max()), y - 0.5 * (y.min() + y.max())
         tangent = np.tan(0.5 * cls.field_of_view)
-        distance = 1.04 * np.max(z + np.maximum(np.abs(y) / tangent, np.abs(x) / (aspect * tangent)))
+        for _ in range(12):  # what is near takes more of the picture: turn to the picture's middle, then come nearer
+            x, y, z = (p - middle) @ right, (p - middle) @ up, (p - middle) @ back
+            distance = 1.04 * float(np.max(z + np.maximum(np.abs(y), np.abs(x) / aspect) / tangent))
+            u, v = x / (distance - z), y / (distance - z)
+            middle = middle + 0.5 * distance * ((u.min() + u.max()) * right + (v.min() + v.max()) * up)
+        x, y, z = (p - middle) @ right, (p - middle) @ up, (p - middle) @ back
+        distance = 1.04 * float(np.max(z + np.maximum(np.abs(y), np.abs(x) / aspect) / tangent))
         position = middle + distance * back
         return cls(tuple(map(float, position)), tuple(map(float, middle)))  # type: ignore[arg-type]
 
