@@ -141,10 +141,9 @@ class DMP:
         if len(trajectory) < 3:
             raise InputError(f"DMP.fit: needs at least 3 samples, got {len(trajectory)}")
         share = (trajectory.times - trajectory.times[0]) / trajectory.duration
-        x = trajectory.positions
-        learnt = imitate(share, x, self.gains_, self.n_basis, self.regularisation)
+        learnt = imitate(share, trajectory.positions, self.gains_, self.n_basis, self.regularisation)
         self.weights_, self.progress_weights_ = learnt.weights, learnt.progress_weights
-        self.start_, self.goal_, self.duration_ = x[0].copy(), x[-1].copy(), trajectory.duration
+        self.start_, self.goal_, self.duration_ = learnt.start, learnt.goal, trajectory.duration
         self.start_velocity_, self.path_length_ = learnt.start_rate / self.duration_, learnt.path_length
         self.orientation_ = None
         if trajectory.quaternions is not None:

@@ -16,18 +16,23 @@ from imitarm.skills.spring import Gains, propagator, roll_out
 Array = NDArray[np.float64]
 
 _FINE = 512  # steps of the grid on which responses are computed
+_NOISE = 1e-4  # [m] the repeatability of industrial arms
 
 
 class Imitation(NamedTuple):
     """What was learnt from one path.
 
     Attributes:
+        start: x_0, shape (3,) [m].
+        goal: g, shape (3,) [m].
         weights: w, shape (N, 3) [m].
         progress_weights: w_p, shape (N,).
         start_rate: T x'(0), shape (3,) [m].
         path_length: of the fitted motion [m].
     """
 
+    start: Array
+    goal: Array
     weights: Array
     progress_weights: Array
     start_rate: Array
@@ -36,7 +41,7 @@ class Imitation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Responses:
-    """What the spring answers on the fine grid to a start of 1, a goal of 1, a rate of 1, and each basis function."""
+    """What the spring answers on the fine grid to a start of 1, a rate of 1, a goal of 1, and each basis function."""
 
     values: Array  # (_FINE + 1, 3 + N)
     rates: Array
@@ -45,60 +50,82 @@ class _Responses:
 
 @lru_cache(maxsize=8)
 def _responses(gains: Gains, n_basis: int) -> _Responses:
-    s, basis = on_grid(n_basis, _FINE)
-    # the base target is x_0 s + g (1 - s): a start of 1 gives s, a change of goal by 1 gives 1 - s
-    inputs = np.column_stack([np.ones_like(s), 1.0 - s, np.zeros_like(s), basis])
+    basis = on_grid(n_basis, _FINE)[1]
+    nothing = np.zeros(len(basis))
+    inputs = np.column_stack([nothing, nothing, np.ones_like(nothing), basis])
     start = np.zeros((2, inputs.shape[1]))
-    start[0, 0] = start[1, 2] = 1.0
+    start[0, 0] = start[1, 1] = 1.0
     z = roll_out(propagator(gains, 1.0 / _FINE), start, inputs)
-    spline = CubicHermiteSpline(np.linspace(0.0, 1.0, _FINE + 1), z[0], z[1])
-    return _Responses(z[0], z[1], spline)
+    return _Responses(z[0], z[1], CubicHermiteSpline(np.linspace(0.0, 1.0, _FINE + 1), z[0], z[1]))
 
 
 def imitate(share: Array, x: Array, gains: Gains, n_basis: int, regularisation: float) -> Imitation:
     r"""Learn a path.
 
-    The motion is linear in the weights: ``x(t) = x_base(t) + sum_i w_i R_i(t)``, R_i the spring's response to basis
-    function i. This is METHODS C's ridge regression on the force, ``tau v' + D v`` and so on, with both sides filtered
-    by the spring itself, which turns accelerations that nobody measured into positions that were. So no noise is
-    differentiated, time stamps may lie anywhere, and what is minimised is the error of the reproduction in metres. The
-    last sample is met exactly.
+    The motion is linear in the drives ``d_i = w_i - (g - x_0)``: with R the spring's responses to a start, a rate, a
+    goal and each basis function, ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. This is METHODS C's
+    ridge regression on the force, ``tau v' + D v`` and so on, with both sides filtered by the spring itself, which
+    turns accelerations that nobody measured into positions that were. So no noise is differentiated, time stamps may
+    lie anywhere, and what is minimised is the error of the reproduction in metres.
+
+    The motion passes exactly through its start and its goal. They are the first and the last sample, or, where noise
+    has put one of these more than 0.1 mm beside the path that fits all samples, that path's end: forced through a noisy
+    sample, it would jerk there. The last drive stays 0, so that the target is the goal when the duration is over. (Left
+    to the regression it is hardly determined, and pulls the tool off the goal by decimetres after the end.)
 
     Args:
         share: of the duration, 0 to 1, shape (n,).
         x: positions, shape (n, 3) [m].
         gains: of the spring.
-        n_basis: number of basis functions.
+        n_basis: number N of basis functions.
         regularisation: ridge, relative to the mean square response.
     """
     responses = _responses(gains, n_basis)
-    at_samples = responses.spline(share)
+    R = responses.spline(share)
     rate = start_rate(share, x)
-    ends = np.stack([x[0], x[-1] - x[0], rate])
-    base = at_samples[:, :3] @ ends
-    weights = _ridge(at_samples[:, 3:], x - base, x[-1] - base[-1], regularisation)
-    fitted_rate = responses.rates @ np.concatenate([ends, weights])
-    progress, path_length = _progress(fitted_rate)
-    base_progress = responses.values[:, 1]
-    progress_weights = _ridge(
-        responses.values[:, 3:], (progress - base_progress)[:, None], 1.0 - base_progress[-1:], regularisation
+    ends = np.stack([x[0], rate, x[-1]])
+    beside = _beside(R, x - R[:, :3] @ ends, n_basis, regularisation)
+    if start_rate(1.0 - share[::-1], x[::-1]).any():  # cut off under way: the last sample is as good as any
+        beside[2] = 0.0
+    ends += np.where(np.linalg.norm(beside, axis=1, keepdims=True) > _NOISE, beside, 0.0)
+    base = R[:, :3] @ ends
+    force = phase_basis(n_basis).centers  # of a drive of 1: late ones carry the factor s = 0.01
+    drives = _without_last(R[:, 3:], x - base, force, regularisation, ends[2] - base[-1])
+    progress, path_length = _progress(responses.rates @ np.concatenate([ends, drives]))
+    base_progress = responses.values[:, 2]
+    progress_drives = _without_last(
+        responses.values[:, 3:], (progress - base_progress)[:, None], force, regularisation, 1.0 - base_progress[-1:]
     )
-    return Imitation(weights, progress_weights[:, 0], rate, path_length)
+    weights = drives + (ends[2] - ends[0])
+    return Imitation(ends[0], ends[2], weights, progress_drives[:, 0] + 1.0, rate, path_length)
 
 
-def _ridge(R: Array, y: Array, end: Array, regularisation: float) -> Array:
-    """Return weights with ``R w = y`` in the sense of ridge regression, and exactly ``R[-1] w = end``.
+def _without_last(R: Array, y: Array, force: Array, regularisation: float, end: Array) -> Array:
+    """As :func:`_ridge`, with the last drive 0."""
+    drives = _ridge(R[:, :-1], y, force[:-1], regularisation, end)
+    return np.concatenate([drives, np.zeros((1, y.shape[1]))])
 
-    Late basis functions carry the factor s = 0.01, so each weight is punished by the force it makes.
-    """
+
+def _beside(R: Array, y: Array, n_basis: int, regularisation: float) -> Array:
+    """Return how far beside the first and the last sample the best path passes, rows (start, 0, goal)."""
+    columns = np.concatenate([R[:, :1], R[:, 3:-1]], axis=1)
+    solution = _ridge(columns, y, np.append(1.0, phase_basis(n_basis).centers[:-1]), regularisation)
+    start, goal = columns[[0, -1]] @ solution - y[[0, -1]]
+    return np.stack([start, np.zeros(3), goal])
+
+
+def _ridge(R: Array, y: Array, force: Array, regularisation: float, end: Array | None = None) -> Array:
+    """Return ``d`` with ``R d = y``, by ridge regression on ``force d``, and exactly ``R[-1] d = end`` if given."""
     n = R.shape[1]
-    force = phase_basis(n).centers
     S = R / force
     kkt = np.zeros((n + 1, n + 1))
     kkt[:n, :n] = S.T @ S / len(S)
     kkt[np.arange(n), np.arange(n)] += regularisation * np.trace(kkt) / n
-    kkt[n, :n] = kkt[:n, n] = S[-1]
-    right = np.concatenate([S.T @ y / len(S), end[None]])
+    right = np.concatenate([S.T @ y / len(S), np.zeros((1, y.shape[1])) if end is None else end[None]])
+    if end is None:
+        kkt[n, n] = 1.0
+    else:
+        kkt[n, :n] = kkt[:n, n] = S[-1]
     return np.asarray(np.linalg.solve(kkt, right)[:n] / force[:, None])
 
 
