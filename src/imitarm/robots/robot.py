@@ -28,11 +28,12 @@ def limit_velocity(
     1. *velocity*: all joints are slowed by one factor, so that the direction of the tool stays.
     2. *acceleration* and *position*, joint by joint, the box of METHODS A.9::
 
-           upper = min(v_max, v_p + a dt, max(v_b(q_max - q), v_p - a dt)),   lower mirrored
+           upper = min(v_max, v_p + a dt, max(v_b(q_max - q - v_p dt / 2), v_p - a dt)),   lower mirrored
            v_b(D) = -a dt + sqrt(a^2 dt^2 + 2 a max(D, 0))
 
-       ``v_b`` satisfies ``v^2 / 2a + v dt <= D``: whoever obeys it can always brake before the limit,
-       so the box is never empty, also beyond a limit.
+       ``v_b`` satisfies ``v^2 / 2a + v dt <= D``. The term ``v_p dt / 2`` is there because the speed changes evenly
+       during ``dt``: with it whoever obeys the box can always brake before the limit, so the box is never empty,
+       also beyond a limit.
 
     Args:
         arm: whose limits.
@@ -48,8 +49,9 @@ def limit_velocity(
     a = arm.max_acceleration
     scaled = asked / max(1.0, float(np.max(np.abs(asked) / arm.max_velocity)))
     reached = np.clip(scaled, v_p - a * dt, v_p + a * dt)
-    upper = np.maximum(_braking_velocity(arm.upper - q, a, dt), v_p - a * dt)
-    lower = np.minimum(-_braking_velocity(q - arm.lower, a, dt), v_p + a * dt)
+    ahead = q + 0.5 * dt * v_p
+    upper = np.maximum(_braking_velocity(arm.upper - ahead, a, dt), v_p - a * dt)
+    lower = np.minimum(-_braking_velocity(ahead - arm.lower, a, dt), v_p + a * dt)
     braked = np.clip(reached, lower, upper)
     stages = (("velocity", asked, scaled), ("acceleration", scaled, reached), ("position", reached, braked))
     tolerance = _TOUCHED * arm.max_velocity

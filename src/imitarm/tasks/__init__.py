@@ -1,1 +1,9 @@
 """Whole scenes with a success test."""
+
+from __future__ import annotations
+
+from imitarm.tasks.sweep import DEMONSTRATIONS, SCENES, SweepTask
+
+TASKS: dict[str, type[SweepTask]] = {"sweep": SweepTask}
+
+__all__ = ["DEMONSTRATIONS", "SCENES", "TASKS", "SweepTask"]

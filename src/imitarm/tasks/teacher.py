@@ -143,7 +143,7 @@ def _minimum_jerk(times: Array, points: Array) -> BSpline:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Write one demonstration for each of :data:`SEEDS` into a folder."""
+    """Write one demonstration for each of the packaged seeds into a folder."""
     parser = argparse.ArgumentParser(prog="python -m imitarm.tasks.teacher", description=main.__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder for the files; made when it is missing")
     folder = parser.parse_args(arguments).out

@@ -1,0 +1,147 @@
+"""The drives of a simulated arm: position servos, computed torque, and the free drive of hand guiding."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.kinematics.arm import ArmModel
+
+Array = NDArray[np.float64]
+
+SERVO_FREQUENCY = 60.0  # [rad/s] stiffness of the position servos: K = w^2 times the joint's own inertia
+COMPUTED_FREQUENCY = 40.0  # [rad/s] of the computed-torque error dynamics
+_DRY_FRICTION_SPEED = 0.02  # [rad/s] below it the drives take only a part of the dry friction for granted
+_LIGHTENED_FRICTION = 0.7  # share of the dry friction that a free drive takes off the hand
+_GUIDED_DAMPING = 0.05  # [s/rad] damping of a guided joint over its rated torque
+
+
+def add_drives(spec: mujoco.MjSpec, arm: ArmModel) -> None:
+    """Give every joint of the arm one drive with its rated torque, instead of any actuator it had.
+
+    Args:
+        spec: the world that holds the arm; changed in place.
+        arm: whose joints and torques.
+    """
+    for actuator in list(spec.actuators):
+        if actuator.target in arm.joint_names:
+            spec.delete(actuator)
+    for name, limit in zip(arm.joint_names, arm.max_torque, strict=True):
+        limited = bool(np.isfinite(limit))
+        spec.add_actuator(
+            name=f"drive/{name}",
+            target=name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            forcelimited=limited,
+            forcerange=[-limit, limit] if limited else [0.0, 0.0],
+        )
+
+
+class Drives:
+    """One drive for each joint; every method makes one physics step.
+
+    ``M`` is the inertia matrix with the rotors, ``h`` gravity and Coriolis torques, ``f`` the joints' viscous and dry
+    friction at ``v_d``, ``q_d``, ``v_d``, ``a_d`` the set-point. Torques beyond the rated ones are cut off.
+
+    Args:
+        model: the compiled world, with the drives that :func:`add_drives` has added.
+        data: its state.
+        arm: the arm.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, arm: ArmModel) -> None:
+        self._model, self._data = model, data
+        joints = [model.joint(name).id for name in arm.joint_names]
+        self._qpos, self._dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+        self._ids = np.array([model.actuator(f"drive/{name}").id for name in arm.joint_names])
+        servos = (model.actuator_gainprm[:, 0] > 0.0) & (model.actuator_biasprm[:, 1] == -model.actuator_gainprm[:, 0])
+        self._servos = np.setdiff1d(np.flatnonzero(servos), self._ids)
+        self._guided_damping = _GUIDED_DAMPING * np.minimum(arm.max_torque, 100.0)
+        self._every, self._torque = np.zeros(model.nv), np.zeros(model.nv)
+        data.qpos[:] = arm.posture(model)
+        mujoco.mj_forward(model, data)
+        inertia = np.array([self._inertia_times(row)[i] for i, row in enumerate(np.eye(arm.n_joints))])
+        self._stiffness = SERVO_FREQUENCY**2 * inertia
+        self._damping = 2.0 * SERVO_FREQUENCY * inertia
+
+    @property
+    def q(self) -> Array:
+        """Joint angles, shape (n,) [rad]."""
+        return np.asarray(self._data.qpos[self._qpos])
+
+    @property
+    def velocity(self) -> Array:
+        """Joint velocities, shape (n,) [rad/s]."""
+        return np.asarray(self._data.qvel[self._dof])
+
+    @property
+    def torque(self) -> Array:
+        """Torques that the drives give, shape (n,) [N m]."""
+        return np.asarray(self._data.actuator_force[self._ids])
+
+    def hold(self) -> None:
+        """Give the torque that holds the arm still, and let a gripper's servos keep its opening; without a step."""
+        self._use_servos(False)
+        self._data.ctrl[self._servos] = self._data.actuator_length[self._servos]
+        self._data.ctrl[self._ids] = self._data.qfrc_bias[self._dof]
+        mujoco.mj_forward(self._model, self._data)
+
+    def servo(self, q_d: Array, v_d: Array, a_d: Array) -> None:
+        """Step with a stiff servo at each joint: ``tau = K (q_d - q) + D (v_d - v) + M a_d + h + f``.
+
+        ``K`` is diagonal, 60^2 times the diagonal of ``M`` at the arm's home posture, and ``D = 2 K / 60``.
+        What is fed forward goes into the servo's position command, so that the torque limit cuts the sum; the damping
+        is part of the drive, and the implicit integrator keeps it stable.
+        """
+        self._use_servos(True)
+        forward = self._inertia_times(a_d) + self._data.qfrc_bias[self._dof] + self._friction(v_d)
+        self._data.ctrl[self._ids] = q_d + (self._damping * v_d + forward) / self._stiffness
+        mujoco.mj_step(self._model, self._data)
+
+    def computed_torque(self, q_d: Array, v_d: Array, a_d: Array) -> None:
+        """Step with ``tau = M (a_d + w^2 (q_d - q) + 2 w (v_d - v)) + h + f``, ``w`` = 40 rad/s: softer than servos."""
+        self._use_servos(False)
+        mujoco.mj_step1(self._model, self._data)
+        w = COMPUTED_FREQUENCY
+        wanted = a_d + w * w * (q_d - self.q) + 2.0 * w * (v_d - self.velocity)
+        self._data.ctrl[self._ids] = self._inertia_times(wanted) + self._data.qfrc_bias[self._dof] + self._friction(v_d)
+        mujoco.mj_step2(self._model, self._data)
+
+    def free(self, force: Array, torque: Array, site: int) -> None:
+        """Step with ``tau = h + 0.7 c sign(v) - D v``, ``c`` the dry friction, while a hand pulls at a site.
+
+        Args:
+            force: of the hand, in the base frame, shape (3,) [N].
+            torque: of the hand, shape (3,) [N m].
+            site: id of the site.
+        """
+        m, d = self._model, self._data
+        self._use_servos(False)
+        mujoco.mj_step1(m, d)
+        velocity = self.velocity
+        lightened = _LIGHTENED_FRICTION * m.dof_frictionloss[self._dof] * np.tanh(velocity / _DRY_FRICTION_SPEED)
+        d.ctrl[self._ids] = d.qfrc_bias[self._dof] + lightened - self._guided_damping * velocity
+        mujoco.mj_applyFT(m, d, force, torque, d.site_xpos[site], int(m.site_bodyid[site]), d.qfrc_applied)
+        mujoco.mj_step2(m, d)
+        d.qfrc_applied[:] = 0.0
+
+    def _use_servos(self, stiff: bool) -> None:
+        """Let the drives be position servos, or plain sources of torque."""
+        gain, bias = self._model.actuator_gainprm, self._model.actuator_biasprm
+        gain[self._ids, 0] = self._stiffness if stiff else 1.0
+        bias[self._ids, 1] = -self._stiffness if stiff else 0.0
+        bias[self._ids, 2] = -self._damping if stiff else 0.0
+
+    def _inertia_times(self, acceleration: Array) -> Array:
+        """Return ``M a`` (n,) [N m]."""
+        self._every[self._dof] = acceleration
+        mujoco.mj_mulM(self._model, self._data, self._torque, self._every)
+        return self._torque[self._dof]
+
+    def _friction(self, velocity: Array) -> Array:
+        """Return the torque (n,) [N m] that the joints' friction takes at ``velocity``."""
+        dry = self._model.dof_frictionloss[self._dof] * np.tanh(velocity / _DRY_FRICTION_SPEED)
+        return np.asarray(self._model.dof_damping[self._dof] * velocity + dry)

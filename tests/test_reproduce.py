@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from imitarm.errors import InfeasibleError, InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.pose import Pose
+from imitarm.policies.policy import Policy
+from imitarm.reproduce import reproduce
+from imitarm.robots import SimulatedRobot
+from imitarm.scene import Box, Scene
+
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+ARM = ArmModel.load("sawyer", tool="brush")
+START = ARM.tool_pose(ARM.home)
+
+
+class Glide(Policy):
+    """Along a line with a smooth speed, then stand."""
+
+    def __init__(self, way, duration=2.0):
+        self.way, self.duration, self.resets = np.asarray(way, dtype=float), duration, 0
+
+    def reset(self, observation):
+        self.resets += 1
+        self.start = observation.tool_to_base
+
+    def wanted(self, time):
+        u = np.clip(time / self.duration, 0.0, 1.0)
+        return Pose(self.start.position + self.way * (10 * u**3 - 15 * u**4 + 6 * u**5), self.start.quaternion)
+
+    def step(self, observation, dt):
+        rate = (self.wanted(observation.time + dt).position - self.wanted(observation.time).position) / dt
+        forward = np.concatenate([rate, np.zeros(3)])
+        return forward + 5.0 * observation.tool_to_base.error_to(self.wanted(observation.time))
+
+    def finished(self, observation):
+        return observation.time >= self.duration + 0.3
+
+
+def robot_with(*obstacles, **options):
+    return SimulatedRobot(ARM, scene=Scene(None, obstacles), **options)
+
+
+def wall(gap):
+    return Box(Pose(START.position + np.array([gap + 0.15, 0.0, 0.0]), UPRIGHT), size=[0.2, 0.3, 0.4], name="wall")
+
+
+@pytest.mark.parametrize("dt", [0.004, 0.01])
+@pytest.mark.parametrize("method", ["qp", "dls"])
+def test_the_tool_goes_where_the_policy_wants(dt, method):
+    policy, robot = Glide([0.05, 0.15, -0.05]), robot_with(wall(0.4))
+    rollout = reproduce(policy, robot, lambda t: robot.scene, dt=dt, method=method)
+    assert rollout.success
+    assert rollout.reason == "finished"
+    wanted = np.array([policy.wanted(t).position for t in rollout.trajectory.times])
+    assert np.linalg.norm(rollout.trajectory.positions - wanted, axis=1).max() < 1e-3
+    assert rollout.trajectory.times[0] == 0.0
+    assert rollout.trajectory.duration == pytest.approx(2.3, abs=0.05)
+    np.testing.assert_allclose(np.diff(rollout.trajectory.times), dt, atol=1e-9)
+    assert np.abs(rollout.velocities[-1]).max() < 2e-3  # at rest
+    assert rollout.clearance.shape == rollout.trajectory.times.shape
+    assert rollout.min_clearance == pytest.approx(rollout.clearance.min())
+    assert rollout.details["twists"].shape == (len(rollout.trajectory), 6)
+    assert rollout.details["clamped"] == {}
+    np.testing.assert_allclose(rollout.torques[0], ARM.gravity_torque(ARM.home), atol=1e-2)
+
+
+def test_each_step_is_told_and_the_scene_is_the_observed_one():
+    seen, scenes = [], []
+    robot = robot_with()
+
+    def observe(time):
+        scenes.append(Scene(Pose([time, 0.0, 0.0], UPRIGHT)))
+        return scenes[-1]
+
+    rollout = reproduce(Glide([0.0, 0.02, 0.0], 0.3), robot, observe, on_step=seen.append)
+    assert [step.time for step in seen] == pytest.approx(list(rollout.trajectory.times[1 : len(seen) + 1]))
+    assert all(step.scene in scenes for step in seen)
+    assert seen[10].scene.goal.position[0] == pytest.approx(0.10)
+    np.testing.assert_array_equal(seen[5].state.q, rollout.joints[6])
+    np.testing.assert_array_equal(seen[5].twist, rollout.details["twists"][6])
+
+
+def test_a_second_reproduction_begins_at_time_zero_again():
+    robot, policy = robot_with(), Glide([0.0, 0.03, 0.0], 0.3)
+    first = reproduce(policy, robot, lambda t: Scene())
+    second = reproduce(policy, robot, lambda t: Scene())
+    assert first.trajectory.times[0] == second.trajectory.times[0] == 0.0
+    assert policy.resets == 2
+    away = second.trajectory.positions[-1] - first.trajectory.positions[0]
+    np.testing.assert_allclose(away, [0.0, 0.06, 0.0], atol=2e-3)
+
+
+def test_out_of_time_the_robot_stops_and_the_reason_is_told():
+    robot = robot_with()
+    rollout = reproduce(Glide([0.0, 0.2, 0.0], 2.0), robot, lambda t: Scene(), timeout=1.0)
+    assert not rollout.success
+    assert rollout.reason == "not finished within 1 s"
+    assert not robot.velocity.any()
+    assert np.abs(rollout.velocities[50]).max() > 0.05  # it was under way
+
+
+def test_what_is_touched_is_named_and_a_held_robot_gives_up():
+    robot = robot_with(wall(0.04))
+    rollout = reproduce(Glide([0.3, 0.0, 0.0]), robot, lambda t: robot.scene)
+    assert not rollout.success
+    assert "protective stop" in rollout.reason
+    assert 'with box "wall"' in rollout.reason
+    assert rollout.min_clearance <= 0.0
+    assert rollout.trajectory.duration < 2.0
+
+
+@pytest.mark.parametrize("stage", ["step", "observe", "on_step"])
+def test_whatever_is_raised_the_robot_is_stopped_first(stage):
+    robot, policy = robot_with(), Glide([0.0, 0.2, 0.0])
+
+    def fail(time):
+        if time > 0.7:
+            raise RuntimeError("camera unplugged")
+
+    step = policy.step
+    if stage == "step":
+        policy.step = lambda observation, dt: (fail(observation.time), step(observation, dt))[1]
+
+    def observe(time):
+        if stage == "observe":
+            fail(time)
+        return Scene()
+
+    with pytest.raises(RuntimeError, match="camera unplugged"):
+        reproduce(policy, robot, observe, on_step=(lambda s: fail(s.time)) if stage == "on_step" else None)
+    assert robot.time > 0.7
+    assert not robot.velocity.any()
+
+
+def test_an_answer_that_is_no_twist_is_an_error():
+    policy = Glide([0.0, 0.1, 0.0])
+    policy.step = lambda observation, dt: np.full(6, np.nan)
+    with pytest.raises(InputError, match=r"Glide\.step must answer 6 finite numbers"):
+        reproduce(policy, robot_with(), lambda t: Scene())
+
+
+def test_a_refusal_comes_before_any_motion():
+    class Refuse(Glide):
+        def reset(self, observation):
+            raise InfeasibleError('box "wall" is in the way')
+
+    robot = robot_with()
+    with pytest.raises(InfeasibleError, match="in the way"):
+        reproduce(Refuse([0, 0, 0]), robot, lambda t: Scene())
+    assert robot.time == 0.0
+
+
+@pytest.mark.parametrize("times", [{"dt": 0.0}, {"dt": -1.0}, {"timeout": 0.001}, {"timeout": np.inf}])
+def test_times_that_make_no_loop_are_refused(times):
+    with pytest.raises(InputError, match="0 < dt <= timeout"):
+        reproduce(Glide([0, 0, 0]), robot_with(), lambda t: Scene(), **times)
