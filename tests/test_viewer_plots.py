@@ -4,37 +4,16 @@ import re
 from xml.etree import ElementTree
 
 import numpy as np
-import pytest
 
 from imitarm.scene import Scene, Sphere
-from imitarm.trajectory import Demonstration, Trajectory
+from imitarm.trajectory import Trajectory
 from imitarm.viewer import palette, plots
-from imitarm.viewer.views import Grid, View
+from imitarm.viewer.views import View
 from viewer_samples import make_adaptation, make_learning, make_path, make_scene
 
 
 def text_of(svg: str) -> str:
     return " ".join(" ".join(ElementTree.fromstring(svg).itertext()).split())
-
-
-@pytest.mark.parametrize(
-    ("spans", "view"),
-    [
-        ((0.5, 0.2, 0.0), View(0, 1)),
-        ((0.2, 0.8, 0.1), View(1, 0)),
-        ((0.6, 0.1, 0.5), View(0, 2)),
-        ((0.1, 0.6, 0.5), View(1, 2)),
-    ],
-)
-def test_the_view_shows_the_two_axes_that_matter(spans: tuple[float, float, float], view: View) -> None:
-    corners = np.array([[0.0, 0.0, 0.0], spans])
-    assert View.best(corners) == view
-    assert view.depth not in (view.across, view.up)
-    np.testing.assert_array_equal(view.of(corners)[1], [spans[view.across], spans[view.up]])
-
-
-def test_seen_from_above_x_up_means_y_to_the_left() -> None:
-    assert View(1, 0).leftwards and not View(0, 1).leftwards and not View(1, 2).leftwards
 
 
 def test_demonstrations_shows_every_demonstration_and_component() -> None:
@@ -93,16 +72,6 @@ def test_a_path_in_space_shows_the_obstacles_shadow_where_the_path_is() -> None:
     assert "ball" not in text_of(plots.adaptation(path, path, scene=far, clearance=0.03))
 
 
-def test_the_footprint_is_the_cut_at_the_paths_height() -> None:
-    ball = Scene(None, (Sphere((0.0, 0.0, 0.05), 0.05),))
-    grid = Grid(View(0, 1), np.linspace(-0.1, 0.1, 161), np.linspace(-0.08, 0.08, 129))
-    distance = grid.distance(ball, 0, np.array([0.08]))
-    inside = distance < 0.0
-    radius = np.hypot(grid.across[None, :], grid.up[:, None])
-    assert radius[inside].max() == pytest.approx(0.04, abs=0.002)
-    assert radius[~inside].min() == pytest.approx(0.04, abs=0.002)
-
-
 def test_the_tools_spheres_turn_with_the_tool() -> None:
     half = np.sqrt(0.5)
     turned = np.array([[1.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half]])  # a quarter turn about z
@@ -117,13 +86,6 @@ def test_the_band_is_two_sigma_wide_across_the_path() -> None:
     band = plots._band(path, np.repeat(np.diag([9e-4, 4e-4, 1.0])[None], 20, axis=0), View(0, 1))
     np.testing.assert_allclose(np.abs(band[:, 1]), 0.04)
     np.testing.assert_allclose(band[:20, 0], path[:, 0])
-
-
-def test_a_flat_map_is_stretched_and_says_so_only_where_distances_do_not_matter() -> None:
-    flat = Trajectory([0.0, 1.0, 2.0], [[0.0, 0.0, 0.0], [0.5, 0.01, 0.0], [1.0, 0.0, 0.0]])
-    shown = plots.demonstrations([Demonstration(flat)], np.zeros((1, 3)), 1e-4 * np.eye(3)[None])
-    assert re.search(r"seen from above; y is stretched \d\.\d times", text_of(shown))
-    assert "stretched" not in text_of(plots.adaptation(flat, flat))
 
 
 def test_an_obstacles_hostile_name_stays_text() -> None:

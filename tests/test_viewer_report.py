@@ -15,7 +15,6 @@ from imitarm.demonstrations import Finding
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.scene import Scene, Sphere
 from imitarm.viewer import Report, report, report_html, write_report
-from imitarm.viewer.markup import number, scene_id, script_text
 from viewer_samples import make_learning, make_recording, make_report, make_result
 
 VOID = {"meta", "link", "br", "img", "input", "hr"}
@@ -208,10 +207,3 @@ def test_names_that_are_no_text_do_not_stop_the_report(tmp_path: Path) -> None:
     learning = replace(make_learning(), findings=[Finding("note", "idle", "rests", name)])
     target = write_report(Report("x", [], learning=learning), tmp_path / "report.html")
     assert "sweep_?.csv" in target.read_text(encoding="utf-8")
-
-
-def test_small_pieces() -> None:
-    assert number(math.nan) == number(math.inf) == "–"
-    assert number(2.345, 1, "mm") == "2.3\N{NO-BREAK SPACE}mm"
-    assert scene_id(0, "Två boxes!") == "scene-1-tv-boxes" and scene_id(1, "…") == "scene-2-x"
-    assert "<" not in script_text("<!-- </script>") and json.loads(script_text("</x>")) == "</x>"

@@ -198,11 +198,14 @@ def selection(
         name, f"{chosen} Gaussian components were chosen out of {k.min():.0f} to {k.max():.0f}", (5.5, 2.4)
     ) as drawing:
         left, right = drawing.axes(0.88, 0.48, 2.75, 2.3), drawing.axes(3.45, 0.48, 5.4, 2.3)
-        for values, label, colour, style in ((bic, "BIC", palette.ADAPTED, "o-"), (aic, "AIC", palette.UNMOVED, "s--")):
-            if len(np.asarray(values)):
-                left.plot(k, np.asarray(values, dtype=float), style, color=colour, ms=3.5, lw=1.4, label=label)
-        left.set_ylabel("information criterion [-]")
-        left.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
+        criteria = {"BIC": np.asarray(bic, dtype=float), "AIC": np.asarray(aic, dtype=float)}
+        large = max((float(np.abs(values).max()) for values in criteria.values() if len(values)), default=0.0) >= 1e4
+        for (label, values), colour, style in zip(
+            criteria.items(), (palette.ADAPTED, palette.UNMOVED), ("o-", "s--"), strict=True
+        ):
+            if len(values):
+                left.plot(k, values / (1e3 if large else 1.0), style, color=colour, ms=3.5, lw=1.4, label=label)
+        left.set_ylabel("information criterion" + (" / 1000" if large else ""))
         left.legend()
         if len(np.asarray(held_out_error)):
             right.plot(k, MM * np.asarray(held_out_error, dtype=float), "o-", color=palette.MOVED, ms=3.5, lw=1.4)

@@ -247,7 +247,7 @@ class Report:
         clear = sum(scene.rollout is not None and not scene.contact for scene in obstructed)
         parts = [f"{clear} of {len(obstructed)} scenes with obstacles without contact"]
         if math.isfinite(self.min_clearance):
-            parts.append(f"smallest clearance {1000.0 * self.min_clearance:.0f} mm")
+            parts.append(f"smallest clearance {1000.0 * self.min_clearance:.1f} mm")
         if done < len(self.scenes):
             parts.append(f"{len(self.scenes) - done} not done")
         return "; ".join(parts)

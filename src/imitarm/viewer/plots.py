@@ -59,7 +59,9 @@ def demonstrations(
     text = (
         f"{len(shown)} demonstrations, {len(np.asarray(means))} Gaussian components and the learnt path, {view.title}"
     )
-    corners = corners_of(view.of(np.concatenate([d.trajectory.positions for d in shown])), 0.06)
+    reach = _CHI_95 * np.sqrt(np.einsum("kii->ki", np.asarray(covariances, dtype=float)))
+    spread = [d.trajectory.positions for d in shown] + [np.asarray(means) - reach, np.asarray(means) + reach]
+    corners = corners_of(view.of(np.concatenate(spread)), 0.01)
     with drawn_map(name, text, view, corners, legend_rows=1, stretched=True) as (axes, drawing):
         for i, demonstration in enumerate(shown):
             path = view.of(demonstration.trajectory.positions)[thin(len(demonstration))]
