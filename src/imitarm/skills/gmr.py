@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 _SAME_DURATION = 0.01  # demonstrations whose durations differ by a larger share were not aligned
 _CLOCK_DIGITS = 6  # microseconds: epoch stamps have no finer ones, so that they give the same skill as others
-_AXES = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
+_AXES = ("x", "y", "z")
 
 
 class SingleDemonstrationWarning(UserWarning):
@@ -156,10 +156,11 @@ class GMR:
         self._learn(mixture.weights_, mixture.means_, mixture.covariances_)
         self.converged_, self.lower_bound_ = mixture.converged_, mixture.lower_bound_
         self.degenerate_axes_ = tuple(i - 1 for i in mixture.degenerate_axes_)
-        if self.degenerate_axes_:
-            names = ", ".join(_AXES[i] for i in self.degenerate_axes_)
+        still = [_AXES[i] for i in self.degenerate_axes_ if i < len(_AXES)]
+        if still:  # rotations that stay, or turn about one axis, are nothing unusual
             warnings.warn(
-                f"the demonstrations don't move in {names}; kept constant there, without influence on the other axes",
+                f"the demonstrations don't move in {', '.join(still)}; kept constant there, without influence on the "
+                "other axes",
                 DegenerateAxisWarning,
                 stacklevel=2,
             )

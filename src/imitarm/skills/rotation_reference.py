@@ -46,7 +46,10 @@ class RotationReference:
 
     def __post_init__(self) -> None:
         times = np.array(self.times, dtype=float)
-        quaternions = continuous_signs(checked_unit_quaternions(self.quaternions, "RotationReference"))
+        quaternions = checked_unit_quaternions(self.quaternions, "RotationReference")
+        if np.allclose(quaternions, self.quaternions, rtol=0.0, atol=1e-12):
+            quaternions = np.array(self.quaternions, dtype=float)  # scaling again would change the last bit
+        quaternions = continuous_signs(quaternions)
         if times.ndim != 1 or quaternions.shape != (len(times), 4) or len(times) < 1 or np.any(np.diff(times) <= 0.0):
             raise InputError(
                 "RotationReference: needs increasing times (m,) and quaternions (m, 4), got "

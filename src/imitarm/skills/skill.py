@@ -224,8 +224,9 @@ def _gmr_content(gmr: GMR) -> dict[str, Any]:
         "covariances": gmr.covariances_,
         "degenerate_axes": gmr.degenerate_axes_,
         "converged": gmr.converged_,
-        "log_likelihood": gmr.lower_bound_,
     }
+    if not np.isnan(gmr.lower_bound_):
+        content["log_likelihood"] = gmr.lower_bound_
     if gmr.reference_ is not None:
         content["reference"] = {"times": gmr.reference_.times, "quaternions": gmr.reference_.quaternions}
     if gmr.selection_:
@@ -262,7 +263,7 @@ def _read_gmr(fields: Fields) -> GMR:
         selection=selection,
         degenerate_axes=[int(i) for i in fields.array("degenerate_axes", 1)],
         converged=fields.flag("converged"),
-        lower_bound=fields.number("log_likelihood"),
+        lower_bound=fields.number("log_likelihood") if fields.has("log_likelihood") else np.nan,
     )
 
 

@@ -82,9 +82,9 @@ class Fields:
         return tuple(value)
 
     def integer(self, name: str) -> int:
-        """Return a whole number of at least 0."""
+        """Return a whole number from 0 to 2^53."""
         value = self._get(name)
-        if type(value) is not int or value < 0:
+        if type(value) is not int or not 0 <= value <= 2**53:
             raise FileFormatError(f"{self._place}: {name!r} should be a whole number, is {value!r:.80}")
         return value
 
@@ -123,11 +123,14 @@ def write_skill(path: str | os.PathLike[str], content: Mapping[str, Any]) -> Non
     """Write ``content`` (plain values and arrays), aside first and then renamed.
 
     Raises:
-        InputError: when the file can't be written; what was there before stays as it was.
+        InputError: when a number is not finite, or the file can't be written; what was there before stays as it was.
     """
     target = Path(path)
     whole = {"format": FORMAT, "version": VERSION, **_ABOUT, **{k: _plain(v) for k, v in content.items()}}
-    whole["checksum"] = _checksum(whole)
+    try:
+        whole["checksum"] = _checksum(whole)
+    except ValueError as error:
+        raise InputError(f"can't write skill file {target}: it holds a number that is not finite") from error
     text = "".join(_lines(whole, "")) + "\n"
     aside: Path | None = None
     try:
