@@ -26,6 +26,7 @@ __all__ = ["METHODS", "IKStep", "clearance_rows", "find_posture", "solve_ik", "s
 Array = NDArray[np.float64]
 Rows = tuple[ArrayLike, ArrayLike]
 
+_WEIGHTS = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
 _MAX_SPEED = {"dls": 0.6, "qp": 2.0, "svd": 0.6}  # [m/s] clamp of the weighted twist
 _NULL = 1e-12  # squared singular values below this belong to directions that the arm can't move in
 _FILTER = 0.06  # [m/rad] SVD filter: directions with a smaller singular value are damped, up to this much
@@ -134,7 +135,7 @@ def solve_ik_step(arm: ArmModel, q: ArrayLike, twist: ArrayLike, **options: obje
     task = _task(arm, q, twist, **settings)  # type: ignore[arg-type]
     result = METHODS[str(settings["method"])](task)
     error = task.twist - task.jacobian @ result
-    error[3:] /= ANGLE_LENGTH
+    error /= _WEIGHTS
     near = 1e-9 * task.max_velocity
     limited = (result >= task.upper - near) | (result <= task.lower + near)
     slack = np.zeros(0) if task.rows is None else np.maximum(0.0, task.rows[1] - task.rows[0] @ result)
@@ -182,8 +183,8 @@ def _task(
         raise InputError(f"solve_ik: twist must be 6 finite numbers (linear, angular), got {twist!r}")
     position = np.asarray(q, dtype=float)
     jacobian = arm.tool_jacobian(position) if frame == "tool" else arm.jacobian(position)
-    jacobian[3:] *= ANGLE_LENGTH
-    wanted[3:] *= ANGLE_LENGTH
+    jacobian *= _WEIGHTS[:, None]
+    wanted *= _WEIGHTS
     speed, most = math.sqrt(float(wanted.dot(wanted))), _MAX_SPEED[method] if max_speed is None else max_speed
     if speed > most:
         wanted *= most / speed
@@ -227,7 +228,7 @@ def _quadratic_program(task: _Task) -> Array:
     if task.posture is not None:
         effort += _POSTURE
         linear -= _POSTURE * task.posture
-    hessian.flat[:: n + 1] += effort
+    hessian.ravel()[:: n + 1] += effort
     matrix, upper, lower, sense = np.empty((0, n)), task.upper, task.lower, np.zeros(n, dtype=np.intc)
     if task.rows is not None:
         matrix, least = task.rows
