@@ -1,0 +1,76 @@
+"""Learn a skill: read recordings, check them, align them, learn, save, load, and go to another goal.
+
+The recordings are those that come with the package: a Sawyer with a brush was led by hand, eight times, through
+sweeping crumbs into a dustpan. A robot of yours records its own; `docs/demonstrations.md` says which files can be read.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from imitarm import Demonstration, Skill, Trajectory, align, lint, read
+from imitarm.tasks import DEMONSTRATIONS
+
+
+def main() -> None:
+    # Read. A folder, a file or several; the content tells the format.
+    shown = read(DEMONSTRATIONS)
+    for one in shown:
+        motion = one.trajectory
+        print(f"{Path(one.source).name}: {len(one)} poses, {motion.duration:.1f} s, {motion.path_length:.2f} m")
+
+    # Check, before anything is learnt. Notes are for information, warnings want a look, errors spoil the result.
+    print("\nlint says:")
+    for finding in lint(shown):
+        print(f"  {finding.severity} {finding.code}: {finding.message}")
+
+    # What it would say of a recording in which the tool jumps by 8 cm between two samples:
+    positions = np.array(shown[0].trajectory.positions)
+    positions[150:] += [0.0, 0.08, 0.0]
+    damaged = Demonstration(Trajectory(shown[0].trajectory.times, positions), source="damaged.csv")
+    for finding in lint([damaged]):
+        if finding.severity == "error":
+            print(f"  {finding}")
+
+    # Align. People never show a motion twice at the same pace; averaging at equal times would flatten every bend.
+    ready = align(shown)
+    before = np.ptp([one.trajectory.duration for one in shown])
+    print(f"\naligned to {ready[0].trajectory.duration:.1f} s (durations differed by {before:.1f} s)")
+
+    # Learn. The number of Gaussians is the smallest that reproduces a demonstration it has not seen as well as any and
+    # rounds off little (bias); where none does both, the one with the least held-out error. BIC alone would go on
+    # falling with more of them, because neighbouring samples are not independent.
+    skill = Skill().fit(ready)
+    print("\ncomponents, held-out error [mm], bias [mm], BIC")
+    for tried in skill.gmr_.selection_:
+        mark = "  <- chosen" if tried.n_components == skill.gmr_.n_components_ else ""
+        errors = f"{tried.held_out_rmse_mm:6.2f}  {tried.bias_rmse_mm:6.2f}"
+        print(f"  {tried.n_components:2d}  {errors}  {tried.bic:7.0f}{mark}")
+    print(skill)
+
+    # How exact must the robot be? As exact as the person was: the covariance at each instant is the tolerance.
+    times = np.linspace(0.0, skill.duration_, 6)
+    spread = 1e3 * np.sqrt(np.trace(skill.tolerance(times), axis1=1, axis2=2))
+    print(
+        "\ntolerance along the motion:", ", ".join(f"{t:.1f} s: {s:.0f} mm" for t, s in zip(times, spread, strict=True))
+    )
+
+    # Save and load. The file is JSON that a person can read; nothing in it is executed, and a cut or edited one is
+    # refused.
+    path = Path("sweep.json")
+    skill.save(path)
+    again = Skill.load(path)
+    np.testing.assert_array_equal(again.generate().positions, skill.generate().positions)
+    print(f"\nsaved and loaded {path}, {path.stat().st_size / 1000:.0f} kB; the motion is the same to the last bit")
+
+    # Do it to another goal, and in half the time.
+    goal = again.goal_.position + np.array([0.0, 0.06, 0.0])
+    motion = again.generate(goal=goal, duration=0.5 * again.duration_, dt=0.01)
+    away = 1e3 * np.linalg.norm(motion.positions[-1] - goal)
+    print(f"to a goal 6 cm further in {motion.duration:.2f} s: {len(motion)} poses, ends {away:.2f} mm from it")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""Write a policy of your own, register it, and let it reproduce a skill under the same conditions as the built-in one.
+
+A policy sees an `Observation` (time, measured pose of the tool, scene) and answers with a twist. Everything else is the
+same for all: robot, inverse kinematics, limits, and the clearance that the simulator measures.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imitarm import (
+    POLICIES,
+    ArmModel,
+    Demonstration,
+    Observation,
+    Policy,
+    Pose,
+    Scene,
+    SimulatedRobot,
+    Skill,
+    Sphere,
+    Trajectory,
+    find_posture,
+    reproduce,
+)
+
+
+class Repelled(Policy):
+    """Follow the learnt path by the clock, pushed off whatever is near (the repulsive force of thesis Eq 2.19)."""
+
+    def __init__(self, skill: Skill, *, tool_radius: float, influence: float = 0.06, gain: float = 4.0) -> None:
+        super().__init__(skill)
+        self.tool_radius, self.influence, self.gain = tool_radius, influence, gain
+
+    def reset(self, observation: Observation) -> None:
+        """Take the learnt path from where the tool is."""
+        self.path = self.skill.generate(observation.tool_to_base, observation.scene.goal)
+
+    def step(self, observation: Observation, dt: float) -> np.ndarray:
+        """Answer with a pull towards the path and a push off every obstacle that is near."""
+        positions, quaternions = self.path.at([observation.time + dt])
+        twist = self.gain * observation.tool_to_base.error_to(Pose(positions[0], quaternions[0]))
+        for obstacle in observation.scene.obstacles:
+            distance, normal = obstacle.distance_and_gradient(observation.tool_to_base.position)
+            d = max(float(distance) - self.tool_radius, 0.01)
+            if d < self.influence:
+                twist[:3] += 2e-6 * (1.0 / d - 1.0 / self.influence) / d**2 * normal
+        return twist
+
+    def finished(self, observation: Observation) -> bool:
+        """The time is over and the goal is reached."""
+        away = np.linalg.norm(self.path.positions[-1] - observation.tool_to_base.position)
+        return observation.time > self.path.duration and bool(away < 0.005)
+
+
+POLICIES["repelled"] = Repelled
+
+
+def reaches(start: Pose, goal: Pose, n: int = 5) -> list[Demonstration]:
+    """Make up demonstrations of a reach with an arch that differs from one to the next."""
+    rng = np.random.default_rng(0)
+    u = np.linspace(0.0, 1.0, 150)[:, None]
+    pace = 10 * u**3 - 15 * u**4 + 6 * u**5
+    quaternions = np.tile(start.quaternion, (len(u), 1))
+    shown = []
+    for i in range(n):
+        arch = np.sin(np.pi * pace) * rng.normal([0.0, 0.0, 0.05], [0.01, 0.02, 0.01])
+        positions = start.position + pace * (goal.position - start.position) + arch
+        shown.append(
+            Demonstration(Trajectory(4.0 * u[:, 0], positions, quaternions), task="reach", source=f"reach {i}")
+        )
+    return shown
+
+
+def main() -> None:
+    arm = ArmModel.load("panda", tool="gripper")
+    tool = arm.tool_pose(arm.home)
+    middle = tool.position - np.array([0.0, 0.0, 0.05])
+    aside = np.array([0.0, 0.25, 0.0])
+    start, goal = Pose(middle - aside, tool.quaternion), Pose(middle + aside, tool.quaternion)
+    skill = Skill(n_components=7).fit(reaches(start, goal))
+
+    # Between two balls the pull along the path and the pushes balance: a local minimum, where a field that looks only
+    # at the nearest points stops or touches. ACFRA looks at the whole path.
+    on_path = middle + np.array([0.0, 0.0, 0.05])
+    balls = [Sphere(on_path + side * np.array([0.08, 0.0, 0.0]), 0.05) for side in (-1.0, 1.0)]
+    scenes = {
+        "nothing in the way": Scene(),
+        "a ball on the path": Scene(None, [Sphere(on_path + np.array([0.01, 0.0, 0.0]), 0.04)]),
+        "two balls, one on each side": Scene(None, balls),
+    }
+    for name, scene in scenes.items():
+        print(name)
+        for key, make in POLICIES.items():
+            # Where a policy fails, the inverse kinematics can still keep every link clear, whatever is asked for.
+            for barrier in (None, 0.01):
+                robot = SimulatedRobot(arm, scene=scene, q=find_posture(arm, start))
+                policy = make(skill, tool_radius=arm.tool_radius)
+                rollout = reproduce(policy, robot, scene.after, timeout=6.0, link_clearance=barrier)
+                near = f"clearance {1e3 * rollout.min_clearance:.0f} mm, " if scene.obstacles else ""
+                held = "" if barrier is None else " with links kept clear"
+                print(f"  {key}{held}: {near}{rollout.trajectory.duration:.1f} s, {rollout.reason}")
+                if rollout.success:
+                    break
+
+
+if __name__ == "__main__":
+    main()
