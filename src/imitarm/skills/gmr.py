@@ -12,22 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError
 from imitarm.skills.gmm import DegenerateAxisWarning, GaussianMixture
 from imitarm.skills.rotation_reference import RotationReference, left_jacobian
+from imitarm.skills.samples import SingleDemonstrationWarning, samples_of
 from imitarm.skills.selection import Candidate, choose, try_numbers_of_components
 from imitarm.trajectory import Demonstration, Trajectory
 
 Array = NDArray[np.float64]
 
-_SAME_DURATION = 0.01  # demonstrations whose durations differ by a larger share were not aligned
-_CLOCK_DIGITS = 6  # microseconds: epoch stamps have no finer ones, so that they give the same skill as others
 _AXES = ("x", "y", "z")
-
-
-class SingleDemonstrationWarning(UserWarning):
-    """Only one demonstration: its covariance tells how well it was fitted, not how much a person varies."""
-
-
-class UnalignedWarning(UserWarning):
-    """Demonstrations of different durations were given; unaligned demonstrations flatten the mean."""
 
 
 class GMR:
@@ -121,13 +112,14 @@ class GMR:
         """Learn from demonstrations, aligned beforehand (``imitarm.demonstrations.align``).
 
         Times start anywhere: each demonstration's first time is subtracted. Durations that differ by more than 1 %
-        are scaled to their median, with an :class:`UnalignedWarning`.
+        are scaled to their median, with an
+        :class:`~imitarm.skills.samples.UnalignedWarning`.
 
         Raises:
             InputError: when there is no demonstration, only some have quaternions, or there are fewer samples than
                 components.
         """
-        tables, reference, duration = _tables(demonstrations)
+        tables, reference, duration = samples_of(demonstrations)
         self.duration_, self.n_demonstrations_, self.reference_ = duration, len(tables), reference
         min_std = np.array([0.0, *[self.min_std[0]] * 3, *[self.min_std[1]] * 3])[: tables[0].shape[1]]
         if len(tables) == 1:
@@ -338,37 +330,3 @@ class GMR:
             positions, quaternions, _ = self.predict_pose(times)
             return Trajectory(times, positions, quaternions)
         return Trajectory(times, self.predict(times)[0])
-
-
-def _tables(
-    demonstrations: Sequence[Demonstration | Trajectory],
-) -> tuple[list[Array], RotationReference | None, float]:
-    """Return the samples [t, x, y, z(, r)] of each demonstration, the reference of the rotations, and the duration."""
-    if isinstance(demonstrations, Demonstration | Trajectory):
-        raise InputError("GMR.fit: give a list of demonstrations, not one alone")
-    if len(demonstrations) < 1:
-        raise InputError("GMR.fit: no demonstrations; give at least 1, better 3 or more")
-    trajectories = [d.trajectory if isinstance(d, Demonstration) else d for d in demonstrations]
-    without = [i for i, trajectory in enumerate(trajectories) if trajectory.quaternions is None]
-    if 0 < len(without) < len(trajectories):
-        raise InputError(
-            f"GMR.fit: demonstrations {without} have no quaternions while the others have; "
-            "record orientation in all of them or drop it from all"
-        )
-    durations = np.array([trajectory.duration for trajectory in trajectories])
-    duration = float(np.median(durations))
-    if np.ptp(durations) > _SAME_DURATION * duration:
-        warnings.warn(
-            f"demonstrations last from {durations.min():.3g} to {durations.max():.3g} s; their times are scaled to "
-            f"{duration:.3g} s. Align them first: unaligned demonstrations flatten the mean",
-            UnalignedWarning,
-            stacklevel=3,
-        )
-    times = [np.round(k.times - k.times[0], _CLOCK_DIGITS) * (duration / k.duration) for k in trajectories]
-    tables = [np.column_stack([t, k.positions]) for t, k in zip(times, trajectories, strict=True)]
-    if without:
-        return tables, None, duration
-    rotations = [(t, k.quaternions) for t, k in zip(times, trajectories, strict=True) if k.quaternions is not None]
-    reference = RotationReference.among(rotations)
-    vectors = [reference.to_vectors(t, q) for t, q in rotations]
-    return [np.column_stack(pair) for pair in zip(tables, vectors, strict=True)], reference, duration
