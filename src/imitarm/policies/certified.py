@@ -31,6 +31,8 @@ MAX_LIFT = 0.35  # [m] a sample that would have to move farther than this is giv
 AFFECTED_DISTANCE = 0.05  # [m] d_0 of METHODS D.2.4: components nearer than this may help
 _ANGLES = np.arange(12) * (np.pi / 6.0)
 _RING = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # directions tried across the path in 3-D
+_IDENTITY = np.eye(3)
+_OTHERS = ([1, 2], [0, 2], [0, 1])
 _MAX_ROWS = 20  # violated samples that vote on a direction; the polish then holds all of them
 _REFINED = 3  # directions whose amplitudes are made smallest; the others wait with a rougher answer
 _VIOLATION_COST = 1e3  # [1/m] price of violated clearance against the style cost (METHODS D.2.5)
@@ -132,9 +134,10 @@ class _Search:
         lifts = self._exits(self.pairs[worst], positions, rows, directions)
         children, costs, entered = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
         if entered:  # the best way out of this obstacle runs into another one: also try to go beyond all of them
-            for i, pair in enumerate(self.pairs):
+            near = distance[:, rows].min(axis=1) < self.wanted + MAX_LIFT
+            for i in np.flatnonzero(near):
                 if i != worst:
-                    lifts = np.maximum(lifts, self._exits(pair, positions, rows, directions))
+                    lifts = np.maximum(lifts, self._exits(self.pairs[i], positions, rows, directions))
             more, prices, _ = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
             children, costs = children + more, costs + prices
         return list(zip(costs, children, strict=True))
@@ -171,8 +174,9 @@ class _Search:
         costs[best], violation = self._costs(children[best])
         before = np.maximum(0.0, self.wanted - distance[:, ::_THINNED]).sum(axis=1)
         after = violation[:, np.argmin(costs[best])]
-        entered = bool(np.any(np.delete(after - before, worst) > 0.0))
-        return list(children), costs.tolist(), entered
+        nearer = after > before
+        nearer[worst] = False
+        return list(children), costs.tolist(), bool(nearer.any())
 
     def _costs(self, displacements: Array) -> tuple[Array, Array]:
         """Rate displacements (c, n_components, 3): demonstrated variance they use up, and clearance still violated.
@@ -195,8 +199,8 @@ class _Search:
         axis = int(np.argmax(np.abs(tangent)))
         v = tangent.copy()
         v[axis] += np.copysign(1.0, tangent[axis])
-        across = np.delete(np.eye(3) - np.outer(v, v) * (2.0 / (v @ v)), axis, axis=0)
-        candidates = np.vstack([_RING @ across, normal[at] - (normal[at] @ tangent) * tangent])
+        across = (_IDENTITY - v[:, None] * v * (2.0 / (v @ v)))[_OTHERS[axis]]
+        candidates = np.concatenate([_RING @ across, (normal[at] - (normal[at] @ tangent) * tangent)[None]])
         for _ in range(2 if len(self.forbidden) else 0):  # taking out one part may bring back a little of another
             for f in self.forbidden:
                 candidates = candidates - np.maximum(candidates @ f, 0.0)[:, None] * f

@@ -122,7 +122,7 @@ class ComponentPath:
             basis=window[:, None] * influence,
             means=means,
             covariances=gmr.position_covariances_ + TOLERANCE_FLOOR**2 * np.eye(3),
-            yields=gmr.predict(gmr.time_means_)[1] + TOLERANCE_FLOOR**2 * np.eye(3),
+            yields=tolerance[_nearest(times, gmr.time_means_)] + TOLERANCE_FLOOR**2 * np.eye(3),
             tolerance=tolerance,
             spheres=_checked_spheres(spheres, quaternions is not None),
         )
@@ -165,6 +165,12 @@ def _checked_spheres(spheres: ArrayLike, turns_known: bool) -> Array:
             "record quaternions, or give one tool_radius"
         )
     return rows
+
+
+def _nearest(times: Array, moments: Array) -> NDArray[np.intp]:
+    """Return the index of the sample nearest to each moment; the samples are equally spaced."""
+    step = times[1] - times[0]
+    return np.clip(np.rint((moments - times[0]) / step), 0, len(times) - 1).astype(np.intp)
 
 
 def _window(times: Array, pins: Sequence[float]) -> Array:

@@ -22,10 +22,12 @@ Index = NDArray[np.intp]
 
 NEGLIGIBLE_LEVER = 1e-3  # a sample that no component can move has no row
 UNBOUNDED = 1e30  # daqp's infinity
-_INFLUENCE = 0.06  # [m] obstacles farther from a sample than this get no row
-_STEPS = 6
+_INFLUENCE = 0.04  # [m] at first, obstacles farther from a sample than this get no row
+_STEPS = 4
+_HOPELESS = 0.002  # [m] a sample that lacks this much is no dip between two of them
+_TRIES = 5  # a segment that still dips then is given up
 _SLACK_SCALE = 1e-4  # [m] missing the tangents by this costs as much as one demonstrated sigma
-_GAIN = 0.97  # stop when a step saves less than 3 %
+_GAIN = 0.95  # stop when a step saves less than 5 %
 _SOLVED = 1  # daqp's exit flag of an optimal solution
 
 
@@ -67,42 +69,57 @@ class LeastDetour:
 
     def shrink(self, detour: Detour, distance: Array, normal: Array) -> Detour:
         """Shrink a displacement to the least one that its tangents allow; where a segment dips, ask for more there."""
-        best = self._judged(detour.displacement, detour.positions, distance, normal, detour.expanded)
-        moved = np.flatnonzero(np.any(detour.displacement != 0.0, axis=1))
-        positions, wanted = detour.positions, self.wanted
-        cost = self._cost(detour.displacement)
-        for _ in range(_STEPS if len(moved) else 0):
-            displacement = self._least(moved, positions, distance, normal, wanted)
-            if displacement is None:
+        best: Detour | None = None
+        moved = np.flatnonzero(detour.displacement.any(axis=1))
+        displacement, positions, wanted = detour.displacement, detour.positions, self.wanted
+        for _ in range(_TRIES if len(moved) else 0):
+            cost = self._cost(displacement)
+            for _ in range(_STEPS):
+                step = self._step(moved, positions, distance, normal, wanted)
+                if step is None:
+                    break
+                displacement, positions, distance, normal = step
+                previous, cost = cost, self._cost(displacement)
+                if cost > _GAIN * previous:
+                    break
+            trial = judged(self.pairs, displacement, positions, distance, normal, self.clearance, detour.expanded)
+            if best is None or trial.bounds.min() > best.bounds.min():
+                best = trial
+            if trial.feasible or distance.min() < self.clearance - _HOPELESS:
                 break
-            positions = self.path.displaced(displacement)
-            distance, normal = distances(self.pairs, positions)
-            trial = self._judged(displacement, positions, distance, normal, detour.expanded)
-            if not trial.feasible:
-                if trial.bounds.min() > best.bounds.min():
-                    best = trial
-                wanted += 1.2 * (self.clearance - float(trial.bounds.min())) + 1e-6
-                continue
-            best = trial
-            previous, cost = cost, self._cost(displacement)
-            if cost > _GAIN * previous:
-                break
-        return best
+            wanted += 2.0 * (self.clearance - float(trial.bounds.min())) + 1e-6
+        return detour if best is None else best
 
-    def _judged(self, displacement: Array, positions: Array, distance: Array, normal: Array, expanded: int) -> Detour:
-        return judged(self.pairs, displacement, positions, distance, normal, self.clearance, expanded)
+    def _step(
+        self, moved: Index, positions: Array, distance: Array, normal: Array, wanted: float
+    ) -> tuple[Array, Array, Array, Array] | None:
+        """Return the displacement of least cost under the tangents, its path, distances and normals; None: no solution.
+
+        At first only samples near an obstacle get a row. Where that lets another one in, all of them do.
+        """
+        for influence in (_INFLUENCE, np.inf):
+            displacement = self._least(moved, positions, distance, normal, wanted, influence)
+            if displacement is None:
+                return None
+            new = self.path.displaced(displacement)
+            answer = distances(self.pairs, new)
+            if answer[0].min() >= min(wanted, float(distance.min())) - STILL:
+                break
+        return displacement, new, *answer
 
     def _cost(self, displacement: Array) -> float:
         return float(np.einsum("kd,kde,ke->", displacement, self.precisions, displacement))
 
-    def _least(self, moved: Index, positions: Array, distance: Array, normal: Array, wanted: float) -> Array | None:
+    def _least(
+        self, moved: Index, positions: Array, distance: Array, normal: Array, wanted: float, influence: float
+    ) -> Array | None:
         """Minimise ``sum Delta_k^T Y_k^-1 Delta_k`` under the tangents at ``positions``; None: no solution.
 
         With the yields ``Y_k = L_k L_k^T`` and ``Delta_k = L_k y_k`` the cost is ``|y|^2``: a least-norm problem. Where
         it has no solution, one more unknown lets all tangents be missed by the same, smallest length; from the path
         that comes of it the renewed tangents may have one.
         """
-        o, j = np.nonzero((distance < wanted + _INFLUENCE) & self.movable)
+        o, j = np.nonzero((distance < wanted + influence) & self.movable)
         n = normal[o, j]
         factors = self.factors[moved]
         rows = self.path.basis[np.ix_(j, moved)][:, :, None] * np.swapaxes(n @ factors, 0, 1)
