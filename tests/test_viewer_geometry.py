@@ -91,6 +91,7 @@ def test_every_kind_of_geom_has_the_size_mujoco_gives_it() -> None:
         np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), size, rtol=0.01)
     roof = geom_mesh(model, 6)
     assert roof is not None and volume(roof) == pytest.approx(1 / 6, rel=1e-3)
+    assert len(roof.vertices) == 4 * 3  # sharp: no two of its faces share a vertex
     assert geom_mesh(model, 7) is None and geom_mesh(model, 8) is None  # floors
 
 
@@ -110,3 +111,4 @@ def test_a_fine_mesh_is_thinned_and_keeps_its_shape() -> None:
     mesh = geom_mesh(model, 0)
     assert mesh is not None and 1000 < len(mesh.faces) <= 3000
     assert volume(mesh) == pytest.approx(4 / 3 * np.pi * 1e-3, rel=0.03)
+    assert len(mesh.vertices) < 1.2 * len(mesh.faces)  # round: faces share vertices

@@ -31,7 +31,9 @@ def messages(page: str) -> tuple[float, list[tuple[float, dict[str, Any]]]]:
 def page() -> str:
     path = make_path()
     marks = [ComponentMark("a/b", path.positions[50], np.diag([4e-4, 1e-3, 1e-9]), "#d55e00")]
-    return playback_html(make_recording(seconds=2.0), paths=[PathMark("learnt", path.positions)], components=marks)
+    return playback_html(
+        make_recording(seconds=2.0, crumbs=24), paths=[PathMark("learnt", path.positions)], components=marks
+    )
 
 
 def test_every_frame_of_the_recording_is_played_at_its_time(page: str) -> None:

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 _AROUND: Final = 28  # edges of a circle
 _RINGS: Final = 7  # rings of half a sphere
 _MAX_FACES: Final = 3000  # triangles of one mesh file; a nicer mesh is thinned to about this
+_SMOOTH: Final = 0.77  # faces that meet at less than about 40 degrees are parts of one round surface
 _FLOOR: Final = 1.0  # [m] half of a plane's width: larger ones, and endless ones (0), are floors
 _NO_COLOUR: Final = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that was given none
 
@@ -117,6 +118,26 @@ def _thinned(mesh: Mesh) -> Mesh:
     return mesh
 
 
+def _sharpened(mesh: Mesh) -> Mesh:
+    """Give faces that meet at a sharp edge vertices of their own; those that point about the same way share them."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15)
+    faces = mesh.faces.copy()
+    copies: dict[int, list[tuple[int, Array]]] = {}  # of each vertex: its number, and the normal it began with
+    origin: list[int] = []
+    for face, corner in np.ndindex(faces.shape):
+        vertex, normal = int(faces[face, corner]), normals[face]
+        mine = copies.setdefault(vertex, [])
+        number = next((n for n, other in mine if other @ normal > _SMOOTH), None)
+        if number is None:
+            number = len(origin)
+            origin.append(vertex)
+            mine.append((number, normal))
+        faces[face, corner] = number
+    return Mesh(mesh.vertices[origin], faces)
+
+
 def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
     """Return the triangles of a geom in its own frame; None for floors (large planes) and for height fields.
 
@@ -134,7 +155,7 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
         first_vertex, first_face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
         vertices = model.mesh_vert[first_vertex : first_vertex + model.mesh_vertnum[mesh]]
         faces = model.mesh_face[first_face : first_face + model.mesh_facenum[mesh]]
-        return _thinned(Mesh(np.array(vertices, dtype=float), np.array(faces, dtype=np.int64)))
+        return _sharpened(_thinned(Mesh(np.array(vertices, dtype=float), np.array(faces, dtype=np.int64))))
     return None
 
 

@@ -28,9 +28,9 @@ Array = NDArray[np.float64]
 _STEP: Final = 2.0**-13  # [m], [-] poses are rounded to this (0.12 mm): a file of round numbers is a third as large
 _REST: Final = 1.5  # [s] how long the last picture stands before the playback starts again
 _CHI2_95: Final = 7.815  # 95 % of a 3-D Gaussian is within sqrt(7.815) sigma
-# viser warns of slow drawing with a note over the picture, which then hides the arm
-_NO_TOAST: Final = "<style>.mantine-Notifications-root{display:none!important}</style>"
-_MANY: Final = 4  # so many equal bodies are drawn as one batch
+# viser warns of slow drawing with a note that hides the arm, and fades the picture in frame by frame: for ever, then
+_STYLE: Final = "<style>.mantine-Notifications-root{display:none!important}canvas{opacity:1!important}</style>"
+_MANY: Final = 24  # so many equal bodies are drawn as one batch: small in the file, late on a slow machine
 _PATH_POINTS: Final = 160
 _EXPOSURE: Final = 0.7
 _BACKDROP: Final = {False: ((246, 247, 249), (221, 225, 231)), True: ((38, 42, 50), (20, 22, 27))}  # dark: top, bottom
@@ -272,4 +272,4 @@ def playback_html(
                 mover.show(frame)
         serializer.insert_sleep(_REST if len(recording) > 1 else 0.0)
         page: str = serializer.as_html(dark_mode=dark)
-    return page.replace("</head>", _NO_TOAST + "</head>", 1)
+    return page.replace("</head>", _STYLE + "</head>", 1)
