@@ -34,12 +34,12 @@ _RING = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # directions tried
 _IDENTITY = np.eye(3)
 _OTHERS = ([1, 2], [0, 2], [0, 1])
 _MAX_ROWS = 20  # violated samples that vote on a direction; the polish then holds all of them
-_REFINED = 3  # directions whose amplitudes are made smallest; the others wait with a rougher answer
+_REFINED = 2  # directions whose amplitudes are made smallest; the others wait with a rougher answer
 _VIOLATION_COST = 1e3  # [1/m] price of violated clearance against the style cost (METHODS D.2.5)
 _STYLE_COST = 1e-3
 _REPAIRABLE = 0.003  # [m] a violation that the polish can take out itself
 _NEWTON_STEPS = 12
-_LIFT_TOLERANCE = 1e-4  # [m]
+_LIFT_TOLERANCE = 1e-3  # [m] lifts are this much too long at most
 _THINNED = 2  # sides are rated on every second sample
 
 
@@ -135,7 +135,7 @@ class _Search:
         children, costs, entered = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
         if entered:  # the best way out of this obstacle runs into another one: also try to go beyond all of them
             near = distance[:, rows].min(axis=1) < self.wanted + MAX_LIFT
-            for i in np.flatnonzero(near):
+            for i in np.flatnonzero(near).tolist():
                 if i != worst:
                     lifts = np.maximum(lifts, self._exits(self.pairs[i], positions, rows, directions))
             more, prices, _ = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
@@ -184,7 +184,7 @@ class _Search:
         Returns:
             costs (c,) and, by pair, the violation summed over every second sample (n_pairs, c) [m].
         """
-        style = np.einsum("ckd,kde,cke->c", displacements, self.least.precisions, displacements)
+        style = np.einsum("ckd,kde,cke->c", displacements, self.path.precisions, displacements)
         sampled = self.path.nominal.positions[::_THINNED] + self.path.basis[::_THINNED] @ displacements
         every = slice(None, None, _THINNED)
         lacking = [np.maximum(0.0, self.wanted - pair.distance(sampled, every)).sum(axis=1) for pair in self.pairs]

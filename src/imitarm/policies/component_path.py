@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose, rotate
 from imitarm.policies.certificate import Pair
 from imitarm.scene.obstacle import Obstacle
+from imitarm.skills.gmr import GMR
 from imitarm.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -54,6 +56,8 @@ class ComponentPath:
             hold the motion itself too: a component is long along the path.
         yields: how much the teacher varied at the instant of each component's centre, floored as well: GMR's
             covariance there, (n_components, 3, 3) [m^2]. It is what a displacement is measured against.
+        factors: lower Cholesky factors of the yields, (n_components, 3, 3) [m].
+        precisions: inverses of the yields, (n_components, 3, 3) [1/m^2].
         tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
         spheres: that hold the tool: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
     """
@@ -64,6 +68,8 @@ class ComponentPath:
     means: Array
     covariances: Array
     yields: Array
+    factors: Array
+    precisions: Array
     tolerance: Array
     spheres: Array
 
@@ -95,37 +101,21 @@ class ComponentPath:
         """
         if n_samples < 10:
             raise InputError(f"n_samples must be at least 10, got {n_samples}")
-        gmr = skill.gmr_
-        times = np.linspace(0.0, skill.duration_, n_samples)
         outside = [p for p in pinned if not 0.0 <= p <= skill.duration_]
         if outside:
             raise InputError(f"pinned instant {outside[0]:g} s is outside the motion (0 to {skill.duration_:g} s)")
-        quaternions: Array | None = None
-        if gmr.has_orientation_:
-            mean, quaternions, covariance = gmr.predict_pose(times)
-            tolerance = covariance[:, :3, :3]
-        else:
-            mean, tolerance = gmr.predict(times)
-        responsibilities = gmr.responsibilities(times)
-        means = gmr.position_means_
-        if start is not None or goal is not None:
-            moved = skill.generate(start, goal, skill.duration_, skill.duration_ / (n_samples - 1))
-            centre_times = np.clip(gmr.time_means_, times[0], times[-1])
-            shift = moved.positions - mean
-            means = means + np.stack([np.interp(centre_times, times, column) for column in shift.T], axis=1)
-            mean, quaternions = moved.positions, moved.quaternions
-        window = _window(times, [0.0, skill.duration_, *pinned])
-        influence = np.where(responsibilities < NEGLIGIBLE_RESPONSIBILITY, 0.0, responsibilities)
-        return cls(
-            nominal=Trajectory(times, mean, quaternions),
-            responsibilities=responsibilities,
-            basis=window[:, None] * influence,
-            means=means,
-            covariances=gmr.position_covariances_ + TOLERANCE_FLOOR**2 * np.eye(3),
-            yields=tolerance[_nearest(times, gmr.time_means_)] + TOLERANCE_FLOOR**2 * np.eye(3),
-            tolerance=tolerance,
-            spheres=_checked_spheres(spheres, quaternions is not None),
-        )
+        rows = _checked_spheres(spheres, skill.gmr_.has_orientation_)
+        window = (0.0, *map(float, pinned), skill.duration_)
+        if start is None and goal is None:
+            return replace(_learnt(skill.gmr_, n_samples, window), spheres=rows)
+        learnt = _learnt(skill.gmr_, n_samples, window)
+        times = learnt.nominal.times
+        moved = skill.generate(start, goal, skill.duration_, skill.duration_ / (n_samples - 1))
+        shift = moved.positions - learnt.nominal.positions
+        centre_times = np.clip(skill.gmr_.time_means_, times[0], times[-1])
+        carried = np.stack([np.interp(centre_times, times, column) for column in shift.T], axis=1)
+        nominal = Trajectory(times, moved.positions, moved.quaternions)
+        return replace(learnt, nominal=nominal, means=learnt.means + carried, spheres=rows)
 
     @property
     def n_components(self) -> int:
@@ -151,8 +141,42 @@ class ComponentPath:
 
     def deviation(self, displacement: Array) -> float:
         """Return the largest Mahalanobis length of a mean's displacement: how many demonstrated sigmas it moved."""
-        solved = np.linalg.solve(self.yields, displacement[..., None])[..., 0]
-        return float(np.sqrt(np.max(np.sum(displacement * solved, axis=-1), initial=0.0)))
+        squares = np.einsum("kd,kde,ke->k", displacement, self.precisions, displacement)
+        return float(np.sqrt(squares.max(initial=0.0)))
+
+
+_PATHS: WeakKeyDictionary[GMR, tuple[Array, tuple[int, tuple[float, ...]], ComponentPath]] = WeakKeyDictionary()
+
+
+def _learnt(gmr: GMR, n_samples: int, pins: tuple[float, ...]) -> ComponentPath:
+    """Take the learnt path apart; the last answer for each regression is kept, since no scene changes it."""
+    key = (n_samples, pins)
+    if gmr in _PATHS and _PATHS[gmr][0] is gmr.means_ and _PATHS[gmr][1] == key:  # fitting again makes new means
+        return _PATHS[gmr][2]
+    times = np.linspace(0.0, pins[-1], n_samples)
+    quaternions: Array | None = None
+    if gmr.has_orientation_:
+        mean, quaternions, covariance = gmr.predict_pose(times)
+        tolerance = covariance[:, :3, :3]
+    else:
+        mean, tolerance = gmr.predict(times)
+    responsibilities = gmr.responsibilities(times)
+    yields = tolerance[_nearest(times, gmr.time_means_)] + TOLERANCE_FLOOR**2 * np.eye(3)
+    influence = np.where(responsibilities < NEGLIGIBLE_RESPONSIBILITY, 0.0, responsibilities)
+    path = ComponentPath(
+        nominal=Trajectory(times, mean, quaternions),
+        responsibilities=responsibilities,
+        basis=_window(times, pins)[:, None] * influence,
+        means=gmr.position_means_,
+        covariances=gmr.position_covariances_ + TOLERANCE_FLOOR**2 * np.eye(3),
+        yields=yields,
+        factors=np.asarray(np.linalg.cholesky(yields), dtype=np.float64),
+        precisions=np.asarray(np.linalg.inv(yields), dtype=np.float64),
+        tolerance=tolerance,
+        spheres=np.zeros((1, 4)),
+    )
+    _PATHS[gmr] = (gmr.means_, key, path)
+    return path
 
 
 def _checked_spheres(spheres: ArrayLike, turns_known: bool) -> Array:

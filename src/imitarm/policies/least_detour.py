@@ -27,7 +27,7 @@ _STEPS = 4
 _HOPELESS = 0.002  # [m] a sample that lacks this much is no dip between two of them
 _TRIES = 5  # a segment that still dips then is given up
 _SLACK_SCALE = 1e-4  # [m] missing the tangents by this costs as much as one demonstrated sigma
-_GAIN = 0.95  # stop when a step saves less than 5 %
+_GAIN = 0.9  # stop when a step saves less than a tenth
 _SOLVED = 1  # daqp's exit flag of an optimal solution
 
 
@@ -52,7 +52,6 @@ class LeastDetour:
 
     Attributes:
         wanted: distance planned for at the samples: the clearance, and what a chord may sag between two of them [m].
-        precisions: inverse of the components' yields, shape (n_components, 3, 3) [1/m^2].
         movable: which samples some component can move, shape (n,).
     """
 
@@ -63,8 +62,6 @@ class LeastDetour:
         # step^2 / 8 radius.
         radius = clearance + min(pair.radius for pair in pairs)
         self.wanted = clearance + 1e-4 + 1.5 * step**2 / (8.0 * max(radius, 1e-3))
-        self.factors = np.linalg.cholesky(path.yields)
-        self.precisions = np.linalg.inv(path.yields)
         self.movable = path.basis.max(axis=1) > NEGLIGIBLE_LEVER
 
     def shrink(self, detour: Detour, distance: Array, normal: Array) -> Detour:
@@ -97,18 +94,19 @@ class LeastDetour:
 
         At first only samples near an obstacle get a row. Where that lets another one in, all of them do.
         """
+        answer = None
         for influence in (_INFLUENCE, np.inf):
             displacement = self._least(moved, positions, distance, normal, wanted, influence)
             if displacement is None:
                 return None
             new = self.path.displaced(displacement)
-            answer = distances(self.pairs, new)
-            if answer[0].min() >= min(wanted, float(distance.min())) - STILL:
+            answer = (displacement, new, *distances(self.pairs, new))
+            if answer[2].min() >= min(wanted, float(distance.min())) - STILL:
                 break
-        return displacement, new, *answer
+        return answer
 
     def _cost(self, displacement: Array) -> float:
-        return float(np.einsum("kd,kde,ke->", displacement, self.precisions, displacement))
+        return float(np.einsum("kd,kde,ke->", displacement, self.path.precisions, displacement))
 
     def _least(
         self, moved: Index, positions: Array, distance: Array, normal: Array, wanted: float, influence: float
@@ -121,7 +119,7 @@ class LeastDetour:
         """
         o, j = np.nonzero((distance < wanted + influence) & self.movable)
         n = normal[o, j]
-        factors = self.factors[moved]
+        factors = self.path.factors[moved]
         rows = self.path.basis[np.ix_(j, moved)][:, :, None] * np.swapaxes(n @ factors, 0, 1)
         offset = np.einsum("rd,rd->r", n, positions[j] - self.path.nominal.positions[j])
         lower = wanted - distance[o, j] + offset
