@@ -135,13 +135,13 @@ def log_densities(theta: Array, features: Array) -> Array:
 
 
 def normalise(log_density: Array) -> tuple[Array, Array]:
-    """Turn log-densities (B, K, n) into responsibilities, by log-sum-exp over the components.
+    """Turn log-densities (B, K, n) into responsibilities, in place, by log-sum-exp over the components.
 
     Returns:
-        Responsibilities (B, K, n) and log-likelihoods of the samples (B, n).
+        Responsibilities (B, K, n), in the memory given, and log-likelihoods of the samples (B, n).
     """
     top = log_density.max(axis=1)
-    ratio = log_density - top[:, None]
+    ratio = np.subtract(log_density, top[:, None], out=log_density)
     np.maximum(ratio, _NOTHING, out=ratio)
     np.exp(ratio, out=ratio)
     total = ratio.sum(axis=1)

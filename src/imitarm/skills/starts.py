@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 _SLOTS = 40  # equal time slots that segments are made of, at least; four times as many as components if that is more
 _EDGE = 1e-4  # of a slot: a time that falls on an edge must not change sides by rounding (of epoch stamps, too)
 _SOFT = 1e-6  # variance added to a segment, relative to the columns', so that a straight one costs a finite amount
-_EVEN = 0.2  # cost of the squared lengths, beside about 10 that a sample costs: equal lengths where data don't care
+_EVEN = 0.05  # cost of the squared lengths, beside about 10 that a sample costs: equal lengths where data don't care
 
 
 def responsibilities_by_segments(features: Array, column: Array, numbers: Sequence[int]) -> list[Array]:
