@@ -16,6 +16,7 @@ Adjustment = Literal["progress", "hoffmann", "rotodilatation"]
 
 ADJUSTMENTS = ("progress", "hoffmann", "rotodilatation")
 _CLOSED = 0.1  # net motion below this share of the path length gives no direction to turn and stretch by
+_SAME_STEP = 1e-12  # so little a step may miss a whole number of steps and still be taken for one
 _LONGEST_PLAN = 100_000  # steps
 
 
@@ -71,8 +72,12 @@ class Course:
             return None
         plan = self._plans[step]
         if plan is None and 1.0 / step < _LONGEST_PLAN:
-            n = int(np.ceil(1.0 / step))
-            y = self.target(np.exp(-0.5 * DECAY * step * np.arange(2 * n + 1)))
+            n = round(1.0 / step)
+            if abs(n * step - 1.0) < _SAME_STEP:
+                y = self.target_on_grid(n)
+            else:
+                n = int(np.ceil(1.0 / step))
+                y = self.target(np.exp(-0.5 * DECAY * step * np.arange(2 * n + 1)))
             E, G, _ = propagator(gains, step)
             plan = Plan(E, G @ np.stack([y[:-1:2], y[1::2], y[2::2]], axis=1))
             self._plans[step] = plan

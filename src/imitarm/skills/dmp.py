@@ -236,10 +236,11 @@ class DMP:
             done = -1
         plan = course.plan(self.gains_, h) if done >= 0 else None
         if plan is not None and done < len(plan.pushes):
-            motion = plan.transition @ state.motion + plan.pushes[done]
+            motion = plan.transition.dot(state.motion) + plan.pushes[done]  # dot: @ is slower on small arrays
         else:
             E, G, _ = propagator(self.gains_, h)
-            motion = E @ state.motion + G @ course.target(np.exp(-DECAY * (state.share + h * _BEGIN_MIDDLE_END)))
+            y = course.target(np.exp(-DECAY * (state.share + h * _BEGIN_MIDDLE_END)))
+            motion = E.dot(state.motion) + G.dot(y)
         turning = None
         if coupling is not None:
             T = course.duration
