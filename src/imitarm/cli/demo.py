@@ -39,6 +39,14 @@ _SUMMARY = (
     "simulated arm; clearance, torques and crumbs are measured by the simulator, not by the planner."
 )
 
+_CAPTIONS = {
+    "free": "Nothing is in the way: the brush does what it was shown.",
+    "two_boxes": "Two boxes stand on the learnt path, one before the dirt and one behind it.",
+    "tall_and_low": "Boxes of other sizes, each on the other side of the path.",
+    "boxes_and_cone": "A box and a cone stand on the path, and a tall box narrows the way round.",
+    "cone_first": "A cone and a box stand on the path, and a large box narrows the way round.",
+}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes."""
@@ -120,6 +128,7 @@ def _sweep(
         tool_radius=task.tool_radius,
         demonstrations=demonstrations,
         judge=task.judge,
+        caption=_CAPTIONS.get(name, ""),
         progress=lambda share: progress.update(whole, completed=before + share),
     )
     progress.update(whole, completed=before + 1.0)
@@ -139,7 +148,7 @@ def show_results(report: Report) -> None:
                 "done" if scene.success else "FAILED",
                 f"{1e3 * scene.min_clearance:.1f}" if np.isfinite(scene.min_clearance) else "-",
                 proven,
-                f"{1e3 * scene.rmse:.1f}",
+                f"{1e3 * scene.rmse:.1f}" if np.isfinite(scene.rmse) else "-",
                 f"{100 * scene.unmoved_share:.0f}",
                 f"{1e3 * adaptation.compute_time:.1f}" if adaptation else "-",
                 scene.reason,

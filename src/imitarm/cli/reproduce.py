@@ -79,7 +79,6 @@ def run(arguments: argparse.Namespace) -> int:
     start = _start(skill, arm, arguments.start)
     robot = SimulatedRobot(arm, scene=scene, control=arguments.control, q=find_posture(arm, start))
     spheres = _tool(skill, arm, arguments.tool_radius)
-    radius = float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]))
     policy = ACFRA(
         skill,
         method=arguments.method,
@@ -96,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
             policy,
             clearance=1e-3 * arguments.clearance,
             link_clearance=None if arguments.tool_only else 1e-3 * arguments.clearance,
-            tool_radius=radius if len(spheres) == 1 else 0.0,
+            tool_spheres=spheres,
             progress=lambda share: progress.update(moving, completed=share),
         )
     report = Report(title=f"{skill.task_ or 'A skill'} on {arm.name}", scenes=[result], provenance=provenance())

@@ -39,6 +39,7 @@ def try_scene(
     clearance: float,
     link_clearance: float | None = None,
     tool_radius: float = 0.0,
+    tool_spheres: Array | None = None,
     demonstrations: Sequence[Demonstration] = (),
     judge: Judge | None = None,
     caption: str = "",
@@ -54,6 +55,7 @@ def try_scene(
         clearance: that is asked for [m].
         link_clearance: that every link must keep [m]; None: only the tool is looked after.
         tool_radius: for the drawing [m].
+        tool_spheres: for the drawing, instead of a radius, shape (m, 4) [m].
         demonstrations: aligned, to measure the distance to.
         judge: the task's own verdict over the rollout.
         caption: a sentence about what is to be seen.
@@ -100,6 +102,7 @@ def try_scene(
         rmse=_distance_to(demonstrations, rollout, phases),
         reason=reason,
         tool_radius=tool_radius,
+        tool_spheres=tool_spheres,
         recording=frames.recording(),
         torque_limits=robot.arm.max_torque,
         joint_names=tuple(robot.arm.joint_names),
@@ -111,10 +114,8 @@ def try_scene(
 def _details(rollout: Rollout | None, policy: ACFRA) -> dict[str, object]:
     """Return what else the table shows."""
     details: dict[str, object] = {}
-    if rollout is not None:
-        if "swept_share" in rollout.details:
-            details["dirt in the pan"] = f"{100 * rollout.details['swept_share']:.0f} %"
-        details["contact steps"] = rollout.details.get("contact_steps", 0)
+    if rollout is not None and "swept_share" in rollout.details:
+        details["dirt in the pan"] = f"{100 * rollout.details['swept_share']:.0f} %"
     if policy.adaptation is not None:
         details["demonstrated sigmas moved"] = f"{policy.adaptation.deviation:.1f}"
     return details
