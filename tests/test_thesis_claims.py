@@ -7,6 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import ttest_rel, wilcoxon
 
+from imitarm.benchmark.avoidance import learn
+from imitarm.policies import adapt
+from imitarm.scene import Scene, Sphere
 from imitarm.skills import DMP
 from imitarm.skills.phase_basis import DECAY
 from imitarm.skills.spring import GAINS
@@ -122,3 +125,13 @@ def test_equations_4_4_to_4_6_have_more_than_one_stationary_point_and_a_misprint
     assert np.count_nonzero(slope != np.roll(slope, 1)) == 4
     printed = np.stack([a * np.cos(phi), a * np.sin(phi)])  # y_e = a sin(phi), as it stands before Eq 4.6
     assert np.abs((printed[0] / a) ** 2 + (printed[1] / b) ** 2 - 1.0).max() > 1.0
+
+
+def test_equation_4_9_has_its_root() -> None:
+    skill, path = learn(planar=False)
+    adapted = adapt(skill, Scene(None, [Sphere(path[200], 0.04)]), tool_radius=0.02)
+    squares = [
+        np.sum((a - b) ** 2) for a, b in zip(adapted.trajectory.positions, adapted.nominal.positions, strict=True)
+    ]
+    assert adapted.rmse_to_nominal == pytest.approx(np.sqrt(sum(squares) / len(squares)))
+    assert adapted.rmse_to_nominal > 0.005  # [m], where its square would be a hundred times less
