@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import Progress, TaskID
 
-from imitarm.cli.screen import progress_bar, say, show_table
+from imitarm.cli.screen import progress_bar, remark, say, show_table
 from imitarm.cli.trial import learning_summary, provenance, try_scene
 from imitarm.demonstrations import compute_alignment, lint
 from imitarm.errors import InputError
@@ -136,40 +136,33 @@ def _sweep(
 
 
 def show_results(report: Report) -> None:
-    """Print one row a scene."""
+    """Print one row a scene, and below the table why a scene failed."""
     rows, styles = [], []
     for scene in report.scenes:
         adaptation = scene.adaptation
-        proven = f"{1e3 * adaptation.certified_clearance:.1f}" if adaptation and scene.scene.obstacles else "-"
+        around = adaptation is not None and bool(scene.scene.obstacles)
         rows.append(
             (
                 scene.title,
-                str(len(scene.scene.obstacles)),
                 "done" if scene.success else "FAILED",
+                str(len(scene.scene.obstacles)),
                 f"{1e3 * scene.min_clearance:.1f}" if np.isfinite(scene.min_clearance) else "-",
-                proven,
+                f"{1e3 * adaptation.certified_clearance:.1f}" if adaptation and around else "-",
                 f"{1e3 * scene.rmse:.1f}" if np.isfinite(scene.rmse) else "-",
-                f"{100 * scene.unmoved_share:.0f}",
+                f"{100 * scene.unmoved_share:.0f} %",
                 f"{1e3 * adaptation.compute_time:.1f}" if adaptation else "-",
-                scene.reason,
             )
         )
         styles.append("" if scene.success else "red")
-    show_table(
-        [
-            "scene",
-            "obstacles>",
-            "",
-            "measured clearance [mm]>",
-            "proven for the tool [mm]>",
-            "to the demonstrations [mm]>",
-            "unmoved [%]>",
-            "adapted in [ms]>",
-            "",
-        ],
-        rows,
-        styles=styles,
+    headings = ["scene", "", "obstacles>", "clearance>", "proven>", "RMSE>", "unmoved>", "adapted>"]
+    show_table(headings, rows, styles=styles)
+    remark(
+        "clearance: least distance of arm and tool to an obstacle, measured [mm]; proven: of the tool's planned path [mm]; "
+        "RMSE to the demonstrations [mm]; unmoved: share of components; adapted: compute time [ms]"
     )
+    for scene in report.scenes:
+        if not scene.success:
+            say(f"{scene.title}: {scene.reason}")
     say(report.verdict)
 
 

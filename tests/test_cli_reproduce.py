@@ -1,0 +1,114 @@
+"""The commands demo and reproduce, as a user calls them: exit status, files, messages."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from imitarm.cli import main
+from imitarm.cli.demo import packaged_demonstrations
+from imitarm.demonstrations import align, read
+from imitarm.skills import Skill
+from imitarm.trajectory import Demonstration
+
+SCENES = Path(__file__).parent.parent / "examples" / "real_data"
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory):
+    path = tmp_path_factory.mktemp("skills") / "sweep.json"
+    Skill(10).fit(align(packaged_demonstrations())).save(path)
+    return path
+
+
+@pytest.mark.slow
+def test_the_demo_does_the_main_job(tmp_path, capsys):
+    assert main(["demo", "--out", str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    assert "4 of 4 scenes with obstacles without contact" in out
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert results["passed"] and len(results["scenes"]) == 5
+    for scene in results["scenes"][1:]:
+        assert scene["success"] and scene["min_clearance_m"] > 0.015 and scene["certified_clearance_m"] >= 0.02
+        assert scene["n_moved_components"] < scene["n_components"]
+        assert scene["details"]["dirt in the pan"] == "100 %"
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert 'src="http' not in page and 'href="http' not in page
+    assert Skill.load(tmp_path / "out" / "skill.json").n_demonstrations_ == 8
+    assert str(tmp_path) not in (tmp_path / "out" / "skill.json").read_text()
+
+
+def test_a_demo_that_fails_says_so_by_its_status(tmp_path, monkeypatch, capsys):
+    """The thesis's potential field does not keep the path clear; the exit status tells."""
+    monkeypatch.setattr("imitarm.cli.demo.SCENES", ("two_boxes",))
+    monkeypatch.setattr("imitarm.cli.demo.write_report", lambda report, path: path)
+    monkeypatch.setattr("imitarm.policies.certified.MAX_LIFT", 0.0)  # no way round is ever found
+    assert main(["demo", "--out", str(tmp_path)]) == 1
+    assert "no way round" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_demo_folder_that_cannot_be_made_is_bad_input(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(["demo", "--out", str(tmp_path / "file" / "sub")]) == 2
+    assert "name another folder" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("recording", "scene"), [("pouring", "pouring_scene"), ("bottle2shelf", "shelf_scene")])
+def test_real_recordings_on_the_panda_around_three_obstacles(real_data, tmp_path, capsys, recording, scene):
+    """Hand-guided on a real Panda; learnt with orientation, reproduced without contact, as docs/real_data.md says."""
+    shown = read(real_data / "panda_kinesthetic" / f"{recording}.npy", units="cm", duration=10.0, task=recording)
+    skill = Skill().fit(align(shown))
+    assert skill.gmr_.has_orientation_
+    skill.save(tmp_path / "skill.json")
+    command = ["reproduce", str(tmp_path / "skill.json"), "--robot", "panda", "--tool", "gripper"]
+    status = main([*command, "--scene", str(SCENES / f"{scene}.yaml"), "--out", str(tmp_path / "done.csv")])
+    out = capsys.readouterr().out
+    assert status == 0, out
+    assert "1 of 1 scenes with obstacles without contact" in out
+    done = Demonstration.load(tmp_path / "done.csv")
+    assert done.joints is not None and done.joints.shape[1] == 7
+
+
+def test_reproduce_without_obstacles(sweep, capsys):
+    assert main(["reproduce", str(sweep), "--robot", "sawyer", "--tool", "brush", "--keep-height"]) == 0
+    assert "1 of 1 scenes done" in capsys.readouterr().out
+
+
+def test_a_refusal_is_a_failed_task_with_the_obstacle_and_the_reason(sweep, tmp_path, capsys):
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        "format: imitarm-scene\nversion: 1\nunits: cm\n"
+        "obstacles: [{type: box, name: crate, position: [58, -48, 5], size: [10, 10, 10]}]\n"
+    )
+    command = ["reproduce", str(sweep), "--robot", "sawyer", "--tool", "brush", "--scene", str(scene)]
+    assert main(command) == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "crate" in out and "start" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        (["nosuch.json", "--robot", "sawyer"], 2, "nosuch.json"),
+        (["{sweep}", "--robot", "atlas"], 2, "known: panda, sawyer"),
+        (["{sweep}", "--robot", "sawyer", "--tool", "hammer"], 2, "hammer"),
+        (["{sweep}", "--robot", "sawyer", "--scene", "nosuch.yaml"], 2, "nosuch.yaml"),
+        (["{sweep}", "--robot", "sawyer", "--report", "nowhere/page.html"], 2, "there is no folder"),
+        (["{sweep}", "--robot", "sawyer", "--start", "300", "0", "0"], 1, "can't bring its tool"),
+        (["{sweep}", "--robot", "sawyer", "--clearance", "-5"], 2, "clearance"),
+    ],
+)
+def test_bad_input_is_one_clear_message(sweep, capsys, words, status, message):
+    assert main(["reproduce", *(word.format(sweep=sweep) for word in words)]) == status
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error and error.count("imitarm: error:") == 1
+
+
+def test_a_damaged_skill_is_refused(sweep, tmp_path, capsys):
+    damaged = tmp_path / "skill.json"
+    damaged.write_text(sweep.read_text().replace("0.5", "0.6", 1))
+    assert main(["reproduce", str(damaged), "--robot", "sawyer"]) == 2
+    assert "skill.json" in capsys.readouterr().err

@@ -1,0 +1,198 @@
+"""adapt(): options, errors, moved goals, tools wider than their tip."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from imitarm.benchmark.avoidance import learn
+from imitarm.benchmark.families import sparse_clutter
+from imitarm.errors import InputError, UnknownNameError
+from imitarm.kinematics.pose import Pose, quaternion_exp, rotate
+from imitarm.policies import HORIZONTAL_ONLY, METHODS, adapt
+from imitarm.policies.component_path import ComponentPath, quintic_step
+from imitarm.policies.potential_components import FORCES, component_distances, push_components
+from imitarm.scene import Box, Scene, Sphere
+from imitarm.skills import Skill
+from imitarm.trajectory import Demonstration, Trajectory
+
+
+@pytest.fixture(scope="module")
+def spatial():
+    return learn(planar=False)
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """A skill that moves 0.6 m along x while the tool turns by 100 degrees about z."""
+    rng = np.random.default_rng(3)
+    times = np.linspace(0.0, 4.0, 150)
+    u = quintic_step(times / 4.0)
+    shown = []
+    for i in range(5):
+        positions = np.stack([0.6 * u, 0.01 * rng.normal() * np.sin(np.pi * u), 0.3 + 0.01 * rng.normal() * u], axis=1)
+        turns = np.stack([0 * u, 0 * u, np.deg2rad(100) * u], axis=1) + 0.01 * rng.normal(size=3)
+        shown.append(Demonstration(Trajectory(times, positions, quaternion_exp(turns)), source=str(i)))
+    return Skill(n_components=7).fit(shown)
+
+
+def test_unknown_method_lists_the_known_ones(spatial):
+    with pytest.raises(UnknownNameError, match="certified, literal, mapf"):
+        adapt(spatial[0], Scene(), "magic")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tool_radius": -0.01}, "must be >= 0"),
+        ({"clearance": float("nan")}, "must be >= 0"),
+        ({"forbidden": [[0, 0, 0]]}, "none of them zero"),
+        ({"forbidden": [1.0, 2.0]}, "rows of 3"),
+        ({"n_samples": 3}, "at least 10"),
+        ({"pinned": [99.0]}, "outside the motion"),
+        ({"tool_radius": 0.1, "tool_spheres": [[0, 0, 0, 0.1]]}, "not both"),
+        ({"tool_spheres": [[0, 0, 0]]}, "rows x y z r"),
+        ({"tool_spheres": [[0, 0, 0, -1]]}, "r >= 0"),
+        ({"tool_spheres": [[0, 0, 0.1, 0.02]]}, "orientation, which was not learnt"),
+    ],
+)
+def test_bad_options_say_what_is_wrong(spatial, options, message):
+    with pytest.raises(InputError, match=message):
+        adapt(spatial[0], Scene(), **options)
+
+
+def test_without_obstacles_nothing_changes(spatial):
+    adaptation = adapt(spatial[0], Scene())
+    assert adaptation.feasible and adaptation.reason == "" and adaptation.certified_clearance == np.inf
+    assert not adaptation.moved.any() and adaptation.unmoved_share == 1.0 and adaptation.rmse_to_nominal == 0.0
+    np.testing.assert_array_equal(adaptation.trajectory.positions, adaptation.nominal.positions)
+
+
+def test_a_goal_that_moved_is_reached_and_the_components_ride_along(spatial):
+    skill, _ = spatial
+    goal = Pose(np.add(skill.goal_.position, [0.05, -0.08, 0.04]), [1, 0, 0, 0])
+    adaptation = adapt(skill, Scene(goal, [Sphere([0.3, 0.0, 0.33], 0.03)]), tool_radius=0.03)
+    assert adaptation.feasible
+    np.testing.assert_allclose(adaptation.trajectory.positions[-1], goal.position, atol=2e-3)
+    np.testing.assert_allclose(adaptation.trajectory.positions[0], skill.start_.position, atol=2e-3)
+    learnt = ComponentPath.of_skill(skill)
+    assert np.linalg.norm(adaptation.means[-1] - learnt.means[-1]) > 0.05
+    assert np.linalg.norm(adaptation.means[0] - learnt.means[0]) < 0.01
+
+
+def test_fitting_again_forgets_the_path_that_was_kept():
+    skill, _ = learn(planar=False)
+    first = ComponentPath.of_skill(skill)
+    assert ComponentPath.of_skill(skill).nominal is first.nominal  # kept: no scene changes it
+    other = [
+        Demonstration(Trajectory([0.0, 1.0, 2.0, 3.0], np.eye(3)[[0, 1, 2, 0]] * s), source="") for s in (1.0, 1.1)
+    ]
+    skill.gmr_.n_components = 2
+    skill.gmr_.fit(other)
+    again = ComponentPath.of_skill(skill)
+    assert again.nominal is not first.nominal
+    assert np.abs(again.nominal.positions - first.nominal.positions).max() > 0.1
+
+
+def test_every_sphere_of_a_turning_tool_keeps_clear(turning):
+    """A bar sticks out of the tool by 12 cm and turns with it; the tip alone would pass, the bar would not."""
+    spheres = np.array([[0.12 * s, 0.0, 0.0, 0.02] for s in (0.0, 0.5, 1.0)])
+    box = Box(Pose([0.42, 0.10, 0.3], [1, 0, 0, 0]), [0.05, 0.05, 0.3])
+    scene = Scene(None, [box])
+    tip_only = adapt(turning, scene, tool_radius=0.02, clearance=0.02)
+    assert not tip_only.moved.any()
+    whole = adapt(turning, scene, tool_spheres=spheres, clearance=0.02)
+    assert whole.feasible and whole.moved.any()
+
+    def measured(trajectory):
+        times = np.linspace(0.0, turning.duration_, 3000)
+        positions, quaternions = trajectory.at(times)
+        centres = [positions + rotate(quaternions, s[:3]) for s in spheres]
+        return min(box.signed_distance(c).min() - s[3] for c, s in zip(centres, spheres, strict=True))
+
+    assert measured(tip_only.trajectory) < 0.0
+    assert whole.certified_clearance <= measured(whole.trajectory) + 1e-9
+    assert measured(whole.trajectory) >= 0.02
+
+
+def test_one_sphere_at_the_tip_is_the_same_as_a_radius(spatial):
+    skill, path = spatial
+    scene = sparse_clutter(5, path, n_obstacles=2, planar=False).scene
+    one, other = adapt(skill, scene, tool_radius=0.03), adapt(skill, scene, tool_spheres=[[0, 0, 0, 0.03]])
+    np.testing.assert_array_equal(one.trajectory.positions, other.trajectory.positions)
+
+
+def test_adaptation_is_deterministic(spatial):
+    skill, path = spatial
+    scene = sparse_clutter(8, path, n_obstacles=3, planar=False).scene
+    runs = [adapt(skill, scene, method, tool_radius=0.03).trajectory.positions for method in METHODS for _ in range(2)]
+    for a, b in zip(runs[::2], runs[1::2], strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_what_is_said_is_what_was_measured(spatial):
+    skill, path = spatial
+    for seed in range(10):
+        case = sparse_clutter(seed, path, n_obstacles=2, planar=False)
+        for method in METHODS:
+            adaptation = adapt(skill, case.scene, method, tool_radius=0.03)
+            at_samples = case.scene.clearance(adaptation.trajectory.positions).min() - 0.03
+            assert adaptation.min_clearance == pytest.approx(at_samples, abs=1e-9)
+            assert adaptation.certified_clearance <= adaptation.min_clearance + 1e-12
+            assert adaptation.feasible == (adaptation.certified_clearance >= 0.02)
+            assert bool(adaptation.reason) != adaptation.feasible
+
+
+@pytest.mark.parametrize("method", sorted(FORCES))
+def test_forces_are_minus_the_gradient_of_their_potential(method):
+    """Central differences of the potential, with spread and influence distance frozen as the method freezes them."""
+    reach = 0.05
+
+    def potential(d, gain):
+        d = max(d, 0.15 * reach)
+        if d >= reach:
+            return 0.0
+        return 0.5 * (1 / d - 1 / reach) ** 2 if method == "literal" else 0.5 * gain * reach**2 * (reach / d - 1) ** 2
+
+    normal = np.array([[[0.0, 0.6, 0.8]]])
+    for d in np.linspace(0.009, 0.06, 25):
+        force = FORCES[method](np.array([[d]]), normal, np.array([[0.01]]))[0, 0]
+        slope = (potential(d + 1e-8, 1.0) - potential(d - 1e-8, 1.0)) / 2e-8
+        np.testing.assert_allclose(force @ normal[0, 0], -slope, rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(np.cross(force, normal[0, 0]), 0.0, atol=1e-9)
+
+
+def test_the_spread_has_no_effect_on_the_literal_force_and_has_on_the_modified_one():
+    distance, normal = np.full((1, 2), 0.02), np.tile([0.0, 0.0, 1.0], (1, 2, 1))
+    tight, loose = np.array([[0.01, 0.01]]), np.array([[0.01, 0.03]])
+    np.testing.assert_array_equal(
+        FORCES["literal"](distance, normal, tight), FORCES["literal"](distance, normal, loose)
+    )
+    modified = FORCES["mapf"](distance, normal, loose)[0, :, 2]
+    assert modified[1] > modified[0]  # loosely demonstrated components yield more
+
+
+def test_component_distance_is_a_lower_bound_of_the_distance_to_the_ellipse(spatial):
+    skill, path = spatial
+    parts = ComponentPath.of_skill(skill)
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(4000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for seed in range(10):
+        scene = sparse_clutter(seed, path, n_obstacles=2, planar=False).scene
+        still = np.zeros((parts.n_components, 3))
+        bound, _, _ = component_distances(parts, still, scene.obstacles, 0.0)
+        for k in range(parts.n_components):
+            surface = parts.means[k] + directions @ np.linalg.cholesky(parts.covariances[k]).T
+            for o, obstacle in enumerate(scene.obstacles):
+                if obstacle.signed_distance(parts.means[k]) > 0:
+                    assert bound[o, k] <= obstacle.signed_distance(surface).min() + 1e-9
+
+
+def test_pushed_components_keep_forbidden_directions():
+    skill, path = learn(planar=True)
+    parts = ComponentPath.of_skill(skill)
+    scene = Scene(None, [Sphere(path[200] + [0.0, 0.0, 0.02], 0.04)])
+    for method in FORCES:
+        pushed = push_components(parts, scene.obstacles, 0.05, method=method, forbidden=np.array(HORIZONTAL_ONLY))
+        assert np.abs(pushed).max() > 0.0 and np.abs(pushed[:, 2]).max() == 0.0
