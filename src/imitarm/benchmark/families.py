@@ -69,24 +69,31 @@ def s_shaped_demonstrations(*, planar: bool, n_demonstrations: int = 8, seed: in
     return demonstrations
 
 
-def random_obstacle(rng: np.random.Generator, centre: Array, *, planar: bool) -> Obstacle:
+SIMPLE = ("sphere", "box")  # the shapes of the earlier figures in METHODS D.2
+KINDS = (*SIMPLE, "capsule", "cylinder", "ellipsoid", "convex hull")
+
+
+def random_obstacle(
+    rng: np.random.Generator, centre: Array, *, planar: bool, kinds: tuple[str, ...] = KINDS
+) -> Obstacle:
     """Make an obstacle of a random kind, 2 to 10 cm across; in a planar scene it stands upright on the table."""
     radius = rng.uniform(0.02, 0.05)
     turn = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]) if planar else rng.normal(size=3)
     pose = Pose(centre, quaternion_exp(turn))
     half = rng.uniform(0.015, 0.045, size=3)
-    kinds: list[Callable[[], Obstacle]] = [
-        lambda: Sphere(centre, radius),
-        lambda: Box(pose, 2.0 * half),
-        lambda: Capsule(centre - pose.rotation[:, 0] * half[0], centre + pose.rotation[:, 0] * half[0], 0.6 * radius),
-        lambda: Cylinder(pose, radius, 4.0 * half[2]),
-        lambda: Ellipsoid(pose, half),
-        lambda: ConvexHull(centre + rng.normal(size=(12, 3)) * 0.02),
-    ]
-    return kinds[int(rng.integers(len(kinds)))]()
+    along = pose.rotation[:, 0] * half[0]
+    make: dict[str, Callable[[], Obstacle]] = {
+        "sphere": lambda: Sphere(centre, radius),
+        "box": lambda: Box(pose, 2.0 * half),
+        "capsule": lambda: Capsule(centre - along, centre + along, 0.6 * radius),
+        "cylinder": lambda: Cylinder(pose, radius, 4.0 * half[2]),
+        "ellipsoid": lambda: Ellipsoid(pose, half),
+        "convex hull": lambda: ConvexHull(centre + rng.normal(size=(12, 3)) * 0.02),
+    }
+    return make[kinds[int(rng.integers(len(kinds)))]]()
 
 
-def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool) -> Case:
+def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, kinds: tuple[str, ...] = KINDS) -> Case:
     """Family S1/S3: obstacles of all kinds placed on the path, well apart; solvable, since one can go round each.
 
     Args:
@@ -94,6 +101,7 @@ def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool) ->
         path: nominal path that they are put on, shape (n, 3) [m].
         n_obstacles: how many.
         planar: whether the path must stay in its plane.
+        kinds: which shapes to choose from.
     """
     rng = np.random.default_rng([11, n_obstacles, planar, seed])
     ends = path[[0, -1]]
@@ -102,7 +110,7 @@ def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool) ->
     while len(chosen) < n_obstacles:
         off = _OFF_PATH * rng.normal(size=3) * ([1.0, 1.0, 0.0] if planar else [1.0, 1.0, 1.0])
         centre = path[rng.integers(len(path))] + off
-        obstacle = random_obstacle(rng, centre, planar=planar)
+        obstacle = random_obstacle(rng, centre, planar=planar, kinds=kinds)
         if obstacle.signed_distance(ends).min() < TOOL_RADIUS + _FREE_ENDS:
             continue
         if all(np.linalg.norm(centre - other) >= _APART for other in centres):

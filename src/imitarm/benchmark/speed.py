@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from imitarm.benchmark import avoidance, families
 from imitarm.skills import DMP, GMR, GaussianMixture
 from imitarm.trajectory import Trajectory
 
@@ -362,6 +363,44 @@ def importing() -> Row:
     return Row("import imitarm", lambda: _in_fresh_interpreter(code), most_seconds=0.3, repeats=5, self_timed=True)
 
 
+def _avoidance(n_obstacles: int, most_seconds: float) -> Row:
+    """Certified ACFRA in 3-D over 40 seeded scenes of spheres and boxes; the median scene counts."""
+    skill, path = avoidance.learn(planar=False)
+    cases = [
+        families.sparse_clutter(seed, path, n_obstacles=n_obstacles, planar=False, kinds=families.SIMPLE)
+        for seed in range(40)
+    ]
+
+    def outcomes() -> list[avoidance.Outcome]:
+        return avoidance.run_family(skill, cases)
+
+    def check() -> tuple[bool, str]:
+        done = outcomes()
+        kept = sum(o.accepted and o.kept for o in done)
+        slow = 1e3 * np.percentile([o.seconds for o in done], 95)
+        return kept == len(done), f"{kept} of {len(done)} keep 20 mm; 95th percentile {slow:.1f} ms"
+
+    name = f"certified ACFRA, 3-D, 200 samples, 8 components, {n_obstacles} obstacle{'s' * (n_obstacles > 1)}"
+    return Row(
+        name,
+        lambda: float(np.median([o.seconds for o in outcomes()])),
+        most_seconds=most_seconds,
+        check=check,
+        repeats=5,
+        self_timed=True,
+    )
+
+
+def avoidance_of_one() -> Row:
+    """Certified ACFRA with one obstacle in the way."""
+    return _avoidance(1, 0.002)
+
+
+def avoidance_of_three() -> Row:
+    """Certified ACFRA with three obstacles in the way."""
+    return _avoidance(3, 0.006)
+
+
 ROWS: tuple[Callable[[], Row], ...] = (
     gaussian_mixture,
     regression_with_covariance,
@@ -370,6 +409,8 @@ ROWS: tuple[Callable[[], Row], ...] = (
     steps_against_pydmps,
     steps_against_movement_primitives,
     rollout,
+    avoidance_of_one,
+    avoidance_of_three,
     importing,
 )
 

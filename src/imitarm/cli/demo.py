@@ -154,10 +154,10 @@ def show_results(report: Report) -> None:
             )
         )
         styles.append("" if scene.success else "red")
-    headings = ["scene", "", "obstacles>", "clearance>", "proven>", "RMSE>", "unmoved>", "adapted>"]
+    headings = ["scene", "", "obstacles>", "clear>", "proven>", "RMSE>", "unmoved>", "adapted>"]
     show_table(headings, rows, styles=styles)
     remark(
-        "clearance: least distance of arm and tool to an obstacle, measured [mm]; proven: of the tool's planned path [mm]; "
+        "clear: least distance of arm and tool to an obstacle, measured [mm]; proven: of the tool's path [mm]; "
         "RMSE to the demonstrations [mm]; unmoved: share of components; adapted: compute time [ms]"
     )
     for scene in report.scenes:
