@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -168,13 +166,3 @@ class _Notes:
             reason=fault or "finished",
             details=details,
         )
-
-
-class _CallableModule(ModuleType):
-    """``imitarm.reproduce`` is this module once it is imported, and the public function before; both can be called."""
-
-    def __call__(self, *args: Any, **options: Any) -> Rollout:
-        return reproduce(*args, **options)
-
-
-sys.modules[__name__].__class__ = _CallableModule

@@ -33,7 +33,7 @@ _ANGLES = np.arange(12) * (np.pi / 6.0)
 _RING = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # directions tried across the path in 3-D
 _IDENTITY = np.eye(3)
 _OTHERS = ([1, 2], [0, 2], [0, 1])
-_MAX_ROWS = 20  # violated samples that vote on a direction; the polish then holds all of them
+_MAX_ROWS = 12  # violated samples that vote on a direction; the polish then holds all of them
 _REFINED = 2  # directions whose amplitudes are made smallest; the others wait with a rougher answer
 _VIOLATION_COST = 1e3  # [1/m] price of violated clearance against the style cost (METHODS D.2.5)
 _STYLE_COST = 1e-3
@@ -211,8 +211,8 @@ class _Search:
     def _exits(self, pair: Pair, positions: Array, rows: Index, directions: Array) -> Array:
         """Return how far each sample has to go along each direction to be clear of the obstacle for good.
 
-        Newton's method from ``MAX_LIFT`` inwards: the signed distance along a ray is convex, so it comes down to the
-        largest root without passing it. A ray that is still inside at ``MAX_LIFT`` gets inf.
+        Newton's method from outside: the signed distance along a ray is convex, so it comes down to the largest root
+        without passing it. A lift above ``MAX_LIFT`` becomes inf.
 
         Args:
             pair: sphere and obstacle.
@@ -224,19 +224,18 @@ class _Search:
             Lifts, shape (m, p) [m].
         """
         points = pair.centres(positions[rows], rows)
-        lift = np.full((len(directions), len(points)), MAX_LIFT)
-        blocked = np.zeros(lift.shape, dtype=bool)
-        for iteration in range(_NEWTON_STEPS):
+        # Beyond the obstacle's farthest plane along a direction every point is clear: begin there.
+        farthest = np.einsum("md,md->m", pair.obstacle.support(directions), directions) + self.wanted + pair.radius
+        lift = np.maximum(farthest[:, None] - directions @ points.T, 0.0)
+        for _ in range(_NEWTON_STEPS):
             d, n = pair.distance_and_normal(points + lift[..., None] * directions[:, None, :])
             gap = d - self.wanted
-            if iteration == 0:
-                blocked = gap < 0.0
             slope = (n @ directions[:, :, None])[..., 0]
             falling = slope <= 1e-9  # past the point of closest approach: the ray never enters
             lift = np.where(falling, 0.0, np.maximum(lift - gap / np.where(falling, 1.0, slope), 0.0))
             if np.all((gap < _LIFT_TOLERANCE) | (lift <= 0.0)):
                 break
-        return np.where(blocked, np.inf, lift)
+        return np.where(lift > MAX_LIFT, np.inf, lift)
 
     def _affected(self, rows: Index, displacement: Array, worst: int) -> Index:
         """Return the indices of the components near the obstacle or in charge of a violated sample (METHODS D.2.4)."""
