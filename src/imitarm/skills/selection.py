@@ -53,21 +53,27 @@ def choose(candidates: Sequence[Candidate]) -> int:
       beside what demonstrations differ by anyway. The held-out error alone hardly sees such a bias, because squares
       add.
 
-    If no K does both, the one with the smallest held-out error. BIC alone keeps growing with K on data over time,
+    If no K does both, the bias has stopped falling above that: the smallest K that generalises with a bias within a
+    tenth of the least bias that was reached. BIC alone keeps growing with K on data over time,
     because neighbouring samples are not independent (METHODS C); it decides only when there is one demonstration, so
     that nothing can be held out.
     """
     ordered = sorted(candidates, key=lambda c: c.n_components)
     if any(np.isnan(c.held_out_rmse_mm) for c in ordered):
         return min(ordered, key=lambda c: c.bic).n_components
-    best = min(ordered, key=lambda c: c.held_out_rmse_mm)
-    least = best.held_out_rmse_mm
-    return next((c.n_components for c in ordered if _good(c, least)), best.n_components)
+    least = min(c.held_out_rmse_mm for c in ordered)
+    general = [c for c in ordered if _generalises(c, least)]
+    floor = (1.0 + _BIAS) * min(c.bias_rmse_mm for c in general)
+    settled = next(c for c in general if c.bias_rmse_mm <= floor)
+    return next((c for c in general if _good(c, least)), settled).n_components
+
+
+def _generalises(candidate: Candidate, least: float) -> bool:
+    return candidate.held_out_rmse_mm <= max(_HELD_OUT * least, least + _SLACK_MM)
 
 
 def _good(candidate: Candidate, least: float) -> bool:
-    generalises = candidate.held_out_rmse_mm <= max(_HELD_OUT * least, least + _SLACK_MM)
-    return generalises and candidate.bias_rmse_mm <= max(_BIAS * least, _SLACK_MM)
+    return _generalises(candidate, least) and candidate.bias_rmse_mm <= max(_BIAS * least, _SLACK_MM)
 
 
 def try_numbers_of_components(
