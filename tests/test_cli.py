@@ -121,6 +121,12 @@ def test_a_reader_that_goes_away_is_no_error(shown):
     assert "error" not in done.stderr
 
 
+@pytest.fixture(autouse=True)
+def wide(monkeypatch):
+    """Tables as wide as in a file: the tests read words, not how they are broken into lines."""
+    monkeypatch.setenv("COLUMNS", "200")
+
+
 # --- lint
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_LEAST_PATIENCE = 5e-3  # [m] no robot follows more closely than this at every moment
 _SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learnt one is the learnt one
 
 
@@ -27,9 +28,11 @@ class ACFRA(Policy):
     ``reset`` adapts the skill to the scene that is seen and refuses when it can't keep the clearance. ``step`` follows
     the adapted path with the velocity that belongs to it plus a pull towards it::
 
-        twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = 1 / (1 + (|e| / e_0)^2)
+        twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
-    so the phase ``s`` waits for a robot that lags (its speed limits, a hand that holds it) instead of cutting corners.
+    so the phase ``s`` waits for a robot that lags (its speed limits, a hand that holds it). With ``e_0`` the asked
+    clearance, no corner is cut by more than half of it: each point of the straight way back is within ``e_0 / 2`` of
+    the tool or of its target, and both are clear.
 
     Attributes:
         adaptation: what the last ``reset`` found.
@@ -46,7 +49,7 @@ class ACFRA(Policy):
         forbidden: ArrayLike = (),
         pinned: Sequence[float] = (),
         gain: float = 8.0,  # [1/s]
-        patience: float = 0.01,  # [m] a lag of this halves the pace
+        patience: float | None = None,  # [m] e_0: the phase stops at this lag; None: the clearance, at least 5 mm
         arrival: float = 0.003,  # [m]
     ) -> None:
         super().__init__(skill)
@@ -60,7 +63,8 @@ class ACFRA(Policy):
             "forbidden": forbidden,
             "pinned": pinned,
         }
-        self._gain, self._patience, self._arrival = gain, patience, arrival
+        self._gain, self._arrival = gain, arrival
+        self._patience = max(clearance, _LEAST_PATIENCE) if patience is None else patience
         self.adaptation: Adaptation | None = None
         self._phase = 0.0
 
@@ -115,7 +119,7 @@ class ACFRA(Policy):
                 quaternion_multiply(self._hold.quaternion, quaternion_conjugate(observation.tool_to_base.quaternion))
             )
         lag = float(np.linalg.norm(error[:3])) / self._patience
-        pace = 1.0 / (1.0 + lag**2) if self._phase < self.adaptation.trajectory.times[-1] else 0.0
+        pace = max(0.0, 1.0 - lag**2) if self._phase < self.adaptation.trajectory.times[-1] else 0.0
         self._phase = min(self._phase + pace * dt, float(self.adaptation.trajectory.times[-1]))
         return pace * forward + self._gain * error
 
