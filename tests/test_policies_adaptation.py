@@ -196,3 +196,57 @@ def test_pushed_components_keep_forbidden_directions():
     for method in FORCES:
         pushed = push_components(parts, scene.obstacles, 0.05, method=method, forbidden=np.array(HORIZONTAL_ONLY))
         assert np.abs(pushed).max() > 0.0 and np.abs(pushed[:, 2]).max() == 0.0
+
+
+def near_an_end(seed, path):
+    """An obstacle that leaves the start or the goal just clear, where the path can hardly move."""
+    rng = np.random.default_rng([21, seed])
+    end, inward = (path[0], path[45] - path[0]) if rng.random() < 0.5 else (path[-1], path[-45] - path[-1])
+    direction = inward / np.linalg.norm(inward) + 0.1 * rng.normal(size=3)
+    radius = rng.uniform(0.02, 0.05)
+    gap = 0.03 + 0.02 + rng.uniform(0.0005, 0.004)
+    return Scene(None, [Sphere(end + direction / np.linalg.norm(direction) * (radius + gap), radius)])
+
+
+def test_no_accepted_path_leads_absurdly_far_or_jumps(spatial):
+    """Next to a pinned end a tiny lift would take a huge displacement: that is a refusal, not a way round."""
+    skill, path = spatial
+    verdicts = []
+    for seed in range(80):
+        adaptation = adapt(skill, near_an_end(seed, path), tool_radius=0.03)
+        verdicts.append(adaptation.feasible)
+        if adaptation.feasible:
+            nominal, done = adaptation.nominal.positions, adaptation.trajectory.positions
+            steps = [np.linalg.norm(np.diff(p, axis=0), axis=1).max() for p in (done, nominal)]
+            assert np.linalg.norm(done - nominal, axis=1).max() <= 0.5
+            assert steps[0] <= 8.0 * steps[1]
+        else:
+            assert "sphere 1" in adaptation.reason and "move" in adaptation.reason
+    assert 0 < sum(verdicts) < 80  # both happen
+
+
+def test_what_a_refusal_says_of_its_best_attempt_is_proven(spatial):
+    skill, path = spatial
+    refused = 0
+    for seed in range(60):
+        scene = near_an_end(seed, path)
+        adaptation = adapt(skill, scene, tool_radius=0.03)
+        times = np.linspace(0.0, skill.duration_, 4000)
+        dense = scene.clearance(adaptation.trajectory.at(times)[0]).min() - 0.03
+        assert adaptation.certified_clearance <= dense + 1e-9
+        refused += not adaptation.feasible
+    assert refused > 0
+
+
+@pytest.mark.parametrize("n_samples", [10, 37, 200])
+def test_pinned_instants_between_samples_do_not_move(spatial, n_samples):
+    skill, path = spatial
+    pin = 0.4137 * skill.duration_
+    scene = Scene(None, [Sphere(path[230], 0.03)])
+    adaptation = adapt(skill, scene, tool_radius=0.02, pinned=[pin], n_samples=n_samples)
+    assert adaptation.moved.any()
+    at, _ = adaptation.trajectory.at([pin])
+    np.testing.assert_allclose(at[0], adaptation.nominal.at([pin])[0][0], atol=1e-12)
+    on_it = Scene(None, [Sphere(skill.gmr_.predict([pin])[0][0], 0.02, name="jar")])
+    refused = adapt(skill, on_it, tool_radius=0.02, pinned=[pin], n_samples=n_samples)
+    assert 'sphere "jar" covers the pinned point at' in refused.reason

@@ -200,6 +200,12 @@ def _reason(path: ComponentPath, scene: Scene, detour: Detour, method: str, clea
             f"the path passes {name} at {left} ({asked}): method {method!r} pushes components and does "
             "not look at the path between them; try method 'certified'"
         )
+    if detour.strays:
+        far = np.linalg.norm(detour.positions - path.nominal.positions, axis=1).max()
+        return (
+            f"no way round {name} with {asked}: next to a point that must not move it would lead {far:.2f} m away or "
+            "jump; move the obstacle, or ask for less clearance"
+        )
     near = {pairs[i].index for i in np.flatnonzero(detour.bounds < clearance)} - {pairs[worst].index}
     sample = int(np.argmin(pairs[worst].distance(detour.positions)))
     held = path.basis[sample].sum() < 0.5

@@ -61,8 +61,9 @@ class Detour:
         positions: the path of the tool's tip, shape (n, 3) [m].
         bounds: proven lower bound of the clearance of each pair over the whole path, shape (n_pairs,) [m].
         nearest: smallest clearance of each pair at the samples, shape (n_pairs,) [m].
-        feasible: whether every bound reaches the asked clearance.
+        feasible: whether every bound reaches the asked clearance and the path does not stray.
         expanded: how many choices of a side were made.
+        strays: whether the path leads absurdly far away or jumps, as it does where a point that must not move is near.
     """
 
     displacement: Array
@@ -71,6 +72,7 @@ class Detour:
     nearest: Array
     feasible: bool
     expanded: int
+    strays: bool = False
 
 
 def judged(

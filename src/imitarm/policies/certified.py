@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +108,7 @@ class _Search:
             detour = Detour(node.displacement, positions, bounds, bounds, False, expanded)
             if bounds.min() >= self.wanted - _REPAIRABLE:
                 detour = self.least.shrink(detour, distance, normal)
-            if best is None or detour.bounds.min() > best.bounds.min():
+            if best is None or (detour.feasible, detour.nearest.min()) > (best.feasible, best.nearest.min()):
                 best = detour
             if detour.feasible or expanded >= max_choices:
                 break
@@ -117,6 +117,10 @@ class _Search:
                 order += 1
                 heapq.heappush(heap, _Node(cost, order, displacement))
         assert best is not None
+        if not best.feasible:  # say what is proven of the best attempt, not what its samples look like
+            distance, normal = distances(self.pairs, best.positions)
+            best = self.least.judged(best.displacement, best.positions, distance, normal, expanded)
+            best = replace(best, feasible=False)
         return best
 
     def _children(

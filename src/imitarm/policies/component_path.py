@@ -93,7 +93,8 @@ class ComponentPath:
             start: where the motion begins; None: where it was learnt.
             goal: where the motion ends; None: where it was learnt. A moved start or goal bends the nominal path by
                 the skill's DMP, and the components ride on it.
-            pinned: further instants [s] at which the path must not move, for example a contact point.
+            pinned: further instants [s] at which the path must not move, for example a contact point; each becomes a
+                sample.
 
         Raises:
             InputError: when there are fewer than 10 samples, a pinned instant is outside the motion, or a sphere lies
@@ -110,12 +111,12 @@ class ComponentPath:
             return replace(_learnt(skill.gmr_, n_samples, window), spheres=rows)
         learnt = _learnt(skill.gmr_, n_samples, window)
         times = learnt.nominal.times
-        moved = skill.generate(start, goal, skill.duration_, skill.duration_ / (n_samples - 1))
+        generated = skill.generate(start, goal, skill.duration_, skill.duration_ / (n_samples - 1))
+        moved = Trajectory(times, *generated.at(times))
         shift = moved.positions - learnt.nominal.positions
         centre_times = np.clip(skill.gmr_.time_means_, times[0], times[-1])
         carried = np.stack([np.interp(centre_times, times, column) for column in shift.T], axis=1)
-        nominal = Trajectory(times, moved.positions, moved.quaternions)
-        return replace(learnt, nominal=nominal, means=learnt.means + carried, spheres=rows)
+        return replace(learnt, nominal=moved, means=learnt.means + carried, spheres=rows)
 
     @property
     def n_components(self) -> int:
@@ -153,7 +154,7 @@ def _learnt(gmr: GMR, n_samples: int, pins: tuple[float, ...]) -> ComponentPath:
     key = (n_samples, pins)
     if gmr in _PATHS and _PATHS[gmr][0] is gmr.means_ and _PATHS[gmr][1] == key:  # fitting again makes new means
         return _PATHS[gmr][2]
-    times = np.linspace(0.0, pins[-1], n_samples)
+    times = _instants(n_samples, pins)
     quaternions: Array | None = None
     if gmr.has_orientation_:
         mean, quaternions, covariance = gmr.predict_pose(times)
@@ -191,10 +192,16 @@ def _checked_spheres(spheres: ArrayLike, turns_known: bool) -> Array:
     return rows
 
 
+def _instants(n_samples: int, pins: tuple[float, ...]) -> Array:
+    """Return equally spaced times, and every pinned instant among them: what is pinned must be a sample."""
+    even = np.linspace(0.0, pins[-1], n_samples)
+    beside = np.abs(even[:, None] - np.asarray(pins)).min(axis=1) > 0.01 * even[1]
+    return np.unique(np.concatenate([even[beside], pins]))
+
+
 def _nearest(times: Array, moments: Array) -> NDArray[np.intp]:
-    """Return the index of the sample nearest to each moment; the samples are equally spaced."""
-    step = times[1] - times[0]
-    return np.clip(np.rint((moments - times[0]) / step), 0, len(times) - 1).astype(np.intp)
+    """Return the index of the sample nearest to each moment."""
+    return np.argmin(np.abs(times[:, None] - moments), axis=0)
 
 
 def _window(times: Array, pins: Sequence[float]) -> Array:

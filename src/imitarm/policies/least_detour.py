@@ -9,6 +9,7 @@ the feasible set and never gets worse.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import daqp
 import numpy as np
@@ -20,7 +21,9 @@ from imitarm.policies.component_path import STILL, ComponentPath
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-NEGLIGIBLE_LEVER = 1e-3  # a sample that no component can move has no row
+NEGLIGIBLE_LEVER = 0.02  # a sample that components can hardly move has no row: it would take a huge displacement
+FARTHEST = 0.5  # [m] no sample is led farther than this from where it was learnt
+_LONGEST_STEP = 8.0  # times the longest step of the nominal path: a longer one is a jump
 UNBOUNDED = 1e30  # daqp's infinity
 _INFLUENCE = 0.04  # [m] at first, obstacles farther from a sample than this get no row
 _STEPS = 2
@@ -64,6 +67,15 @@ class LeastDetour:
         self.wanted = clearance + 1e-4 + 1.5 * step**2 / (8.0 * max(radius, 1e-3))
         self.movable = path.basis.max(axis=1) > NEGLIGIBLE_LEVER
 
+    def judged(self, displacement: Array, positions: Array, distance: Array, normal: Array, expanded: int) -> Detour:
+        """Judge a path by its certificate, and by whether it is one that a robot could follow."""
+        detour = judged(self.pairs, displacement, positions, distance, normal, self.clearance, expanded)
+        nominal = self.path.nominal.positions
+        away = np.linalg.norm(positions - nominal, axis=1).max()
+        steps = [np.linalg.norm(np.diff(p, axis=0), axis=1).max() for p in (positions, nominal)]
+        strays = bool(away > FARTHEST or steps[0] > _LONGEST_STEP * steps[1])
+        return replace(detour, feasible=detour.feasible and not strays, strays=strays)
+
     def shrink(self, detour: Detour, distance: Array, normal: Array) -> Detour:
         """Shrink a displacement to the least one that its tangents allow; where a segment dips, ask for more there."""
         best: Detour | None = None
@@ -79,10 +91,10 @@ class LeastDetour:
                 previous, cost = cost, self._cost(displacement)
                 if cost > _GAIN * previous:
                     break
-            trial = judged(self.pairs, displacement, positions, distance, normal, self.clearance, detour.expanded)
+            trial = self.judged(displacement, positions, distance, normal, detour.expanded)
             if best is None or trial.bounds.min() > best.bounds.min():
                 best = trial
-            if trial.feasible or distance.min() < self.clearance - _HOPELESS:
+            if trial.feasible or trial.strays or distance.min() < self.clearance - _HOPELESS:
                 break
             wanted += 2.0 * (self.clearance - float(trial.bounds.min())) + 1e-6
         return detour if best is None else best
