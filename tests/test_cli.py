@@ -69,7 +69,7 @@ def test_words_that_are_no_command(words, capsys):
     ("error", "status", "message"),
     [
         (InputError("wrong"), 2, "imitarm: error: wrong\n"),
-        (UnreachableError("too far"), 1, "imitarm: error: too far\n"),
+        (UnreachableError("too far"), 2, "imitarm: error: too far\n"),
         (
             PermissionError(13, "Permission denied", "x.csv"),
             2,

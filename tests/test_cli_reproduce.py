@@ -97,7 +97,8 @@ def test_a_refusal_is_a_failed_task_with_the_obstacle_and_the_reason(sweep, tmp_
         (["{sweep}", "--robot", "sawyer", "--tool", "hammer"], 2, "hammer"),
         (["{sweep}", "--robot", "sawyer", "--scene", "nosuch.yaml"], 2, "nosuch.yaml"),
         (["{sweep}", "--robot", "sawyer", "--report", "nowhere/page.html"], 2, "there is no folder"),
-        (["{sweep}", "--robot", "sawyer", "--start", "300", "0", "0"], 1, "can't bring its tool"),
+        (["{sweep}", "--robot", "sawyer", "--start", "300", "0", "0"], 2, "can't bring its tool"),
+        (["{sweep}", "--robot", "sawyer", "--goal", "300", "0", "0"], 2, "can't bring its tool"),
         (["{sweep}", "--robot", "sawyer", "--clearance", "-5"], 2, "clearance"),
     ],
 )

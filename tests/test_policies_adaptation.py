@@ -204,7 +204,7 @@ def near_an_end(seed, path):
     end, inward = (path[0], path[45] - path[0]) if rng.random() < 0.5 else (path[-1], path[-45] - path[-1])
     direction = inward / np.linalg.norm(inward) + 0.1 * rng.normal(size=3)
     radius = rng.uniform(0.02, 0.05)
-    gap = 0.03 + 0.02 + rng.uniform(0.0005, 0.004)
+    gap = 0.03 + 0.02 + 10 ** rng.uniform(-6, -2.5)
     return Scene(None, [Sphere(end + direction / np.linalg.norm(direction) * (radius + gap), radius)])
 
 
@@ -212,7 +212,7 @@ def test_no_accepted_path_leads_absurdly_far_or_jumps(spatial):
     """Next to a pinned end a tiny lift would take a huge displacement: that is a refusal, not a way round."""
     skill, path = spatial
     verdicts = []
-    for seed in range(80):
+    for seed in range(40):
         adaptation = adapt(skill, near_an_end(seed, path), tool_radius=0.03)
         verdicts.append(adaptation.feasible)
         if adaptation.feasible:
@@ -222,13 +222,13 @@ def test_no_accepted_path_leads_absurdly_far_or_jumps(spatial):
             assert steps[0] <= 8.0 * steps[1]
         else:
             assert "sphere 1" in adaptation.reason and "move" in adaptation.reason
-    assert 0 < sum(verdicts) < 80  # both happen
+    assert 0 < sum(verdicts) < 40  # both happen
 
 
 def test_what_a_refusal_says_of_its_best_attempt_is_proven(spatial):
     skill, path = spatial
     refused = 0
-    for seed in range(60):
+    for seed in range(25):
         scene = near_an_end(seed, path)
         adaptation = adapt(skill, scene, tool_radius=0.03)
         times = np.linspace(0.0, skill.duration_, 4000)

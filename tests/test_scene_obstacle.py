@@ -305,3 +305,10 @@ def test_bad_values_are_refused_when_built(build, message):
     with pytest.raises(InputError) as caught:
         build()
     assert message in str(caught.value)
+
+
+def test_velocity_zero_is_an_obstacle_that_stands():
+    for obstacle in (Sphere([0, 0, 0], 0.1, velocity=0), Box(Pose.identity(), [0.1, 0.1, 0.1], velocity=0.0)):
+        np.testing.assert_array_equal(obstacle.velocity, np.zeros(3))
+    with pytest.raises(InputError, match="velocity"):
+        Sphere([0, 0, 0], 0.1, velocity=1)

@@ -48,7 +48,9 @@ class TaskFailedError(ImitarmError):
 
 
 class UnreachableError(TaskFailedError):
-    """No joint configuration within the limits reaches the pose that was asked for."""
+    """No joint configuration within the limits reaches the pose that was asked for: another pose is needed."""
+
+    exit_status = 2
 
 
 class InfeasibleError(TaskFailedError):

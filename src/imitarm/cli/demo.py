@@ -7,11 +7,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from rich.progress import Progress, TaskID
 
-from imitarm.cli.screen import progress_bar, remark, say, show_table
-from imitarm.cli.trial import learning_summary, provenance, try_scene
+from imitarm.cli.screen import progress_bar, say
+from imitarm.cli.trial import learning_summary, provenance, show_results, try_scene
 from imitarm.demonstrations import compute_alignment, lint
 from imitarm.errors import InputError
 from imitarm.policies import ACFRA, HORIZONTAL_ONLY, METHODS
@@ -135,38 +134,12 @@ def _sweep(
     return result
 
 
-def show_results(report: Report) -> None:
-    """Print one row a scene, and below the table why a scene failed."""
-    rows, styles = [], []
-    for scene in report.scenes:
-        adaptation = scene.adaptation
-        around = adaptation is not None and bool(scene.scene.obstacles)
-        rows.append(
-            (
-                scene.title,
-                "done" if scene.success else "FAILED",
-                str(len(scene.scene.obstacles)),
-                f"{1e3 * scene.min_clearance:.1f}" if np.isfinite(scene.min_clearance) else "-",
-                f"{1e3 * adaptation.certified_clearance:.1f}" if adaptation and around else "-",
-                f"{1e3 * scene.rmse:.1f}" if np.isfinite(scene.rmse) else "-",
-                f"{100 * scene.unmoved_share:.0f} %",
-                f"{1e3 * adaptation.compute_time:.1f}" if adaptation else "-",
-            )
-        )
-        styles.append("" if scene.success else "red")
-    headings = ["scene", "", "obstacles>", "clear>", "proven>", "RMSE>", "unmoved>", "adapted>"]
-    show_table(headings, rows, styles=styles)
-    remark(
-        "clear: least distance of arm and tool to an obstacle, measured [mm]; proven: of the tool's path [mm]; "
-        "RMSE to the demonstrations [mm]; unmoved: share of components; adapted: compute time [ms]"
-    )
-    for scene in report.scenes:
-        if not scene.success:
-            say(f"{scene.title}: {scene.reason}")
-    say(report.verdict)
-
-
 def _write_json(data: object, path: Path) -> None:
+    """Write aside and rename; nothing is left behind when that fails."""
     aside = path.with_suffix(".json.part")
-    aside.write_text(json.dumps(data, indent=2, allow_nan=False), encoding="utf-8")
-    aside.replace(path)
+    try:
+        aside.write_text(json.dumps(data, indent=2, allow_nan=False), encoding="utf-8")
+        aside.replace(path)
+    except OSError as error:
+        aside.unlink(missing_ok=True)
+        raise InputError(f"{path}: can't be written ({error.strerror}); choose another folder with --out") from error

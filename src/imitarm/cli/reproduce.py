@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.cli.demo import show_results
-from imitarm.cli.screen import progress_bar, say
-from imitarm.cli.trial import provenance, try_scene
+from imitarm.cli.screen import progress_bar, remark, say
+from imitarm.cli.trial import provenance, show_results, try_scene
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_file import ARMS, TOOLS
@@ -58,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--control", choices=("position", "torque"), default="position", help="of the simulated drives")
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=Path, metavar="FILE", help="the measured motion, as a demonstration (CSV)")
+    output.add_argument("--force", action="store_true", help="replace the file of --out")
     output.add_argument("--report", type=Path, metavar="FILE", help="a page with 3-D playback and figures (HTML)")
 
 
@@ -71,12 +71,18 @@ def run(arguments: argparse.Namespace) -> int:
     for path in (arguments.out, arguments.report):
         if path is not None and not path.absolute().parent.is_dir():
             raise InputError(f"{path}: there is no folder {path.parent}; make it first")
+    if arguments.out is not None and arguments.out.exists() and not arguments.force:
+        raise InputError(f"--out {arguments.out}: is there already; name another file, or replace it with --force")
     skill = Skill.load(arguments.skill)
     arm = ArmModel.load(arguments.robot, tool=arguments.tool)
     scene = Scene() if arguments.scene is None else load_scene(arguments.scene)
     if arguments.goal is not None:
         scene = Scene(Pose(0.01 * np.array(arguments.goal), skill.goal_.quaternion), scene.obstacles)
+    scene.check()
     start = _start(skill, arm, arguments.start)
+    if scene.goal is not None:  # said before anything moves
+        turn = skill.goal_.quaternion if skill.gmr_.has_orientation_ else start.quaternion
+        find_posture(arm, Pose(scene.goal.position, turn))
     robot = SimulatedRobot(arm, scene=scene, control=arguments.control, q=find_posture(arm, start))
     spheres = _tool(skill, arm, arguments.tool_radius)
     policy = ACFRA(
@@ -103,6 +109,8 @@ def run(arguments: argparse.Namespace) -> int:
         source = f"{arm.name}, simulated, from {arguments.skill.name}"
         Demonstration(result.rollout.trajectory, result.rollout.joints, skill.task_, source).save(arguments.out)
         say(f"wrote {arguments.out}")
+    elif arguments.out is not None:
+        remark(f"nothing was done, so {arguments.out} was not written")
     if arguments.report is not None:
         say(f"wrote {write_report(report, arguments.report)}")
     show_results(report)

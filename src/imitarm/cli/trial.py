@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm import __version__
+from imitarm.cli.screen import remark, say, show_table
 from imitarm.demonstrations import Alignment, Finding
 from imitarm.errors import InfeasibleError
 from imitarm.policies import ACFRA
@@ -19,7 +20,7 @@ from imitarm.reproduce import Step, reproduce
 from imitarm.robots import SimulatedRobot
 from imitarm.skills import Skill
 from imitarm.trajectory import Demonstration, Rollout, Trajectory
-from imitarm.viewer import FrameRecorder, LearningSummary, SceneResult
+from imitarm.viewer import FrameRecorder, LearningSummary, Report, SceneResult
 
 Array = NDArray[np.float64]
 
@@ -168,3 +169,34 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
+
+
+def show_results(report: Report) -> None:
+    """Print one row a scene, and below the table why a scene failed."""
+    rows, styles = [], []
+    for scene in report.scenes:
+        adaptation = scene.adaptation
+        around = adaptation is not None and bool(scene.scene.obstacles)
+        rows.append(
+            (
+                scene.title,
+                "done" if scene.success else "FAILED",
+                str(len(scene.scene.obstacles)),
+                f"{1e3 * scene.min_clearance:.1f}" if np.isfinite(scene.min_clearance) else "-",
+                f"{1e3 * adaptation.certified_clearance:.1f}" if adaptation and around else "-",
+                f"{1e3 * scene.rmse:.1f}" if np.isfinite(scene.rmse) else "-",
+                f"{100 * scene.unmoved_share:.0f} %",
+                f"{1e3 * adaptation.compute_time:.1f}" if adaptation else "-",
+            )
+        )
+        styles.append("" if scene.success else "red")
+    headings = ["scene", "", "obstacles>", "clear>", "proven>", "RMSE>", "unmoved>", "adapted>"]
+    show_table(headings, rows, styles=styles)
+    remark(
+        "clear: least distance of arm and tool to an obstacle, measured [mm]; proven: of the tool's path [mm]; "
+        "RMSE to the demonstrations [mm]; unmoved: share of components; adapted: compute time [ms]"
+    )
+    for scene in report.scenes:
+        if not scene.success:
+            say(f"{scene.title}: {scene.reason}")
+    say(report.verdict)

@@ -75,7 +75,7 @@ def _moving(times: Array, values: Array, still: float, place: float) -> tuple[in
     left = np.linalg.norm(mean - mean[0], axis=1) > radius
     not_yet = np.linalg.norm(mean - mean[-1], axis=1) > radius
     after_start, before_end = np.flatnonzero((speed > limit) | left), np.flatnonzero((speed > limit) | not_yet)
-    if not len(after_start):
+    if not len(after_start) or not len(before_end) or after_start[0] > before_end[-1]:
         return None
     return int(after_start[0]), int(before_end[-1])
 

@@ -160,6 +160,8 @@ def _flange_and_joints(spec: mujoco.MjSpec, flange: str | None, path: Path) -> t
     """Make sure of a site ``flange`` and return the names of the joints from the base to it."""
     site = spec.site(flange or "flange")
     body = site.parent if site is not None else spec.body(flange) if flange else _last_body(spec)
+    if body is None and flange is None:
+        raise InputError(f"{path}: has no joint that moves a body, so it is no arm; give the MJCF or URDF file of one")
     if body is None:
         raise UnknownNameError.among(f"flange in {path}: body or site", flange, _names(spec))
     if site is None or site.name != "flange":

@@ -34,6 +34,9 @@ class ACFRA(Policy):
     clearance, no corner is cut by more than half of it: each point of the straight way back is within ``e_0 / 2`` of
     the tool or of its target, and both are clear.
 
+    Only ``"certified"`` knows beforehand that it can't keep the clearance, and refuses; the thesis's potential fields
+    (``"mapf"``, ``"literal"``) are followed wherever they lead, so that they can be compared.
+
     Attributes:
         adaptation: what the last ``reset`` found.
     """

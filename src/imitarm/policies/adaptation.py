@@ -119,8 +119,9 @@ def adapt(
     """
     if method not in METHODS:
         raise UnknownNameError.among("method", method, METHODS)
-    if not (0.0 <= tool_radius < np.inf and 0.0 <= clearance < np.inf):
-        raise InputError(f"tool_radius and clearance must be >= 0 m, got {tool_radius} and {clearance}")
+    for name, length in (("tool_radius", tool_radius), ("clearance", clearance)):
+        if not 0.0 <= length < np.inf:
+            raise InputError(f"{name} must be >= 0 m, got {length:g}")
     if tool_spheres is not None and tool_radius > 0.0:
         raise InputError("give tool_radius or tool_spheres, not both")
     spheres = ((0.0, 0.0, 0.0, tool_radius),) if tool_spheres is None else tool_spheres

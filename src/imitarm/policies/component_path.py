@@ -182,8 +182,10 @@ def _learnt(gmr: GMR, n_samples: int, pins: tuple[float, ...]) -> ComponentPath:
 
 def _checked_spheres(spheres: ArrayLike, turns_known: bool) -> Array:
     rows = np.asarray(spheres, dtype=float)
-    if rows.ndim != 2 or rows.shape[1] != 4 or not len(rows) or not np.isfinite(rows).all() or np.any(rows[:, 3] < 0.0):
-        raise InputError(f"tool spheres must be rows x y z r, finite and r >= 0 [m], got shape {rows.shape}")
+    if rows.ndim != 2 or rows.shape[1] != 4 or not len(rows):
+        raise InputError(f"tool spheres must be rows x y z r [m], got shape {rows.shape}")
+    if not np.isfinite(rows).all() or np.any(rows[:, 3] < 0.0):
+        raise InputError(f"tool spheres must be finite with r >= 0 m, got radii from {rows[:, 3].min():g} m")
     if not turns_known and np.any(rows[:, :3] != 0.0):
         raise InputError(
             "tool spheres beside the tip need the tool's orientation, which was not learnt: "

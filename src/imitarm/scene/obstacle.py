@@ -98,7 +98,7 @@ class Obstacle(ABC):
     Points have any leading shape and one call treats them all. They must be finite: a nan gives a distance of nan.
 
     Attributes:
-        velocity: of all its points, in the base frame, shape (3,) [m/s].
+        velocity: of all its points, in the base frame, shape (3,) [m/s]; 0 for one that stands.
         name: how messages call it; a :class:`~imitarm.scene.Scene` falls back on ``"box 1"``.
 
     Raises:
@@ -114,7 +114,8 @@ class Obstacle(ABC):
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.isprintable():
             raise InputError(f"{type(self).__name__}: name must be one line of text, got {self.name!r}")
-        self._set(velocity=checked_vector(self.velocity, f"{self._label}: velocity", limit=MAX_SPEED, unit="m/s"))
+        velocity = np.zeros(3) if np.isscalar(self.velocity) and self.velocity == 0 else self.velocity
+        self._set(velocity=checked_vector(velocity, f"{self._label}: velocity", limit=MAX_SPEED, unit="m/s"))
 
     @property
     def _label(self) -> str:

@@ -8,6 +8,7 @@ its tab is looked at; what all players have in common is stored once.
 from __future__ import annotations
 
 import base64
+import errno
 import json
 import os
 from html import escape
@@ -47,8 +48,8 @@ def write_report(report: Report, path: str | Path) -> Path:
         Where it was written, absolute.
 
     Raises:
-        InputError: when the folder is missing or may not be written, or the libraries that draw are not installed.
-        TaskFailedError: when the file can't be written all the same, for example on a full disk.
+        InputError: when the folder is missing or can't be written, or the libraries that draw are not installed.
+        TaskFailedError: when the disk is full.
     """
     target = Path(path).expanduser().absolute()
     _check_writable(target)
@@ -56,7 +57,8 @@ def write_report(report: Report, path: str | Path) -> Path:
     try:
         _replace(target, page)
     except OSError as error:
-        raise TaskFailedError(
+        full = error.errno in {errno.ENOSPC, errno.EDQUOT}
+        raise (TaskFailedError if full else InputError)(
             f"report {target}: can't be written ({error.strerror or error}); make room or choose another place"
         ) from error
     return target
