@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from imitarm.benchmark import speed
-from imitarm.benchmark.speed import Measurement, Row, measure, run, show
+from imitarm.benchmark import speed, speed_rows
+from imitarm.benchmark.speed import run, show
+from imitarm.benchmark.timing import Measurement, Row, measure
 
 
 def sleeper(seconds: float) -> Callable[[], None]:
@@ -97,25 +98,25 @@ def test_the_table_tells_everything() -> None:
 
 
 def test_every_row_says_what_it_does() -> None:
-    assert all(row.__doc__ for row in speed.ROWS)
+    assert all(row.__doc__ for row in speed_rows.ROWS)
 
 
 def test_importing_imitarm_is_measured_in_a_fresh_interpreter() -> None:
-    seconds = speed.importing().ours()
+    seconds = speed_rows.importing().ours()
     assert 0.0 < seconds < 30.0
     code = f"import sys; print(float({sys.version_info.major}))"
-    assert speed._in_fresh_interpreter(code) == sys.version_info.major
+    assert speed_rows._in_fresh_interpreter(code) == sys.version_info.major
 
 
 def test_the_made_up_motions_are_the_same_every_time() -> None:
-    a, b = speed.made_up_demonstrations(3), speed.made_up_demonstrations(3)
+    a, b = speed_rows.made_up_demonstrations(3), speed_rows.made_up_demonstrations(3)
     assert len(a) == 8
     for x, y in zip(a, b, strict=True):
         np.testing.assert_array_equal(x.positions, y.positions)
 
 
 @pytest.mark.parametrize(
-    "row", [r for r in speed.ROWS if r.__name__ not in {"importing", "regression_threads_as_installed"}]
+    "row", [r for r in speed_rows.ROWS if r.__name__ not in {"importing", "regression_threads_as_installed"}]
 )
 def test_rows_run_and_their_results_are_good(row: Callable[[], Row]) -> None:
     try:

@@ -3,9 +3,6 @@
 Each row times something of ours and the same job in a peer, in turns (ours, peer, ours, peer, ...), so that whatever
 else the machine does hits both, and compares medians. A row may also look at the results: speed that is bought with
 accuracy doesn't count. One numerical thread each.
-
-To add a row, write a function that returns a :class:`Row` and put it into ``ROWS``. Peers are imported inside it: where
-one is missing the row says how to install it.
 """
 
 from __future__ import annotations
@@ -13,409 +10,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
-import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from importlib.metadata import version
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from imitarm.benchmark import avoidance, families
-from imitarm.skills import DMP, GMR, GaussianMixture
-from imitarm.trajectory import Trajectory
+from imitarm.benchmark.speed_rows import ROWS, THREADS
+from imitarm.benchmark.timing import Measurement, Row, duration, measure
 
-Array = NDArray[np.float64]
-
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _INSTALL = "pip install 'imitarm[bench]'"
-
-
-def _no_check() -> tuple[bool, str]:
-    return True, ""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One comparison, or one absolute limit.
-
-    Attributes:
-        name: what is done.
-        ours: does it once.
-        peer: does the same once with the peer; None for an absolute limit.
-        peer_name: name and version of the peer.
-        least_ratio: how many times faster than the peer we must be.
-        most_seconds: how long ours may take at most, for a row without a peer [s].
-        check: looks at the results: whether they are good enough, and what to say about them.
-        repeats: how often each is measured.
-        self_timed: the calls measure themselves and return seconds.
-    """
-
-    name: str
-    ours: Callable[[], Any]
-    peer: Callable[[], Any] | None = None
-    peer_name: str = ""
-    least_ratio: float = 0.0
-    most_seconds: float = float("inf")
-    check: Callable[[], tuple[bool, str]] = field(default=_no_check)
-    repeats: int = 21
-    self_timed: bool = False
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """What a row came to.
-
-    Attributes:
-        name: of the row.
-        ours: median time of ours [s]; nan when it could not be measured.
-        peer: median time of the peer [s]; nan without one.
-        peer_name: of the row.
-        target: in words.
-        passed: whether the target was met; None when it could not be measured.
-        note: what the check said, or how to install what is missing.
-    """
-
-    name: str
-    ours: float
-    peer: float
-    peer_name: str
-    target: str
-    passed: bool | None
-    note: str
-
-    @property
-    def ratio(self) -> float:
-        """How many times faster ours is."""
-        return self.peer / self.ours
-
-
-def measure(row: Row) -> Measurement:
-    """Time a row: both sides in turns, medians."""
-    calls = [row.ours] if row.peer is None else [row.ours, row.peer]
-    batches = [1 if row.self_timed else _batch(call) for call in calls]
-    times: list[list[float]] = [[] for _ in calls]
-    for _ in range(row.repeats):
-        for call, batch, seconds in zip(calls, batches, times, strict=True):
-            seconds.append(float(call()) if row.self_timed else _timed(call, batch))
-    medians = [float(np.median(seconds)) for seconds in times]
-    good, note = row.check()
-    ours, peer = medians[0], medians[1] if len(medians) > 1 else float("nan")
-    if row.peer is None:
-        fast, target = ours <= row.most_seconds, f"at most {_duration(row.most_seconds)}"
-    else:
-        fast, target = peer / ours >= row.least_ratio, f"at least {row.least_ratio:g} x"
-    return Measurement(row.name, ours, peer, row.peer_name, target, fast and good, note)
-
-
-def _timed(call: Callable[[], Any], batch: int) -> float:
-    begin = time.perf_counter()
-    for _ in range(batch):
-        call()
-    return (time.perf_counter() - begin) / batch
-
-
-def _batch(call: Callable[[], Any], least: float = 2e-3) -> int:
-    """Return how many calls take at least 2 ms, after one to warm up."""
-    call()
-    batch = 1
-    while _timed(call, batch) * batch < least:
-        batch *= 2
-    return batch
-
-
-def _duration(seconds: float) -> str:
-    for unit, size in (("s", 1.0), ("ms", 1e-3)):
-        if seconds >= size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds * 1e6:.3g} us"
-
-
-# ---------------------------------------------------------------------------------------------------------- the rows
-
-
-def made_up_demonstrations(seed: int, n_demonstrations: int = 8, n: int = 200) -> list[Trajectory]:
-    """Return demonstrations of one made-up motion of 2 s, each a little different and with 2 mm of noise."""
-    rng = np.random.default_rng(seed)
-    t = np.linspace(0.0, 2.0, n)
-    shown = []
-    for _ in range(n_demonstrations):
-        a = 1.0 + 0.1 * rng.standard_normal(6)
-        x = np.stack(
-            [
-                0.3 * a[0] * np.sin(1.5 * t + 0.1 * a[1]),
-                0.2 * a[2] * np.cos(2.5 * t),
-                0.1 * a[3] * np.sin(4.0 * t + 0.2 * a[4]),
-            ],
-            axis=1,
-        )
-        shown.append(Trajectory(t, x + 0.002 * rng.standard_normal((n, 3))))
-    return shown
-
-
-def _samples(seed: int) -> Array:
-    return np.concatenate([np.column_stack([k.times, k.positions]) for k in made_up_demonstrations(seed)])
-
-
-def _minimum_jerk(n: int = 201) -> Trajectory:
-    """Return 2 s of a known, smooth motion whose exact positions a reproduction can be held against."""
-    t = np.linspace(0.0, 2.0, n)
-    u = t / 2.0
-    return Trajectory(t, (u**3 * (10.0 + u * (6.0 * u - 15.0)))[:, None] * np.array([0.3, 0.2, -0.1]))
-
-
-def gaussian_mixture() -> Row:
-    """GMM of 8 demonstrations x 200 steps x 4 columns, 8 components; five data sets in turn, same for both."""
-    from sklearn.mixture import GaussianMixture as Peer
-
-    data = [_samples(seed) for seed in range(5)]
-
-    def check() -> tuple[bool, str]:
-        gains = [GaussianMixture(8).fit(X).score(X) - Peer(8, random_state=0).fit(X).score(X) for X in data]
-        note = f"log-likelihood per sample: {np.mean(gains):+.4f} on average, worst data set {min(gains):+.4f}"
-        return bool(np.mean(gains) >= 0.0), note
-
-    return Row(
-        "GMM fit, 1600 x 4, 8 components (5 data sets)",
-        lambda: [GaussianMixture(8).fit(X) for X in data],
-        lambda: [Peer(8, random_state=0).fit(X) for X in data],
-        _named("scikit-learn"),
-        least_ratio=3.0,
-        check=check,
-        repeats=9,
-    )
-
-
-def _regressions() -> tuple[GMR, Any, Array]:
-    """Return ours, the peer's with the same mixture, and 200 instants."""
-    import gmr
-
-    ours = GMR(8).fit(made_up_demonstrations(0))
-    peer = gmr.GMM(8, priors=ours.weights_, means=ours.means_, covariances=ours.covariances_)
-    return ours, peer, np.linspace(0.0, ours.duration_, 200)
-
-
-def regression_with_covariance() -> Row:
-    """GMR at 200 instants, mean and covariance; the peer gives covariances one query at a time."""
-    ours, peer, times = _regressions()
-
-    def peer_queries() -> tuple[Array, Array]:
-        answers = [peer.condition(np.array([0]), np.array([t])).to_mvn() for t in times]
-        return np.stack([a.mean for a in answers]), np.stack([a.covariance for a in answers])
-
-    def check() -> tuple[bool, str]:
-        apart = [np.abs(a - b).max() for a, b in zip(ours.predict(times), peer_queries(), strict=True)]
-        return bool(max(apart) < 1e-6), f"agree to {apart[0]:.0e} m, {apart[1]:.0e} m^2"
-
-    name = "GMR, 200 queries, mean and covariance"
-    return Row(
-        name, lambda: ours.predict(times), peer_queries, _named("gmr"), least_ratio=150.0, check=check, repeats=5
-    )
-
-
-def regression_threads_as_installed() -> Row:
-    """GMR at 200 instants, ours with covariance, the peer's mean only, threads as NumPy comes.
-
-    The peer's time swings by a factor of ten with what else the machine does: its many small solves wait for threads.
-    """
-    _regressions()  # say here and now what is missing
-
-    def timed(which: str) -> Callable[[], float]:
-        return lambda: _in_fresh_interpreter(_TIME_REGRESSION.format(which=which), one_thread=False)
-
-    return Row(
-        "GMR, 200 queries, peer mean only, threads as installed",
-        timed("ours.predict(times)"),
-        timed("peer.predict(np.array([0]), times[:, None])"),
-        _named("gmr"),
-        least_ratio=5.0,
-        repeats=5,
-        self_timed=True,
-    )
-
-
-_TIME_REGRESSION = """
-import time
-import numpy as np
-from imitarm.benchmark.speed import _regressions
-ours, peer, times = _regressions()
-seconds = []
-for _ in range(9):
-    begin = time.perf_counter()
-    {which}
-    seconds.append(time.perf_counter() - begin)
-print(np.median(seconds))
-"""
-
-
-def regression_mean_only() -> Row:
-    """GMR at 200 instants, ours with covariance, the peer's mean only, one thread."""
-    ours, peer, times = _regressions()
-    return Row(
-        "GMR, 200 queries, peer mean only, one thread",
-        lambda: ours.predict(times),
-        lambda: peer.predict(np.array([0]), times[:, None]),
-        _named("gmr"),
-        least_ratio=5.0,
-    )
-
-
-def _primitives() -> tuple[Trajectory, DMP]:
-    """Return a motion whose exact positions are known, and our primitive of it."""
-    shown = _minimum_jerk()
-    return shown, DMP(n_basis=40).fit(shown)
-
-
-def _movement_primitives_dmp(shown: Trajectory) -> Any:
-    from movement_primitives import dmp
-
-    peer = dmp.DMP(n_dims=3, execution_time=shown.duration, dt=0.01, n_weights_per_dim=40)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        peer.imitate(shown.times, shown.positions)
-        peer.configure(start_y=shown.positions[0], goal_y=shown.positions[-1])
-    return peer
-
-
-def _all_steps(ours: DMP) -> None:
-    state = ours.begin()
-    for _ in range(200):
-        state = ours.step(state, 0.01)
-
-
-def steps_against_pydmps() -> Row:
-    """A motion of 200 steps, one step at a time, 3 dimensions, 40 basis functions."""
-    from pydmps.dmp_discrete import DMPs_discrete
-
-    shown, ours = _primitives()
-    peer = DMPs_discrete(n_dmps=3, n_bfs=40, dt=0.005)
-    peer.imitate_path(shown.positions.T)
-
-    def peer_steps() -> None:
-        peer.reset_state()
-        for _ in range(200):
-            peer.step()
-
-    name = "DMP, 200 times one step"
-    return Row(name, lambda: _all_steps(ours), peer_steps, _named("pydmps"), least_ratio=3.0, repeats=11)
-
-
-def steps_against_movement_primitives() -> Row:
-    """The same against another peer."""
-    shown, ours = _primitives()
-    peer = _movement_primitives_dmp(shown)
-
-    def peer_steps() -> None:
-        peer.reset()
-        y, yd = shown.positions[0], np.zeros(3)
-        for _ in range(200):
-            y, yd = peer.step(y, yd)
-
-    name = "DMP, 200 times one step"
-    return Row(name, lambda: _all_steps(ours), peer_steps, _named("movement-primitives"), least_ratio=7.0, repeats=11)
-
-
-def rollout() -> Row:
-    """A whole motion of 200 steps at once, and how far it is from the motion shown at the same instants."""
-    shown, ours = _primitives()
-    peer = _movement_primitives_dmp(shown)
-
-    def peer_rollout() -> Array:
-        peer.reset()
-        return np.asarray(peer.open_loop()[1])
-
-    def check() -> tuple[bool, str]:
-        mine = 1e3 * np.abs(ours.generate().positions - shown.positions).max()
-        theirs = 1e3 * np.abs(peer_rollout()[: len(shown)] - shown.positions).max()
-        return bool(mine <= theirs), f"largest error: ours {mine:.4f} mm, theirs {theirs:.4f} mm"
-
-    return Row(
-        "DMP rollout of 200 steps",
-        ours.generate,
-        peer_rollout,
-        _named("movement-primitives"),
-        least_ratio=15.0,
-        check=check,
-        repeats=11,
-    )
-
-
-def _named(distribution: str) -> str:
-    return f"{distribution} {version(distribution)}"
-
-
-def _in_fresh_interpreter(code: str, *, one_thread: bool = True) -> float:
-    """Run ``code`` in a new Python and return the number it prints."""
-    environment = {k: v for k, v in os.environ.items() if k not in _THREADS}
-    if one_thread:
-        environment |= dict.fromkeys(_THREADS, "1")
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment)
-    return float(done.stdout)
-
-
-def importing() -> Row:
-    """``import imitarm`` in a fresh interpreter."""
-    code = "import time; t = time.perf_counter(); import imitarm; print(time.perf_counter() - t)"
-    return Row("import imitarm", lambda: _in_fresh_interpreter(code), most_seconds=0.3, repeats=5, self_timed=True)
-
-
-def _avoidance(n_obstacles: int, most_seconds: float) -> Row:
-    """Certified ACFRA in 3-D over 40 seeded scenes of spheres and boxes; the median scene counts."""
-    skill, path = avoidance.learn(planar=False)
-    cases = [
-        families.sparse_clutter(seed, path, n_obstacles=n_obstacles, planar=False, kinds=families.SIMPLE)
-        for seed in range(40)
-    ]
-
-    def outcomes() -> list[avoidance.Outcome]:
-        return avoidance.run_family(skill, cases)
-
-    def check() -> tuple[bool, str]:
-        done = outcomes()
-        kept = sum(o.accepted and o.kept for o in done)
-        slow = 1e3 * np.percentile([o.seconds for o in done], 95)
-        return kept == len(done), f"{kept} of {len(done)} keep 20 mm; 95th percentile {slow:.1f} ms"
-
-    name = f"certified ACFRA, 3-D, 200 samples, 8 components, {n_obstacles} obstacle{'s' * (n_obstacles > 1)}"
-    return Row(
-        name,
-        lambda: float(np.median([o.seconds for o in outcomes()])),
-        most_seconds=most_seconds,
-        check=check,
-        repeats=5,
-        self_timed=True,
-    )
-
-
-def avoidance_of_one() -> Row:
-    """Certified ACFRA with one obstacle in the way."""
-    return _avoidance(1, 0.002)
-
-
-def avoidance_of_three() -> Row:
-    """Certified ACFRA with three obstacles in the way."""
-    return _avoidance(3, 0.006)
-
-
-ROWS: tuple[Callable[[], Row], ...] = (
-    gaussian_mixture,
-    regression_with_covariance,
-    regression_threads_as_installed,
-    regression_mean_only,
-    steps_against_pydmps,
-    steps_against_movement_primitives,
-    rollout,
-    avoidance_of_one,
-    avoidance_of_three,
-    importing,
-)
-
-
-# --------------------------------------------------------------------------------------------------------- the table
 
 
 def run(rows: Sequence[Callable[[], Row]] = ROWS) -> list[Measurement]:
@@ -440,8 +44,8 @@ def show(measured: Sequence[Measurement], console: Console) -> None:
         table.add_column(heading, justify="right" if heading in {"ours", "ratio"} else "left")
     for m in measured:
         verdict = {True: "met", False: "MISSED", None: "not measured"}[m.passed]
-        ours = "" if np.isnan(m.ours) else _duration(m.ours)
-        peer, ratio = ("", "") if np.isnan(m.peer) else (_duration(m.peer), f"{m.ratio:.1f} x")
+        ours = "" if np.isnan(m.ours) else duration(m.ours)
+        peer, ratio = ("", "") if np.isnan(m.peer) else (duration(m.peer), f"{m.ratio:.1f} x")
         table.add_row(m.name, ours, peer, m.peer_name, ratio, m.target, verdict, m.note)
     console.print(table)
 
@@ -455,11 +59,11 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    if any(os.environ.get(name) != "1" for name in _THREADS):  # read when NumPy is loaded, so begin again
+    if any(os.environ.get(name) != "1" for name in THREADS):  # read when NumPy is loaded, so begin again
         again = subprocess.run(
             [sys.executable, "-m", "imitarm.benchmark.speed"],
             check=False,
-            env={**os.environ, **dict.fromkeys(_THREADS, "1")},
+            env={**os.environ, **dict.fromkeys(THREADS, "1")},
         )
         sys.exit(again.returncode)
     sys.exit(main())
