@@ -167,12 +167,13 @@ def _detour(path: ComponentPath, scene: Scene, clearance: float, method: str, ax
     pairs = path.pairs(scene.obstacles)
     positions = path.nominal.positions
     distance, normal = distances(pairs, positions)
-    unmoved = judged(pairs, still, positions, distance, normal, clearance)
-    if unmoved.feasible:
-        return unmoved
+    covered = bool(distance[:, _pins(path)].min() < clearance)
+    if covered or distance.min() >= clearance:  # else a sample already tells that it has to move
+        unmoved = judged(pairs, still, positions, distance, normal, clearance)
+        if unmoved.feasible or (covered and method == "certified"):
+            return unmoved
     if method == "certified":
-        covered = bool(distance[:, _pins(path)].min() < clearance)
-        return unmoved if covered else find_detour(path, pairs, clearance, distance, normal, forbidden=axes)
+        return find_detour(path, pairs, clearance, distance, normal, forbidden=axes)
     reach = float(np.max(np.linalg.norm(path.spheres[:, :3], axis=1) + path.spheres[:, 3]))
     pushed = push_components(path, scene.obstacles, reach + clearance, method=method, forbidden=axes)
     positions = path.displaced(pushed)

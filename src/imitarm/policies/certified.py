@@ -40,7 +40,7 @@ _STYLE_COST = 1e-3
 _REPAIRABLE = 0.003  # [m] a violation that the polish can take out itself
 _NEWTON_STEPS = 12
 _LIFT_TOLERANCE = 1e-3  # [m] lifts are this much too long at most
-_THINNED = 2  # sides are rated on every second sample
+_THINNED = 3  # sides are rated on every third sample
 
 
 @dataclass(order=True)
@@ -131,9 +131,9 @@ class _Search:
         rows = np.flatnonzero((distance[worst] < self.wanted) & self.least.movable)
         if not len(rows):
             return []
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, _MAX_ROWS).astype(int))] if len(rows) > _MAX_ROWS else rows
+        rows = rows[:: -(-len(rows) // _MAX_ROWS)]
         directions = self._directions(positions, normal[worst], int(np.argmin(distance[worst])))
-        affected = self._affected(rows, displacement, worst)
+        affected = self._affected(rows, worst, distance, normal)
         lever = self.path.basis[np.ix_(rows, affected)]
         lifts = self._exits(self.pairs[worst], positions, rows, directions)
         children, costs, entered = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
@@ -175,6 +175,8 @@ class _Search:
             if amplitude is not None:
                 children[i] = displacement
                 children[i, affected] += amplitude[:, None] * directions[i]
+        if len(self.pairs) == 1:  # nothing else to run into, and the cheapest direction stays the cheapest
+            return list(children), costs.tolist(), False
         costs[best], violation = self._costs(children[best])
         before = np.maximum(0.0, self.wanted - distance[:, ::_THINNED]).sum(axis=1)
         after = violation[:, np.argmin(costs[best])]
@@ -186,7 +188,7 @@ class _Search:
         """Rate displacements (c, n_components, 3): demonstrated variance they use up, and clearance still violated.
 
         Returns:
-            costs (c,) and, by pair, the violation summed over every second sample (n_pairs, c) [m].
+            costs (c,) and, by pair, the violation summed over every third sample (n_pairs, c) [m].
         """
         style = np.einsum("ckd,kde,cke->c", displacements, self.path.precisions, displacements)
         sampled = self.path.nominal.positions[::_THINNED] + self.path.basis[::_THINNED] @ displacements
@@ -241,13 +243,14 @@ class _Search:
                 break
         return np.where(lift > MAX_LIFT, np.inf, lift)
 
-    def _affected(self, rows: Index, displacement: Array, worst: int) -> Index:
-        """Return the indices of the components near the obstacle or in charge of a violated sample (METHODS D.2.4)."""
-        pair = self.pairs[worst]
-        beside = 0.0 if pair.offset is None else float(np.linalg.norm(pair.offset[0]))
-        centre, normal = pair.distance_and_normal(self.path.means + displacement)
-        spread = np.sqrt(np.einsum("kd,kde,ke->k", normal, self.path.covariances, normal))
-        near = centre - spread - beside - self.clearance <= AFFECTED_DISTANCE
+    def _affected(self, rows: Index, worst: int, distance: Array, normal: Array) -> Index:
+        """Return the indices of the components near the obstacle or in charge of a violated sample (METHODS D.2.4).
+
+        A component's centre is taken to be where the path is at its instant; there the distances are known.
+        """
+        centre, n = distance[worst, self.path.centres], normal[worst, self.path.centres]
+        spread = np.sqrt(np.einsum("kd,kde,ke->k", n, self.path.covariances, n))
+        near = centre - spread - self.clearance <= AFFECTED_DISTANCE
         in_charge = self.path.responsibilities[rows].max(axis=0) > 0.25
         return np.flatnonzero(
             (near | in_charge | self.everywhere) & (self.path.basis[rows].max(axis=0) > NEGLIGIBLE_LEVER)

@@ -56,6 +56,7 @@ class ComponentPath:
             hold the motion itself too: a component is long along the path.
         yields: how much the teacher varied at the instant of each component's centre, floored as well: GMR's
             covariance there, (n_components, 3, 3) [m^2]. It is what a displacement is measured against.
+        centres: sample at which each component has its centre, (n_components,).
         factors: lower Cholesky factors of the yields, (n_components, 3, 3) [m].
         precisions: inverses of the yields, (n_components, 3, 3) [1/m^2].
         tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
@@ -68,6 +69,7 @@ class ComponentPath:
     means: Array
     covariances: Array
     yields: Array
+    centres: NDArray[np.intp]
     factors: Array
     precisions: Array
     tolerance: Array
@@ -162,7 +164,8 @@ def _learnt(gmr: GMR, n_samples: int, pins: tuple[float, ...]) -> ComponentPath:
     else:
         mean, tolerance = gmr.predict(times)
     responsibilities = gmr.responsibilities(times)
-    yields = tolerance[_nearest(times, gmr.time_means_)] + TOLERANCE_FLOOR**2 * np.eye(3)
+    centres = _nearest(times, gmr.time_means_)
+    yields = tolerance[centres] + TOLERANCE_FLOOR**2 * np.eye(3)
     influence = np.where(responsibilities < NEGLIGIBLE_RESPONSIBILITY, 0.0, responsibilities)
     path = ComponentPath(
         nominal=Trajectory(times, mean, quaternions),
@@ -171,6 +174,7 @@ def _learnt(gmr: GMR, n_samples: int, pins: tuple[float, ...]) -> ComponentPath:
         means=gmr.position_means_,
         covariances=gmr.position_covariances_ + TOLERANCE_FLOOR**2 * np.eye(3),
         yields=yields,
+        centres=centres,
         factors=np.asarray(np.linalg.cholesky(yields), dtype=np.float64),
         precisions=np.asarray(np.linalg.inv(yields), dtype=np.float64),
         tolerance=tolerance,

@@ -50,6 +50,11 @@ def least_norm(rows: Array, lower: Array, upper: Array) -> Array | None:
     return np.asarray(y) if flag == _SOLVED else None
 
 
+def _longest_step(positions: Array) -> float:
+    step = positions[1:] - positions[:-1]
+    return float(np.sqrt(np.einsum("nd,nd->n", step, step).max()))
+
+
 class LeastDetour:
     """Shrinks detours of one path among one set of obstacles, for all spheres of the tool.
 
@@ -60,7 +65,7 @@ class LeastDetour:
 
     def __init__(self, path: ComponentPath, pairs: Sequence[Pair], clearance: float, forbidden: Array) -> None:
         self.path, self.pairs, self.clearance, self.forbidden = path, pairs, clearance, forbidden
-        step = float(np.linalg.norm(np.diff(path.nominal.positions, axis=0), axis=1).max())
+        step = self._longest_step = _longest_step(path.nominal.positions)
         # Round a corner of an obstacle the centre of a sphere passes on an arc of this radius; its chord sags by
         # step^2 / 8 radius.
         radius = clearance + min(pair.radius for pair in pairs)
@@ -70,11 +75,11 @@ class LeastDetour:
     def judged(self, displacement: Array, positions: Array, distance: Array, normal: Array, expanded: int) -> Detour:
         """Judge a path by its certificate, and by whether it is one that a robot could follow."""
         detour = judged(self.pairs, displacement, positions, distance, normal, self.clearance, expanded)
-        nominal = self.path.nominal.positions
-        away = np.linalg.norm(positions - nominal, axis=1).max()
-        steps = [np.linalg.norm(np.diff(p, axis=0), axis=1).max() for p in (positions, nominal)]
-        strays = bool(away > FARTHEST or steps[0] > _LONGEST_STEP * steps[1])
-        return replace(detour, feasible=detour.feasible and not strays, strays=strays)
+        away = positions - self.path.nominal.positions
+        far = bool(np.sqrt(np.einsum("nd,nd->n", away, away).max()) > FARTHEST)
+        if far or _longest_step(positions) > _LONGEST_STEP * self._longest_step:
+            return replace(detour, feasible=False, strays=True)
+        return detour
 
     def shrink(self, detour: Detour, distance: Array, normal: Array) -> Detour:
         """Shrink a displacement to the least one that its tangents allow; where a segment dips, ask for more there."""
