@@ -16,7 +16,6 @@ from imitarm.trajectory import Demonstration, Trajectory
 from skill_samples import same, shown
 
 Array = NDArray[np.float64]
-REAL = Path(__file__).parents[2] / "shared" / "data" / "panda_kinesthetic"
 
 
 @pytest.fixture(scope="module")
@@ -154,10 +153,9 @@ def test_a_file_with_a_right_checksum_and_wrong_content_is_refused(skill: Skill,
             Skill.load(path)
 
 
-@pytest.mark.skipif(not REAL.exists(), reason="the real recordings are not beside this checkout")
 @pytest.mark.parametrize("name", ["bottle2shelf", "pouring"])
-def test_real_recordings_of_a_panda_are_learnt_with_orientation(name: str) -> None:
-    rows = np.load(REAL / f"{name}.npy", allow_pickle=False)[:, ::5]
+def test_real_recordings_of_a_panda_are_learnt_with_orientation(real_data: Path, name: str) -> None:
+    rows = np.load(real_data / "panda_kinesthetic" / f"{name}.npy", allow_pickle=False)[:, ::5]
     demonstrations = []
     for i, row in enumerate(rows):
         q = row[:, 3:] / np.linalg.norm(row[:, 3:], axis=1, keepdims=True)
