@@ -1,0 +1,233 @@
+"""Skeleton: a person as a camera sees one, at one instant; SkeletonSource: where skeletons come from."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InputError, UnknownNameError
+
+Array = NDArray[np.float64]
+
+JOINTS = (
+    "spine_base",
+    "spine_mid",
+    "neck",
+    "head",
+    "shoulder_left",
+    "elbow_left",
+    "wrist_left",
+    "hand_left",
+    "shoulder_right",
+    "elbow_right",
+    "wrist_right",
+    "hand_right",
+    "hip_left",
+    "knee_left",
+    "ankle_left",
+    "foot_left",
+    "hip_right",
+    "knee_right",
+    "ankle_right",
+    "foot_right",
+    "spine_shoulder",
+    "hand_tip_left",
+    "thumb_left",
+    "hand_tip_right",
+    "thumb_right",
+)
+"""Names of the 25 joints, in the order of the Kinect v2 SDK; left and right are the person's own."""
+
+JOINT = {name: index for index, name in enumerate(JOINTS)}
+"""Index of each joint."""
+
+SIDES = ("left", "right")
+FARTHEST = 20.0  # [m] no skeleton camera sees as far: a joint beyond it was not measured
+_ARM_PARTS = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
+_ARM_INDEX = {side: np.array([JOINT[f"{part}_{side}"] for part in _ARM_PARTS]) for side in SIDES}
+
+
+class Tracking(IntEnum):
+    """How a camera knows where a joint is; the numbers are those of the Kinect SDK."""
+
+    LOST = 0
+    INFERRED = 1
+    TRACKED = 2
+
+
+class HandState(IntEnum):
+    """What a hand does; the numbers are those of the Kinect SDK."""
+
+    UNKNOWN = 0
+    NOT_TRACKED = 1
+    OPEN = 2
+    CLOSED = 3
+    LASSO = 4
+
+
+CONFIDENCE = np.array([0.0, 0.2, 1.0])
+"""How far a position is believed, by its :class:`Tracking` (METHODS A.6)."""
+CONFIDENCE.setflags(write=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """One arm of a person at one instant, in the sensor's frame.
+
+    Attributes:
+        time: [s].
+        points: shoulder, elbow, wrist, hand, hand tip, thumb, shape (6, 3) [m]; nan where lost.
+        confidence: of each point, 0 (lost) to 1 (tracked), shape (6,).
+        hand_state: open, closed, or not known.
+    """
+
+    time: float
+    points: Array
+    confidence: Array
+    hand_state: HandState = HandState.UNKNOWN
+
+    @property
+    def shoulder(self) -> Array:
+        """Position of the shoulder, shape (3,) [m]."""
+        return self.points[0]
+
+    @property
+    def elbow(self) -> Array:
+        """Position of the elbow, shape (3,) [m]."""
+        return self.points[1]
+
+    @property
+    def wrist(self) -> Array:
+        """Position of the wrist, shape (3,) [m]."""
+        return self.points[2]
+
+    @property
+    def seen(self) -> bool:
+        """Whether shoulder, elbow and wrist all have a position."""
+        return bool(self.confidence[:3].min() > 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A person as a camera sees one at one instant.
+
+    The frame is that of the Kinect v2: the origin in the sensor, x to the sensor's left, y up, z away from the
+    sensor, right-handed. A person who faces the sensor has the right hand at larger x than the left one.
+
+    A position that can't have been measured (not finite, or farther than 20 m) is taken as lost, and every lost
+    position is nan, so that it can't be used by mistake.
+
+    Attributes:
+        time: of the exposure, on the source's clock [s].
+        positions: of the joints :data:`JOINTS`, shape (25, 3) [m]; nan where lost.
+        tracking: :class:`Tracking` of each joint, shape (25,).
+        hand_states: of the left and the right hand.
+        person: which person this is, as the source counts them.
+
+    Raises:
+        InputError: when a shape is wrong, the time is not finite, or a state is not one that exists.
+    """
+
+    time: float
+    positions: Array
+    tracking: NDArray[np.int8] = field(default_factory=lambda: np.full(len(JOINTS), Tracking.TRACKED, np.int8))
+    hand_states: tuple[HandState, HandState] = (HandState.UNKNOWN, HandState.UNKNOWN)
+    person: int = 0
+
+    def __post_init__(self) -> None:
+        n = len(JOINTS)
+        positions = np.array(self.positions, dtype=float)
+        tracking = np.array(self.tracking)
+        if positions.shape != (n, 3) or tracking.shape != (n,):
+            raise InputError(
+                f"Skeleton: positions and tracking must have shapes ({n}, 3) and ({n},), "
+                f"got {positions.shape} and {tracking.shape}"
+            )
+        if not np.isfinite(self.time):
+            raise InputError(f"Skeleton: time must be a finite number of seconds, got {self.time!r}")
+        if not np.isin(tracking, (0, 1, 2)).all():
+            raise InputError(f"Skeleton: tracking must be 0, 1 or 2 (lost, inferred, tracked), got {tracking}")
+        try:
+            left, right = (HandState(state) for state in self.hand_states)
+        except ValueError as error:
+            raise InputError(f"Skeleton: hand_states must be two of 0 to 4, got {self.hand_states!r}") from error
+        tracking = tracking.astype(np.int8)
+        with np.errstate(invalid="ignore"):
+            measured = (np.abs(positions) <= FARTHEST).all(axis=1)
+        tracking[~measured] = Tracking.LOST
+        positions[tracking == Tracking.LOST] = np.nan
+        positions.setflags(write=False)
+        tracking.setflags(write=False)
+        object.__setattr__(self, "time", float(self.time))
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "tracking", tracking)
+        object.__setattr__(self, "hand_states", (left, right))
+
+    def joint(self, name: str) -> Array:
+        """Return the position of a joint, shape (3,) [m]; nan when lost.
+
+        Raises:
+            UnknownNameError: when there is no such joint.
+        """
+        if name not in JOINT:
+            raise UnknownNameError.among("joint", name, JOINTS)
+        return self.positions[JOINT[name]]
+
+    def arm(self, side: str = "right") -> Arm:
+        """Return the arm of one side.
+
+        Raises:
+            UnknownNameError: when ``side`` is neither left nor right.
+        """
+        if side not in _ARM_INDEX:
+            raise UnknownNameError.among("side", side, SIDES)
+        index = _ARM_INDEX[side]
+        return Arm(
+            self.time, self.positions[index], CONFIDENCE[self.tracking[index]], self.hand_states[SIDES.index(side)]
+        )
+
+
+class SkeletonSource(ABC):
+    """Where skeletons come from: a recording, a camera, a stream, a made-up person.
+
+    Iterating gives skeletons in the order of their times until the source is over::
+
+        with KinectRecording(path) as source:
+            for skeleton in source:
+                ...
+
+    Attributes:
+        name: for messages and for what is recorded, for example the file's name.
+    """
+
+    name: str = "skeletons"
+
+    @abstractmethod
+    def read(self, timeout: float = 1.0) -> Skeleton | None:
+        """Return the next skeleton, or None when none came within ``timeout`` seconds or the source is over."""
+
+    @property
+    @abstractmethod
+    def over(self) -> bool:
+        """Whether no more skeletons will come."""
+
+    def close(self) -> None:  # noqa: B027 (a source without anything to let go of needs none)
+        """Let go of files, sockets and devices; a second call does nothing."""
+
+    def __iter__(self) -> Iterator[Skeleton]:
+        while not self.over:
+            skeleton = self.read()
+            if skeleton is not None:
+                yield skeleton
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

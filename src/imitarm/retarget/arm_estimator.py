@@ -1,0 +1,161 @@
+"""ArmEstimator: from noisy skeletons to one steady estimate of a person's arm; what all methods begin with."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.capture.skeleton import HandState, Skeleton
+from imitarm.errors import InputError
+from imitarm.kinematics.pose import matrix_to_quaternion
+from imitarm.retarget.correspondence import Correspondence
+from imitarm.retarget.human_arm import carried, hand_rotation
+from imitarm.retarget.limbs import LimbLengths, correct_limbs, measure_limbs
+from imitarm.retarget.smoothing import GAP, Hampel, OneEuro, OneEuroRotation
+
+Array = NDArray[np.float64]
+
+_LEARNING_FRAMES = 60  # lengths that were not given are learnt from so many, then kept
+_GRIP_FRAMES = 3  # a hand state counts when so many frames in a row have it
+_JUMP = 0.12  # [m] what a hand may go within half the outlier filter's window without being one
+
+
+@dataclass(frozen=True, eq=False)
+class ArmEstimate:
+    """A person's arm, smoothed, with the true lengths of its bones, in the robot's base frame.
+
+    Attributes:
+        time: of the frame, on the source's clock [s].
+        shoulder: position, shape (3,) [m].
+        elbow: position, shape (3,) [m].
+        wrist: position, shape (3,) [m].
+        velocity: of the wrist, shape (3,) [m/s].
+        hand: rotation of the hand, wxyz, shape (4,): its x along the hand, its z away from the palm's back.
+        angular_velocity: of the hand, shape (3,) [rad/s].
+        confidence: of elbow, wrist and hand rotation, each 0 to 1.
+        closed: whether the hand is closed; None while that is not known.
+    """
+
+    time: float
+    shoulder: Array
+    elbow: Array
+    wrist: Array
+    velocity: Array
+    hand: Array
+    angular_velocity: Array
+    confidence: tuple[float, float, float]
+    closed: bool | None
+
+
+class ArmEstimator:
+    """Turns skeletons into :class:`ArmEstimate`: outliers out, limbs corrected, smoothed, hand turned.
+
+    All methods share it, so that none can win by better plumbing (METHODS B).
+
+    Args:
+        correspondence: which arm, and where the sensor is.
+        smoothing: One-Euro filters on; off, the corrected points are given as they are.
+    """
+
+    def __init__(self, correspondence: Correspondence, *, smoothing: bool = True) -> None:
+        self.correspondence = correspondence
+        self._smoothing = smoothing
+        self._rotation = correspondence.sensor_to_base.rotation
+        self._origin = correspondence.sensor_to_base.position
+        self._filters = (OneEuro(), OneEuro(), OneEuro())
+        self._turn = OneEuroRotation()
+        self._guard = Hampel(least=_JUMP)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past, learnt lengths too."""
+        self._time = -np.inf
+        self._hand: Array | None = None  # rotation matrix in the base frame
+        self._fore: Array | None = None
+        self._grips: deque[HandState] = deque(maxlen=_GRIP_FRAMES)
+        self._closed: bool | None = None
+        self._learning: list[Skeleton] = []
+        self.lengths: LimbLengths | None = self.correspondence.lengths
+        for part in (*self._filters, self._turn, self._guard):
+            part.reset()
+
+    def update(self, skeleton: Skeleton) -> ArmEstimate | None:
+        """Take in the next skeleton; None when its arm is lost, impossible, not newer, or of unknown length yet."""
+        if skeleton.time <= self._time:
+            return None
+        gap = skeleton.time - self._time
+        self._time = skeleton.time
+        arm = skeleton.arm(self.correspondence.side)
+        if not arm.seen:
+            return None
+        if self.lengths is None or self._learning:
+            self._learn(skeleton)
+        if self.lengths is None or not self._guard.accept(arm.time, arm.wrist - arm.shoulder):
+            return None
+        points = arm.points @ self._rotation.T + self._origin
+        elbow, wrist = correct_limbs(points[0], points[1], points[2], self.lengths)
+        confidence = arm.confidence
+        elbow_known, wrist_known = float(confidence[1]), float(min(confidence[2], confidence[0]))
+        if gap > GAP:
+            self._hand = None
+        rotation, hand_known = self._hand_rotation(points, confidence, wrist - elbow)
+        s, e, w, hand = self._smooth(arm.time, (points[0], elbow, wrist), rotation, confidence, hand_known)
+        return ArmEstimate(
+            arm.time,
+            s,
+            e,
+            w,
+            self._filters[2].velocity if self._smoothing else np.zeros(3),
+            hand,
+            self._turn.velocity if self._smoothing else np.zeros(3),
+            (elbow_known, wrist_known, hand_known),
+            self._grip(arm.hand_state),
+        )
+
+    def _learn(self, skeleton: Skeleton) -> None:
+        """Measure the arm over the first frames in which it is seen."""
+        self._learning.append(skeleton)
+        try:
+            self.lengths = measure_limbs(self._learning, self.correspondence.side)
+        except InputError:  # not enough frames yet, or not an arm
+            self._learning = self._learning[-_LEARNING_FRAMES:]
+            return
+        if len(self._learning) >= _LEARNING_FRAMES:
+            self._learning = []
+
+    def _hand_rotation(self, points: Array, confidence: Array, forearm: Array) -> tuple[Array, float]:
+        """Return the hand's rotation in the base frame, and how far it is believed; carried along where not seen."""
+        length = float(np.sqrt(forearm @ forearm))
+        fore = forearm / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
+        seen = confidence[[2, 4, 5]].min() >= 1.0
+        rotation = hand_rotation(points[2], points[4], points[5]) if seen else None
+        known = 1.0 if rotation is not None else 0.0
+        if rotation is None:
+            rotation = carried(self._hand, self._fore, fore)
+        self._hand, self._fore = rotation, fore
+        return rotation, known
+
+    def _smooth(
+        self, time: float, points: tuple[Array, Array, Array], rotation: Array, confidence: Array, hand_known: float
+    ) -> tuple[Array, Array, Array, Array]:
+        hand = matrix_to_quaternion(rotation)
+        if not self._smoothing:
+            return *points, hand
+        s, e, w = (
+            one.filter(time, point, float(known))
+            for one, point, known in zip(self._filters, points, confidence[:3], strict=True)
+        )
+        return s, e, w, self._turn.filter(time, hand, 1.0 if hand_known else 0.5)
+
+    def _grip(self, state: HandState) -> bool | None:
+        """Return whether the hand is closed, once several frames in a row say so."""
+        self._grips.append(state)
+        if len(self._grips) == _GRIP_FRAMES and len(set(self._grips)) == 1 and state in _GRIP:
+            self._closed = _GRIP[state]
+        return self._closed
+
+
+_GRIP = {HandState.OPEN: False, HandState.CLOSED: True}

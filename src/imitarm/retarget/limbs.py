@@ -1,0 +1,134 @@
+"""The lengths of a person's arm: measured over many frames, then put back into every one (thesis Eq 3.1 to 3.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.capture.skeleton import Skeleton
+from imitarm.errors import InputError
+
+Array = NDArray[np.float64]
+
+MAD_TO_SIGMA = 1.4826  # of a normal distribution
+ACCEPTED = 0.005  # [m] standard error of a length that is good enough (METHODS A.1)
+_SLOW = 0.3  # [m/s] a faster elbow or wrist is smeared by the camera's exposure
+_LEAST_FRAMES = 5
+_PLAUSIBLE = (0.10, 0.60)  # [m] of an upper arm or forearm, from a child's to a giant's
+_POINT = 1e-3  # [m] two joints nearer than this have no direction
+
+
+@dataclass(frozen=True)
+class LimbLengths:
+    """Lengths of a person's upper arm and forearm.
+
+    Attributes:
+        upper_arm: shoulder to elbow [m].
+        forearm: elbow to wrist [m].
+        spread: of single measurements of the two about their median, as a standard deviation [m].
+        n_frames: frames measured; 0 when the lengths were given.
+
+    Raises:
+        InputError: when a length is not one of an arm.
+    """
+
+    upper_arm: float
+    forearm: float
+    spread: tuple[float, float] = (0.0, 0.0)
+    n_frames: int = 0
+
+    def __post_init__(self) -> None:
+        low, high = _PLAUSIBLE
+        for what, length in (("upper_arm", self.upper_arm), ("forearm", self.forearm)):
+            if not low <= length <= high:
+                raise InputError(
+                    f"LimbLengths: {what} must be between {low} and {high} m, got {length!r}; is the unit metres, and "
+                    "is the arm in view?"
+                )
+
+    @property
+    def standard_error(self) -> float:
+        """Of the worse of the two lengths [m]; 0 when they were given."""
+        return max(self.spread) / self.n_frames**0.5 if self.n_frames else 0.0
+
+    @property
+    def accepted(self) -> bool:
+        """Whether they are known to 5 mm."""
+        return self.standard_error < ACCEPTED
+
+    @property
+    def reach(self) -> float:
+        """Of the stretched arm, shoulder to wrist [m]."""
+        return self.upper_arm + self.forearm
+
+
+def measure_limbs(skeletons: Iterable[Skeleton], side: str = "right") -> LimbLengths:
+    """Measure the lengths of an arm: the medians over frames in which it is tracked and slow (METHODS A.1).
+
+    Args:
+        skeletons: in the order of their times; two seconds are plenty.
+        side: which arm.
+
+    Raises:
+        InputError: when fewer than five frames show the whole arm, or what they show is no arm.
+    """
+    arms = [skeleton.arm(side) for skeleton in skeletons]
+    whole = [arm for arm in arms if arm.confidence[:3].min() >= 1.0]
+    slow = [
+        after
+        for before, after in pairwise(whole)
+        if after.time > before.time
+        and np.abs(after.points[1:3] - before.points[1:3]).max() < _SLOW * (after.time - before.time)
+    ]
+    used = slow if len(slow) >= _LEAST_FRAMES else whole
+    if len(used) < _LEAST_FRAMES:
+        raise InputError(
+            f"limb lengths: the {side} arm is fully tracked in {len(used)} of {len(arms)} frames, {_LEAST_FRAMES} are "
+            "needed; face the sensor with the arm away from the body"
+        )
+    points = np.array([arm.points[:3] for arm in used])
+    lengths = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    middle = np.median(lengths, axis=0)
+    spread = MAD_TO_SIGMA * np.median(np.abs(lengths - middle), axis=0)
+    return LimbLengths(float(middle[0]), float(middle[1]), (float(spread[0]), float(spread[1])), len(used))
+
+
+def correct_limbs(
+    shoulder: ArrayLike,
+    elbow: ArrayLike,
+    wrist: ArrayLike,
+    lengths: LimbLengths,
+    *,
+    as_printed: bool = False,
+) -> tuple[Array, Array]:
+    r"""Give an arm its true lengths back, keeping the directions of its bones (thesis Eq 3.1 to 3.4, METHODS A.1).
+
+    .. math:: E_c = S + L_U \frac{E - S}{|E - S|}, \qquad W_c = E_c + L_F \frac{W - E}{|W - E|}
+
+    Args:
+        shoulder: shape (..., 3) [m]; so are elbow and wrist.
+        elbow: as measured.
+        wrist: as measured.
+        lengths: of this person.
+        as_printed: with the thesis's signs, and the forearm set on the measured elbow: the elbow then comes out on
+            the other side of the shoulder.
+
+    Returns:
+        elbow and wrist, shapes (..., 3) [m].
+    """
+    s, e, w = (np.asarray(point, dtype=float) for point in (shoulder, elbow, wrist))
+    upper, fore = _direction(e - s), _direction(w - e)
+    if as_printed:
+        return s - lengths.upper_arm * upper, e - lengths.forearm * fore
+    corrected = s + lengths.upper_arm * upper
+    return corrected, corrected + lengths.forearm * fore
+
+
+def _direction(vectors: Array) -> Array:
+    """Return unit vectors; a vector of hardly any length has none and becomes zero."""
+    length = np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True))
+    return np.where(length > _POINT, vectors / np.maximum(length, _POINT), 0.0)

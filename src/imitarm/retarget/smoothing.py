@@ -1,0 +1,139 @@
+"""Live smoothing of what a camera sees: calm at rest, quick in motion; and a guard against jumps."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.pose import quaternion_conjugate, quaternion_exp, quaternion_log, quaternion_multiply
+
+Array = NDArray[np.float64]
+
+GAP = 0.3  # [s] after a longer gap a filter begins anew
+
+
+def smoothing_share(cutoff: float, period: float) -> float:
+    r"""Return :math:`\alpha = 1 / (1 + 1/(2\pi f T))`: how much of a new value a low-pass filter takes over."""
+    return 1.0 / (1.0 + 1.0 / (2.0 * math.pi * cutoff * period))
+
+
+class OneEuro:
+    r"""The One-Euro filter of a vector (Casiez et al. 2012; METHODS A.9).
+
+    A low-pass filter whose cut-off rises with the speed of the motion:
+
+    .. math:: \hat x \leftarrow \hat x + \alpha(f_c)\,(x - \hat x), \qquad f_c = f_{min} + \beta\,|\hat{\dot x}|
+
+    The speed is that of the vector, not of each axis, so the filter is the same in every direction. A value with a
+    confidence c below 1 is taken over by c times as much.
+
+    Args:
+        min_cutoff: cut-off at rest [Hz].
+        beta: how quickly it rises [Hz per unit/s]; for positions in metres 8 to 15.
+        derivative_cutoff: of the estimated speed [Hz].
+    """
+
+    def __init__(self, min_cutoff: float = 1.0, beta: float = 10.0, derivative_cutoff: float = 1.0) -> None:
+        if not (min_cutoff > 0.0 and beta >= 0.0 and derivative_cutoff > 0.0):
+            raise InputError("OneEuro: cut-off frequencies must be positive [Hz] and beta not negative")
+        self.min_cutoff, self.beta, self.derivative_cutoff = min_cutoff, beta, derivative_cutoff
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._time = -math.inf
+        self.value: Array = np.zeros(0)
+        self.velocity: Array = np.zeros(0)
+
+    def filter(self, time: float, x: Array, confidence: float = 1.0) -> Array:
+        """Take in a measured vector and return the smoothed one, same shape; ``velocity`` is its derivative.
+
+        Args:
+            time: of the measurement [s]; when it is not later than the one before, that one is returned.
+            x: shape (d,).
+            confidence: 0 to 1.
+        """
+        period = time - self._time
+        if period > GAP:
+            self._time, self.value, self.velocity = time, np.array(x, dtype=float), np.zeros(len(x))
+            return self.value
+        if period <= 0.0:
+            return self.value
+        self._time = time
+        step = self._difference(x)
+        self.velocity = self.velocity + confidence * smoothing_share(self.derivative_cutoff, period) * (
+            step / period - self.velocity
+        )
+        cutoff = self.min_cutoff + self.beta * math.sqrt(float(self.velocity.dot(self.velocity)))
+        self.value = self._moved(confidence * smoothing_share(cutoff, period) * step)
+        return self.value
+
+    def _difference(self, x: Array) -> Array:
+        return np.asarray(x - self.value)
+
+    def _moved(self, step: Array) -> Array:
+        return np.asarray(self.value + step)
+
+
+class OneEuroRotation(OneEuro):
+    """The One-Euro filter of a rotation (quaternion w x y z): steps and speed are rotation vectors in the base frame.
+
+    Args:
+        min_cutoff: cut-off at rest [Hz].
+        beta: how quickly it rises [Hz per rad/s].
+        derivative_cutoff: of the estimated angular velocity [Hz].
+    """
+
+    def __init__(self, min_cutoff: float = 1.0, beta: float = 1.0, derivative_cutoff: float = 1.0) -> None:
+        super().__init__(min_cutoff, beta, derivative_cutoff)
+
+    def filter(self, time: float, x: Array, confidence: float = 1.0) -> Array:
+        """Take in a measured unit quaternion (4,) and return the smoothed one; ``velocity`` is (3,) [rad/s]."""
+        result = super().filter(time, x, confidence)
+        if len(self.velocity) == 4:  # it has just begun
+            self.velocity = np.zeros(3)
+        return result
+
+    def _difference(self, x: Array) -> Array:
+        return quaternion_log(quaternion_multiply(x, quaternion_conjugate(self.value)))
+
+    def _moved(self, step: Array) -> Array:
+        moved = quaternion_multiply(quaternion_exp(step), self.value)
+        return np.asarray(moved / math.sqrt(float(moved.dot(moved))))
+
+
+class Hampel:
+    r"""Tells a jump from a motion: a value too far from the median of the last moments is an outlier (METHODS A.9).
+
+    :math:`|x - \mathrm{med}| > \max(4 \cdot 1.4826\,\mathrm{MAD},\; r)`. A real jump is believed once the window has
+    filled with it: after half the window most values agree.
+
+    Args:
+        window: [s].
+        least: r, what is never an outlier [m]: more than a quick hand goes within half the window.
+    """
+
+    def __init__(self, window: float = 0.3, least: float = 0.02) -> None:
+        self.window, self.least = window, least
+        self._seen: deque[tuple[float, Array]] = deque()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._seen.clear()
+
+    def accept(self, time: float, x: Array) -> bool:
+        """Take in a value (d,) and return whether it fits those before it."""
+        seen = self._seen
+        while seen and (time - seen[0][0] > self.window or time <= seen[0][0]):
+            seen.popleft()
+        seen.append((time, x))
+        if len(seen) < 4:
+            return True
+        values = np.array([value for _, value in seen])
+        middle = np.median(values, axis=0)
+        away = np.sqrt(np.sum(np.square(values - middle), axis=1))
+        return bool(away[-1] <= max(4.0 * 1.4826 * float(np.median(away)), self.least))
