@@ -14,7 +14,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import Pose
-from imitarm.policies.barrier import clearance_rows
+from imitarm.scene.barrier import clearance_rows
 from imitarm.policies.policy import Observation, Policy
 from imitarm.robots.robot import Robot
 from imitarm.scene import Scene
@@ -70,7 +70,7 @@ def reproduce(
         timeout: longest duration [s].
         method: of :func:`solve_ik`.
         link_clearance: distance that every link must keep to every obstacle [m], held by
-            :func:`~imitarm.policies.barrier.clearance_rows` in the inverse kinematics (``method="qp"``); the tool then
+            :func:`~imitarm.scene.barrier.clearance_rows` in the inverse kinematics (``method="qp"``); the tool then
             leaves its path where a link would not get by. None: only the policy looks after obstacles.
         on_step: called after each step, for progress or drawing; what it raises stops the robot and is passed on.
 

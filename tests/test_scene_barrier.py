@@ -7,7 +7,7 @@ import pytest
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import solve_ik
-from imitarm.policies.barrier import clearance_rows
+from imitarm.scene.barrier import clearance_rows
 from imitarm.scene import Scene, Sphere
 
 
