@@ -1,0 +1,85 @@
+"""JerkLimiter: the last stage before the robot; what leaves it keeps every limit of the joints."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+
+Array = NDArray[np.float64]
+
+
+class JerkLimiter:
+    r"""Follows a reference of the joints with limited position, velocity, acceleration and jerk.
+
+    A critically damped follower with feed-forward,
+    :math:`a_d = \omega^2 (q_r - q) + 2\omega (v_r - v)`, whose acceleration is cut to
+    :math:`|a| \le a_{max}` and to :math:`|a - a_p| \le j\,dt`. The velocity :math:`v + a\,dt` that follows is then
+    cut to what the joints may have: with D the way left to a limit and the set-point moving by the mean of two
+    velocities, a joint that must be able to stop has at most
+
+    .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a \max(D - \tfrac12 v\,dt,\,0)} .
+
+    A joint that kept this bound can keep it again by braking with a, so that there is always a way on. Near a limit
+    the last cut may exceed the jerk; position, velocity and acceleration are kept always.
+
+    Args:
+        arm: whose limits.
+        dt: control period [s].
+        frequency: omega [rad/s]; must be well below 1/dt.
+        rise_time: how long a joint takes to full acceleration [s]: j = a_max / rise_time.
+    """
+
+    def __init__(self, arm: ArmModel, dt: float, *, frequency: float = 30.0, rise_time: float = 0.05) -> None:
+        if not 0.0 < frequency * dt < 1.0:
+            raise InputError(f"JerkLimiter: frequency must be positive and below 1/dt = {1 / dt:g} rad/s")
+        if not rise_time >= dt:
+            raise InputError(f"JerkLimiter: rise_time must be at least dt = {dt:g} s, got {rise_time:g}")
+        self._dt = dt
+        self._stiffness, self._damping = frequency * frequency, 2.0 * frequency
+        self._v_max, self._a_max = arm.max_velocity, arm.max_acceleration
+        self._step = arm.max_acceleration * dt
+        self._jerk_step = arm.max_acceleration * (dt / rise_time)
+        self.max_jerk = arm.max_acceleration / rise_time
+        self._ends = np.stack([arm.upper, -arm.lower])
+        self.start(arm.home)
+
+    def start(self, q: ArrayLike) -> None:
+        """Be at rest at ``q``, shape (n_joints,) [rad]."""
+        self.q: Array = np.array(q, dtype=float)
+        self.velocity: Array = np.zeros_like(self.q)
+        self.acceleration: Array = np.zeros_like(self.q)
+
+    def follow(self, q: Array, velocity: Array) -> Array:
+        """Go on by one period towards a reference and return the joint positions reached, (n_joints,) [rad].
+
+        Args:
+            q: of the reference, shape (n_joints,) [rad].
+            velocity: of the reference, shape (n_joints,) [rad/s].
+        """
+        dt, before = self._dt, self.velocity
+        # semi-implicit: the error is that at the end of the period, which keeps the follower calm at a large omega dt
+        error = q - self.q - dt * before
+        wanted = (self._stiffness * error + self._damping * (velocity - before)) / (
+            1.0 + dt * self._damping + dt * dt * self._stiffness
+        )
+        most = np.minimum(self.acceleration + self._jerk_step, self._a_max)
+        least = np.maximum(self.acceleration - self._jerk_step, -self._a_max)
+        after = before + dt * np.minimum(np.maximum(wanted, least), most)
+        lower, upper = self._box()
+        after = np.minimum(np.maximum(after, lower), upper)
+        self.q = self.q + 0.5 * dt * (before + after)
+        self.velocity, self.acceleration = after, (after - before) / dt
+        return self.q
+
+    def _box(self) -> tuple[Array, Array]:
+        """Return the least and largest velocity from which each joint can still stop before its limits."""
+        moved = np.stack([self.velocity, -self.velocity])
+        way = np.maximum(self._ends - np.stack([self.q, -self.q]) - (0.5 * self._dt) * moved, 0.0)
+        half = 0.5 * self._step
+        bound = np.sqrt(half * half + 2.0 * self._a_max * way) - half
+        bound = np.minimum(np.maximum(bound, moved - self._step), moved + self._step)
+        bound = np.minimum(bound, self._v_max)
+        return -bound[1], bound[0]
