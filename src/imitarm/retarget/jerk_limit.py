@@ -20,7 +20,9 @@ class JerkLimiter:
     cut to what the joints may have: with D the way left to a limit and the set-point moving by the mean of two
     velocities, a joint that must be able to stop has at most
 
-    .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a \max(D - \tfrac12 v\,dt,\,0)} .
+    .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a D'}, \qquad D' = D - \tfrac12 v\,dt,
+
+    and :math:`2 D'/dt` where that is negative.
 
     A joint that kept this bound can keep it again by braking with a, so that there is always a way on. Near a limit
     the last cut may exceed the jerk; position, velocity and acceleration are kept always.
@@ -77,9 +79,10 @@ class JerkLimiter:
     def _box(self) -> tuple[Array, Array]:
         """Return the least and largest velocity from which each joint can still stop before its limits."""
         moved = np.stack([self.velocity, -self.velocity])
-        way = np.maximum(self._ends - np.stack([self.q, -self.q]) - (0.5 * self._dt) * moved, 0.0)
+        way = self._ends - np.stack([self.q, -self.q]) - (0.5 * self._dt) * moved
         half = 0.5 * self._step
-        bound = np.sqrt(half * half + 2.0 * self._a_max * way) - half
+        bound = np.sqrt(half * half + 2.0 * self._a_max * np.maximum(way, 0.0)) - half
+        bound = bound + np.minimum(way, 0.0) * (2.0 / self._dt)  # the speed already had leads beyond: it must turn
         bound = np.minimum(np.maximum(bound, moved - self._step), moved + self._step)
         bound = np.minimum(bound, self._v_max)
         return -bound[1], bound[0]

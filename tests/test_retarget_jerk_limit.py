@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imitarm import ArmModel, InputError
+from imitarm.retarget.jerk_limit import JerkLimiter
+
+DT = 0.01
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return ArmModel.load("sawyer")
+
+
+def broken(arm, joints, dt=DT):
+    """Return how far position, velocity and acceleration limits are exceeded, from the joint positions alone."""
+    velocity = np.diff(joints, axis=0) / dt
+    acceleration = np.diff(velocity, axis=0) / dt
+    return (
+        max(float((joints - arm.upper).max()), float((arm.lower - joints).max())),
+        float((np.abs(velocity) / arm.max_velocity).max()) - 1.0,
+        float((np.abs(acceleration) / arm.max_acceleration).max()) - 1.0,
+    )
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5, 3.0]))
+def test_no_reference_makes_it_break_a_limit(seed, jump):
+    arm = ArmModel.load("sawyer")
+    rng = np.random.default_rng(seed)
+    limiter = JerkLimiter(arm, DT)
+    limiter.start(arm.home)
+    q, joints = arm.home.copy(), [arm.home]
+    for k in range(400):
+        if k % 40 == 0:
+            q = q + jump * rng.normal(size=7)
+        q = q + 0.03 * rng.normal(size=7)
+        joints.append(limiter.follow(q, 3.0 * arm.max_velocity * rng.normal(size=7)))
+    position, velocity, acceleration = broken(arm, np.array(joints))
+    assert position <= 1e-9
+    assert velocity <= 1e-9
+    assert acceleration <= 1e-6
+
+
+def test_it_stops_before_a_limit_at_full_speed(arm):
+    limiter = JerkLimiter(arm, DT)
+    limiter.start(arm.home)
+    joints = [arm.home]
+    for _ in range(500):
+        joints.append(limiter.follow(arm.upper + 10.0, arm.max_velocity))
+    assert broken(arm, np.array(joints))[0] <= 1e-9
+    np.testing.assert_allclose(joints[-1], arm.upper, atol=0.02)
+
+
+def test_jerk_is_limited_away_from_the_limits(arm):
+    limiter = JerkLimiter(arm, DT)
+    limiter.start(arm.home)
+    t = np.arange(0.0, 4.0, DT)[:, None]
+    q = arm.home + 0.15 * np.sin(2.0 * t + np.arange(7))
+    v = 0.3 * np.cos(2.0 * t + np.arange(7))
+    accelerations = []
+    for a, b in zip(q, v, strict=True):
+        limiter.follow(a, b)
+        accelerations.append(limiter.acceleration)
+    jerk = np.abs(np.diff(accelerations, axis=0)) / DT
+    assert (jerk <= limiter.max_jerk * (1.0 + 1e-9)).all()
+
+
+def test_a_smooth_reference_is_followed_without_lag(arm):
+    limiter = JerkLimiter(arm, DT)
+    limiter.start(arm.home)
+    t = np.arange(0.0, 6.0, DT)[:, None]
+    q = arm.home + 0.2 * (1.0 - np.cos(1.5 * t))
+    v = 0.3 * np.sin(1.5 * t)
+    reached = np.array([limiter.follow(a, b) for a, b in zip(q, v, strict=True)])
+    assert np.abs(reached - q)[100:].max() < 0.002
+
+
+@pytest.mark.parametrize("options", [{"frequency": 0.0}, {"frequency": 200.0}, {"rise_time": 0.001}])
+def test_settings_that_can_not_work_are_refused(arm, options):
+    with pytest.raises(InputError, match="JerkLimiter"):
+        JerkLimiter(arm, DT, **options)
