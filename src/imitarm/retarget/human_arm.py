@@ -1,0 +1,211 @@
+r"""The person's arm as a chain of joints: seven angles, forwards and backwards (thesis Eq 3.5, METHODS A.2 and A.3).
+
+The chain is shoulder, upper arm, elbow, forearm, wrist; all angles zero is the arm stretched along the base's x:
+
+.. math:: R = R_z(q_0) R_y(q_1) R_x(q_2)\;|\,L_U\,|\;R_y(q_3) R_x(q_4)\;|\,L_F\,|\;R_y(q_5) R_x(q_6)
+
+These are the axes of Sawyer's joints at zero, in the same order, so a person's angles are a Sawyer's angles but for the
+offsets between its links.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.retarget.limbs import LimbLengths
+
+Array = NDArray[np.float64]
+
+AXES = ("z", "y", "x", "y", "x", "y", "x")
+"""Axis of each angle of the chain at zero."""
+
+_SINGULAR = 0.05  # sine below which an angle is held, because noise alone would turn it
+_APART = 0.2  # least sine between hand and thumb
+_HAND_LENGTH = 0.03  # [m] a hand tip nearer to the wrist has no direction
+_UNIT = {"x": 0, "y": 1, "z": 2}
+
+
+def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike, *, as_printed: bool = False) -> Array:
+    r"""Return Denavit-Hartenberg transforms from frame i to frame i-1 (thesis Eq 3.5).
+
+    .. math::
+        \begin{pmatrix} c & -c_\alpha s & s_\alpha s & a c \\ s & c_\alpha c & -s_\alpha c & a s \\
+        0 & s_\alpha & c_\alpha & d \\ 0 & 0 & 0 & 1 \end{pmatrix}
+
+    Args:
+        theta: angle about the old z [rad]; all four broadcast.
+        d: along the old z [m].
+        a: along the new x [m].
+        alpha: about the new x [rad].
+        as_printed: with the thesis's second row, which has sin where cos belongs and is no rotation.
+
+    Returns:
+        shape (..., 4, 4).
+    """
+    theta, d, a, alpha = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (theta, d, a, alpha)))
+    c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
+    row = s if as_printed else c
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    rows = [
+        [c, -ca * s, sa * s, a * c],
+        [s, ca * row, -sa * row, a * s],
+        [zero, sa, ca, d],
+        [zero, zero, zero, one],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def human_arm_pose(angles: ArrayLike, lengths: LimbLengths) -> tuple[Array, Array, Array]:
+    """Return elbow (3,), wrist (3,) [m] and the hand's rotation (3, 3), seen from the shoulder, for angles (7,)."""
+    elbow, wrist, hand, _ = _chain(np.asarray(angles, dtype=float), lengths)
+    return elbow, wrist, hand
+
+
+def human_arm_jacobian(angles: ArrayLike, lengths: LimbLengths) -> Array:
+    """Return the Jacobian of wrist and hand, shape (6, 7), linear rows first, in the shoulder's frame."""
+    elbow, wrist, _, axes = _chain(np.asarray(angles, dtype=float), lengths)
+    origins = np.array([np.zeros(3)] * 3 + [elbow] * 2 + [wrist] * 2)
+    return np.concatenate([np.cross(axes, wrist - origins).T, axes.T])
+
+
+def _chain(angles: Array, lengths: LimbLengths) -> tuple[Array, Array, Array, Array]:
+    """Return elbow, wrist, hand rotation, and the axis of each angle in the shoulder's frame, shape (7, 3)."""
+    rotation, axes = np.eye(3), np.empty((7, 3))
+    at, elbow = np.zeros(3), np.zeros(3)
+    for i, (name, angle) in enumerate(zip(AXES, angles, strict=True)):
+        axes[i] = rotation[:, _UNIT[name]]
+        rotation = rotation @ _turn(name, float(angle))
+        if i == 2:
+            elbow = at = lengths.upper_arm * rotation[:, 0]
+        elif i == 4:
+            at = elbow + lengths.forearm * rotation[:, 0]
+    return elbow, at, rotation, axes
+
+
+def _turn(axis: str, angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    if axis == "x":
+        return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    if axis == "y":
+        return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def human_arm_angles(upper: ArrayLike, forearm: ArrayLike, hand: ArrayLike, previous: ArrayLike | None = None) -> Array:
+    """Return the seven angles of an arm in closed form (METHODS A.2).
+
+    Where an angle can't be seen, it is held at its previous value: the first when the upper arm points along z, the
+    third when the arm is stretched, the fifth when the hand is in line with the forearm. Of the two ways to bend the
+    wrist the one nearer to the previous angles is taken.
+
+    Args:
+        upper: unit vector from shoulder to elbow, shape (3,).
+        forearm: unit vector from elbow to wrist, shape (3,).
+        hand: rotation of the hand, shape (3, 3).
+        previous: angles one frame before, shape (7,); None: zeros.
+
+    Returns:
+        shape (7,) [rad].
+    """
+    u, f = (np.asarray(v, dtype=float) for v in (upper, forearm))
+    held = np.zeros(7) if previous is None else np.asarray(previous, dtype=float)
+    q = np.empty(7)
+    across = math.hypot(u[0], u[1])
+    q[0] = math.atan2(u[1], u[0]) if across >= _SINGULAR else held[0]
+    q[1] = math.atan2(-u[2], u[0] * math.cos(q[0]) + u[1] * math.sin(q[0]))
+    upper_rotation = _turn("z", q[0]) @ _turn("y", q[1])
+    fx, fy, fz = upper_rotation.T @ f
+    bent = math.hypot(fy, fz)
+    q[2] = math.atan2(fy, -fz) if bent >= _SINGULAR else held[2]
+    q[3] = math.atan2(fy * math.sin(q[2]) - fz * math.cos(q[2]), fx)
+    forearm_rotation = upper_rotation @ _turn("x", q[2]) @ _turn("y", q[3])
+    wrist = forearm_rotation.T @ np.asarray(hand, dtype=float)
+    q[4:] = _wrist_angles(wrist, held[4:])
+    return q
+
+
+def _wrist_angles(rotation: Array, held: Array) -> Array:
+    """Return angles (a, b, c) with Rx(a) Ry(b) Rx(c) = rotation, the branch nearest to ``held``."""
+    sine = math.hypot(rotation[1, 0], rotation[2, 0])
+    if sine < _SINGULAR:  # only the sum of the two turns about the forearm is seen
+        rest = _turn("x", -held[0]) @ rotation
+        bend = math.atan2(-rest[2, 0], rest[0, 0])
+        return np.array([held[0], bend, math.atan2(-rest[1, 2], rest[1, 1])])
+    branches = [
+        np.array(
+            [
+                math.atan2(s * rotation[1, 0], -s * rotation[2, 0]),
+                math.atan2(s * sine, rotation[0, 0]),
+                math.atan2(s * rotation[0, 1], s * rotation[0, 2]),
+            ]
+        )
+        for s in (1.0, -1.0)
+    ]
+    return min(branches, key=lambda angles: float(np.abs(_wrapped(angles - held)).sum()))
+
+
+def _wrapped(angles: Array) -> Array:
+    return np.asarray((angles + math.pi) % (2.0 * math.pi) - math.pi)
+
+
+def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
+    r"""Return the hand's rotation from three of its points, or None when they do not tell it (METHODS A.3).
+
+    The shoulder, elbow and wrist alone do not show how the forearm is rolled or the wrist bent. With
+    :math:`x = \overline{tip - W}` and :math:`n = \overline{x \times (thumb - W)}` it is :math:`[x,\; n \times x,\; n]`.
+
+    Args:
+        wrist: shape (3,) [m]; so are tip and thumb.
+        tip: of the hand.
+        thumb: its tip.
+
+    Returns:
+        shape (3, 3); None when hand and thumb are in line within 12 degrees, or a point is not where a hand has one.
+    """
+    x, y = tip - wrist, thumb - wrist
+    long, wide = math.sqrt(float(x.dot(x))), math.sqrt(float(y.dot(y)))
+    if not (long > _HAND_LENGTH and wide > 0.5 * _HAND_LENGTH):  # nan too
+        return None
+    x, y = x / long, y / wide
+    n = _cross(x, y)
+    sine = math.sqrt(float(n.dot(n)))
+    if sine < _APART:
+        return None
+    n = n / sine
+    rotation = np.empty((3, 3))
+    rotation[:, 0], rotation[:, 1], rotation[:, 2] = x, _cross(n, x), n
+    return rotation
+
+
+def carried(rotation: Array | None, before: Array | None, after: Array) -> Array:
+    """Return the hand's rotation after the forearm turned, when the hand itself is not seen (METHODS A.3).
+
+    Args:
+        rotation: of the hand before, shape (3, 3); None: not known, then its x is along the forearm and its z level.
+        before: unit vector along the forearm then, shape (3,).
+        after: unit vector along the forearm now, shape (3,).
+
+    Returns:
+        shape (3, 3): ``rotation`` turned by the smallest turn that takes ``before`` to ``after``.
+    """
+    if rotation is None or before is None:
+        side = _cross(np.array([0.0, 0.0, 1.0]), after)
+        length = math.sqrt(float(side.dot(side)))
+        y = side / length if length > _SINGULAR else np.array([0.0, 1.0, 0.0])
+        y = y - after * float(y.dot(after))
+        y /= math.sqrt(float(y.dot(y)))
+        return np.stack([after, y, _cross(after, y)], axis=1)
+    axis, cosine = _cross(before, after), float(before.dot(after))
+    if cosine < -0.999:  # turned back on itself: no smallest turn; keep what was
+        return rotation
+    k = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    turned: Array = rotation + (k + (k @ k) / (1.0 + cosine)) @ rotation
+    return turned
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return the cross product of two vectors (3,): np.cross takes ten times as long."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
