@@ -7,8 +7,8 @@ import pytest
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import solve_ik
-from imitarm.scene.barrier import clearance_rows
 from imitarm.scene import Scene, Sphere
+from imitarm.scene.barrier import clearance_rows
 
 
 @pytest.fixture(scope="module")

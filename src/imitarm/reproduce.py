@@ -14,10 +14,10 @@ from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import Pose
-from imitarm.scene.barrier import clearance_rows
 from imitarm.policies.policy import Observation, Policy
 from imitarm.robots.robot import Robot
 from imitarm.scene import Scene
+from imitarm.scene.barrier import clearance_rows
 from imitarm.trajectory import Rollout, Trajectory
 
 Array = NDArray[np.float64]

@@ -1,0 +1,223 @@
+"""Person: a made-up person, seeded: how long the limbs are, where the person stands, how the elbow is carried."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.capture.skeleton import JOINT, JOINTS, HandState, Skeleton
+from imitarm.errors import InputError, UnknownNameError
+
+Array = NDArray[np.float64]
+
+STRETCHED = 0.98  # share of the arm's length beyond which nobody reaches
+SENSOR_HEIGHT = 1.1  # [m] above the floor
+_TREMOR_BAND = (4.0, 9.0)  # [Hz] physiological tremor
+_WAVES = 4
+
+# Shares of the stature (Drillis and Contini 1966)
+_UPPER_ARM, _FOREARM, _HAND = 0.186, 0.146, 0.108
+_SHOULDER_HEIGHT, _HALF_SHOULDERS = 0.818, 0.1295
+_HEIGHTS = {
+    "head": 0.93,
+    "neck": 0.85,
+    "spine_shoulder": 0.818,
+    "spine_mid": 0.68,
+    "spine_base": 0.54,
+    "hip": 0.53,
+    "knee": 0.285,
+    "ankle": 0.039,
+    "foot": 0.01,
+}
+_HALF_HIPS, _FOOT = 0.0955, 0.10
+_TO_HAND, _TO_TIP, _TO_THUMB = 0.45, 0.85, (0.35, 0.35)  # of the hand's length, from the wrist: as a Kinect has them
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    r"""A made-up person before a sensor, upright and facing it, in the sensor's frame (x left, y up, z away).
+
+    An arm is two straight bones. Where the wrist W is given, the elbow is on a circle about the line from shoulder to
+    wrist; with :math:`\hat d` down and :math:`\hat o` outwards, both at right angles to that line, it is at
+
+    .. math:: E = S + a\,\hat w + h\,(\cos\psi\,\hat d + \sin\psi\,\hat o), \qquad
+              a = \frac{L_U^2 + r^2 - L_F^2}{2r},\quad h = \sqrt{L_U^2 - a^2},\quad r = |W - S| .
+
+    Attributes:
+        seed: of everything below, when it came from :meth:`from_seed`.
+        stature: height [m].
+        upper_arm: shoulder to elbow [m].
+        forearm: elbow to wrist [m].
+        hand: wrist to finger tip [m].
+        position: of the point on the floor between the feet, x and z in the sensor's frame, shape (2,) [m].
+        swivel: psi of an arm at rest: how far the elbow is carried outwards [rad].
+        lift: how much psi grows for each metre that the hand is above the shoulder's height [rad/m].
+        tremor: waves of the hand's tremor, amplitude [m], frequency [rad/s] and phase for each wave and axis,
+            shape (3, n, 3).
+        sway: amplitude [m], frequency [rad/s] and phase of the body's sway along x and z, shape (3, 2).
+    """
+
+    seed: int
+    stature: float
+    upper_arm: float
+    forearm: float
+    hand: float
+    position: Array
+    swivel: float
+    lift: float
+    tremor: Array
+    sway: Array
+
+    @classmethod
+    def from_seed(cls, seed: int) -> Person:
+        """Make up the person number ``seed``; limbs vary by up to 15 percent about those of the stature."""
+        rng = np.random.default_rng([30310, seed])
+        stature = float(np.clip(rng.normal(1.72, 0.09), 1.50, 1.95))
+        proportion = np.clip(rng.normal(1.0, 0.05, 3), 0.85, 1.15)
+        tremor = np.stack(
+            [
+                rng.uniform(0.05e-3, 0.3e-3, (_WAVES, 3)),
+                2.0 * np.pi * rng.uniform(*_TREMOR_BAND, (_WAVES, 3)),
+                rng.uniform(0.0, 2.0 * np.pi, (_WAVES, 3)),
+            ]
+        )
+        sway = np.stack(
+            [rng.uniform(0.001, 0.004, 2), 2.0 * np.pi * rng.uniform(0.15, 0.4, 2), rng.uniform(0.0, 2.0 * np.pi, 2)]
+        )
+        return cls(
+            seed,
+            stature,
+            float(stature * _UPPER_ARM * proportion[0]),
+            float(stature * _FOREARM * proportion[1]),
+            float(stature * _HAND * proportion[2]),
+            np.array([rng.uniform(-0.2, 0.2), rng.uniform(2.0, 2.7)]),
+            float(rng.normal(0.35, 0.12)),
+            float(rng.uniform(0.3, 0.9)),
+            tremor,
+            sway,
+        )
+
+    @property
+    def reach(self) -> float:
+        """How far from the shoulder the wrist gets [m]."""
+        return STRETCHED * (self.upper_arm + self.forearm)
+
+    def shoulder(self, side: str = "right", time: float = 0.0) -> Array:
+        """Return where a shoulder is, with the body's sway, shape (3,) [m].
+
+        Raises:
+            UnknownNameError: when ``side`` is neither left nor right.
+        """
+        return self._middle(time) + np.array(
+            [_outwards(side) * _HALF_SHOULDERS * self.stature, _SHOULDER_HEIGHT * self.stature - SENSOR_HEIGHT, 0.0]
+        )
+
+    def skeleton(
+        self,
+        time: float,
+        wrist: ArrayLike,
+        *,
+        swivel: float | None = None,
+        hand: ArrayLike | None = None,
+        closed: bool = False,
+        side: str = "right",
+    ) -> Skeleton:
+        """Return the truth: where every joint is when the hand is held at ``wrist``; the other arm hangs.
+
+        Args:
+            time: [s]; tremor and sway depend on it.
+            wrist: where the person wants the wrist, in the sensor's frame, shape (3,) [m]; out of reach it is
+                on the way there.
+            swivel: psi [rad]; None: as this person carries the elbow.
+            hand: rotation of the hand in the sensor's frame, shape (3, 3), its x along the hand, its y towards the
+                thumb; None: in line with the forearm, the thumb up.
+            closed: whether the hand is a fist.
+            side: of the arm that moves.
+
+        Raises:
+            InputError: when the wrist is not three finite numbers.
+        """
+        wanted = np.asarray(wrist, dtype=float)
+        if wanted.shape != (3,) or not np.isfinite(wanted).all():
+            raise InputError(f"Person.skeleton: wrist must be 3 finite numbers [m], got {wrist!r}")
+        points = self._body(time)
+        other = "left" if side == "right" else "right"
+        hanging = self.shoulder(other, time) + np.array([_outwards(other) * 0.06, -0.97 * self.reach, -0.05])
+        self._place_arm(points, other, time, hanging, None, None)
+        amplitude, frequency, phase = self.tremor
+        shake = (amplitude * np.sin(frequency * time + phase)).sum(axis=0)
+        self._place_arm(points, side, time, wanted + shake, swivel, hand)
+        states = {side: HandState.CLOSED if closed else HandState.OPEN, other: HandState.OPEN}
+        return Skeleton(time, points, hand_states=(states["left"], states["right"]))
+
+    def elbow(self, shoulder: Array, wrist: Array, swivel: float, side: str = "right") -> tuple[Array, Array]:
+        """Return elbow and wrist (3,) [m]: the wrist brought within reach, the elbow on its circle at ``swivel``."""
+        way = wrist - shoulder
+        distance = float(np.linalg.norm(way))
+        along = way / distance if distance > 1e-6 else np.array([0.0, 0.0, -1.0])
+        nearest = abs(self.upper_arm - self.forearm) + 0.03
+        r = float(np.clip(distance, nearest, self.reach))
+        a = (self.upper_arm**2 + r * r - self.forearm**2) / (2.0 * r)
+        h = math.sqrt(max(self.upper_arm**2 - a * a, 0.0))
+        down = np.array([0.0, -1.0, 0.0])
+        down = down - along * (down @ along)
+        if np.linalg.norm(down) < 1e-3:  # the arm points up or down: the elbow is carried backwards
+            down = np.array([0.0, 0.0, 1.0]) - along * along[2]
+        down /= np.linalg.norm(down)
+        out = np.cross(down, along) if side == "right" else np.cross(along, down)
+        return shoulder + a * along + h * (math.cos(swivel) * down + math.sin(swivel) * out), shoulder + r * along
+
+    def _middle(self, time: float) -> Array:
+        amplitude, frequency, phase = self.sway
+        x, z = self.position + amplitude * np.sin(frequency * time + phase)
+        return np.array([x, 0.0, z])
+
+    def _body(self, time: float) -> Array:
+        points = np.empty((len(JOINTS), 3))
+        middle, height = self._middle(time), self.stature
+        for name, share in _HEIGHTS.items():
+            y = share * height - SENSOR_HEIGHT
+            if name in JOINT:
+                points[JOINT[name]] = middle + [0.0, y, 0.0]
+                continue
+            forward = -_FOOT * height if name == "foot" else 0.0
+            for side in ("left", "right"):
+                points[JOINT[f"{name}_{side}"]] = middle + [_outwards(side) * _HALF_HIPS * height, y, forward]
+        return points
+
+    def _place_arm(
+        self, points: Array, side: str, time: float, wrist: Array, swivel: float | None, hand: ArrayLike | None
+    ) -> None:
+        shoulder = self.shoulder(side, time)
+        psi = self.swivel + self.lift * max(float(wrist[1] - shoulder[1]) + 0.3, 0.0) if swivel is None else swivel
+        elbow, at = self.elbow(shoulder, wrist, psi, side)
+        rotation = _hand_along(at - elbow) if hand is None else np.asarray(hand, dtype=float)
+        long, thumb_long, thumb_wide = _TO_TIP, *_TO_THUMB
+        for name, point in (
+            ("shoulder", shoulder),
+            ("elbow", elbow),
+            ("wrist", at),
+            ("hand", at + _TO_HAND * self.hand * rotation[:, 0]),
+            ("hand_tip", at + long * self.hand * rotation[:, 0]),
+            ("thumb", at + self.hand * (thumb_long * rotation[:, 0] + thumb_wide * rotation[:, 1])),
+        ):
+            points[JOINT[f"{name}_{side}"]] = point
+
+
+def _outwards(side: str) -> float:
+    """Return the sign of x on which a side of a person who faces the sensor is."""
+    if side not in {"left", "right"}:
+        raise UnknownNameError.among("side", side, ("left", "right"))
+    return 1.0 if side == "right" else -1.0
+
+
+def _hand_along(forearm: Array) -> Array:
+    """Return the rotation of a hand in line with the forearm, its thumb as far up as it goes."""
+    x = forearm / np.linalg.norm(forearm)
+    up = np.array([0.0, 1.0, 0.0]) if abs(x[1]) < 0.95 else np.array([0.0, 0.0, 1.0])
+    y = up - x * (up @ x)
+    y /= np.linalg.norm(y)
+    return np.stack([x, y, np.cross(x, y)], axis=1)

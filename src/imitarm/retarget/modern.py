@@ -1,0 +1,172 @@
+"""ModernRetargeter: what we would use on a robot; every limit kept, the elbow followed, losses survived."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.capture.skeleton import Skeleton
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik import solve_ik
+from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
+from imitarm.kinematics.posture import ANGLE_LENGTH
+from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
+from imitarm.retarget.correspondence import Correspondence
+from imitarm.retarget.engagement import Engagement
+from imitarm.retarget.jerk_limit import JerkLimiter
+from imitarm.retarget.retargeter import Command, Retargeter
+from imitarm.scene import Scene
+from imitarm.scene.barrier import clearance_rows
+
+Array = NDArray[np.float64]
+
+COAST, HOLD = 0.1, 0.3  # [s] without a sight of the arm: until then the motion fades out; until then the target stands
+_FADE = 0.05  # [s] time constant of the fading motion
+_PUSHED = 0.05  # [rad] an arm found farther than this from its command was moved by somebody
+_BETWEEN = 0.07  # [s] cameras leave out a frame now and then
+_BRAKING = 1.5  # [m/s^2] the tool can nearly always brake so hard, 1 rad counting as 0.3 m
+_STILL = 1e-6  # [rad/s] slower is at rest
+
+
+class ModernRetargeter(Retargeter):
+    r"""Follow the hand with the tool and the elbow with the elbow, inside every limit (METHODS A.9).
+
+    One step is
+
+    1. the arm's estimate (:class:`~imitarm.retarget.arm_estimator.ArmEstimator`), carried on from its last frame at
+       the estimated velocity, which fades: :math:`W + v\,\tau(1 - e^{-s/\tau})` after s seconds, tau = 50 ms;
+    2. the clutch's target, and the twist that goes there, :math:`K \log(T_d T^{-1})` plus a share of the hand's
+       velocity;
+    3. a quadratic programme for the joints' velocities: the twist, the elbow's SEW angle, the box of position,
+       velocity and acceleration that can always be kept, bounds that hold the elbow and the wrist off their
+       singularities, rows that keep the links off each other and off the scene;
+    4. a follower that limits the jerk (:class:`~imitarm.retarget.jerk_limit.JerkLimiter`) and guards the limits again.
+
+    Without a sight of the arm it coasts for 0.1 s, holds until 0.3 s, then stops; a stopped one waits until the arm has
+    been seen for half a second and takes hold where both are then, so nothing jumps.
+
+    Args:
+        arm: the robot's arm with its tool.
+        correspondence: what of the person's arm stands for what of the robot's.
+        dt: control period [s].
+        scene: obstacles to keep clear of.
+        gain: K [1/s].
+        lead: share of the hand's velocity that is fed forward, 0 to 1.
+        elbow: weight of the elbow's angle beside the tool; 0: the elbow is free.
+        clearance: to keep from the scene [m].
+        max_speed: the twist is cut to this [m/s], 1 rad counting as 0.3 m.
+    """
+
+    name: ClassVar[str] = "modern"
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        correspondence: Correspondence | None = None,
+        *,
+        dt: float = 0.01,
+        scene: Scene | None = None,
+        gain: float = 20.0,
+        lead: float = 0.5,
+        elbow: float = 0.05,
+        clearance: float = 0.01,
+        max_speed: float = 1.0,
+    ) -> None:
+        if not (0.0 < gain * dt <= 1.0 and 0.0 <= lead <= 1.0 and elbow >= 0.0 and max_speed > 0.0):
+            raise InputError(
+                f"ModernRetargeter: needs 0 < gain <= 1/dt = {1 / dt:g}, lead from 0 to 1, elbow >= 0 and max_speed > 0"
+            )
+        self._gain, self._lead, self._elbow_weight = gain, lead, elbow
+        self._clearance, self._max_speed = clearance, max_speed
+        self._limiter = JerkLimiter(arm, dt)
+        super().__init__(arm, correspondence, dt=dt, scene=scene)
+        self._estimator = ArmEstimator(self.correspondence)
+
+    def _begin(self, q: Array) -> None:
+        self._limiter.start(q)
+        self._q, self._velocity = q.copy(), np.zeros(self.arm.n_joints)  # of the reference
+        self._silence = math.inf
+        self._estimate: ArmEstimate | None = None
+        self._engagement = Engagement(self.correspondence)
+        self._estimator = ArmEstimator(self.correspondence)
+        self._elbow_offset = 0.0
+
+    def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
+        """Return the joint positions to be at after ``dt``; see :class:`~imitarm.retarget.retargeter.Retargeter`."""
+        self._look(skeleton)
+        state = self._state(np.asarray(q, dtype=float))
+        target = closed = None
+        if state in _LED and self._estimate is not None:
+            target, ahead = self._target(self._estimate)
+            closed = self._estimate.closed
+            self._reach(target, ahead)
+        else:
+            self._drive(np.zeros(6))
+        reached = self._limiter.follow(self._q, self._velocity)
+        self.command = Command(self.command.time + self.dt, reached, self._limiter.velocity, closed, state, target)
+        return reached
+
+    def _look(self, skeleton: Skeleton | None) -> None:
+        """Take in a skeleton, and count the time in which none showed the arm."""
+        self._silence += self.dt
+        estimate = None if skeleton is None else self._estimator.update(skeleton)
+        if estimate is not None:
+            self._estimate, self._silence = estimate, 0.0
+
+    def _state(self, q: Array) -> str:
+        """Return what to do now; engage or let go."""
+        if self._engagement.clutch is not None:
+            if self._silence <= HOLD:
+                return "following" if self._silence <= _BETWEEN else "coasting" if self._silence <= COAST else "holding"
+            self._engagement.release()
+        if self._velocity.any() or self._limiter.velocity.any():
+            return "stopped"
+        if np.abs(q - self._q).max() > _PUSHED:  # somebody has moved the arm: go on from there
+            self._q = np.clip(q, self.arm.lower, self.arm.upper)
+            self._limiter.start(self._q)
+        if self._silence == 0.0 and self._engagement.update(self._estimate, self.arm.tool_pose(self._q)) is not None:
+            return "following"
+        return "waiting"
+
+    def _target(self, estimate: ArmEstimate) -> tuple[Pose, Array]:
+        """Return where the tool should be now, and the twist (6,) with which that moves."""
+        clutch = self._engagement.clutch
+        assert clutch is not None
+        left = math.exp(-self._silence / _FADE)
+        seconds = _FADE * (1.0 - left)
+        wrist = estimate.wrist + seconds * estimate.velocity
+        hand = quaternion_multiply(quaternion_exp(seconds * estimate.angular_velocity), estimate.hand)
+        ahead = np.zeros(6)
+        ahead[:3] = (self._lead * left * self.correspondence.scale) * estimate.velocity
+        return clutch.target(wrist, hand), ahead
+
+    def _reach(self, target: Pose, ahead: Array) -> None:
+        """Move the reference towards a target."""
+        error = self.arm.tool_pose(self._q).error_to(target)
+        weighted = math.sqrt(float(error[:3].dot(error[:3])) + ANGLE_LENGTH**2 * float(error[3:].dot(error[3:])))
+        # far away it goes no faster than it can brake again, or it would swing about the target
+        gain = min(self._gain, math.sqrt(2.0 * _BRAKING / max(weighted, 1e-9)))
+        self._drive(gain * error + ahead)
+
+    def _drive(self, twist: Array) -> None:
+        """Move the reference by one step of inverse kinematics."""
+        rows = clearance_rows(self.arm, self._q, self.scene, self._clearance)
+        velocity = solve_ik(
+            self.arm,
+            self._q,
+            twist,
+            dt=self.dt,
+            velocity=self._velocity,
+            rows=rows,
+            max_speed=self._max_speed,
+        )
+        velocity[np.abs(velocity) < _STILL] = 0.0
+        self._velocity = velocity
+        self._q = self._q + self.dt * velocity
+
+
+_LED = frozenset({"following", "coasting", "holding"})

@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imitarm import InputError
+from imitarm.capture.person import Person
+from imitarm.capture.skeleton import HandState
+
+PEOPLE = [Person.from_seed(seed) for seed in range(10)]
+finite = st.floats(-2.0, 2.0)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.sampled_from(PEOPLE),
+    st.tuples(finite, finite, finite),
+    st.floats(0.0, 100.0),
+    st.sampled_from(["left", "right"]),
+)
+def test_bones_have_their_lengths_wherever_the_hand_goes(person, offset, time, side):
+    truth = person.skeleton(time, person.shoulder(side) + np.array(offset), side=side)
+    for each in ("left", "right"):
+        arm = truth.arm(each)
+        assert np.linalg.norm(arm.elbow - arm.shoulder) == pytest.approx(person.upper_arm, abs=1e-9)
+        assert np.linalg.norm(arm.wrist - arm.elbow) == pytest.approx(person.forearm, abs=1e-9)
+
+
+def test_the_wrist_is_where_it_was_wanted_within_reach_and_stops_at_it():
+    person = PEOPLE[0]
+    near = person.shoulder("right", 2.0) + np.array([0.1, -0.2, -0.3])
+    assert np.linalg.norm(person.skeleton(2.0, near).arm().wrist - near) < 4e-3  # the tremor
+    far = person.shoulder("right", 2.0) + np.array([0.0, 0.0, -2.0])
+    arm = person.skeleton(2.0, far).arm()
+    assert np.linalg.norm(arm.wrist - arm.shoulder) == pytest.approx(person.reach, abs=1e-9)
+
+
+def test_a_person_stands_upright_and_faces_the_sensor():
+    for person in PEOPLE:
+        truth = person.skeleton(0.0, person.shoulder("right") + np.array([0.1, -0.3, -0.3]))
+        assert truth.joint("head")[1] > truth.joint("spine_base")[1] > truth.joint("foot_left")[1]
+        assert truth.joint("shoulder_right")[0] > truth.joint("shoulder_left")[0]
+        assert truth.joint("spine_base")[2] > 1.9
+        assert truth.joint("elbow_right")[1] < truth.joint("shoulder_right")[1]
+
+
+def test_people_differ_within_bounds_and_one_seed_is_one_person():
+    lengths = np.array([[p.upper_arm, p.forearm] for p in map(Person.from_seed, range(200))])
+    stature = np.array([Person.from_seed(seed).stature for seed in range(200)])
+    share = lengths / stature[:, None] / [0.186, 0.146]
+    assert np.abs(share - 1.0).max() <= 0.15 + 1e-12
+    assert lengths.std(axis=0).min() > 0.01
+    again, person = Person.from_seed(3), PEOPLE[3]
+    assert np.array_equal(
+        again.skeleton(1.0, [0.3, 0.0, 2.0]).positions, person.skeleton(1.0, [0.3, 0.0, 2.0]).positions
+    )
+
+
+def test_swivel_turns_the_elbow_about_the_line_to_the_wrist():
+    person = PEOPLE[1]
+    s, w = np.zeros(3), np.array([0.0, 0.0, -0.4])
+    down, at = person.elbow(s, w, 0.0)
+    out, _ = person.elbow(s, w, np.pi / 2)
+    np.testing.assert_allclose(at, w)
+    assert down[1] < 0.0
+    assert abs(down[0]) < 1e-12
+    assert out[0] > 0.0  # outwards is to larger x for the right arm of somebody who faces the sensor
+    assert abs(out[1]) < 1e-12
+
+
+def test_a_given_hand_and_fist_are_shown():
+    person = PEOPLE[2]
+    rotation = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    truth = person.skeleton(0.0, person.shoulder("right") + [0.0, -0.2, -0.3], hand=rotation, closed=True)
+    arm = truth.arm("right")
+    way = arm.points[4] - arm.wrist
+    np.testing.assert_allclose(way / np.linalg.norm(way), rotation[:, 0], atol=1e-12)
+    assert arm.hand_state is HandState.CLOSED
+    assert truth.hand_states[0] is HandState.OPEN
+
+
+def test_a_wrist_nowhere_is_refused():
+    with pytest.raises(InputError, match="wrist"):
+        PEOPLE[0].skeleton(0.0, [np.nan, 0.0, 0.0])
