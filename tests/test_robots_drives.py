@@ -4,8 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.robots.drives import COMPUTED_FREQUENCY, Drives, add_drives
+from imitarm.robots.drives import COMPUTED_FREQUENCY, FINGER_SPEED, Drives, add_drives
 
 
 def drives_of(arm, timestep=0.002):
@@ -114,3 +115,29 @@ def test_a_gripper_keeps_its_opening():
         drives.servo(arm.home, np.zeros(7), np.zeros(7))
     assert opening.length[0] == pytest.approx(before, abs=1e-3)
     assert before > 0.01
+
+
+def test_fingers_go_to_the_opening_that_is_asked_at_their_speed():
+    arm = ArmModel.load("sawyer", tool="gripper")
+    _, data, drives = drives_of(arm)
+    drives.grasp(0.08)
+    openings = []
+    for _ in range(500):
+        drives.servo(arm.home, np.zeros(7), np.zeros(7))
+    drives.grasp(0.02)
+    for _ in range(500):
+        drives.servo(arm.home, np.zeros(7), np.zeros(7))
+        openings.append(drives.opening)
+    assert openings[-1] == pytest.approx(0.02, abs=1e-3)
+    speed = -np.diff(openings) / 0.002
+    assert speed.max() < 1.3 * FINGER_SPEED
+    half = np.argmax(np.array(openings) < 0.05) * 0.002
+    assert half == pytest.approx(0.03 / FINGER_SPEED, rel=0.15)
+    assert np.abs(data.actuator("tool/opening").force[0]) <= 70.0
+
+
+def test_a_hand_without_fingers_says_so(sawyer):
+    _, _, _, drives = sawyer
+    assert np.isnan(drives.opening)
+    with pytest.raises(InputError, match="no gripper"):
+        drives.grasp(0.02)

@@ -116,3 +116,10 @@ def test_a_held_joint_is_a_fault_and_nothing_is_sent_any_more():
 def test_a_body_without_senses_measures_no_clearance():
     assert np.isnan(Paper().clearance())
     assert Paper().report() == {}
+
+
+def test_a_robot_without_a_gripper_says_so():
+    robot = Paper()
+    assert np.isnan(robot.opening)
+    with pytest.raises(InputError, match="no gripper"):
+        robot.grasp(0.03)

@@ -183,3 +183,21 @@ def test_bad_commands_are_named(arm):
 
 def test_the_registry_knows_it():
     assert ROBOTS["simulated"] is SimulatedRobot
+
+
+@pytest.mark.parametrize("control", ["position", "torque"])
+def test_a_gripper_opens_and_closes_and_a_reset_forgets_it(control):
+    robot = SimulatedRobot(ArmModel.load("sawyer", tool="gripper"), control=control)
+    start = robot.opening
+    robot.grasp(0.03)
+    for _ in range(80):
+        robot.move(np.zeros(7), DT)
+    assert robot.opening == pytest.approx(0.03, abs=1e-3)
+    with pytest.raises(InputError, match=r"between 0 and 0\.08 m, got 0\.2"):
+        robot.grasp(0.2)
+    robot.reset()
+    for _ in range(20):
+        robot.move(np.zeros(7), DT)
+    assert robot.opening == pytest.approx(start, abs=1e-3)
+    with pytest.raises(InputError, match="no gripper"):
+        SimulatedRobot(ArmModel.load("sawyer")).grasp(0.03)

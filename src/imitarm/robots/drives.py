@@ -1,4 +1,4 @@
-"""The drives of a simulated arm: position servos, computed torque, and the free drive of hand guiding."""
+"""The drives of a simulated arm: position servos, computed torque, the free drive of hand guiding; the gripper's."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 
 Array = NDArray[np.float64]
 
 SERVO_FREQUENCY = 60.0  # [rad/s] stiffness of the position servos: K = w^2 times the joint's own inertia
 COMPUTED_FREQUENCY = 40.0  # [rad/s] of the computed-torque error dynamics
+GRIPPER = "tool/opening"  # the actuator of a mounted gripper
+FINGER_SPEED = 0.12  # [m/s] at which a gripper's opening changes, as electric parallel grippers do
 _DRY_FRICTION_SPEED = 0.02  # [rad/s] below it the drives take only a part of the dry friction for granted
 _LIGHTENED_FRICTION = 0.7  # share of the dry friction that a free drive takes off the hand
 _GUIDED_DAMPING = 0.05  # [s/rad] damping of a guided joint over its rated torque
@@ -59,6 +62,9 @@ class Drives:
         self._ids = np.array([model.actuator(f"drive/{name}").id for name in arm.joint_names])
         servos = (model.actuator_gainprm[:, 0] > 0.0) & (model.actuator_biasprm[:, 1] == -model.actuator_gainprm[:, 0])
         self._servos = np.setdiff1d(np.flatnonzero(servos), self._ids)
+        names = {model.actuator(i).name for i in range(model.nu)}
+        self._gripper = model.actuator(GRIPPER).id if GRIPPER in names else None
+        self._opening_wanted = np.nan
         self._guided_damping = _GUIDED_DAMPING * np.minimum(arm.max_torque, 100.0)
         self._every, self._torque = np.zeros(model.nv), np.zeros(model.nv)
         data.qpos[:] = arm.posture(model)
@@ -82,10 +88,29 @@ class Drives:
         """Torques that the drives give, shape (n,) [N m]."""
         return np.asarray(self._data.actuator_force[self._ids])
 
+    @property
+    def opening(self) -> float:
+        """Opening between the gripper's fingers [m]; nan without a gripper."""
+        return float("nan") if self._gripper is None else float(self._data.actuator_length[self._gripper])
+
+    def grasp(self, opening: float) -> None:
+        """Let the gripper's servo go to ``opening`` [m] at 0.12 m/s; it presses with at most its own force.
+
+        Raises:
+            InputError: when there is no gripper, or it does not open so far.
+        """
+        if self._gripper is None:
+            raise InputError(f"grasp: this world has no gripper (no actuator {GRIPPER!r}); load the arm with one")
+        least, most = self._model.actuator_ctrlrange[self._gripper]
+        if not least <= opening <= most:
+            raise InputError(f"grasp: opening must be between {least:g} and {most:g} m, got {opening!r}")
+        self._opening_wanted = float(opening)
+
     def hold(self) -> None:
         """Give the torque that holds the arm still, and let a gripper's servos keep its opening; without a step."""
         self._use_servos(False)
         self._data.ctrl[self._servos] = self._data.actuator_length[self._servos]
+        self._opening_wanted = np.nan
         self._data.ctrl[self._ids] = self._data.qfrc_bias[self._dof]
         mujoco.mj_forward(self._model, self._data)
 
@@ -96,14 +121,14 @@ class Drives:
         What is fed forward goes into the servo's position command, so that the torque limit cuts the sum; the damping
         is part of the drive, and the implicit integrator keeps it stable.
         """
-        self._use_servos(True)
+        self._prepare(True)
         forward = self._inertia_times(a_d) + self._data.qfrc_bias[self._dof] + self._friction(v_d)
         self._data.ctrl[self._ids] = q_d + (self._damping * v_d + forward) / self._stiffness
         mujoco.mj_step(self._model, self._data)
 
     def computed_torque(self, q_d: Array, v_d: Array, a_d: Array) -> None:
         """Step with ``tau = M (a_d + w^2 (q_d - q) + 2 w (v_d - v)) + h + f``, ``w`` = 40 rad/s: softer than servos."""
-        self._use_servos(False)
+        self._prepare(False)
         mujoco.mj_step1(self._model, self._data)
         w = COMPUTED_FREQUENCY
         wanted = a_d + w * w * (q_d - self.q) + 2.0 * w * (v_d - self.velocity)
@@ -119,7 +144,7 @@ class Drives:
             site: id of the site.
         """
         m, d = self._model, self._data
-        self._use_servos(False)
+        self._prepare(False)
         mujoco.mj_step1(m, d)
         velocity = self.velocity
         lightened = _LIGHTENED_FRICTION * m.dof_frictionloss[self._dof] * np.tanh(velocity / _DRY_FRICTION_SPEED)
@@ -127,6 +152,13 @@ class Drives:
         mujoco.mj_applyFT(m, d, force, torque, d.site_xpos[site], int(m.site_bodyid[site]), d.qfrc_applied)
         mujoco.mj_step2(m, d)
         d.qfrc_applied[:] = 0.0
+
+    def _prepare(self, stiff: bool) -> None:
+        """Before a step: let the drives be what they are to be, and the fingers go on."""
+        self._use_servos(stiff)
+        if self._gripper is not None and np.isfinite(self._opening_wanted):  # nothing was asked: as it is
+            now, most = float(self._data.ctrl[self._gripper]), FINGER_SPEED * self._model.opt.timestep
+            self._data.ctrl[self._gripper] = now + min(max(self._opening_wanted - now, -most), most)
 
     def _use_servos(self, stiff: bool) -> None:
         """Let the drives be position servos, or plain sources of torque."""

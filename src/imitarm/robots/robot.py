@@ -139,6 +139,25 @@ class Robot(ABC):
             self.fault = f"protective stop: {self.arm.joint_names[i]} was held {behind[i]:.2f} rad from its set-point"
         return state
 
+    def grasp(self, opening: float) -> None:
+        """Begin to move the gripper's fingers to an opening; they go on by themselves while the arm moves.
+
+        Fingers that meet something press on it with their limited force: ``grasp(0.0)`` takes hold of what is
+        between them.
+
+        Args:
+            opening: between the fingers [m].
+
+        Raises:
+            InputError: when this robot has no gripper, or its fingers do not open so far.
+        """
+        raise InputError(f"grasp: {type(self).__name__} with {self.arm!r} has no gripper; mount one with a tool")
+
+    @property
+    def opening(self) -> float:
+        """Measured opening between the gripper's fingers [m]; nan without a gripper."""
+        return float("nan")
+
     def clearance(self) -> float:
         """Return the measured distance from arm and tool to the nearest obstacle [m]; nan for a body that can't."""
         return float("nan")

@@ -140,6 +140,19 @@ class SimulatedRobot(Robot):
         """Return the measured joint angles, velocities and drive torques, and the time since the last reset."""
         return ArmState(self._drives.q.copy(), self._drives.velocity.copy(), self._drives.torque.copy(), self.time)
 
+    def grasp(self, opening: float) -> None:
+        """Begin to move the fingers of a mounted gripper; see :meth:`~imitarm.robots.robot.Robot.grasp`.
+
+        The opening that is asked for changes at 0.12 m/s. The servo presses with its stiffness times what is missing,
+        at most with the force its file allows. :meth:`reset` forgets it.
+        """
+        self._drives.grasp(opening)
+
+    @property
+    def opening(self) -> float:
+        """Opening between the gripper's fingers [m]; nan without a gripper."""
+        return self._drives.opening
+
     def clearance(self) -> float:
         """Return the smallest distance from the arm or its tool to an obstacle [m].
 
