@@ -12,8 +12,8 @@ from imitarm.errors import InputError
 
 Array = NDArray[np.float64]
 
-WHITE = 0.2  # share of sigma that is new in every frame: in real Kinect recordings the rest changes slowly
-MEMORY = 0.7  # [s] time constant of the rest
+WHITE = 0.12  # share of sigma that is new in every frame: in real Kinect recordings the rest changes slowly
+MEMORY = 0.35  # [s] time constant of the rest, which is smooth: two low-pass filters in a row
 DEPTH = 1.4  # the error along the line of sight over that across it
 _HAND_PARTS = np.array([JOINT[f"{part}_{side}"] for side in ("left", "right") for part in ("hand_tip", "thumb")])
 _RESTLESS = 2.0  # the tips of hands are seen worse
@@ -32,7 +32,7 @@ _BEFORE = math.radians(3.0)  # a hand in line with the elbow hides it
 class SkeletonCamera:
     r"""A skeleton camera with the faults of a real one (METHODS B, "noise model").
 
-    A joint is seen at :math:`x + b + c(t) + n`: ``c`` an Ornstein-Uhlenbeck process with 0.7 s of memory, ``n`` white,
+    A joint is seen at :math:`x + b + c(t) + n`: ``c`` a smooth Gauss-Markov process of second order, ``n`` white,
     together with standard deviation ``sigma`` on each axis across the line of sight and 1.4 of it along; ``b`` a bias
     of the elbow's depth. In real recordings of a Kinect v2 the white part is 0.2 to 3 mm, a small share of the 1 to
     2 cm by which limbs change their lengths: ``docs/capture.md``.
@@ -69,7 +69,8 @@ class SkeletonCamera:
         self._bias = self._rng.uniform(-elbow_bias, elbow_bias)
         self._scale = np.tile([1.0, 1.0, DEPTH], (len(JOINTS), 1))
         self._scale[_HAND_PARTS] *= _RESTLESS
-        self._slow = self._rng.normal(size=(len(JOINTS), 3))
+        self._drive = self._rng.normal(size=(len(JOINTS), 3))
+        self._slow = math.sqrt(0.5) * (self._drive + self._rng.normal(size=self._drive.shape))
         self._time = -math.inf
         self._dropped = {"left": (0, Tracking.INFERRED), "right": (0, Tracking.INFERRED)}
         self._misread = [(0, HandState.UNKNOWN), (0, HandState.UNKNOWN)]
@@ -97,7 +98,8 @@ class SkeletonCamera:
         period = max(truth.time - self._time, 0.0) if math.isfinite(self._time) else 0.0
         self._time = truth.time
         keep = math.exp(-period / MEMORY)
-        self._slow = keep * self._slow + math.sqrt(1.0 - keep * keep) * self._rng.normal(size=self._slow.shape)
+        self._drive = keep * self._drive + math.sqrt(1.0 - keep * keep) * self._rng.normal(size=self._slow.shape)
+        self._slow = keep * self._slow + (1.0 - keep) * math.sqrt(2.0) * self._drive
         white = self._rng.normal(size=self._slow.shape)
         error = math.sqrt(1.0 - WHITE**2) * self._slow + WHITE * white
         tracking = np.array(truth.tracking)

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.capture.skeleton import HandState, Skeleton
-from imitarm.errors import InputError
+from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import matrix_to_quaternion
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import carried, hand_rotation
-from imitarm.retarget.limbs import LimbLengths, correct_limbs, measure_limbs
+from imitarm.retarget.limbs import LimbLengths, correct_limbs, fit_limbs, measure_limbs
 from imitarm.retarget.smoothing import GAP, Hampel, OneEuro, OneEuroRotation
 
 Array = NDArray[np.float64]
 
 _LEARNING_FRAMES = 60  # lengths that were not given are learnt from so many, then kept
 _GRIP_FRAMES = 3  # a hand state counts when so many frames in a row have it
+_QUICK = 3.0  # [Hz] of the speed estimate: at the usual 1 Hz it comes late, and the robot with it
 _JUMP = 0.12  # [m] what a hand may go within half the outlier filter's window without being one
 
 
@@ -58,14 +60,24 @@ class ArmEstimator:
     Args:
         correspondence: which arm, and where the sensor is.
         smoothing: One-Euro filters on; off, the corrected points are given as they are.
+        limbs: how the bones get their lengths: ``"fit"`` by the least change of all three points,
+            ``"direction"`` as the thesis does, from the shoulder outwards.
     """
 
-    def __init__(self, correspondence: Correspondence, *, smoothing: bool = True) -> None:
-        self.correspondence = correspondence
+    def __init__(
+        self,
+        correspondence: Correspondence,
+        *,
+        smoothing: bool = True,
+        limbs: Literal["fit", "direction"] = "fit",
+    ) -> None:
+        if limbs not in {"fit", "direction"}:
+            raise UnknownNameError.among("limbs", limbs, ("fit", "direction"))
+        self.correspondence, self._limbs = correspondence, limbs
         self._smoothing = smoothing
         self._rotation = correspondence.sensor_to_base.rotation
         self._origin = correspondence.sensor_to_base.position
-        self._filters = (OneEuro(), OneEuro(), OneEuro())
+        self._filters = tuple(OneEuro(derivative_cutoff=_QUICK) for _ in range(3))
         self._turn = OneEuroRotation()
         self._guard = Hampel(least=_JUMP)
         self.reset()
@@ -96,13 +108,15 @@ class ArmEstimator:
         if self.lengths is None or not self._guard.accept(arm.time, arm.wrist - arm.shoulder):
             return None
         points = arm.points @ self._rotation.T + self._origin
-        elbow, wrist = correct_limbs(points[0], points[1], points[2], self.lengths)
         confidence = arm.confidence
+        shoulder, (elbow, wrist) = points[0], correct_limbs(points[0], points[1], points[2], self.lengths)
+        if self._limbs == "fit":
+            shoulder, elbow, wrist = fit_limbs(points[:3], confidence[:3], self.lengths)
         elbow_known, wrist_known = float(confidence[1]), float(min(confidence[2], confidence[0]))
         if gap > GAP:
             self._hand = None
         rotation, hand_known = self._hand_rotation(points, confidence, wrist - elbow)
-        s, e, w, hand = self._smooth(arm.time, (points[0], elbow, wrist), rotation, confidence, hand_known)
+        s, e, w, hand = self._smooth(arm.time, (shoulder, elbow, wrist), rotation, confidence, hand_known)
         return ArmEstimate(
             arm.time,
             s,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -126,6 +127,44 @@ def correct_limbs(
         return s - lengths.upper_arm * upper, e - lengths.forearm * fore
     corrected = s + lengths.upper_arm * upper
     return corrected, corrected + lengths.forearm * fore
+
+
+def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds: int = 3) -> tuple[Array, Array, Array]:
+    r"""Move shoulder, elbow and wrist as little as possible so that the bones have their lengths (METHODS A.1).
+
+    The most likely arm when every point is measured with an error, each believed by its confidence c:
+
+    .. math:: \min \sum_j c_j |x_j - \tilde x_j|^2 \quad\text{s.t.}\quad |E - S| = L_U,\; |W - E| = L_F
+
+    by a few steps of Gauss and Newton, each with its 2 x 2 system for the multipliers. :func:`correct_limbs` is the case
+    in which the shoulder is exact and of the rest only the directions count: it carries the error of the elbow and
+    the shoulder to the wrist.
+
+    Args:
+        points: shoulder, elbow, wrist, shape (3, 3) [m].
+        confidence: of each, above 0, shape (3,).
+        lengths: of this person.
+        rounds: steps.
+
+    Returns:
+        shoulder, elbow, wrist, each of shape (3,) [m]; the bones have their lengths exactly.
+    """
+    s, e, w = points
+    free_s, free_e, free_w = (1.0 / max(float(c), 1e-3) for c in confidence)
+    for _ in range(rounds):
+        upper, fore = e - s, w - e
+        long_u, long_f = math.sqrt(float(upper.dot(upper))), math.sqrt(float(fore.dot(fore)))
+        if min(long_u, long_f) < _POINT:
+            break
+        u, f = upper / long_u, fore / long_f
+        m11, m22, m12 = free_s + free_e, free_e + free_w, -free_e * float(u.dot(f))
+        r1, r2 = lengths.upper_arm - long_u, lengths.forearm - long_f
+        determinant = m11 * m22 - m12 * m12
+        a = ((m22 * r1 - m12 * r2) / determinant) * u
+        b = ((m11 * r2 - m12 * r1) / determinant) * f
+        s, e, w = s - free_s * a, e + free_e * (a - b), w + free_w * b
+    elbow, wrist = correct_limbs(s, e, w, lengths)
+    return s, elbow, wrist
 
 
 def _direction(vectors: Array) -> Array:

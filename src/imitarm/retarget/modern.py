@@ -1,4 +1,4 @@
-"""ModernRetargeter: what we would use on a robot; every limit kept, the elbow followed, losses survived."""
+"""ModernRetargeter: what we would use on a robot; every limit kept, losses of sight survived."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _STILL = 1e-6  # [rad/s] slower is at rest
 
 
 class ModernRetargeter(Retargeter):
-    r"""Follow the hand with the tool and the elbow with the elbow, inside every limit (METHODS A.9).
+    r"""Follow the hand with the tool, inside every limit (METHODS A.9).
 
     One step is
 
@@ -41,9 +41,8 @@ class ModernRetargeter(Retargeter):
        the estimated velocity, which fades: :math:`W + v\,\tau(1 - e^{-s/\tau})` after s seconds, tau = 50 ms;
     2. the clutch's target, and the twist that goes there, :math:`K \log(T_d T^{-1})` plus a share of the hand's
        velocity;
-    3. a quadratic programme for the joints' velocities: the twist, the elbow's SEW angle, the box of position,
-       velocity and acceleration that can always be kept, bounds that hold the elbow and the wrist off their
-       singularities, rows that keep the links off each other and off the scene;
+    3. a quadratic programme for the joints' velocities: the twist, the box of position, velocity and acceleration
+       that can always be kept, rows that keep the links off the scene;
     4. a follower that limits the jerk (:class:`~imitarm.retarget.jerk_limit.JerkLimiter`) and guards the limits again.
 
     Without a sight of the arm it coasts for 0.1 s, holds until 0.3 s, then stops; a stopped one waits until the arm has
@@ -56,7 +55,6 @@ class ModernRetargeter(Retargeter):
         scene: obstacles to keep clear of.
         gain: K [1/s].
         lead: share of the hand's velocity that is fed forward, 0 to 1.
-        elbow: weight of the elbow's angle beside the tool; 0: the elbow is free.
         clearance: to keep from the scene [m].
         max_speed: the twist is cut to this [m/s], 1 rad counting as 0.3 m.
     """
@@ -72,19 +70,17 @@ class ModernRetargeter(Retargeter):
         scene: Scene | None = None,
         gain: float = 20.0,
         lead: float = 0.5,
-        elbow: float = 0.05,
         clearance: float = 0.01,
         max_speed: float = 1.0,
     ) -> None:
-        if not (0.0 < gain * dt <= 1.0 and 0.0 <= lead <= 1.0 and elbow >= 0.0 and max_speed > 0.0):
+        if not (0.0 < gain * dt <= 1.0 and 0.0 <= lead <= 1.0 and max_speed > 0.0):
             raise InputError(
-                f"ModernRetargeter: needs 0 < gain <= 1/dt = {1 / dt:g}, lead from 0 to 1, elbow >= 0 and max_speed > 0"
+                f"ModernRetargeter: needs 0 < gain <= 1/dt = {1 / dt:g}, lead from 0 to 1 and max_speed > 0"
             )
-        self._gain, self._lead, self._elbow_weight = gain, lead, elbow
+        self._gain, self._lead = gain, lead
         self._clearance, self._max_speed = clearance, max_speed
         self._limiter = JerkLimiter(arm, dt)
         super().__init__(arm, correspondence, dt=dt, scene=scene)
-        self._estimator = ArmEstimator(self.correspondence)
 
     def _begin(self, q: Array) -> None:
         self._limiter.start(q)
@@ -93,7 +89,6 @@ class ModernRetargeter(Retargeter):
         self._estimate: ArmEstimate | None = None
         self._engagement = Engagement(self.correspondence)
         self._estimator = ArmEstimator(self.correspondence)
-        self._elbow_offset = 0.0
 
     def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
         """Return the joint positions to be at after ``dt``; see :class:`~imitarm.retarget.retargeter.Retargeter`."""

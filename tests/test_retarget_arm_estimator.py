@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+
+from imitarm.capture.camera_model import SkeletonCamera
+from imitarm.capture.motions import reaching
+from imitarm.capture.person import Person
+from imitarm.capture.skeleton import HandState, Skeleton
+from imitarm.capture.synthetic import SyntheticSource
+from imitarm.errors import UnknownNameError
+from imitarm.retarget import FACING, Correspondence, LimbLengths
+from imitarm.retarget.arm_estimator import ArmEstimator
+
+PERSON = Person.from_seed(2)
+LENGTHS = LimbLengths(PERSON.upper_arm, PERSON.forearm)
+HOLD = PERSON.shoulder("right") + np.array([0.2, -0.25, -0.25])
+
+
+def frames(seconds=1.0, **options):
+    return [PERSON.skeleton(k / 30, HOLD, **options) for k in range(int(30 * seconds))]
+
+
+def test_without_noise_it_is_the_arm_in_the_base_frame():
+    estimator = ArmEstimator(Correspondence(lengths=LENGTHS), smoothing=False)
+    for frame in frames(0.3):
+        estimate, arm = estimator.update(frame), frame.arm()
+        np.testing.assert_allclose(estimate.shoulder, FACING.apply(arm.shoulder), atol=1e-9)
+        np.testing.assert_allclose(estimate.elbow, FACING.apply(arm.elbow), atol=1e-9)
+        np.testing.assert_allclose(estimate.wrist, FACING.apply(arm.wrist), atol=1e-9)
+        assert estimate.confidence == (1.0, 1.0, 1.0)
+
+
+def test_smoothing_takes_off_noise_and_bones_keep_their_lengths():
+    truth = reaching(PERSON, 0, duration=8.0)
+    estimator = ArmEstimator(Correspondence(lengths=LENGTHS), smoothing=False)
+    seen = 0
+    for frame in SyntheticSource(truth, SkeletonCamera(0), 8.0):
+        estimate = estimator.update(frame)
+        if estimate is not None:
+            seen += 1
+            assert np.linalg.norm(estimate.elbow - estimate.shoulder) == pytest.approx(PERSON.upper_arm)
+            assert np.linalg.norm(estimate.wrist - estimate.elbow) == pytest.approx(PERSON.forearm)
+    assert seen > 150
+
+
+def test_lengths_that_are_not_known_are_learnt_first():
+    estimator = ArmEstimator(Correspondence())
+    estimates = [estimator.update(frame) for frame in frames(2.0)]
+    assert estimates[0] is None
+    assert estimates[-1] is not None
+    assert estimator.lengths.upper_arm == pytest.approx(PERSON.upper_arm, abs=2e-3)
+
+
+def test_a_lost_arm_an_old_frame_and_a_jump_give_no_estimate():
+    estimator = ArmEstimator(Correspondence(lengths=LENGTHS))
+    shown = frames(1.0)
+    for frame in shown:
+        assert estimator.update(frame) is not None
+    assert estimator.update(shown[3]) is None  # time runs backwards
+    lost = np.array(shown[-1].positions)
+    lost[10] = np.inf
+    assert estimator.update(Skeleton(1.0, lost)) is None
+    away = np.array(shown[-1].positions)
+    away[8:12] += [0.0, 0.0, 0.0]
+    away[10] += [0.0, 0.6, 0.0]
+    assert estimator.update(Skeleton(1.04, away)) is None
+    assert estimator.update(PERSON.skeleton(1.07, HOLD)) is not None
+
+
+def test_a_hand_counts_as_closed_when_three_frames_say_so():
+    estimator = ArmEstimator(Correspondence(lengths=LENGTHS))
+    for frame in frames(0.5):
+        estimate = estimator.update(frame)
+    assert estimate.closed is False
+    states = [True, True, False, True, True, True]
+    for k, closed in enumerate(states):
+        estimate = estimator.update(PERSON.skeleton(0.5 + k / 30, HOLD, closed=closed))
+        assert estimate.closed is (k == 5)
+    unknown = Skeleton(0.9, PERSON.skeleton(0.9, HOLD).positions, hand_states=(HandState.UNKNOWN, HandState.UNKNOWN))
+    assert estimator.update(unknown).closed is True
+
+
+def test_the_hand_is_carried_by_the_forearm_when_it_is_not_seen():
+    estimator = ArmEstimator(Correspondence(lengths=LENGTHS), smoothing=False)
+    for frame in frames(0.3):
+        before = estimator.update(frame)
+    positions = np.array(PERSON.skeleton(0.3, HOLD).positions)
+    positions[24] = np.nan  # the thumb
+    after = estimator.update(Skeleton(0.3, positions))
+    assert after.confidence[2] == 0.0
+    assert abs(float(after.hand @ before.hand)) > 0.999
+
+
+def test_an_unknown_way_with_limbs_is_named():
+    with pytest.raises(UnknownNameError, match="fit"):
+        ArmEstimator(Correspondence(), limbs="guess")

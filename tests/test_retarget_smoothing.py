@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imitarm import InputError
+from imitarm.kinematics.pose import quaternion_exp, quaternion_log
+from imitarm.retarget.smoothing import Hampel, OneEuro, OneEuroRotation, smoothing_share
+
+T = 1 / 30
+
+
+def test_it_is_calm_at_rest_and_quick_in_motion():
+    rng = np.random.default_rng(0)
+    noise = 0.005 * rng.normal(size=(600, 3))
+    still = OneEuro()
+    calm = np.array([still.filter(k * T, x) for k, x in enumerate(noise)])[60:]
+    assert calm.std() < 0.6 * noise.std()
+    moving, path = OneEuro(derivative_cutoff=3.0), np.arange(600)[:, None] * T * np.array([0.8, 0.0, 0.0])
+    late = np.array([moving.filter(k * T, x) for k, x in enumerate(path)])[120:]
+    assert np.abs(late - path[120:]).max() / 0.8 < 0.03  # [s] of lag at 0.8 m/s
+    np.testing.assert_allclose(moving.velocity, [0.8, 0.0, 0.0], atol=1e-3)
+
+
+def test_units_are_metres_a_beta_meant_for_millimetres_does_nothing():
+    path = np.arange(300)[:, None] * T * np.array([0.8, 0.0, 0.0])
+    lag = {}
+    for beta in (0.01, 10.0):
+        one = OneEuro(beta=beta)
+        late = np.array([one.filter(k * T, x) for k, x in enumerate(path)])
+        lag[beta] = np.abs(late - path)[-1, 0] / 0.8
+    assert lag[0.01] > 0.12
+    assert lag[10.0] < 0.04
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_it_is_the_same_in_every_direction(seed):
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(random_state=int(seed % 10000)).as_matrix()
+    plain, turned = OneEuro(), OneEuro()
+    for k, x in enumerate(rng.normal(size=(30, 3))):
+        np.testing.assert_allclose(turned.filter(k * T, turn @ x), turn @ plain.filter(k * T, x), atol=1e-12)
+
+
+def test_a_gap_begins_anew_and_an_old_frame_changes_nothing():
+    one = OneEuro()
+    one.filter(0.0, np.zeros(3))
+    np.testing.assert_array_equal(one.filter(0.5, np.ones(3)), np.ones(3))
+    np.testing.assert_array_equal(one.filter(0.4, np.zeros(3)), np.ones(3))
+    np.testing.assert_array_equal(one.velocity, np.zeros(3))
+
+
+def test_confidence_weighs_a_value():
+    sure, unsure = OneEuro(), OneEuro()
+    for one in (sure, unsure):
+        one.filter(0.0, np.zeros(1))
+    assert 0.0 < unsure.filter(T, np.ones(1), 0.2)[0] < 0.5 * sure.filter(T, np.ones(1), 1.0)[0]
+    assert unsure.filter(2 * T, np.full(1, 9.0), 0.0)[0] == unsure.value[0]
+
+
+def test_the_share_is_that_of_a_low_pass():
+    assert smoothing_share(1e9, T) == pytest.approx(1.0)
+    assert smoothing_share(1.0, 1.0 / (2.0 * np.pi)) == pytest.approx(0.5)
+
+
+def test_rotations_are_smoothed_on_the_sphere_and_signs_do_not_matter():
+    one = OneEuroRotation()
+    rng = np.random.default_rng(1)
+    for k in range(200):
+        q = quaternion_exp(np.array([0.0, 0.0, 0.5 * k * T]) + 0.02 * rng.normal(size=3))
+        smooth = one.filter(k * T, q if rng.random() < 0.5 else -q)
+        assert np.linalg.norm(smooth) == pytest.approx(1.0)
+    np.testing.assert_allclose(one.velocity, [0.0, 0.0, 0.5], atol=0.15)
+    assert abs(np.linalg.norm(quaternion_log(smooth)) - 0.5 * 199 * T) < 0.2
+
+
+def test_a_jump_is_an_outlier_and_a_motion_is_not():
+    guard, rng = Hampel(least=0.05), np.random.default_rng(2)
+    accepted = []
+    for k in range(90):
+        x = np.array([0.6 * k * T, 0.0, 0.0]) + 0.003 * rng.normal(size=3)
+        accepted.append(guard.accept(k * T, x + (0.4 if k in {40, 60} else 0.0)))
+    assert not accepted[40]
+    assert not accepted[60]
+    assert np.mean(accepted) > 0.95
+
+
+def test_a_lasting_change_is_believed():
+    guard = Hampel()
+    verdicts = [guard.accept(k * T, np.full(3, 0.0 if k < 30 else 1.0)) for k in range(60)]
+    assert not verdicts[30]
+    assert all(verdicts[38:])
+
+
+@pytest.mark.parametrize("options", [{"min_cutoff": 0.0}, {"beta": -1.0}, {"derivative_cutoff": 0.0}])
+def test_settings_that_filter_nothing_are_refused(options):
+    with pytest.raises(InputError, match="OneEuro"):
+        OneEuro(**options)
