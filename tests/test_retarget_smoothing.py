@@ -69,12 +69,12 @@ def test_the_share_is_that_of_a_low_pass():
 def test_rotations_are_smoothed_on_the_sphere_and_signs_do_not_matter():
     one = OneEuroRotation()
     rng = np.random.default_rng(1)
-    for k in range(200):
+    for k in range(150):
         q = quaternion_exp(np.array([0.0, 0.0, 0.5 * k * T]) + 0.02 * rng.normal(size=3))
         smooth = one.filter(k * T, q if rng.random() < 0.5 else -q)
         assert np.linalg.norm(smooth) == pytest.approx(1.0)
-    np.testing.assert_allclose(one.velocity, [0.0, 0.0, 0.5], atol=0.15)
-    assert abs(np.linalg.norm(quaternion_log(smooth)) - 0.5 * 199 * T) < 0.2
+    np.testing.assert_allclose(one.velocity, [0.0, 0.0, 0.5], atol=0.3)
+    assert abs(np.linalg.norm(quaternion_log(smooth)) - 0.5 * 149 * T) < 0.2
 
 
 def test_a_jump_is_an_outlier_and_a_motion_is_not():

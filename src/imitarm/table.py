@@ -151,7 +151,20 @@ def read_table(path: str | Path) -> Table:
         FileFormatError: when it is empty, binary, not UTF-8, holds no rows, a row has another length than the first
             one, or something is not a number; the message names file and line.
     """
-    text = _text_of(path, read_bytes(path))
+    return parse_table(path, read_bytes(path))
+
+
+def parse_table(path: str | Path, content: bytes) -> Table:
+    """Read a table of numbers from the content of a file, as :func:`read_table` does.
+
+    Args:
+        path: where it is from, for messages.
+        content: all of the file, or what of it is wanted.
+
+    Raises:
+        FileFormatError: as :func:`read_table`.
+    """
+    text = _text_of(path, content)
     stripped = [(number, line.strip(" \f\v")) for number, line in enumerate(text.split("\n"), start=1)]
     written = [(number, line) for number, line in stripped if line.strip()]
     body = [(number, line) for number, line in written if line[0] not in "#%"]

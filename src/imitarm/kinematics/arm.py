@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.arm_file import ArmFile, quiet, read_arm
 from imitarm.kinematics.arm_limits import compiled
+from imitarm.kinematics.arm_memory import ArmMemory, columns
+from imitarm.kinematics.landmarks import Landmarks
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.spheres import SphereCover
 
@@ -37,18 +38,6 @@ class ArmState:
     velocity: Array
     torque: Array
     time: float
-
-
-class _Scratch(threading.local):
-    """MuJoCo's working memory, one for each thread, and the posture it holds."""
-
-    def __init__(self, model: mujoco.MjModel, home: Array) -> None:
-        self.data = mujoco.MjData(model)
-        self.data.qpos[:] = home
-        self.posture = b""
-        self.jacobian = np.zeros((6, model.nv))
-        self.linear, self.angular = self.jacobian[:3], self.jacobian[3:]
-        self.force = np.zeros(model.nv)
 
 
 class ArmModel:
@@ -77,6 +66,7 @@ class ArmModel:
         tool_to_flange: where the tool's tip is; the identity when there is no tool.
         tool_radius: radius of the cylinder about the tool's axis that holds the tool's head [m]; 0 without a tool.
         sphere_bodies: for each sphere of :meth:`collision_spheres` the name of its body.
+        landmarks: shoulder, elbow and wrist, from sites of these names in the file; None when it has none.
     """
 
     name: str
@@ -90,6 +80,7 @@ class ArmModel:
     tool_to_flange: Pose
     tool_radius: float
     sphere_bodies: tuple[str, ...]
+    landmarks: Landmarks | None
 
     @classmethod
     def load(
@@ -137,9 +128,9 @@ class ArmModel:
         for name, position in file.home.items():
             posture[model.jnt_qposadr[model.joint(name).id]] = position
         self._source, self._spec, self._model = source, file.spec, model
-        self._scratch = _Scratch(model, posture)
-        self._qpos = _slice(model.jnt_qposadr[joints])
-        self._dofs = _slice(model.jnt_dofadr[joints])
+        self._qpos = columns(model.jnt_qposadr[joints])
+        self._dofs = columns(model.jnt_dofadr[joints])
+        self._scratch = ArmMemory(model, posture, self._qpos, self._dofs)
         self._joints = np.array(joints)
         self._flange = model.site("flange").id
         names = [model.site(i).name for i in range(model.nsite)]
@@ -158,6 +149,7 @@ class ArmModel:
             self.tool_to_flange = self.forward_kinematics(self.home).inverse() @ self.tool_pose(self.home)
         self._cover = SphereCover(whole, self._joints)
         self.sphere_bodies = self._cover.bodies
+        self.landmarks = Landmarks.find(model, self._joints)
         self._sealed = True
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -268,6 +260,31 @@ class ArmModel:
         mujoco.mj_jac(self._model, scratch.data, scratch.linear, None, position, index)
         return np.array(scratch.linear[:, self._dofs])
 
+    def sew_points(self, q: ArrayLike) -> Array:
+        """Return shoulder, elbow and wrist in the base frame, shape (3, 3) [m].
+
+        Raises:
+            InputError: when the arm's file does not say where they are.
+        """
+        return self.marked().points(self._at(q))
+
+    def sew_jacobians(self, q: ArrayLike) -> Array:
+        """Return the Jacobians of shoulder, elbow and wrist, shape (3, 3, n_joints) [m/rad]; as ``sew_points``."""
+        return self.marked().jacobians(self._model, self._at(q), self._dofs)
+
+    def marked(self) -> Landmarks:
+        """Return ``landmarks``.
+
+        Raises:
+            InputError: when the arm's file does not say where shoulder, elbow and wrist are.
+        """
+        if self.landmarks is None:
+            raise InputError(
+                f"{self.name} does not say where its shoulder, elbow and wrist are: add sites named 'shoulder', "
+                "'elbow' and 'wrist' to its MJCF file, on the links that these joints move"
+            )
+        return self.landmarks
+
     def collision_spheres(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return spheres that together cover all moving collision shapes of arm and tool.
 
@@ -342,27 +359,21 @@ class ArmModel:
             raise InputError(f"{self.name}: {what} must be finite numbers, got {array}")
         return array
 
-    def _at(self, q: ArrayLike) -> _Scratch:
+    def _at(self, q: ArrayLike) -> ArmMemory:
         """Return the working memory with kinematics at ``q``, computed only when the posture is a new one."""
-        values, scratch = self._checked(q, "q"), self._scratch
-        posture = values.tobytes()
-        if posture != scratch.posture:
-            scratch.data.qpos[self._qpos] = values
-            mujoco.mj_kinematics(self._model, scratch.data)
-            mujoco.mj_comPos(self._model, scratch.data)
-            scratch.posture = posture
-        return scratch
+        memory = self._scratch
+        memory.move_to(self._checked(q, "q"))
+        return memory
 
-    def _site_pose(self, scratch: _Scratch, site: int) -> Pose:
+    def _site_pose(self, scratch: ArmMemory, site: int) -> Pose:
         quaternion = np.empty(4)
         mujoco.mju_mat2Quat(quaternion, scratch.data.site_xmat[site])
         return _pose(scratch.data.site_xpos[site].copy(), quaternion)
 
-    def _site_jacobian(self, scratch: _Scratch, site: int) -> Array:
-        mujoco.mj_jacSite(self._model, scratch.data, scratch.linear, scratch.angular, site)
-        return np.array(scratch.jacobian[:, self._dofs])
+    def _site_jacobian(self, scratch: ArmMemory, site: int) -> Array:
+        return np.array(scratch.site_jacobian(site))
 
-    def _recursive_newton_euler(self, scratch: _Scratch, velocity: Array | None, acceleration: Array | None) -> Array:
+    def _recursive_newton_euler(self, scratch: ArmMemory, velocity: Array | None, acceleration: Array | None) -> Array:
         data = scratch.data
         data.qvel[self._dofs] = 0.0 if velocity is None else velocity
         data.qacc[self._dofs] = 0.0 if acceleration is None else acceleration
@@ -374,12 +385,6 @@ class ArmModel:
 def _massless(geom: mujoco.MjsGeom) -> bool:
     """Return whether leaving out ``geom`` changes no link's mass (a mass that was not given is nan)."""
     return bool(geom.density == 0.0 and not geom.mass > 0.0)
-
-
-def _slice(indices: NDArray[np.int32]) -> slice | NDArray[np.int32]:
-    """Return consecutive indices as a slice, which is several times quicker."""
-    first = int(indices[0])
-    return slice(first, first + len(indices)) if np.all(np.diff(indices) == 1) else indices
 
 
 def _frozen(values: Array) -> Array:

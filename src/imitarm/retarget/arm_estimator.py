@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 _LEARNING_FRAMES = 60  # lengths that were not given are learnt from so many, then kept
 _GRIP_FRAMES = 3  # a hand state counts when so many frames in a row have it
-_QUICK = 3.0  # [Hz] of the speed estimate: at the usual 1 Hz it comes late, and the robot with it
+_FILTER = (1.5, 15.0, 3.0)  # [Hz, Hz per m/s, Hz] of the points; a slower speed estimate makes the robot late
 _JUMP = 0.12  # [m] what a hand may go within half the outlier filter's window without being one
 
 
@@ -77,7 +77,7 @@ class ArmEstimator:
         self._smoothing = smoothing
         self._rotation = correspondence.sensor_to_base.rotation
         self._origin = correspondence.sensor_to_base.position
-        self._filters = tuple(OneEuro(derivative_cutoff=_QUICK) for _ in range(3))
+        self._filters = tuple(OneEuro(*_FILTER) for _ in range(3))
         self._turn = OneEuroRotation()
         self._guard = Hampel(least=_JUMP)
         self.reset()

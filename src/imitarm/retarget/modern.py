@@ -68,8 +68,8 @@ class ModernRetargeter(Retargeter):
         *,
         dt: float = 0.01,
         scene: Scene | None = None,
-        gain: float = 20.0,
-        lead: float = 0.5,
+        gain: float = 25.0,
+        lead: float = 0.6,
         clearance: float = 0.01,
         max_speed: float = 1.0,
     ) -> None:

@@ -28,8 +28,9 @@ class OneEuro:
 
     .. math:: \hat x \leftarrow \hat x + \alpha(f_c)\,(x - \hat x), \qquad f_c = f_{min} + \beta\,|\hat{\dot x}|
 
-    The speed is that of the vector, not of each axis, so the filter is the same in every direction. A value with a
-    confidence c below 1 is taken over by c times as much.
+    The speed is that of the vector, not of each axis, so the filter is the same in every direction. It is taken from two
+    measured values; the usual difference to the smoothed value before holds the filter's own lag, and comes out too
+    large (by 40 % on a steady motion at 30 Hz), which matters to whoever leads with it. A value with a confidence c below 1 is taken over by c times as much.
 
     Args:
         min_cutoff: cut-off at rest [Hz].
@@ -46,6 +47,7 @@ class OneEuro:
     def reset(self) -> None:
         """Forget the past."""
         self._time = -math.inf
+        self._raw: Array = np.zeros(0)
         self.value: Array = np.zeros(0)
         self.velocity: Array = np.zeros(0)
 
@@ -60,20 +62,21 @@ class OneEuro:
         period = time - self._time
         if period > GAP:
             self._time, self.value, self.velocity = time, np.array(x, dtype=float), np.zeros(len(x))
+            self._raw = self.value
             return self.value
         if period <= 0.0:
             return self.value
         self._time = time
-        step = self._difference(x)
-        self.velocity = self.velocity + confidence * smoothing_share(self.derivative_cutoff, period) * (
-            step / period - self.velocity
-        )
+        speed = self._difference(x, self._raw) / period
+        self._raw = np.array(x, dtype=float)
+        share = confidence * smoothing_share(self.derivative_cutoff, period)
+        self.velocity = self.velocity + share * (speed - self.velocity)
         cutoff = self.min_cutoff + self.beta * math.sqrt(float(self.velocity.dot(self.velocity)))
-        self.value = self._moved(confidence * smoothing_share(cutoff, period) * step)
+        self.value = self._moved(confidence * smoothing_share(cutoff, period) * self._difference(x, self.value))
         return self.value
 
-    def _difference(self, x: Array) -> Array:
-        return np.asarray(x - self.value)
+    def _difference(self, x: Array, before: Array) -> Array:
+        return np.asarray(x - before)
 
     def _moved(self, step: Array) -> Array:
         return np.asarray(self.value + step)
@@ -98,8 +101,8 @@ class OneEuroRotation(OneEuro):
             self.velocity = np.zeros(3)
         return result
 
-    def _difference(self, x: Array) -> Array:
-        return quaternion_log(quaternion_multiply(x, quaternion_conjugate(self.value)))
+    def _difference(self, x: Array, before: Array) -> Array:
+        return quaternion_log(quaternion_multiply(x, quaternion_conjugate(before)))
 
     def _moved(self, step: Array) -> Array:
         moved = quaternion_multiply(quaternion_exp(step), self.value)

@@ -1,0 +1,42 @@
+"""What a check of a recording says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Severity = Literal["error", "warning", "note"]
+
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong with a recording of a person, or worth knowing before a robot follows it.
+
+    Attributes:
+        severity: ``"error"``: no robot can follow this; ``"warning"``: look at it; ``"note"``: for information.
+        code: short name that stays the same from version to version, such as ``"gap"``.
+        message: what is wrong, with figures.
+        frame: the first frame concerned, from 0; None when it is the whole.
+        time: of that frame, from the first one [s].
+        remedy: what to do.
+    """
+
+    severity: Severity
+    code: str
+    message: str
+    frame: int | None = None
+    time: float | None = None
+    remedy: str = ""
+
+    @property
+    def place(self) -> str:
+        """Where to look: ``frame 12 (0.40 s)`` or nothing."""
+        if self.frame is None:
+            return ""
+        return f"frame {self.frame}" + ("" if self.time is None else f" ({self.time:.2f} s)")
+
+    def __str__(self) -> str:
+        place = f"{self.place}: " if self.frame is not None else ""
+        return f"{self.severity} {self.code}: {place}{self.message}" + (f"; {self.remedy}" if self.remedy else "")

@@ -1,0 +1,54 @@
+"""The working memory in which an arm's kinematics is computed, one for each thread."""
+
+from __future__ import annotations
+
+import threading
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Columns = slice | NDArray[np.int32]
+
+
+class ArmMemory(threading.local):
+    """MuJoCo's working memory, and the posture it holds.
+
+    Attributes:
+        data: kinematics of the posture.
+        jacobian: of the site that was asked for last, shape (6, nv), linear rows first.
+        linear: its first three rows.
+        angular: its last three rows.
+        force: shape (nv,).
+    """
+
+    def __init__(self, model: mujoco.MjModel, home: Array, positions: Columns, joints: Columns) -> None:
+        """Begin at ``home`` (nq,); the arm's joints stand at ``positions`` in qpos and at ``joints`` in qvel."""
+        self.data = mujoco.MjData(model)
+        self.data.qpos[:] = home
+        self.jacobian = np.zeros((6, model.nv))
+        self.linear, self.angular = self.jacobian[:3], self.jacobian[3:]
+        self.force = np.zeros(model.nv)
+        self._model, self._positions, self._joints, self._posture = model, positions, joints, b""
+        self._qpos = self.data.qpos  # asking for it each time takes as long as the kinematics of a link
+
+    def move_to(self, q: Array) -> None:
+        """Compute the kinematics at ``q`` (n,), unless it is what the memory holds."""
+        posture = q.tobytes()
+        if posture != self._posture:
+            self._qpos[self._positions] = q
+            mujoco.mj_kinematics(self._model, self.data)
+            mujoco.mj_comPos(self._model, self.data)
+            self._posture = posture
+
+    def site_jacobian(self, site: int) -> Array:
+        """Return the Jacobian of a site, shape (6, n), as a view that the next one overwrites."""
+        mujoco.mj_jacSite(self._model, self.data, self.linear, self.angular, site)
+        return self.jacobian[:, self._joints]
+
+
+def columns(indices: NDArray[np.int32]) -> Columns:
+    """Return consecutive indices as a slice, which is several times quicker."""
+    first = int(indices[0])
+    return slice(first, first + len(indices)) if np.all(np.diff(indices) == 1) else indices

@@ -1,0 +1,197 @@
+import numpy as np
+import pytest
+
+from imitarm import ArmModel, InputError, Scene, Sphere
+from imitarm.capture.camera_model import SkeletonCamera
+from imitarm.capture.motions import MotionCapture, reaching
+from imitarm.capture.person import Person
+from imitarm.capture.skeleton import Skeleton
+from imitarm.capture.synthetic import SyntheticSource
+from imitarm.retarget import FACING, Correspondence, LimbLengths, ModernRetargeter, retarget
+
+DT = 0.01
+ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
+
+
+def lengths(person):
+    return LimbLengths(person.upper_arm, person.forearm)
+
+
+def recording(seed, kind="inside", duration=8.0, **camera):
+    person = Person.from_seed(seed)
+    truth = reaching(person, seed, duration=duration, kind=kind)
+    return person, truth, list(SyntheticSource(truth, SkeletonCamera(seed, **camera), duration))
+
+
+def assert_within_limits(arm, joints):
+    """Measured from the joint positions alone, in every frame."""
+    velocity = np.diff(joints, axis=0) / DT
+    acceleration = np.diff(velocity, axis=0) / DT
+    assert np.isfinite(joints).all()
+    assert (joints <= arm.upper + 1e-9).all()
+    assert (joints >= arm.lower - 1e-9).all()
+    assert (np.abs(velocity) <= arm.max_velocity * (1.0 + 1e-9)).all()
+    assert (np.abs(acceleration) <= arm.max_acceleration * (1.0 + 1e-6)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
+@pytest.mark.parametrize("kind", ["inside", "edge"])
+def test_no_limit_is_broken_in_any_frame(arm, kind):
+    for seed in range(3):
+        person, _, frames = recording(seed, kind, sigma=0.02, dropout=0.5)
+        for orientation in ("hand", "fixed"):
+            correspondence = Correspondence(lengths=lengths(person), scale=1.43, orientation=orientation)
+            run = ModernRetargeter(arm, correspondence).run(frames)
+            assert_within_limits(arm, run.joints)
+            assert (run.states == "following").mean() > 0.2
+
+
+@pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
+def test_the_tool_follows_the_hand(arm):
+    person, truth, frames = recording(1, sigma=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
+    run = ModernRetargeter(arm, Correspondence(lengths=lengths(person), orientation="fixed", scale=0.6)).run(frames)
+    first = int(np.argmax(run.states == "following"))
+    tool, _ = arm.tool_path(run.joints)
+    wrist = FACING.apply(np.array([truth(t).arm().wrist for t in run.times]))
+    wanted = tool[first] + 0.6 * (wrist - wrist[first])
+    late = 8  # steps
+    error = np.linalg.norm(tool[first + 50 :] - wanted[first + 50 - late : -late], axis=1)
+    assert np.sqrt(np.mean(error**2)) < 0.012
+
+
+def test_it_is_less_than_80_ms_late():
+    """The motion of the tool against that of the true hand, at the shift at which they agree best."""
+    arm, shifts = ARMS["sawyer"], []
+    for seed in range(3):
+        person, truth, frames = recording(seed, sigma=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
+        correspondence = Correspondence(lengths=lengths(person), orientation="fixed", scale=0.6)
+        run = ModernRetargeter(arm, correspondence).run(frames)
+        first = int(np.argmax(run.states == "following")) + 50
+        tool, _ = arm.tool_path(run.joints)
+        wrist = 0.6 * FACING.apply(np.array([truth(t).arm().wrist for t in run.times]))
+
+        def apart(shift, tool=tool, wrist=wrist, first=first):
+            difference = tool[first + shift :] - wrist[first : len(tool) - shift]
+            return float(np.sum(difference.var(axis=0)))
+
+        shifts.append(min(range(30), key=apart) * DT)
+    assert np.mean(shifts) < 0.08
+
+
+def state_at(run, time):
+    return run.states[int(round(time / DT))]
+
+
+def test_a_loss_of_sight_is_coasted_held_and_stopped_and_needs_a_new_hold():
+    person, truth, _ = recording(0)
+    arm = ARMS["sawyer"]
+    times = np.arange(0.0, 8.0, 1 / 30)
+    frames = [truth(t) for t in times if not 4.0 < t < 5.0]
+    run = ModernRetargeter(arm, Correspondence(lengths=lengths(person))).run(frames)
+    assert state_at(run, 0.2) == "waiting"
+    assert state_at(run, 3.9) == "following"
+    assert state_at(run, 4.09) == "coasting"
+    assert state_at(run, 4.2) == "holding"
+    assert state_at(run, 4.4) == "stopped"
+    assert state_at(run, 4.95) == "waiting"
+    assert state_at(run, 5.3) == "waiting"  # seen again, but not for half a second
+    assert state_at(run, 6.0) == "following"
+    assert_within_limits(arm, run.joints)
+    blind = run.joints[485:500]
+    assert np.ptp(blind, axis=0).max() == 0.0  # it stands
+    engaged = int(5.0 / DT) + int(np.argmax(run.states[int(5.0 / DT) :] == "following"))
+    tool, _ = arm.tool_path(run.joints)
+    assert np.linalg.norm(run.targets[0][engaged] - tool[engaged]) < 0.01  # nothing jumps
+
+
+def test_nobody_means_no_motion():
+    lost = [Skeleton(k / 30, np.full((25, 3), np.nan)) for k in range(60)]
+    run = ModernRetargeter(ARMS["sawyer"]).run(lost)
+    assert set(run.states) == {"waiting"}
+    assert np.ptp(run.joints, axis=0).max() == 0.0
+
+
+@pytest.mark.parametrize("what", ["infinite", "swapped", "thrown", "backwards", "slow", "tiny"])
+def test_bad_input_breaks_no_limit(what):
+    person, truth, _ = recording(0)
+    arm, rng = ARMS["sawyer"], np.random.default_rng(0)
+    retargeter = ModernRetargeter(arm, Correspondence(lengths=lengths(person)))
+    joints = [arm.home]
+    for k in range(700):
+        frame = None
+        if k % (20 if what == "slow" else 3) == 0:  # 5 Hz or 33 Hz
+            frame = truth(k * DT)
+            positions = np.array(frame.positions)
+            if what == "infinite" and k % 7 == 0:
+                positions[8:12] = np.inf
+            elif what == "swapped" and k % 60 < 30:
+                positions[[4, 5, 6, 7, 21, 22]], positions[[8, 9, 10, 11, 23, 24]] = (
+                    positions[[8, 9, 10, 11, 23, 24]],
+                    positions[[4, 5, 6, 7, 21, 22]].copy(),
+                )
+            elif what == "thrown":
+                positions += 0.3 * rng.normal(size=positions.shape)
+            elif what == "tiny":
+                positions[8:12] = positions[8]
+            frame = Skeleton(rng.uniform(0.0, 5.0) if what == "backwards" else k * DT, positions)
+        joints.append(retargeter.step(frame, joints[-1]))
+    assert_within_limits(arm, np.array(joints))
+
+
+def test_an_arm_that_was_pushed_while_waiting_starts_where_it_is():
+    arm = ARMS["sawyer"]
+    retargeter = ModernRetargeter(arm)
+    moved = arm.home + 0.2
+    np.testing.assert_array_equal(retargeter.step(None, moved), moved)
+
+
+def test_what_stands_in_the_way_is_not_touched():
+    arm = ARMS["sawyer"]
+    person, truth, frames = recording(1, sigma=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
+    correspondence = Correspondence(lengths=lengths(person), orientation="fixed")
+    free = ModernRetargeter(arm, correspondence).run(frames)
+    tool, _ = arm.tool_path(free.joints)
+    farthest = tool[int(np.argmax(np.linalg.norm(tool - tool[0], axis=1)))]
+    scene = Scene(obstacles=(Sphere(farthest, 0.03),))
+    run = ModernRetargeter(arm, correspondence, scene=scene).run(frames)
+    gaps = []
+    for q in run.joints[::5]:
+        centers, radii = arm.collision_spheres(q)
+        gaps.append(float((scene.clearance(centers) - radii).min()))
+    assert min(gaps) > 0.0
+    assert_within_limits(arm, run.joints)
+
+
+def test_a_real_arm_drives_both_robots_within_their_limits(real_data):
+    capture = MotionCapture.load(real_data / "mocap_arm" / "recording.tsv")
+    frames = list(SyntheticSource(capture.truth(Person.from_seed(0)), SkeletonCamera(0), 15.0))
+    for arm in ARMS.values():
+        run = ModernRetargeter(arm).run(frames)  # it learns the arm's lengths
+        assert (run.states == "following").mean() > 0.5
+        assert_within_limits(arm, run.joints)
+
+
+def test_a_recording_becomes_a_demonstration():
+    person, _, frames = recording(3)
+    arm = ARMS["sawyer"]
+    shown = retarget(frames, ModernRetargeter(arm, Correspondence(lengths=lengths(person))), task="reach")
+    assert shown.task == "reach"
+    assert shown.joints.shape == (len(shown.trajectory), 7)
+    np.testing.assert_allclose(np.diff(shown.trajectory.times), DT)
+    np.testing.assert_allclose(shown.trajectory.positions[40], arm.tool_pose(shown.joints[40]).position)
+
+
+@pytest.mark.parametrize(
+    ("frames", "says"),
+    [([], "at least 2"), ([Skeleton(1.0, np.ones((25, 3))), Skeleton(0.5, np.ones((25, 3)))], "not later")],
+)
+def test_what_is_no_recording_is_named(frames, says):
+    with pytest.raises(InputError, match=says):
+        ModernRetargeter(ARMS["sawyer"]).run(frames)
+
+
+@pytest.mark.parametrize("options", [{"gain": 0.0}, {"gain": 200.0}, {"lead": 2.0}, {"max_speed": 0.0}, {"dt": 1.0}])
+def test_settings_that_can_not_work_are_refused(options):
+    with pytest.raises(InputError, match="ModernRetargeter"):
+        ModernRetargeter(ARMS["sawyer"], **options)
