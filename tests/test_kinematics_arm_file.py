@@ -162,7 +162,8 @@ def test_a_tool_of_ones_own(write):
 def test_names_of_a_composed_arm():
     spec = ArmModel.load("panda", tool="gripper").spec()
     model = spec.compile()
-    assert [model.site(i).name for i in range(model.nsite)] == ["flange", "tool_mount", "tool"]
+    names = [model.site(i).name for i in range(model.nsite)]
+    assert names == ["shoulder", "elbow", "wrist", "flange", "tool_mount", "tool"]
     assert model.actuator(0).name == "tool/opening" and model.nu == 1
     assert {model.body(i).name for i in range(model.nbody)} >= {"panda_link8", "tool/left_finger"}
 

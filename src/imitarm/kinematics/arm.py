@@ -210,11 +210,11 @@ class ArmModel:
 
     def forward_kinematics(self, q: ArrayLike) -> Pose:
         """Return the pose of the flange: ``flange_to_base``."""
-        return self._site_pose(self._at(q), self._flange)
+        return self._at(q).site_pose(self._flange)
 
     def tool_pose(self, q: ArrayLike) -> Pose:
         """Return the pose of the tool's tip: ``tool_to_base``."""
-        return self._site_pose(self._at(q), self._tool)
+        return self._at(q).site_pose(self._tool)
 
     def tool_path(self, joints: ArrayLike) -> tuple[Array, Array]:
         """Return the poses of the tool's tip for many postures.
@@ -225,17 +225,17 @@ class ArmModel:
         Returns:
             positions (n, 3) [m] and quaternions wxyz (n, 4).
         """
-        poses = [self._site_pose(self._at(q), self._tool) for q in np.atleast_2d(np.asarray(joints, dtype=float))]
+        poses = [self._at(q).site_pose(self._tool) for q in np.atleast_2d(np.asarray(joints, dtype=float))]
         positions = np.array([pose.position for pose in poses]).reshape(-1, 3)
         return positions, np.array([pose.quaternion for pose in poses]).reshape(-1, 4)
 
     def jacobian(self, q: ArrayLike) -> Array:
         """Return the Jacobian of the flange, shape (6, n_joints), linear rows first, in the base frame."""
-        return self._site_jacobian(self._at(q), self._flange)
+        return np.array(self._at(q).site_jacobian(self._flange))
 
     def tool_jacobian(self, q: ArrayLike) -> Array:
         """Return the Jacobian of the tool's tip, shape (6, n_joints), linear rows first, in the base frame."""
-        return self._site_jacobian(self._at(q), self._tool)
+        return np.array(self._at(q).site_jacobian(self._tool))
 
     def point_jacobian(self, q: ArrayLike, body: str, point: ArrayLike) -> Array:
         """Return the Jacobian of a point that moves with ``body``.
@@ -365,14 +365,6 @@ class ArmModel:
         memory.move_to(self._checked(q, "q"))
         return memory
 
-    def _site_pose(self, scratch: ArmMemory, site: int) -> Pose:
-        quaternion = np.empty(4)
-        mujoco.mju_mat2Quat(quaternion, scratch.data.site_xmat[site])
-        return _pose(scratch.data.site_xpos[site].copy(), quaternion)
-
-    def _site_jacobian(self, scratch: ArmMemory, site: int) -> Array:
-        return np.array(scratch.site_jacobian(site))
-
     def _recursive_newton_euler(self, scratch: ArmMemory, velocity: Array | None, acceleration: Array | None) -> Array:
         data = scratch.data
         data.qvel[self._dofs] = 0.0 if velocity is None else velocity
@@ -391,13 +383,3 @@ def _frozen(values: Array) -> Array:
     array = np.array(values, dtype=float)
     array.setflags(write=False)
     return array
-
-
-def _pose(position: Array, quaternion: Array) -> Pose:
-    """Build a pose from numbers that are known to be right: Pose's own checks would take ten times as long."""
-    pose = object.__new__(Pose)
-    position.setflags(write=False)
-    quaternion.setflags(write=False)
-    object.__setattr__(pose, "position", position)
-    object.__setattr__(pose, "quaternion", quaternion)
-    return pose

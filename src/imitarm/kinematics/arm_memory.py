@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.kinematics.pose import Pose
+
 Array = NDArray[np.float64]
 Columns = slice | NDArray[np.int32]
 
@@ -42,6 +44,12 @@ class ArmMemory(threading.local):
             mujoco.mj_comPos(self._model, self.data)
             self._posture = posture
 
+    def site_pose(self, site: int) -> Pose:
+        """Return the pose of a site in the base frame."""
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, self.data.site_xmat[site])
+        return _pose(self.data.site_xpos[site].copy(), quaternion)
+
     def site_jacobian(self, site: int) -> Array:
         """Return the Jacobian of a site, shape (6, n), as a view that the next one overwrites."""
         mujoco.mj_jacSite(self._model, self.data, self.linear, self.angular, site)
@@ -52,3 +60,13 @@ def columns(indices: NDArray[np.int32]) -> Columns:
     """Return consecutive indices as a slice, which is several times quicker."""
     first = int(indices[0])
     return slice(first, first + len(indices)) if np.all(np.diff(indices) == 1) else indices
+
+
+def _pose(position: Array, quaternion: Array) -> Pose:
+    """Build a pose from numbers that are known to be right: Pose's own checks would take ten times as long."""
+    pose = object.__new__(Pose)
+    position.setflags(write=False)
+    quaternion.setflags(write=False)
+    object.__setattr__(pose, "position", position)
+    object.__setattr__(pose, "quaternion", quaternion)
+    return pose

@@ -29,7 +29,7 @@ _FADE = 0.05  # [s] time constant of the fading motion
 _PUSHED = 0.05  # [rad] an arm found farther than this from its command was moved by somebody
 _BETWEEN = 0.07  # [s] cameras leave out a frame now and then
 _BRAKING = 1.5  # [m/s^2] the tool can nearly always brake so hard, 1 rad counting as 0.3 m
-_STILL = 1e-6  # [rad/s] slower is at rest
+_STILL = 1e-3  # [rad/s] slower is at rest
 
 
 class ModernRetargeter(Retargeter):
@@ -118,7 +118,7 @@ class ModernRetargeter(Retargeter):
             if self._silence <= HOLD:
                 return "following" if self._silence <= _BETWEEN else "coasting" if self._silence <= COAST else "holding"
             self._engagement.release()
-        if self._velocity.any() or self._limiter.velocity.any():
+        if not self._at_rest():
             return "stopped"
         if np.abs(q - self._q).max() > _PUSHED:  # somebody has moved the arm: go on from there
             self._q = np.clip(q, self.arm.lower, self.arm.upper)
@@ -126,6 +126,15 @@ class ModernRetargeter(Retargeter):
         if self._silence == 0.0 and self._engagement.update(self._estimate, self.arm.tool_pose(self._q)) is not None:
             return "following"
         return "waiting"
+
+    def _at_rest(self) -> bool:
+        """Return whether the arm stands; what is left of its motion, too slow to be seen, is taken off."""
+        if max(np.abs(self._velocity).max(), np.abs(self._limiter.velocity).max()) > _STILL:
+            return False
+        if self._velocity.any() or self._limiter.velocity.any():
+            self._limiter.start(self._limiter.q)
+            self._q, self._velocity = self._limiter.q.copy(), np.zeros(self.arm.n_joints)
+        return True
 
     def _target(self, estimate: ArmEstimate) -> tuple[Pose, Array]:
         """Return where the tool should be now, and the twist (6,) with which that moves."""
@@ -159,7 +168,6 @@ class ModernRetargeter(Retargeter):
             rows=rows,
             max_speed=self._max_speed,
         )
-        velocity[np.abs(velocity) < _STILL] = 0.0
         self._velocity = velocity
         self._q = self._q + self.dt * velocity
 
