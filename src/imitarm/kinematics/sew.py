@@ -1,0 +1,216 @@
+r"""The shoulder-elbow-wrist angle: where the elbow is on its circle about the line from shoulder to wrist.
+
+With seven joints the elbow of an arm can swing while the hand stands still; one angle says where it is, for a person
+and a robot alike. It is measured from a reference direction, and no choice of it is without a singularity
+(Elias and Wen 2024): the ``"conventional"`` angle, from a fixed vector v, is lost when the wrist is anywhere on the line
+through the shoulder along v; the ``"stereographic"`` one only when it is on one half of it, and that half can point
+where no wrist goes. Here it points behind the base (METHODS A.9).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError, UnknownNameError
+
+Array = NDArray[np.float64]
+# Three components, either floats or arrays of one shape: the same formulas serve one instant and many.
+Vector = tuple[Any, Any, Any]
+
+BEHIND = (-1.0, 0.0, 0.0)
+"""Where the stereographic angle is lost: the wrist straight behind the shoulder, base frame."""
+UP = (0.0, 0.0, 1.0)
+"""An elbow that hangs straight down has the angle pi, one that is lifted straight up 0 (wrist in front)."""
+_LOST = 1e-12  # squared sine below which an angle is only rounding
+
+
+class SewAngle(NamedTuple):
+    """The angle of one or many arms and how it changes.
+
+    Attributes:
+        angle: in (-pi, pi], shape (...) [rad].
+        shoulder: derivative by the shoulder's position, shape (..., 3) [rad/m].
+        elbow: derivative by the elbow's, shape (..., 3) [rad/m].
+        wrist: derivative by the wrist's, shape (..., 3) [rad/m].
+        bend: squared sine of the angle at the elbow, shape (...); 0 where the arm is straight and the angle is lost.
+        reference: squared length of the reference direction, shape (...); 0 where that is lost.
+    """
+
+    angle: Any
+    shoulder: Any
+    elbow: Any
+    wrist: Any
+    bend: Any
+    reference: Any
+
+
+def sew_angle(
+    shoulder: ArrayLike, elbow: ArrayLike, wrist: ArrayLike, *, convention: str = "stereographic"
+) -> NDArray[np.float64]:
+    r"""Return the angle of the elbow about the line from shoulder to wrist.
+
+    With :math:`\hat w` the direction from shoulder to wrist, e that from shoulder to elbow, :math:`e_t` behind the
+    base and :math:`e_r` up, the stereographic angle is measured from :math:`e_x`:
+
+    .. math::
+        k_r = (\hat w - e_t) \times e_r, \quad k_x = k_r \times (W - S), \quad e_x = k_x / |k_x|, \quad
+        \psi = \mathrm{atan2}(\hat w \cdot (e_x \times e),\; e_x \cdot e)
+
+    The conventional one is measured from the part of :math:`e_r` that is at right angles to :math:`\hat w`. Both are
+    positive when the elbow turns right-handed about the direction to the wrist.
+
+    Args:
+        shoulder: shape (..., 3) [m], in a frame with x ahead and z up.
+        elbow: shape (..., 3) [m].
+        wrist: shape (..., 3) [m].
+        convention: ``"stereographic"`` or ``"conventional"``.
+
+    Returns:
+        shape (...) [rad], in [-pi, pi]; nan where the angle is lost (a straight arm) or a point is nan.
+
+    Raises:
+        UnknownNameError: when the convention is not known.
+        InputError: when the points are not of three coordinates.
+    """
+    return np.asarray(sew_derivatives(shoulder, elbow, wrist, convention=convention).angle, dtype=float)
+
+
+def sew_derivatives(
+    shoulder: ArrayLike, elbow: ArrayLike, wrist: ArrayLike, *, convention: str = "stereographic"
+) -> SewAngle:
+    """Return what :func:`sew_angle` does, and its derivatives by the three points; same arguments."""
+    formula = _formula(convention)
+    points = [np.asarray(point, dtype=float) for point in (shoulder, elbow, wrist)]
+    if any(point.shape[-1:] != (3,) for point in points):
+        shapes = ", ".join(str(point.shape) for point in points)
+        raise InputError(f"sew_angle: shoulder, elbow and wrist need 3 coordinates each, got shapes {shapes}")
+    s, e, w = np.broadcast_arrays(*points)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = formula(np, _components(e - s), _components(w - s))
+    known = (found.bend > _LOST) & (found.reference > _LOST)
+    gradients = [np.stack(gradient, axis=-1) for gradient in (found.shoulder, found.elbow, found.wrist)]
+    return SewAngle(np.where(known, found.angle, math.nan), *gradients, found.bend, found.reference)
+
+
+def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereographic") -> tuple[float, Array]:
+    """Return the angle of an arm in one posture and its Jacobian.
+
+    Args:
+        points: of shoulder, elbow and wrist, shape (3, 3) [m], as from ``ArmModel.sew_points``.
+        jacobians: theirs, shape (3, 3, n), as from ``ArmModel.sew_jacobians``.
+        convention: as for :func:`sew_angle`.
+
+    Returns:
+        angle [rad] and its Jacobian, shape (n,); nan where the angle is lost.
+    """
+    found = one_angle(points, convention)
+    if found is None:
+        return math.nan, np.full(jacobians.shape[-1], math.nan)
+    gradient = np.array(found.shoulder + found.elbow + found.wrist)
+    return found.angle, gradient.dot(jacobians.reshape(9, -1))
+
+
+def one_angle(points: Array, convention: str = "stereographic") -> SewAngle | None:
+    """Return the angle of one arm with derivatives as triples of floats, many times quicker than for arrays.
+
+    Args:
+        points: of shoulder, elbow and wrist, shape (3, 3) [m].
+        convention: as for :func:`sew_angle`.
+
+    Returns:
+        None where the angle is lost.
+    """
+    (sx, sy, sz), (ex, ey, ez), (wx, wy, wz) = points.tolist()
+    try:
+        found = _formula(convention)(math, (ex - sx, ey - sy, ez - sz), (wx - sx, wy - sy, wz - sz))
+    except ZeroDivisionError:
+        return None
+    return found if found.bend > _LOST and found.reference > _LOST else None
+
+
+def _stereographic(m: Any, e: Vector, w: Vector) -> SewAngle:
+    """Value and derivatives (METHODS A.9), verified by finite differences."""
+    length = m.sqrt(_dot(w, w))
+    along = _times(1.0 / length, w)
+    to_wrist = _dot(along, e)
+    p = _minus(e, _times(to_wrist, along))
+    p_squared = _dot(p, p)
+    k_r = _cross(_minus(along, BEHIND), UP)
+    k_x = _cross(k_r, w)
+    k_squared = _dot(k_x, k_x)
+    per_k = 1.0 / m.sqrt(k_squared)
+    e_x = _times(per_k, k_x)
+    e_y = _cross(along, e_x)
+    angle = m.atan2(_dot(e_y, e), _dot(e_x, e)) if m is math else m.arctan2(_dot(e_y, e), _dot(e_x, e))
+    by_elbow = _times(1.0 / p_squared, _cross(along, p))
+    turn = _cross(UP, _cross(w, e_y))  # the reference turns with the direction to the wrist ...
+    turn = _times(1.0 / length, _minus(turn, _times(_dot(along, turn), along)))
+    swing = _cross(e_y, k_r)  # ... and with the wrist itself
+    by_wrist = _minus(_times(-to_wrist / length, by_elbow), _times(per_k, _plus(turn, swing)))
+    return _found(angle, by_elbow, by_wrist, e, w, length, p_squared, k_squared / (length * length))
+
+
+def _conventional(m: Any, e: Vector, w: Vector) -> SewAngle:
+    """The same from a fixed direction."""
+    length = m.sqrt(_dot(w, w))
+    along = _times(1.0 / length, w)
+    to_wrist, to_up = _dot(along, e), _dot(along, UP)
+    p, reference = _minus(e, _times(to_wrist, along)), _minus(UP, _times(to_up, along))
+    p_squared, squared = _dot(p, p), _dot(reference, reference)
+    y, x = _dot(along, _cross(reference, p)), _dot(reference, p)
+    angle = m.atan2(y, x) if m is math else m.arctan2(y, x)
+    by_elbow = _times(1.0 / p_squared, _cross(along, p))
+    turn = _times(to_up / squared, _cross(along, reference))
+    by_wrist = _times(1.0 / length, _minus(turn, _times(to_wrist, by_elbow)))
+    return _found(angle, by_elbow, by_wrist, e, w, length, p_squared, squared)
+
+
+def _found(
+    angle: Any, by_elbow: Vector, by_wrist: Vector, e: Vector, w: Vector, length: Any, p_squared: Any, reference: Any
+) -> SewAngle:
+    forearm = _minus(w, e)
+    bend = p_squared * length * length / (_dot(e, e) * _dot(forearm, forearm))  # |e x f|^2 = |e x w|^2
+    by_shoulder = _times(-1.0, _plus(by_elbow, by_wrist))
+    return SewAngle(angle, by_shoulder, by_elbow, by_wrist, bend, reference)
+
+
+CONVENTIONS: dict[str, Callable[[Any, Vector, Vector], SewAngle]] = {
+    "conventional": _conventional,
+    "stereographic": _stereographic,
+}
+"""Ways to choose the direction from which the angle is measured."""
+
+
+def _formula(convention: str) -> Callable[[Any, Vector, Vector], SewAngle]:
+    if convention not in CONVENTIONS:
+        raise UnknownNameError.among("convention of the SEW angle", convention, CONVENTIONS)
+    return CONVENTIONS[convention]
+
+
+def _components(vectors: Array) -> Vector:
+    return vectors[..., 0], vectors[..., 1], vectors[..., 2]
+
+
+def _dot(a: Vector, b: Vector) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _plus(a: Vector, b: Vector) -> Vector:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _minus(a: Vector, b: Vector) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def _times(factor: Any, a: Vector) -> Vector:
+    return factor * a[0], factor * a[1], factor * a[2]
