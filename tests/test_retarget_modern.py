@@ -80,7 +80,7 @@ def test_it_is_less_than_80_ms_late():
 
 
 def state_at(run, time):
-    return run.states[int(round(time / DT))]
+    return run.states[round(time / DT)]
 
 
 def test_a_loss_of_sight_is_coasted_held_and_stopped_and_needs_a_new_hold():
@@ -148,7 +148,7 @@ def test_an_arm_that_was_pushed_while_waiting_starts_where_it_is():
 
 def test_what_stands_in_the_way_is_not_touched():
     arm = ARMS["sawyer"]
-    person, truth, frames = recording(1, sigma=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
+    person, _, frames = recording(1, sigma=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
     correspondence = Correspondence(lengths=lengths(person), orientation="fixed")
     free = ModernRetargeter(arm, correspondence).run(frames)
     tool, _ = arm.tool_path(free.joints)

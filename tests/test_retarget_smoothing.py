@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from imitarm import InputError
 from imitarm.kinematics.pose import quaternion_exp, quaternion_log
@@ -36,8 +37,6 @@ def test_units_are_metres_a_beta_meant_for_millimetres_does_nothing():
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_it_is_the_same_in_every_direction(seed):
-    from scipy.spatial.transform import Rotation
-
     rng = np.random.default_rng(seed)
     turn = Rotation.random(random_state=int(seed % 10000)).as_matrix()
     plain, turned = OneEuro(), OneEuro()

@@ -91,8 +91,9 @@ class ArmEstimator:
         self._closed: bool | None = None
         self._learning: list[Skeleton] = []
         self.lengths: LimbLengths | None = self.correspondence.lengths
-        for part in (*self._filters, self._turn, self._guard):
-            part.reset()
+        for one in (*self._filters, self._turn):
+            one.reset()
+        self._guard.reset()
 
     def update(self, skeleton: Skeleton) -> ArmEstimate | None:
         """Take in the next skeleton; None when its arm is lost, impossible, not newer, or of unknown length yet."""

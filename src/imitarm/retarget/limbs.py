@@ -136,9 +136,9 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
 
     .. math:: \min \sum_j c_j |x_j - \tilde x_j|^2 \quad\text{s.t.}\quad |E - S| = L_U,\; |W - E| = L_F
 
-    by a few steps of Gauss and Newton, each with its 2 x 2 system for the multipliers. :func:`correct_limbs` is the case
-    in which the shoulder is exact and of the rest only the directions count: it carries the error of the elbow and
-    the shoulder to the wrist.
+    by a few steps of Gauss and Newton, each with its 2 x 2 system for the multipliers. :func:`correct_limbs` is the
+    case in which the shoulder is exact and of the rest only the directions count: it carries the errors of shoulder
+    and elbow to the wrist.
 
     Args:
         points: shoulder, elbow, wrist, shape (3, 3) [m].

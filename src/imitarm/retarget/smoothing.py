@@ -28,9 +28,10 @@ class OneEuro:
 
     .. math:: \hat x \leftarrow \hat x + \alpha(f_c)\,(x - \hat x), \qquad f_c = f_{min} + \beta\,|\hat{\dot x}|
 
-    The speed is that of the vector, not of each axis, so the filter is the same in every direction. It is taken from two
-    measured values; the usual difference to the smoothed value before holds the filter's own lag, and comes out too
-    large (by 40 % on a steady motion at 30 Hz), which matters to whoever leads with it. A value with a confidence c below 1 is taken over by c times as much.
+    The speed is that of the vector, not of each axis, so the filter is the same in every direction. It is taken from
+    two measured values; the usual difference to the smoothed value before holds the filter's own lag, and comes out
+    too large (by 40 % on a steady motion at 30 Hz), which matters to whoever leads with it. A value with a confidence
+    c below 1 is taken over by c times as much.
 
     Args:
         min_cutoff: cut-off at rest [Hz].
