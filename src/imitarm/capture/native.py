@@ -45,12 +45,12 @@ def header(source: str, frames: str) -> str:
     remarks = {
         "format": FORMAT,
         "version": VERSION,
+        "frames": f"{frames:<20}",
         "units": "m s",
         "frame": "sensor: x to its left, y up, z away from it",
         "tracking": "0 lost, 1 inferred, 2 tracked",
         "hands": ", ".join(f"{state.value} {state.name.lower().replace('_', ' ')}" for state in HandState),
         "source": " ".join(source.split()),
-        "frames": f"{frames:<20}",
     }
     lines = [f"# {key}: {value}" for key, value in remarks.items()]
     return "\n".join([*lines, ",".join(NAMES), ""])
@@ -152,8 +152,8 @@ def assembled(
     return skeletons, _far(table, times, far)
 
 
-def _refuse(table: Table, bad: NDArray[np.bool_], what: str) -> None:
-    if bad.any():
+def _refuse(table: Table, bad: NDArray[np.bool_] | np.bool_, what: str) -> None:
+    if np.any(bad):
         line = int(table.lines[np.argmax(bad)])
         raise FileFormatError(f"{table.path}, line {line}: {what}; mend or remove that line")
 

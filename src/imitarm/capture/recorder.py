@@ -45,6 +45,8 @@ class SkeletonRecorder:
             raise InputError(f"{path}: is there already; name another file, or say that it may be replaced")
         try:
             self._file: TextIOWrapper | None = self._part.open("x", encoding="utf-8", newline="\n")
+            self._file.write(header(source, UNFINISHED))
+            self._file.flush()
         except FileExistsError as error:
             raise InputError(
                 f"{self._part}: was left by a recording that was not closed, or is being written; read it and save it "
@@ -53,8 +55,6 @@ class SkeletonRecorder:
         except OSError as error:
             raise InputError(f"{self._part}: can't be written: {error.strerror or error}") from error
         self._source = source
-        self._file.write(header(source, UNFINISHED))
-        self._file.flush()
 
     def write(self, skeleton: Skeleton) -> None:
         """Add a skeleton.
