@@ -158,3 +158,17 @@ def test_functions_work_on_any_leading_shape():
     assert p.quaternion_to_matrix(q).shape == (4, 5, 3, 3)
     assert p.matrix_to_quaternion(p.quaternion_to_matrix(q)).shape == (4, 5, 4)
     assert np.allclose(p.rotate(q, v)[2, 3], p.rotate(q[2, 3], v[2, 3]))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1e-9, 1e-3, 1.0, 3.1]))
+def test_one_rotation_is_computed_as_many_are(seed, size):
+    rng = np.random.default_rng(seed)
+    v, other = size * rng.normal(size=3), p.quaternion_exp(rng.normal(size=(1, 3)))[0]
+    q = p.quaternion_exp(v)
+    np.testing.assert_allclose(q, p.quaternion_exp(v[None])[0], atol=1e-15)
+    np.testing.assert_allclose(p.quaternion_log(q), p.quaternion_log(q[None])[0], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(p.quaternion_log(-q), p.quaternion_log(-q[None])[0], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        p.quaternion_multiply(other, q), p.quaternion_multiply(other[None], q[None])[0], atol=1e-15
+    )

@@ -1,12 +1,14 @@
 """Positions and rotations: quaternions (w, x, y, z) as arrays, and the typed :class:`Pose`.
 
-All functions take and return arrays with any leading shape and are vectorised over it.
+All functions take and return arrays with any leading shape and are vectorised over it. Where a control step calls one
+with a single rotation, plain numbers are used: arrays of four take twenty times as long.
 Rotation vectors (axis times angle) are in rad. Twists are ``(6,)``: linear velocity [m/s] first,
 then angular velocity [rad/s], both in the base frame.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,17 +32,17 @@ def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     Returns:
         Quaternions wxyz, shape (..., 4).
     """
-    pw, px, py, pz = np.moveaxis(np.asarray(p, dtype=float), -1, 0)
-    qw, qx, qy, qz = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
-    return np.stack(
-        [
-            pw * qw - px * qx - py * qy - pz * qz,
-            pw * qx + px * qw + py * qz - pz * qy,
-            pw * qy - px * qz + py * qw + pz * qx,
-            pw * qz + px * qy - py * qx + pz * qw,
-        ],
-        axis=-1,
-    )
+    first, second = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
+    single = first.ndim == second.ndim == 1
+    pw, px, py, pz = first.tolist() if single else np.moveaxis(first, -1, 0)
+    qw, qx, qy, qz = second.tolist() if single else np.moveaxis(second, -1, 0)
+    product = [
+        pw * qw - px * qx - py * qy - pz * qz,
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+    ]
+    return np.array(product) if single else np.stack(product, axis=-1)
 
 
 def quaternion_conjugate(q: ArrayLike) -> Array:
@@ -51,6 +53,11 @@ def quaternion_conjugate(q: ArrayLike) -> Array:
 def quaternion_exp(rotation_vector: ArrayLike) -> Array:
     """Return unit quaternions wxyz (..., 4) of rotation vectors (..., 3) [rad]."""
     v = np.asarray(rotation_vector, dtype=float)
+    if v.ndim == 1:
+        x, y, z = v.tolist()
+        a = 0.5 * math.sqrt(x * x + y * y + z * z)
+        share = 0.5 * math.sin(a) / a if a > _SMALL_ANGLE else 0.5
+        return np.array([math.cos(a), share * x, share * y, share * z])
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * v], axis=-1)
 
@@ -58,6 +65,12 @@ def quaternion_exp(rotation_vector: ArrayLike) -> Array:
 def quaternion_log(q: ArrayLike) -> Array:
     """Return rotation vectors (..., 3) [rad], length at most pi, of unit quaternions wxyz (..., 4)."""
     q = np.asarray(q, dtype=float)
+    if q.ndim == 1:
+        w, x, y, z = q.tolist()
+        s = math.sqrt(x * x + y * y + z * z)
+        share = 2.0 * math.atan2(s, abs(w)) / s if s > _SMALL_ANGLE else 2.0
+        share = share if w >= 0.0 else -share
+        return np.array([share * x, share * y, share * z])
     q = np.where(q[..., :1] < 0.0, -q, q)  # q and -q are one rotation: take the short way
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, q[..., :1])
