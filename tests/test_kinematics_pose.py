@@ -172,3 +172,5 @@ def test_one_rotation_is_computed_as_many_are(seed, size):
     np.testing.assert_allclose(
         p.quaternion_multiply(other, q), p.quaternion_multiply(other[None], q[None])[0], atol=1e-15
     )
+    m = p.quaternion_to_matrix(q)
+    np.testing.assert_allclose(p.matrix_to_quaternion(m), p.matrix_to_quaternion(m[None])[0], atol=1e-15)

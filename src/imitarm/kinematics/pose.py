@@ -96,6 +96,8 @@ def matrix_to_quaternion(matrix: ArrayLike) -> Array:
     (the usual trace formula loses all digits near 180 degrees).
     """
     m = np.asarray(matrix, dtype=float)
+    if m.ndim == 2:
+        return _largest_column(m)
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
@@ -112,6 +114,21 @@ def matrix_to_quaternion(matrix: ArrayLike) -> Array:
     q = np.take_along_axis(columns, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0.0, -q, q)
+
+
+def _largest_column(m: Array) -> Array:
+    """Do what :func:`matrix_to_quaternion` does, for one matrix (3, 3)."""
+    (a, b, c), (d, e, f), (g, h, i) = m.tolist()
+    diagonal = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
+    best = diagonal.index(max(diagonal))
+    q = (
+        (diagonal[0], h - f, c - g, d - b),
+        (h - f, diagonal[1], b + d, c + g),
+        (c - g, b + d, diagonal[2], f + h),
+        (d - b, c + g, f + h, diagonal[3]),
+    )[best]
+    length = math.copysign(math.sqrt(sum(x * x for x in q)), q[0])
+    return np.array(q) / length
 
 
 def rotate(q: ArrayLike, vectors: ArrayLike) -> Array:

@@ -46,6 +46,8 @@ class JerkLimiter:
         self._jerk_step = arm.max_acceleration * (dt / rise_time)
         self.max_jerk = arm.max_acceleration / rise_time
         self._ends = np.stack([arm.upper, -arm.lower])
+        self._sign = np.array([[1.0], [-1.0]])
+        self._half_squared, self._double = 0.25 * np.square(self._step), 2.0 * arm.max_acceleration
         self.start(arm.home)
 
     def start(self, q: ArrayLike) -> None:
@@ -78,10 +80,10 @@ class JerkLimiter:
 
     def _box(self) -> tuple[Array, Array]:
         """Return the least and largest velocity from which each joint can still stop before its limits."""
-        moved = np.stack([self.velocity, -self.velocity])
-        way = self._ends - np.stack([self.q, -self.q]) - (0.5 * self._dt) * moved
-        half = 0.5 * self._step
-        bound = np.sqrt(half * half + 2.0 * self._a_max * np.maximum(way, 0.0)) - half
+        # both directions at once: row 0 upwards, row 1 downwards, where up is what is down in row 0
+        moved = self._sign * self.velocity
+        way = self._ends - self._sign * self.q - (0.5 * self._dt) * moved
+        bound = np.sqrt(self._half_squared + self._double * np.maximum(way, 0.0)) - 0.5 * self._step
         bound = bound + np.minimum(way, 0.0) * (2.0 / self._dt)  # the speed already had leads beyond: it must turn
         bound = np.minimum(np.maximum(bound, moved - self._step), moved + self._step)
         bound = np.minimum(bound, self._v_max)

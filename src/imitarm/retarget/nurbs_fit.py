@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,31 +44,36 @@ def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
     return np.concatenate([np.full(degree + 1, u[0]), between, np.full(degree + 1, u[-1])])
 
 
-class _Problem(NamedTuple):
-    """The samples and the basis functions at them."""
+class _Problem:
+    """The samples, the basis functions at them, and all of the normal equations that no confidence changes."""
 
-    first: Indices  # (k,)
-    values: Array  # (k, degree + 1), rational ones
-    points: Array  # (k, d)
-    n_control: int
+    def __init__(self, first: Indices, values: Array, points: Array, n_control: int) -> None:
+        self.first, self.values, self.points, self.n_control = first, values, points, n_control
+        self.order, self.dim = order, dim = values.shape[1], points.shape[1]
+        self.reached = first[:, None] + np.arange(order)  # which control points each sample depends on
+        pairs = [(a, b) for a in range(order) for b in range(a + 1)]
+        a, b = (np.array(x) for x in zip(*pairs, strict=True))
+        self._cells = ((a - b) * n_control + self.reached[:, b]).ravel()
+        self._products = values[:, a] * values[:, b]
+        self._places = (self.reached[:, :, None] * dim + np.arange(dim)).ravel()
+        self._moments = (values[:, :, None] * points[:, None, :]).reshape(len(first), -1)
+        self.bend = _bend_band(n_control, order)
 
     def normal(self, confidence: Array) -> tuple[Array, Array]:
         """Return the lower band of R^T C R, shape (degree + 1, n), and R^T C Q, shape (n, d)."""
-        n, order, dim = self.n_control, self.values.shape[1], self.points.shape[1]
-        a, b = np.tril_indices(order)
-        scaled = self.values * confidence[:, None]
-        index = ((a - b) * n + b) + self.first[:, None]
-        band = np.bincount(index.ravel(), (scaled[:, a] * self.values[:, b]).ravel(), order * n).reshape(order, n)
-        where = (self.first[:, None] + np.arange(order))[:, :, None] * dim + np.arange(dim)
-        right = np.bincount(where.ravel(), (scaled[:, :, None] * self.points[:, None, :]).ravel(), n * dim)
-        return np.asarray(band, dtype=float), np.asarray(right.reshape(n, dim), dtype=float)
+        c, n, order, dim = confidence[:, None], self.n_control, self.order, self.dim
+        band = np.bincount(self._cells, (c * self._products).ravel(), order * n)
+        right = np.bincount(self._places, (c * self._moments).ravel(), n * dim)
+        return np.asarray(band.reshape(order, n), dtype=float), np.asarray(right.reshape(n, dim), dtype=float)
 
     def residual(self, control: Array) -> Array:
         """Return R P - Q, shape (k, d)."""
-        order = self.values.shape[1]
-        return np.asarray(
-            np.einsum("ka,kad->kd", self.values, control[self.first[:, None] + np.arange(order)]) - self.points
-        )
+        return np.asarray((self.values[:, None, :] @ control[self.reached])[:, 0] - self.points)
+
+    def with_weights(self, weights: Array) -> _Problem:
+        """Return the same samples for a rational curve with weights (n,)."""
+        weighted = self.values * weights[self.reached]
+        return _Problem(self.first, weighted / weighted.sum(axis=1, keepdims=True), self.points, self.n_control)
 
 
 def fit_nurbs(
@@ -132,7 +136,7 @@ def fit_nurbs(
     weights = np.ones(n)
     if rational:
         weights = _rational_weights(problem, used, mu)
-        problem = problem._replace(values=_with_weights(first, values, weights))
+        problem = problem.with_weights(weights)
         control = _solve(problem, used, mu)
     return NURBS(knots, control, weights, degree)
 
@@ -182,7 +186,7 @@ def _bend_band(n: int, order: int) -> Array:
 
 def _system(problem: _Problem, confidence: Array, mu: float) -> tuple[Array, Array, Array]:
     band, right = problem.normal(confidence)
-    system = band + mu * _bend_band(problem.n_control, len(band))
+    system = band + mu * problem.bend
     system[0] += 1e-12 * float(system[0].max())  # where nothing was seen and nothing is smoothed: stay finite
     return band, system, right
 
@@ -242,20 +246,15 @@ def _least(score: Callable[[float], float]) -> float:
     return float(10.0 ** float(finer.x))
 
 
-def _with_weights(first: Indices, values: Array, weights: Array) -> Array:
-    weighted = values * weights[first[:, None] + np.arange(values.shape[1])]
-    return np.asarray(weighted / weighted.sum(axis=1, keepdims=True))
-
-
 def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
     r"""Return weights w (n,), mean 1, by least squares that are reweighted by the last denominator.
 
     :math:`\sum_k \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is quadratic in
     both; X is eliminated, and of all w that do as well the one nearest to ones is taken.
     """
-    n, order = problem.n_control, problem.values.shape[1]
+    n = problem.n_control
     basis = np.zeros((len(problem.first), n))
-    np.put_along_axis(basis, problem.first[:, None] + np.arange(order), problem.values, axis=1)
+    np.put_along_axis(basis, problem.reached, problem.values, axis=1)
     middle = problem.points - problem.points.mean(axis=0)  # the origin must not matter
     weights = np.ones(n)
     bend = np.diff(np.eye(n), 2, axis=0)

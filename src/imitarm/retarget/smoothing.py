@@ -138,6 +138,8 @@ class Hampel:
         if len(seen) < 4:
             return True
         values = np.array([value for _, value in seen])
-        middle = np.median(values, axis=0)
-        away = np.sqrt(np.sum(np.square(values - middle), axis=1))
-        return bool(away[-1] <= max(4.0 * 1.4826 * float(np.median(away)), self.least))
+        half = len(values) // 2
+        middle = np.sort(values, axis=0)[half]  # np.median takes ten times as long on so few values
+        difference = values - middle
+        away = np.sqrt(np.einsum("ij,ij->i", difference, difference)).tolist()
+        return bool(away[-1] <= max(4.0 * 1.4826 * sorted(away)[half], self.least))
