@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from imitarm.capture.skeleton import JOINT, JOINTS, SIDES, Skeleton, SkeletonSource, Tracking
 
+Array = NDArray[np.float64]
+
 MEMORY = 0.5  # [s] where a joint was longer ago says nothing about where it is
 _TRUNK_SPEED, _ARM_SPEED = 0.5, 4.0  # [m/s] exchanged sides appear faster
 _LEAST = 0.15  # [m] sides nearer to each other than half of this can't be told apart by their motion
@@ -24,6 +26,8 @@ _ARMS = (  # what is exchanged together, and what decides it
     (_pairs(("elbow", "wrist", "hand", "hand_tip", "thumb")), _pairs(("elbow", "wrist"))),
     (_pairs(("wrist", "hand", "hand_tip", "thumb")), _pairs(("wrist",))),
 )
+
+_JUDGED = _pairs(("shoulder", "hip", "elbow", "wrist"))
 
 
 def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
@@ -46,48 +50,49 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     Returns:
         the same skeleton when nothing was exchanged.
     """
-    period = abs(skeleton.time - before.time)
+    return _kept(skeleton, before.positions, abs(skeleton.time - before.time))
+
+
+def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
+    """Return the skeleton with its sides as they were at ``before``, positions (25, 3) [m], a ``period`` [s] ago."""
+    if not (_gain(skeleton.positions, before, _JUDGED, _LEAST) > 0.0).any():  # nearly always
+        return skeleton
     order = np.arange(len(JOINTS))
-    body = _nearer_exchanged(skeleton.positions, before.positions, _TRUNK, max(_LEAST, _TRUNK_SPEED * period))
+    trunk = np.nansum(_gain(skeleton.positions, before, _TRUNK, max(_LEAST, _TRUNK_SPEED * period)))
+    hands = body = bool(trunk > 0.0)
     if body:
         order[_BODY.ravel()] = _BODY[::-1].ravel()
-    hands, margin = body, max(_LEAST, _ARM_SPEED * period)
     for arms, judged in _ARMS:
-        if _nearer_exchanged(skeleton.positions[order], before.positions, judged, margin, every=True):
+        gain = _gain(skeleton.positions[order], before, judged, max(_LEAST, _ARM_SPEED * period))
+        known = np.isfinite(gain)
+        if known.any(axis=0).all() and (np.where(known, gain, 0.0).sum(axis=0) > 0.0).all():
             order[arms.ravel()] = order[arms[::-1].ravel()]
             hands = not hands
             break
-    if not body and not hands:
+    if (order == np.arange(len(JOINTS))).all():
         return skeleton
     left, right = skeleton.hand_states
     states = (right, left) if hands else (left, right)
     return Skeleton(skeleton.time, skeleton.positions[order], skeleton.tracking[order], states, skeleton.person)
 
 
-def _nearer_exchanged(
-    now: NDArray[np.float64], before: NDArray[np.float64], pairs: NDArray[np.int64], margin: float, every: bool = False
-) -> bool:
-    """Whether joints are nearer to where those of the other side were.
+def _gain(now: Array, before: Array, pairs: NDArray[np.int64], margin: float) -> Array:
+    """Return by how much more joints are nearer to where those of the other side were than ``margin`` / 2 [m].
 
     Args:
         now: positions (25, 3) [m].
         before: likewise.
         pairs: joints of the left and the right side, shape (2, n).
-        margin: for each joint [m].
-        every: of each pair, not only of all together.
+        margin: for each pair [m].
+
+    Returns:
+        shape (2, n); nan where a joint is lost, or one of its pair was.
     """
     there, here = before[pairs], now[pairs]
-    straight = np.sqrt(np.sum((here - there) ** 2, axis=2))
-    crossed = np.sqrt(np.sum((here - there[::-1]) ** 2, axis=2))
-    gain = straight - crossed - 0.5 * margin
-    known = np.isfinite(gain)
-    known &= np.isfinite(there).all(axis=(0, 2))  # a joint that was lost before on one side says nothing
-    if not known.any():
-        return False
-    by_pair = np.where(known, gain, 0.0).sum(axis=0)
-    if every:
-        return bool((by_pair[known.any(axis=0)] > 0.0).all() and known.any(axis=0).all())
-    return bool(by_pair.sum() > 0.0)
+    straight, crossed = here - there, here - there[::-1]
+    straight *= straight
+    crossed *= crossed
+    return np.sqrt(straight.sum(axis=2)) - np.sqrt(crossed.sum(axis=2)) - 0.5 * margin
 
 
 class SideMemory:
@@ -99,29 +104,22 @@ class SideMemory:
 
     def __init__(self) -> None:
         self.swaps = 0
-        self._before: Skeleton | None = None
+        self._time = -np.inf
+        self._positions = np.full((len(JOINTS), 3), np.nan)  # where each joint was last, for as long as that counts
         self._seen = np.full(len(JOINTS), -np.inf)
 
     def update(self, skeleton: Skeleton) -> Skeleton:
         """Return the next skeleton with its sides right."""
         right = skeleton
-        if self._before is not None and abs(skeleton.time - self._before.time) <= MEMORY:
-            right = unswapped(skeleton, self._before)
+        period = abs(skeleton.time - self._time)
+        if period <= MEMORY:
+            right = _kept(skeleton, self._positions, period)
             self.swaps += right is not skeleton
-        self._remember(right)
+        seen = right.tracking > Tracking.LOST
+        self._positions[seen], self._seen[seen] = right.positions[seen], right.time
+        self._positions[np.abs(right.time - self._seen) > MEMORY] = np.nan
+        self._time = right.time
         return right
-
-    def _remember(self, skeleton: Skeleton) -> None:
-        """Keep where each joint was last, for as long as that counts."""
-        lost = skeleton.tracking == Tracking.LOST
-        self._seen[~lost] = skeleton.time
-        recent = lost & (np.abs(skeleton.time - self._seen) <= MEMORY)
-        if self._before is None or not recent.any():
-            self._before = skeleton
-            return
-        positions, tracking = np.array(skeleton.positions), np.array(skeleton.tracking)
-        positions[recent], tracking[recent] = self._before.positions[recent], Tracking.INFERRED
-        self._before = Skeleton(skeleton.time, positions, tracking, skeleton.hand_states, skeleton.person)
 
 
 class SwapGuard(SkeletonSource):
