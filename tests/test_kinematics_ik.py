@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from imitarm.errors import InputError, UnknownNameError
-from imitarm.kinematics import ik
+from imitarm.kinematics import ik, ik_methods
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik import METHODS, clearance_rows, solve_ik, solve_ik_step
+from imitarm.kinematics.ik import METHODS, IKSolver, clearance_rows, solve_ik, solve_ik_step
 from imitarm.kinematics.pose import Pose
 
 ARMS = {name: ArmModel.load(name, tool="brush") for name in ("sawyer", "panda")}
@@ -108,7 +108,7 @@ def test_baerlocher_damping_keeps_the_norm_of_the_scaled_velocity(seed):
     q = rng.uniform(SAWYER.lower, SAWYER.upper)
     q[rng.random(7) < 0.4] = 0.0
     twist = rng.normal(size=6) * 10.0 ** rng.uniform(-3, 2)
-    task = ik._task(SAWYER, q, twist, "dls", DT, "tool", None, None, 1.0, None, 1e9, None)
+    task = IKSolver(SAWYER, "dls", dt=DT, max_speed=1e9).task(q, twist)
     free = task._replace(lower=np.full(7, -np.inf), upper=np.full(7, np.inf))
     squares, basis = np.linalg.eigh((scaled := task.jacobian * task.max_velocity) @ scaled.T)
     least, d = np.sqrt(max(squares[0], 0.0)), np.linalg.norm(task.twist)
@@ -125,7 +125,7 @@ def test_the_thesis_small_angle_term_weakens_the_damping():
     for _ in range(2000):
         q, twist = rng.uniform(SAWYER.lower, SAWYER.upper), rng.normal(size=6)
         for variant, found in norms.items():
-            task = ik._task(SAWYER, q, twist, "dls", DT, "tool", None, None, 1.0, None, 10.0, variant)
+            task = IKSolver(SAWYER, "dls", dt=DT, max_speed=10.0, small_angle=variant).task(q, twist)
             free = task._replace(lower=np.full(7, -np.inf), upper=np.full(7, np.inf))
             found.append(np.linalg.norm(METHODS["dls"](free) / SAWYER.max_velocity))
     assert max(norms[None]) <= 1.0 + 1e-9
@@ -149,12 +149,14 @@ def test_the_quadratic_program_finds_the_least_cost(seed):
     rng = np.random.default_rng(seed)
     q = rng.uniform(SAWYER.lower, SAWYER.upper)
     before = 0.3 * rng.normal(size=7)
-    task = ik._task(SAWYER, q, rng.normal(size=6), "qp", DT, "tool", before, SAWYER.home, 1.0, None, 1.0, None)
+    task = IKSolver(SAWYER, dt=DT, max_speed=1.0).task(q, rng.normal(size=6), velocity=before, q_ref=SAWYER.home)
 
     def cost(v):
         miss = task.jacobian @ v - task.twist
         regular = (
-            ik._EFFORT * v @ v + ik._CHANGE * np.sum((v - before) ** 2) + ik._POSTURE * np.sum((v - task.posture) ** 2)
+            ik_methods._EFFORT * v @ v
+            + ik_methods._CHANGE * np.sum((v - before) ** 2)
+            + ik_methods._POSTURE * np.sum((v - task.posture) ** 2)
         )
         return 0.5 * (miss @ miss + regular)
 

@@ -19,7 +19,7 @@ def wrapped(angle):
 
 
 def arm_with_elbow_at(angle, wrist, *, reach=0.4):
-    """Put the elbow on its circle by a rotation about the line to the wrist, from the side that is as high as can be."""
+    """Put the elbow on its circle by a rotation about the line to the wrist, from where it is highest."""
     along = wrist / np.linalg.norm(wrist)
     up = np.array([0, 0, 1.0]) - along * along[2]
     up /= np.linalg.norm(up)

@@ -2,8 +2,8 @@ r"""The shoulder-elbow-wrist angle: where the elbow is on its circle about the l
 
 With seven joints the elbow of an arm can swing while the hand stands still; one angle says where it is, for a person
 and a robot alike. It is measured from a reference direction, and no choice of it is without a singularity
-(Elias and Wen 2024): the ``"conventional"`` angle, from a fixed vector v, is lost when the wrist is anywhere on the line
-through the shoulder along v; the ``"stereographic"`` one only when it is on one half of it, and that half can point
+(Elias and Wen 2024): the ``"conventional"`` angle, from a fixed vector v, is lost when the wrist is anywhere on the
+line through the shoulder along v; the ``"stereographic"`` one only on one half of that line, which can be made to point
 where no wrist goes. Here it points behind the base (METHODS A.9).
 """
 
@@ -93,8 +93,8 @@ def sew_derivatives(
     with np.errstate(divide="ignore", invalid="ignore"):
         found = formula(np, _components(e - s), _components(w - s))
     known = (found.bend > _LOST) & (found.reference > _LOST)
-    gradients = [np.stack(gradient, axis=-1) for gradient in (found.shoulder, found.elbow, found.wrist)]
-    return SewAngle(np.where(known, found.angle, math.nan), *gradients, found.bend, found.reference)
+    by = [np.stack(gradient, axis=-1) for gradient in (found.shoulder, found.elbow, found.wrist)]
+    return SewAngle(np.where(known, found.angle, math.nan), by[0], by[1], by[2], found.bend, found.reference)
 
 
 def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereographic") -> tuple[float, Array]:

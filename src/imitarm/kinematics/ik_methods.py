@@ -1,0 +1,160 @@
+"""Three ways to choose the joints' velocity for one task; :func:`~imitarm.kinematics.ik.solve_ik` explains them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import daqp
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+Array = NDArray[np.float64]
+
+_NULL = 1e-12  # squared singular values below this belong to directions that the arm can't move in
+_FILTER = 0.06  # [m/rad] SVD filter: directions with a smaller singular value are damped, up to this much
+_EFFORT, _POSTURE, _CHANGE = 1e-5, 1e-4, 1e-6  # weights of the QP beside a task of weight 1
+_WRIST = 0.1  # weight of a violated wrist bound: as much as the tool's turn about that joint
+_SLACK = 1e-6  # reciprocal weight of a violated extra row
+_SOFT = 8  # daqp's mark of a constraint that may be violated at a price
+_CLEAR = 1e-3  # squared singular values above this can be factored without losing half of the digits
+_EYE = np.eye(6)
+
+
+class Task(NamedTuple):
+    """What the methods see: the weighted task, and the box of admissible joint velocities."""
+
+    jacobian: Array  # weighted, (6, n); for the QP with the elbow's row (7, n)
+    twist: Array  # weighted and clamped, (6,) or (7,)
+    lower: Array
+    upper: Array
+    max_velocity: Array
+    previous: Array | None
+    posture: Array | None  # wanted joint velocity (n,) where the task leaves freedom
+    rows: tuple[Array, Array] | None
+    small_angle: str | None
+    wrist: tuple[int, float, float] | None = None  # joint, side and least velocity to that side of the soft bound
+
+
+def quadratic_program(task: Task) -> Array:
+    """Minimise the weighted error of the task inside the box and under the rows."""
+    jacobian, n = task.jacobian, len(task.lower)
+    hessian = jacobian.T.dot(jacobian)
+    linear = task.twist.dot(jacobian)
+    effort = _EFFORT
+    if task.previous is not None:
+        effort += _CHANGE
+        linear += _CHANGE * task.previous
+    if task.posture is not None:
+        effort += _POSTURE
+        linear += _POSTURE * task.posture
+    np.negative(linear, out=linear)
+    hessian.ravel()[:: n + 1] += effort
+    velocity = _least_cost(task, hessian, linear)
+    if task.wrist is not None:
+        joint, side, least = task.wrist
+        if side * velocity[joint] < least:  # the price is convex, so where it is paid at all it stands in full
+            hessian[joint, joint] += _WRIST
+            linear[joint] -= _WRIST * side * least
+            velocity = _least_cost(task, hessian, linear)
+    return velocity
+
+
+def _least_cost(task: Task, hessian: Array, linear: Array) -> Array:
+    """Minimise v^T H v / 2 + f^T v; MuJoCo's projected Newton method needs half of the time where a box is all."""
+    n = len(linear)
+    if task.rows is None:
+        velocity = np.zeros(n)
+        memory = np.empty((n, n + 7))
+        solved = mujoco.mju_boxQP(velocity, memory, None, hessian, linear, task.lower, task.upper) >= 0
+        matrix, upper, lower, sense = np.empty((0, n)), task.upper, task.lower, np.zeros(n, dtype=np.intc)
+    else:
+        solved, (matrix, least) = False, task.rows
+        upper = np.concatenate((task.upper, np.full(len(least), 1e30)))
+        lower = np.concatenate((task.lower, least))
+        sense = np.zeros(n + len(least), dtype=np.intc)
+        sense[n:] = _SOFT
+    if not solved:
+        velocity, _, status, _ = daqp.solve(hessian, linear, matrix, upper, lower, sense, rho_soft=_SLACK)
+        if status <= 0:
+            # the box is never empty and rows are soft: only lost digits can bring us here, and standing is safe
+            velocity = np.zeros(n)
+    velocity = np.maximum(velocity, task.lower)
+    return np.minimum(velocity, task.upper, out=velocity)
+
+
+def damped_least_squares(task: Task) -> Array:
+    """Thesis Eq 3.8 and 3.9: one damping for all directions, as little as keeps the joints' speed in bounds."""
+    scaled = task.jacobian * task.max_velocity
+    gram = scaled.dot(scaled.T)
+    square = float(task.twist.dot(task.twist))
+    plain = task.posture is None and task.small_angle is None
+    if plain and _is_above(gram, max(square, _CLEAR)):
+        return _undamped(task, scaled, gram)
+    squares, basis, _ = lapack.dsyev(gram)
+    least = math.sqrt(max(float(squares[0]), 0.0))
+    d = math.sqrt(square)
+    threshold = d if task.small_angle is None else max(d - 0.5 * least, 0.0)
+    if least >= threshold:
+        damping = 0.0
+    elif least >= 0.5 * threshold:
+        damping = least * (threshold - least)
+    else:
+        damping = 0.25 * threshold * threshold
+    along = task.twist.dot(basis)
+    along /= np.maximum(squares + damping, _NULL)
+    result = basis.dot(along).dot(scaled)
+    result *= task.max_velocity
+    return _within_box(task, result, scaled, squares, basis)
+
+
+def _is_above(gram: Array, bound: float) -> bool:
+    """Return whether all eigenvalues are above ``bound``: then, and only then, a Cholesky factor of the rest exists."""
+    rest = gram - bound * _EYE
+    return mujoco.mju_cholFactor(rest, _NULL) == len(rest)
+
+
+def _undamped(task: Task, scaled: Array, gram: Array) -> Array:
+    """Solve without damping; no joint can then be too fast, since the norm is at most 1 in scaled joints."""
+    along = np.empty(6)
+    mujoco.mju_cholFactor(gram, 0.0)
+    mujoco.mju_cholSolve(along, gram, task.twist)
+    result = along.dot(scaled)
+    result *= task.max_velocity
+    np.maximum(result, task.lower, out=result)
+    return np.minimum(result, task.upper, out=result)
+
+
+def filtered_svd(task: Task) -> Array:
+    """Damp only the directions in which the arm hardly moves (Maciejewski and Klein 1988)."""
+    squares, basis, _ = lapack.dsyev(task.jacobian.dot(task.jacobian.T))
+    squares = np.maximum(squares, 0.0)
+    damping = np.maximum(_FILTER * _FILTER - squares, 0.0)
+    along = task.twist.dot(basis) / np.maximum(squares + damping, _NULL)
+    result = basis.dot(along).dot(task.jacobian)
+    return _within_box(task, result, task.jacobian, squares, basis)
+
+
+def _within_box(task: Task, result: Array, jacobian: Array, squares: Array, basis: Array) -> Array:
+    """Add the drift to the posture in the null space, then keep the limits: direction first, then each joint."""
+    if task.posture is not None:
+        scale = task.max_velocity if jacobian is not task.jacobian else np.ones_like(task.posture)
+        drift = task.posture / scale
+        usable = squares > 1e-8
+        used = (basis.T @ (jacobian @ drift))[usable] / squares[usable]
+        result = result + scale * (drift - jacobian.T @ (basis[:, usable] @ used))
+    excess = float((np.abs(result) / task.max_velocity).max())
+    if excess > 1.0:
+        result = result / excess
+    return np.minimum(np.maximum(result, task.lower), task.upper)
+
+
+METHODS: Mapping[str, Callable[[Task], Array]] = {
+    "dls": damped_least_squares,
+    "qp": quadratic_program,
+    "svd": filtered_svd,
+}
+"""All methods of :func:`~imitarm.kinematics.ik.solve_ik`."""

@@ -1,0 +1,233 @@
+"""IKSolver: inverse kinematics with its options checked once, for a control loop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError, UnknownNameError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.bounds import VelocityBox, WristBound
+from imitarm.kinematics.ik_methods import METHODS, Task
+from imitarm.kinematics.posture import ANGLE_LENGTH
+from imitarm.kinematics.sew import CONVENTIONS, one_angle
+
+Array = NDArray[np.float64]
+Rows = tuple[ArrayLike, ArrayLike]
+
+_WEIGHTS = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
+_COLUMN = _WEIGHTS[:, None]
+_MAX_SPEED = {"dls": 0.6, "qp": 2.0, "svd": 0.6}  # [m/s] clamp of the weighted twist
+_REFERENCE = 0.04  # squared length below which the direction that the elbow's angle is measured from fades
+
+
+@dataclass(frozen=True, eq=False)
+class IKStep:
+    """One step of inverse kinematics and how well it could be done.
+
+    Attributes:
+        velocity: of the joints, shape (n_joints,) [rad/s].
+        error: what is missing of the wanted twist after the clamp, shape (6,) [m/s, rad/s].
+        limited: joints that stand at a bound of velocity, acceleration or position, shape (n_joints,) bool.
+        slack: by how much each extra row is violated, shape (m,); 0 where it holds.
+    """
+
+    velocity: Array
+    error: Array
+    limited: NDArray[np.bool_]
+    slack: Array
+
+
+class ElbowTask(NamedTuple):
+    r"""Where the elbow should be while the tool does its task (METHODS A.9).
+
+    It adds :math:`\tfrac{w}2 (J_\psi v - k\,\mathrm{wrap}(\psi_h - \psi))^2` to the cost of ``"qp"``, with
+    :math:`w = w_\psi c \sin^2\beta`, where :math:`\beta` is the angle at the robot's elbow: the weight fades as the
+    arm gets straight, and near the one direction in which the stereographic angle is lost.
+
+    Attributes:
+        angle: wanted :func:`~imitarm.kinematics.sew.sew_angle` [rad].
+        weight: :math:`w_\psi` [m^2] beside the tool's task, whose weight is 1; 0: the elbow is free.
+        confidence: c, 0 to 1: how surely the wanted angle is known.
+        gain: k [1/s].
+        max_rate: the wanted rate of the angle is cut to this [rad/s].
+        convention: of the angle.
+    """
+
+    angle: float
+    weight: float = 0.05
+    confidence: float = 1.0
+    gain: float = 5.0
+    max_rate: float = 2.0
+    convention: str = "stereographic"
+
+
+class IKSolver:
+    r"""Inverse kinematics of one arm for a control loop: what does not change is checked once.
+
+    ``IKSolver(arm, ...).solve(q, twist)`` is :func:`~imitarm.kinematics.ik.solve_ik`, which explains the methods.
+    It holds nothing of a step before and can be used by several threads.
+
+    Args:
+        arm: the arm.
+        method: ``"qp"``, ``"dls"`` or ``"svd"``.
+        dt: length of the control step [s].
+        frame: what moves, ``"tool"`` or ``"flange"``.
+        posture_gain: how quickly ``q_ref`` is approached [1/s].
+        max_speed: the twist is scaled down to this weighted norm [m/s]; None: 0.6 for ``"dls"`` and ``"svd"``, which
+            need it, and 2.0 for ``"qp"``.
+        small_angle: ``"thesis"`` subtracts half the least singular value from d in ``"dls"`` (METHODS A.8).
+        singularity_bounds: keep the elbow 0.15 rad off its stretched position, always, and (``"qp"`` only) the
+            wrist 0.1 rad off its singular ones, where the task can spare it (METHODS A.8).
+
+    Raises:
+        UnknownNameError: when method, frame or small_angle is not known.
+        InputError: when a number can't be used, or the arm's elbow is not known and ``singularity_bounds`` asked for.
+    """
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        method: str = "qp",
+        *,
+        dt: float = 0.01,
+        frame: str = "tool",
+        posture_gain: float = 1.0,
+        max_speed: float | None = None,
+        small_angle: str | None = None,
+        singularity_bounds: bool = False,
+    ) -> None:
+        if method not in METHODS:
+            raise UnknownNameError.among("IK method", method, METHODS)
+        if frame not in {"tool", "flange"}:
+            raise UnknownNameError.among("frame", frame, ("tool", "flange"))
+        if small_angle not in {None, "thesis"}:
+            raise UnknownNameError.among("small_angle", small_angle, ("thesis", None))
+        if not 0.0 < dt < math.inf:
+            raise InputError(f"solve_ik: dt must be a positive time [s], got {dt}")
+        if not math.isfinite(posture_gain) or not (max_speed is None or max_speed >= 0.0):
+            raise InputError(
+                f"solve_ik: posture_gain must be finite and max_speed not negative, got {posture_gain} and {max_speed}"
+            )
+        self.arm, self.method = arm, method
+        self._solve = METHODS[method]
+        self._jacobian = arm.tool_jacobian if frame == "tool" else arm.jacobian
+        self._max_speed = _MAX_SPEED[method] if max_speed is None else max_speed
+        self._posture_gain, self._small_angle, self._max_velocity = posture_gain, small_angle, arm.max_velocity
+        self._box = VelocityBox(arm, dt, singularity_bounds=singularity_bounds)
+        self._wrist = WristBound(arm, dt) if singularity_bounds and method == "qp" else None
+
+    def solve(
+        self,
+        q: ArrayLike,
+        twist: ArrayLike,
+        *,
+        velocity: ArrayLike | None = None,
+        q_ref: ArrayLike | None = None,
+        rows: Rows | None = None,
+        sew: ElbowTask | None = None,
+    ) -> Array:
+        """Return the joint velocity, shape (n_joints,) [rad/s]; arguments as for ``solve_ik``."""
+        return self._solve(self.task(q, twist, velocity=velocity, q_ref=q_ref, rows=rows, sew=sew))
+
+    def step(
+        self,
+        q: ArrayLike,
+        twist: ArrayLike,
+        *,
+        velocity: ArrayLike | None = None,
+        q_ref: ArrayLike | None = None,
+        rows: Rows | None = None,
+        sew: ElbowTask | None = None,
+    ) -> IKStep:
+        """Do what :meth:`solve` does, and report what could not be done; same arguments."""
+        task = self.task(q, twist, velocity=velocity, q_ref=q_ref, rows=rows, sew=sew)
+        result = self._solve(task)
+        error = (task.twist - task.jacobian @ result)[:6] / _WEIGHTS
+        near = 1e-9 * task.max_velocity
+        limited = (result >= task.upper - near) | (result <= task.lower + near)
+        slack = np.zeros(0) if task.rows is None else np.maximum(0.0, task.rows[1] - task.rows[0] @ result)
+        return IKStep(result, error, limited, slack)
+
+    def task(
+        self,
+        q: ArrayLike,
+        twist: ArrayLike,
+        *,
+        velocity: ArrayLike | None = None,
+        q_ref: ArrayLike | None = None,
+        rows: Rows | None = None,
+        sew: ElbowTask | None = None,
+    ) -> Task:
+        """Check the input and weight the task; same arguments."""
+        wanted = np.array(twist, dtype=float)
+        if wanted.shape != (6,) or not math.isfinite(float(wanted.dot(wanted))):
+            raise InputError(f"solve_ik: twist must be 6 finite numbers (linear, angular), got {twist!r}")
+        position = np.asarray(q, dtype=float)
+        jacobian = self._jacobian(position)
+        jacobian *= _COLUMN
+        wanted *= _WEIGHTS
+        speed = math.sqrt(float(wanted.dot(wanted)))
+        if speed > self._max_speed:
+            wanted *= self._max_speed / speed
+        previous = None if velocity is None else self._joints(velocity, "velocity")
+        lower, upper = self._box.at(position, previous)
+        posture = None
+        if q_ref is not None:
+            posture = self._posture_gain * (self._joints(q_ref, "q_ref") - position)
+            posture = np.minimum(np.maximum(posture, lower), upper)
+        checked = None if rows is None else self._checked_rows(rows)
+        if sew is not None:
+            jacobian, wanted = self._with_elbow(position, jacobian, wanted, sew)
+        wrist = self._wrist
+        near = None if wrist is None else wrist.at(position)
+        bound = None if wrist is None or near is None else (wrist.joint, *near)
+        return Task(
+            jacobian, wanted, lower, upper, self._max_velocity, previous, posture, checked, self._small_angle, bound
+        )
+
+    def _with_elbow(self, q: Array, jacobian: Array, wanted: Array, sew: ElbowTask) -> tuple[Array, Array]:
+        """Add the elbow's row to the task; nothing where its angle is lost."""
+        angle, weight, confidence, gain, max_rate, convention = sew
+        if self.method != "qp":
+            raise InputError(f"solve_ik: method {self.method!r} can't lead the elbow; use method='qp'")
+        if not (math.isfinite(angle) and weight >= 0.0 and confidence >= 0.0 and gain >= 0.0 and max_rate >= 0.0):
+            raise InputError(f"solve_ik: sew needs a finite angle and numbers that are not negative, got {sew!r}")
+        if convention not in CONVENTIONS:
+            raise UnknownNameError.among("convention of the SEW angle", convention, CONVENTIONS)
+        if weight * confidence == 0.0:
+            return jacobian, wanted
+        now = one_angle(self.arm.sew_points(q), convention)
+        if now is None:
+            return jacobian, wanted
+        share = math.sqrt(weight * confidence * now.bend * min(1.0, now.reference / _REFERENCE))
+        rate = gain * math.remainder(angle - now.angle, math.tau)
+        gradient = np.array(now.shoulder + now.elbow + now.wrist)
+        gradient *= share
+        row = gradient.dot(self.arm.sew_jacobians(q).reshape(9, -1))
+        extended, target = np.empty((7, len(row))), np.empty(7)
+        extended[:6], extended[6] = jacobian, row
+        target[:6], target[6] = wanted, share * min(max(rate, -max_rate), max_rate)
+        return extended, target
+
+    def _joints(self, values: ArrayLike, what: str) -> Array:
+        array = np.asarray(values, dtype=float)
+        n = self.arm.n_joints
+        if array.shape != (n,) or not math.isfinite(float(array.dot(array))):
+            raise InputError(f"solve_ik: {what} must be {n} finite numbers, got {values!r}")
+        return array
+
+    def _checked_rows(self, rows: Rows) -> tuple[Array, Array]:
+        if self.method != "qp":
+            raise InputError(f"solve_ik: method {self.method!r} can't keep extra rows; use method='qp'")
+        n = self.arm.n_joints
+        matrix, lower = (np.asarray(part, dtype=float) for part in rows)
+        if lower.ndim != 1 or matrix.shape != (len(lower), n):
+            raise InputError(f"solve_ik: rows need shapes (m, {n}) and (m,), got {matrix.shape}, {lower.shape}")
+        if not (np.isfinite(matrix).all() and np.isfinite(lower).all()):
+            raise InputError("solve_ik: rows must be finite numbers")
+        return matrix, lower
