@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from imitarm.capture import Skeleton, SkeletonSource
     from imitarm.demonstrations import Finding, align, lint, read
     from imitarm.errors import ImitarmError, InfeasibleError, InputError, TaskFailedError, UnreachableError
     from imitarm.kinematics.arm import ArmModel, ArmState
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from imitarm.kinematics.pose import Pose
     from imitarm.policies import ACFRA, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Adaptation, Observation, Policy, adapt
     from imitarm.reproduce import reproduce
+    from imitarm.retarget import RETARGETERS, Correspondence, Retargeter, retarget
     from imitarm.robots import Robot, SimulatedRobot
     from imitarm.scene import (
         Box,
@@ -43,6 +45,7 @@ __all__ = [
     "HORIZONTAL_ONLY",
     "NOT_DOWN",
     "POLICIES",
+    "RETARGETERS",
     "Adaptation",
     "ArmModel",
     "ArmState",
@@ -50,6 +53,7 @@ __all__ = [
     "Capsule",
     "Cone",
     "ConvexHull",
+    "Correspondence",
     "Cylinder",
     "Demonstration",
     "Ellipsoid",
@@ -62,10 +66,13 @@ __all__ = [
     "Obstacle",
     "Policy",
     "Pose",
+    "Retargeter",
     "Robot",
     "Rollout",
     "Scene",
     "SimulatedRobot",
+    "Skeleton",
+    "SkeletonSource",
     "Skill",
     "Sphere",
     "TaskFailedError",
@@ -78,6 +85,7 @@ __all__ = [
     "load_scene",
     "read",
     "reproduce",
+    "retarget",
     "save_scene",
     "solve_ik",
 ]
@@ -91,6 +99,7 @@ _HOME = {
     "Capsule": "imitarm.scene",
     "Cone": "imitarm.scene",
     "ConvexHull": "imitarm.scene",
+    "Correspondence": "imitarm.retarget",
     "Cylinder": "imitarm.scene",
     "DMP": "imitarm.skills",
     "Demonstration": "imitarm.trajectory",
@@ -108,10 +117,14 @@ _HOME = {
     "POLICIES": "imitarm.policies",
     "Policy": "imitarm.policies",
     "Pose": "imitarm.kinematics.pose",
+    "RETARGETERS": "imitarm.retarget",
+    "Retargeter": "imitarm.retarget",
     "Robot": "imitarm.robots",
     "Rollout": "imitarm.trajectory",
     "Scene": "imitarm.scene",
     "SimulatedRobot": "imitarm.robots",
+    "Skeleton": "imitarm.capture",
+    "SkeletonSource": "imitarm.capture",
     "Skill": "imitarm.skills",
     "Sphere": "imitarm.scene",
     "TaskFailedError": "imitarm.errors",
@@ -124,6 +137,7 @@ _HOME = {
     "load_scene": "imitarm.scene",
     "read": "imitarm.demonstrations",
     "reproduce": "imitarm.reproduce",
+    "retarget": "imitarm.retarget",
     "save_scene": "imitarm.scene",
     "solve_ik": "imitarm.kinematics.ik",
 }
