@@ -22,6 +22,14 @@ Array = NDArray[np.float64]
 AXES = ("z", "y", "x", "y", "x", "y", "x")
 """Axis of each angle of the chain at zero."""
 
+HUMAN_ARM_DH = (
+    np.array([0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]),
+    np.array([-0.5 * np.pi, 0.5 * np.pi, -0.5 * np.pi, 0.5 * np.pi, -0.5 * np.pi, 0.5 * np.pi, 0.0]),
+)
+"""Offsets of theta, and alpha, of a Denavit-Hartenberg table of the arm [rad], shapes (7,); a is 0, and d is the
+upper arm in the third row and the forearm in the fifth."""
+
+_TO_HAND = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # from the table's last frame
 _SINGULAR = 0.05  # sine below which an angle is held, because noise alone would turn it
 _APART = 0.2  # least sine between hand and thumb
 _HAND_LENGTH = 0.03  # [m] a hand tip nearer to the wrist has no direction
@@ -56,6 +64,31 @@ def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike,
         [zero, zero, zero, one],
     ]
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: bool = False) -> Array:
+    """Return the frames of the Denavit-Hartenberg chain seen from the shoulder (thesis Eq 3.5).
+
+    The thesis prints no table for the arm; :data:`HUMAN_ARM_DH` is one that has the module's chain. Frame 3 has the
+    elbow's position, frame 5 the wrist's; frame 7 is that of the hand: x along it, z away from its back.
+
+    Args:
+        angles: shape (7,) [rad].
+        lengths: of this person.
+        as_printed: with the thesis's second row, so that what comes out is no rotation.
+
+    Returns:
+        shape (8, 4, 4), the shoulder's own first.
+    """
+    offset, alpha = HUMAN_ARM_DH
+    along = np.array([0.0, 0.0, lengths.upper_arm, 0.0, lengths.forearm, 0.0, 0.0])
+    steps = dh_transform(np.asarray(angles, dtype=float) + offset, along, 0.0, alpha, as_printed=as_printed)
+    frames = np.empty((8, 4, 4))
+    frames[0] = np.eye(4)
+    for i, step in enumerate(steps):
+        frames[i + 1] = frames[i] @ step
+    frames[7, :3, :3] = frames[7, :3, :3] @ _TO_HAND
+    return frames
 
 
 def human_arm_pose(angles: ArrayLike, lengths: LimbLengths) -> tuple[Array, Array, Array]:

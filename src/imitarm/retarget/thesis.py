@@ -1,0 +1,230 @@
+"""ThesisRetargeter: the method of the thesis's Chapter 3, corrected; or with the faults of its print, one by one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.capture.skeleton import Skeleton
+from imitarm.errors import InputError, UnknownNameError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik import solve_ik
+from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_multiply
+from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
+from imitarm.retarget.correspondence import Clutch, Correspondence
+from imitarm.retarget.engagement import Engagement
+from imitarm.retarget.human_arm_tracker import HumanArmTracker
+from imitarm.retarget.playback import HandCurve, HandSample, Playback
+from imitarm.retarget.retargeter import Command, Retargeter, Retargeting, in_order, ticks
+from imitarm.scene import Scene
+
+Array = NDArray[np.float64]
+Curve = Literal["live", "global"]
+
+PRINTED = {
+    "limbs": "Eq 3.1 to 3.4: the elbow comes out behind the shoulder, the forearm hangs on the measured elbow",
+    "dh": "Eq 3.5: the second row has sin for cos, so forward kinematics is no rotation",
+    "error": "the error is actual minus wanted: the angles run away from the target",
+    "rpy": "differences of roll, pitch and yaw beside a geometric Jacobian",
+    "step": "one increment per frame",
+    "order": "P_R = P_HA R_HR: the hand moves the tool along the sensor's axes instead of the base's",
+    "damping": "Eq 3.9 fed with all of the error that is left: the farther the target, the slower the arm",
+    "small_angle": "the small angle after Eq 3.9: less damping than the bound on speed needs",
+}
+"""What of the print can be run, by the names that ``as_printed`` takes."""
+
+_SHOWN = 0.1  # [s] without a sight of the arm before a held target is called one
+_PUSHED = 0.05  # [rad] an arm found farther than this from its command was moved by somebody
+_UNCLAMPED = 1e6  # [m/s] a twist that no clamp reaches
+_UNSEEN = 0.2  # weight of a hand's rotation that was only carried along
+
+
+class ThesisRetargeter(Retargeter):
+    r"""Human arm to robot arm as thesis Chapter 3 does it, read as METHODS A.1 to A.8 does.
+
+    For each skeleton
+
+    1. the bones get their true lengths (Eq 3.1 to 3.4);
+    2. the person's joint angles follow by increments :math:`\tau \leftarrow \tau + J^+ \varepsilon`
+       (:class:`~imitarm.retarget.human_arm_tracker.HumanArmTracker`), and Denavit-Hartenberg forward kinematics
+       (Eq 3.5) gives the hand from the shoulder, then in the robot's base frame;
+    3. a NURBS is fitted to the last 0.6 s and read 70 ms late (Eq 3.6 and 3.7,
+       :class:`~imitarm.retarget.playback.Playback`).
+
+    At each control step the tool goes towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
+    3.9), every step clamped, since otherwise the arm freezes. The joints keep their limits of position and velocity;
+    there is none of acceleration, no word on the elbow, none on obstacles and none on what to do when the person is
+    lost: the thesis has none. The target then stays where it was, and jumps when the person is back.
+
+    Args:
+        arm: the robot's arm with its tool.
+        correspondence: what of the person's arm stands for what of the robot's.
+        dt: control period [s].
+        scene: not heeded.
+        small_angle: ``"thesis"``: with the term printed after Eq 3.9 (METHODS A.8).
+        as_printed: True: all of :data:`PRINTED`; or the names of some. The robot's limits are kept all the same.
+        smoothing: ``"live"``; ``"global"``: :meth:`run` fits one curve to the whole recording, without lag (step by
+            step it is live); None: no curve.
+        lag: of the live curve [s].
+        iterations: increments per frame.
+        gain: K of the twist :math:`K \log(T_d T^{-1})` [1/s]; METHODS A.4: one over the period of the frames.
+        max_speed: the twist is cut to this [m/s], 1 rad counting as 0.3 m.
+
+    Raises:
+        InputError: when a number is out of range.
+        UnknownNameError: when a name in ``as_printed``, ``smoothing`` or ``small_angle`` is not known.
+    """
+
+    name: ClassVar[str] = "thesis"
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        correspondence: Correspondence | None = None,
+        *,
+        dt: float = 0.01,
+        scene: Scene | None = None,
+        small_angle: str | None = None,
+        as_printed: bool | Collection[str] = False,
+        smoothing: Curve | None = "live",
+        lag: float = 0.07,
+        iterations: int = 3,
+        gain: float = 30.0,
+        max_speed: float = 1.0,
+    ) -> None:
+        faults = _faults(as_printed)
+        if smoothing is not None and smoothing not in get_args(Curve):
+            raise UnknownNameError.among("smoothing", smoothing, get_args(Curve))
+        if small_angle not in {None, "thesis"}:
+            raise UnknownNameError.among("small_angle", str(small_angle), ("thesis",))
+        if not (0.0 < gain * dt <= 1.0 and max_speed > 0.0 and 1 <= iterations <= 10 and 0.0 <= lag <= 0.3):
+            raise InputError(
+                "ThesisRetargeter: needs 0 < gain <= 1/dt, max_speed > 0, iterations 1 to 10 and lag 0 to 0.3 s; got "
+                f"{gain!r}, {max_speed!r}, {iterations!r}, {lag!r}"
+            )
+        self.faults = faults
+        self._small_angle = "thesis" if "small_angle" in faults else small_angle
+        self._smoothing, self._lag, self._iterations = smoothing, lag, iterations
+        self._gain, self._max_speed = gain, _UNCLAMPED if "damping" in faults else max_speed
+        self._whole: HandCurve | None = None
+        super().__init__(arm, correspondence, dt=dt, scene=scene)
+
+    def _begin(self, q: Array) -> None:
+        self._q = q.copy()
+        self._silence = math.inf
+        self._estimate: ArmEstimate | None = None
+        self._estimator = ArmEstimator(self.correspondence, smoothing=False, limbs="direction")
+        self._tracker = HumanArmTracker(self._iterations, self.faults)
+        self._engagement = Engagement(self.correspondence)
+        self._playback = Playback(lag=self._lag, smooth=self._smoothing is not None, whole=self._whole)
+
+    def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
+        """Return the joint positions to be at after ``dt``; see :class:`~imitarm.retarget.retargeter.Retargeter`."""
+        sample = None if skeleton is None else self._look(skeleton)
+        self._silence = 0.0 if sample is not None else self._silence + self.dt
+        self._playback.step(self.dt)
+        if sample is not None:
+            self._playback.add(sample)
+        hand = self._playback.now()
+        clutch = self._clutch(hand, sample is not None, np.asarray(q, dtype=float))
+        velocity, state, target, closed, elbow = np.zeros(self.arm.n_joints), "waiting", None, None, None
+        if clutch is not None and hand is not None and self._estimate is not None:
+            target = self._target(clutch, *hand)
+            velocity = self._drive(target)
+            state = "following" if self._silence <= _SHOWN else "holding"
+            closed = self._estimate.closed
+            elbow = _direction(self._estimate.elbow - self._estimate.shoulder)
+        self._q = np.clip(self._q + self.dt * velocity, self.arm.lower, self.arm.upper)
+        self.command = Command(self.command.time + self.dt, self._q, velocity, closed, state, target, elbow)
+        return self._q
+
+    def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
+        """Retarget a whole recording; with ``smoothing="global"`` through one curve for all of it.
+
+        Args:
+            skeletons: in the order of their times.
+            q: where the arm is at first, shape (n_joints,) [rad]; None: ``arm.home``.
+
+        Raises:
+            InputError: when there are fewer than two skeletons, times do not increase, or, with one curve for all,
+                fewer than four show the arm.
+        """
+        frames = in_order(skeletons)
+        start = self.arm.home if q is None else q
+        if self._smoothing == "global":
+            self.start(start)
+            samples = [sample for sample in map(self._look, frames) if sample is not None]
+            self._whole = HandCurve.through(samples)
+        try:
+            self.start(start)
+            commands = [self.command]
+            for skeleton in ticks(frames, self.dt):
+                self.step(skeleton, commands[-1].q)
+                commands.append(self.command)
+        finally:
+            self._whole = None
+        return Retargeting.of(self, commands)
+
+    def _look(self, skeleton: Skeleton) -> HandSample | None:
+        """Return where the hand of the followed human arm is; None when the arm is not seen."""
+        estimate = self._estimator.update(skeleton)
+        lengths = self._estimator.lengths
+        if estimate is None or lengths is None:
+            return None
+        wrist, hand = self._tracker.follow(estimate, lengths)
+        self._estimate = estimate
+        _, known, turned = estimate.confidence
+        return HandSample(estimate.time, wrist, hand, (known, max(turned, _UNSEEN)))
+
+    def _clutch(self, hand: tuple[Array, Array] | None, seen: bool, q: Array) -> Clutch | None:
+        """Return the clutch, engaged where the smoothed hand is, so that the tool does not jump."""
+        if self._engagement.clutch is not None or not seen or hand is None or self._estimate is None:
+            return self._engagement.clutch
+        if np.abs(q - self._q).max() > _PUSHED:  # somebody has moved the arm: begin there
+            self._q = np.clip(q, self.arm.lower, self.arm.upper)
+        smooth = replace(self._estimate, wrist=hand[0], hand=hand[1])
+        return self._engagement.update(smooth, self.arm.tool_pose(self._q))
+
+    def _target(self, clutch: Clutch, wrist: Array, hand: Array) -> Pose:
+        """Return where the tool should be."""
+        if "order" in self.faults:
+            sensor_to_base = self.correspondence.sensor_to_base
+            back = quaternion_conjugate(sensor_to_base.quaternion)
+            turn = quaternion_multiply(hand, quaternion_conjugate(clutch.hand))
+            turn = quaternion_multiply(quaternion_multiply(back, turn), sensor_to_base.quaternion)
+            wrist = clutch.wrist + sensor_to_base.rotation.T @ (wrist - clutch.wrist)
+            hand = quaternion_multiply(turn, clutch.hand)
+        return clutch.target(wrist, hand)
+
+    def _drive(self, target: Pose) -> Array:
+        """Return the joints' velocity towards a target by damped least squares, shape (n_joints,) [rad/s]."""
+        error = self.arm.tool_pose(self._q).error_to(target)
+        return solve_ik(
+            self.arm,
+            self._q,
+            self._gain * error,
+            method="dls",
+            dt=self.dt,
+            max_speed=self._max_speed,
+            small_angle=self._small_angle,
+        )
+
+
+def _faults(as_printed: bool | Collection[str]) -> frozenset[str]:
+    if isinstance(as_printed, bool):
+        return frozenset(PRINTED if as_printed else ())
+    names = [as_printed] if isinstance(as_printed, str) else list(as_printed)
+    for name in names:
+        if name not in PRINTED:
+            raise UnknownNameError.among("as_printed", name, PRINTED)
+    return frozenset(names)
+
+
+def _direction(vector: Array) -> Array | None:
+    length = math.sqrt(float(vector @ vector))
+    return vector / length if length > 1e-6 else None
