@@ -105,7 +105,12 @@ class NURBS:
 
         A single number gives one point, shape (d,).
         """
-        return self.derivative(u, 0)
+        at = np.asarray(u, dtype=float)
+        first, values = basis_functions(self.knots, self.degree, at.reshape(-1))
+        near = first[:, None] + np.arange(self.degree + 1)
+        share = values * self.weights[near]
+        points = (share[:, None, :] @ self.control_points[near])[:, 0] / share.sum(axis=1, keepdims=True)
+        return np.asarray(points.reshape(*at.shape, points.shape[1]))
 
     def derivative(self, u: ArrayLike, order: int = 1) -> Array:
         r"""Return a derivative by the parameter at ``u`` (k,), shape (k, d).
@@ -115,7 +120,7 @@ class NURBS:
 
         Args:
             u: where; a single number gives shape (d,). Beyond the ends it is the derivative at the end.
-            order: 0 to ``degree``.
+            order: 0 (the point itself) to ``degree``.
 
         Raises:
             InputError: when the order is not one of these.
