@@ -104,7 +104,7 @@ class StackTask:
     """
 
     seed: int = 0
-    tolerance: float = 0.012
+    tolerance: float = 0.014
 
     start: ClassVar[Pose] = Pose(np.array([0.62, -0.05, 0.19]), np.array(LOOKING_DOWN))  # of the tool
 
@@ -206,7 +206,7 @@ class StackTask:
             return Verdict(False, "protective stop", n, robot.fault)
         if n < history.tallest:
             return Verdict(False, "tower fell", n, f"{history.tallest} cubes stood, now {n}")
-        waiting = range(max(n, 1) if n else 0, N_CUBES)
+        waiting = range(n, N_CUBES)
         lost = sorted(history.lost.intersection(waiting))
         if lost:
             return Verdict(False, "dropped", n, f"cube {lost[0] + 1} fell out of the gripper")
