@@ -7,6 +7,7 @@ from imitarm.capture.motions import MotionCapture, reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import Skeleton
 from imitarm.capture.synthetic import SyntheticSource
+from imitarm.kinematics.sew import sew_angle
 from imitarm.retarget import FACING, Correspondence, LimbLengths, ModernRetargeter, retarget
 
 DT = 0.01
@@ -81,6 +82,28 @@ def test_it_is_less_than_80_ms_late():
 
 def state_at(run, time):
     return run.states[round(time / DT)]
+
+
+@pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
+def test_the_elbow_swings_as_the_persons_does(arm):
+    person = Person.from_seed(4)
+    hold = person.shoulder("right") + np.array([0.05, -0.2, -0.3])
+    still = Person(**{**person.__dict__, "tremor": 0.0 * person.tremor, "sway": 0.0 * person.sway})
+    times = np.arange(0.0, 9.0, 1 / 30)
+    swivel = 0.3 + 0.4 * np.clip((times - 1.5) / 1.5, 0.0, 1.0)
+    frames = [still.skeleton(t, hold, swivel=psi) for t, psi in zip(times, swivel, strict=True)]
+    correspondence = Correspondence(lengths=lengths(person), orientation="fixed")
+    turned = {}
+    for elbow in (0.0, 1e-4):
+        run = ModernRetargeter(arm, correspondence, elbow=elbow).run(frames)
+        angle = np.array([float(sew_angle(*arm.sew_points(q))) for q in run.joints])
+        turned[elbow] = np.unwrap(angle)[-1] - angle[0]
+        tool, _ = arm.tool_path(run.joints)
+        assert np.linalg.norm(tool - tool[0], axis=1).max() < 0.01  # the hand stood still
+    points = [FACING.apply(f.arm().points[:3]) for f in (frames[0], frames[-1])]
+    wanted = float(sew_angle(*points[1]) - sew_angle(*points[0]))
+    assert abs(turned[1e-4] - wanted) < 0.2  # the tool has priority
+    assert abs(turned[0.0]) < 0.1
 
 
 def test_a_loss_of_sight_is_coasted_held_and_stopped_and_needs_a_new_hold():

@@ -6,8 +6,9 @@ from imitarm.retarget.correspondence import FACING, Correspondence
 from imitarm.retarget.limbs import LimbLengths, measure_limbs
 from imitarm.retarget.modern import ModernRetargeter
 from imitarm.retarget.retargeter import Command, Retargeter, Retargeting, retarget
+from imitarm.retarget.thesis import ThesisRetargeter
 
-RETARGETERS: Mapping[str, type[Retargeter]] = {"modern": ModernRetargeter}
+RETARGETERS: Mapping[str, type[Retargeter]] = {"modern": ModernRetargeter, "thesis": ThesisRetargeter}
 """All methods by name."""
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "ModernRetargeter",
     "Retargeter",
     "Retargeting",
+    "ThesisRetargeter",
     "measure_limbs",
     "retarget",
 ]

@@ -51,6 +51,12 @@ class ArmEstimate:
     confidence: tuple[float, float, float]
     closed: bool | None
 
+    @property
+    def upper_arm(self) -> Array:
+        """Direction from the shoulder to the elbow, a unit vector (3,)."""
+        way = self.elbow - self.shoulder
+        return np.asarray(way / max(float(np.sqrt(way @ way)), 1e-9))
+
 
 class ArmEstimator:
     """Turns skeletons into :class:`ArmEstimate`: outliers out, limbs corrected, smoothed, hand turned.

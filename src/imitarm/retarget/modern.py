@@ -1,4 +1,4 @@
-"""ModernRetargeter: what we would use on a robot; every limit kept, losses of sight survived."""
+"""ModernRetargeter: what we would use on a robot; every limit kept, the elbow followed, losses of sight survived."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik import solve_ik
+from imitarm.kinematics.ik_solver import ElbowTask, IKSolver
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
 from imitarm.kinematics.posture import ANGLE_LENGTH
+from imitarm.kinematics.sew import one_angle
 from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.engagement import Engagement
@@ -28,12 +29,14 @@ COAST, HOLD = 0.1, 0.3  # [s] without a sight of the arm: until then the motion 
 _FADE = 0.05  # [s] time constant of the fading motion
 _PUSHED = 0.05  # [rad] an arm found farther than this from its command was moved by somebody
 _BETWEEN = 0.07  # [s] cameras leave out a frame now and then
+_SWING_GAIN, _SWING_RATE = 2.0, 0.4  # [1/s], [rad/s] a quick elbow would take the joints' speed from the tool
+_BENT = 0.1  # squared sine of the angle at the person's elbow below which its swing tells less and less
 _BRAKING = 1.5  # [m/s^2] the tool can nearly always brake so hard, 1 rad counting as 0.3 m
 _STILL = 1e-3  # [rad/s] slower is at rest
 
 
 class ModernRetargeter(Retargeter):
-    r"""Follow the hand with the tool, inside every limit (METHODS A.9).
+    r"""Follow the hand with the tool and the elbow with the elbow, inside every limit (METHODS A.9).
 
     One step is
 
@@ -41,9 +44,14 @@ class ModernRetargeter(Retargeter):
        the estimated velocity, which fades: :math:`W + v\,\tau(1 - e^{-s/\tau})` after s seconds, tau = 50 ms;
     2. the clutch's target, and the twist that goes there, :math:`K \log(T_d T^{-1})` plus a share of the hand's
        velocity;
-    3. a quadratic programme for the joints' velocities: the twist, the box of position, velocity and acceleration
-       that can always be kept, rows that keep the links off the scene;
+    3. a quadratic programme for the joints' velocities: the twist, the elbow's SEW angle, the box of position, velocity
+       and acceleration that can always be kept, bounds that keep elbow and wrist off their singularities, rows that
+       keep the links off the scene;
     4. a follower that limits the jerk (:class:`~imitarm.retarget.jerk_limit.JerkLimiter`) and guards the limits again.
+
+    The elbow's angle changes as the person's does, from where both were when the clutch engaged:
+    :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. It counts less the less surely the person's elbow is seen, and the
+    straighter either arm is.
 
     Without a sight of the arm it coasts for 0.1 s, holds until 0.3 s, then stops; a stopped one waits until the arm has
     been seen for half a second and takes hold where both are then, so nothing jumps.
@@ -55,6 +63,7 @@ class ModernRetargeter(Retargeter):
         scene: obstacles to keep clear of.
         gain: K [1/s].
         lead: share of the hand's velocity that is fed forward, 0 to 1.
+        elbow: weight of the elbow's angle beside the tool [m^2]; 0: the elbow is free.
         clearance: to keep from the scene [m].
         max_speed: the twist is cut to this [m/s], 1 rad counting as 0.3 m.
     """
@@ -70,15 +79,19 @@ class ModernRetargeter(Retargeter):
         scene: Scene | None = None,
         gain: float = 25.0,
         lead: float = 0.6,
+        elbow: float = 1e-4,
         clearance: float = 0.01,
         max_speed: float = 1.0,
     ) -> None:
-        if not (0.0 < gain * dt <= 1.0 and 0.0 <= lead <= 1.0 and max_speed > 0.0):
+        if not (0.0 < gain * dt <= 1.0 and 0.0 <= lead <= 1.0 and elbow >= 0.0 and max_speed > 0.0):
             raise InputError(
-                f"ModernRetargeter: needs 0 < gain <= 1/dt = {1 / dt:g}, lead from 0 to 1 and max_speed > 0"
+                f"ModernRetargeter: needs 0 < gain <= 1/dt = {1 / dt:g}, lead from 0 to 1, elbow >= 0, max_speed > 0"
             )
         self._gain, self._lead = gain, lead
-        self._clearance, self._max_speed = clearance, max_speed
+        self._clearance = clearance
+        known = arm.landmarks is not None  # else neither its elbow's angle nor its singularities are
+        self._solver = IKSolver(arm, dt=dt, max_speed=max_speed, singularity_bounds=known)
+        self._elbow = elbow if known else 0.0
         self._limiter = JerkLimiter(arm, dt)
         super().__init__(arm, correspondence, dt=dt, scene=scene)
 
@@ -89,6 +102,7 @@ class ModernRetargeter(Retargeter):
         self._estimate: ArmEstimate | None = None
         self._engagement = Engagement(self.correspondence)
         self._estimator = ArmEstimator(self.correspondence)
+        self._offset: float | None = None  # of the robot's elbow angle from the person's
 
     def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
         """Return the joint positions to be at after ``dt``; see :class:`~imitarm.retarget.retargeter.Retargeter`."""
@@ -98,11 +112,14 @@ class ModernRetargeter(Retargeter):
         if state in _LED and self._estimate is not None:
             target, ahead = self._target(self._estimate)
             closed = self._estimate.closed
-            self._reach(target, ahead)
+            self._reach(target, ahead, self._elbow_task(self._estimate))
         else:
-            self._drive(np.zeros(6))
+            self._offset = None
+            self._drive(np.zeros(6), None)
         reached = self._limiter.follow(self._q, self._velocity)
-        self.command = Command(self.command.time + self.dt, reached, self._limiter.velocity, closed, state, target)
+        elbow = None if target is None or self._estimate is None else self._estimate.upper_arm
+        time, velocity = self.command.time + self.dt, self._limiter.velocity
+        self.command = Command(time, reached, velocity, closed, state, target, elbow)
         return reached
 
     def _look(self, skeleton: Skeleton | None) -> None:
@@ -148,26 +165,34 @@ class ModernRetargeter(Retargeter):
         ahead[:3] = (self._lead * left * self.correspondence.scale) * estimate.velocity
         return clutch.target(wrist, hand), ahead
 
-    def _reach(self, target: Pose, ahead: Array) -> None:
+    def _elbow_task(self, estimate: ArmEstimate) -> ElbowTask | None:
+        """Return where the elbow should be; None when it is free, or one of the two angles is lost."""
+        if self._elbow == 0.0:
+            return None
+        person = one_angle(np.array([estimate.shoulder, estimate.elbow, estimate.wrist]))
+        if person is None:
+            return None
+        if self._offset is None:
+            robot = one_angle(self.arm.sew_points(self._q))
+            if robot is None:
+                return None
+            self._offset = robot.angle - person.angle
+        confidence = estimate.confidence[0] * min(1.0, person.bend / _BENT)
+        angle = math.remainder(person.angle + self._offset, math.tau)
+        return ElbowTask(angle, self._elbow, confidence, _SWING_GAIN, _SWING_RATE)
+
+    def _reach(self, target: Pose, ahead: Array, elbow: ElbowTask | None) -> None:
         """Move the reference towards a target."""
         error = self.arm.tool_pose(self._q).error_to(target)
         weighted = math.sqrt(float(error[:3].dot(error[:3])) + ANGLE_LENGTH**2 * float(error[3:].dot(error[3:])))
         # far away it goes no faster than it can brake again, or it would swing about the target
         gain = min(self._gain, math.sqrt(2.0 * _BRAKING / max(weighted, 1e-9)))
-        self._drive(gain * error + ahead)
+        self._drive(gain * error + ahead, elbow)
 
-    def _drive(self, twist: Array) -> None:
+    def _drive(self, twist: Array, elbow: ElbowTask | None) -> None:
         """Move the reference by one step of inverse kinematics."""
         rows = clearance_rows(self.arm, self._q, self.scene, self._clearance)
-        velocity = solve_ik(
-            self.arm,
-            self._q,
-            twist,
-            dt=self.dt,
-            velocity=self._velocity,
-            rows=rows,
-            max_speed=self._max_speed,
-        )
+        velocity = self._solver.solve(self._q, twist, velocity=self._velocity, rows=rows, sew=elbow)
         self._velocity = velocity
         self._q = self._q + self.dt * velocity
 
