@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ UNFINISHED = "not closed"
 """What the header says of the number of frames while they are still being written."""
 
 _MARK = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s*[#%][^\n]*\n)*?\s*[#%]\s*format:\s*" + FORMAT.encode() + rb"\b")
+_WHOLE = re.compile(rb"-?\d{1,20}")
 _N = len(JOINTS)
 
 
@@ -106,9 +108,9 @@ def read(path: str, content: bytes) -> tuple[list[Skeleton], list[Finding], str]
         lost = " and the frame that was being written is lost" if torn else ""
         message = f"was not closed: its writer was stopped or is still at work; {n} whole frames were read{lost}"
         findings.append(Finding("note", "not-closed", message, n - 1, remedy="save it under another name to keep it"))
-    skeletons, far = assembled(
-        table, table.values[:, 0], table.values[:, 4:].reshape(n, _N, 4), states=table.values[:, 1:4]
-    )
+    persons = _persons(table, content)
+    joints = table.values[:, 4:].reshape(n, _N, 4)
+    skeletons, far = assembled(table, table.values[:, 0], joints, table.values[:, 2:4], persons)
     return skeletons, findings + far, table.remarks.get("source", "")
 
 
@@ -117,8 +119,16 @@ def _unfinished(content: bytes) -> bool:
     return re.search(rb"^#\s*frames:\s*" + UNFINISHED.encode() + rb"\s*$", head, re.MULTILINE) is not None
 
 
+def _persons(table: Table, content: bytes) -> list[int]:
+    """Return the column of persons: the Kinect SDK counts bodies in numbers too large for a float."""
+    lines = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n")
+    fields = [lines[line - 1].split(b",")[1].strip() for line in table.lines]
+    _refuse(table, np.array([_WHOLE.fullmatch(field) is None for field in fields]), "the person is not a whole number")
+    return [int(field) for field in fields]
+
+
 def assembled(
-    table: Table, times: Array, joints: Array, states: Array | None = None
+    table: Table, times: Array, joints: Array, hands: Array | None = None, persons: Sequence[int] | None = None
 ) -> tuple[list[Skeleton], list[Finding]]:
     """Build skeletons from columns, whatever the format they are from.
 
@@ -126,28 +136,23 @@ def assembled(
         table: what was read, for messages.
         times: shape (n,) [s].
         joints: x, y, z [m] and tracking state of each joint, shape (n, 25, 4).
-        states: person, state of the left and of the right hand, shape (n, 3); None: not in the file.
+        hands: state of the left and of the right hand, shape (n, 2); None: not in the file.
+        persons: who each is; None: not in the file.
 
     Raises:
         FileFormatError: when a time is not finite, or a state is none; the message names file and line.
     """
-    known = np.zeros((len(times), 3)) if states is None else states
+    states = np.zeros((len(times), 2)) if hands is None else hands
     _refuse(table, ~np.isfinite(times), "the time is not a finite number")
     _refuse(table, ~np.isin(joints[..., 3], (0, 1, 2)).all(axis=1), "a tracking state is not 0, 1 or 2")
-    _refuse(table, ~np.isin(known[:, 1:], range(len(HandState))).all(axis=1), "a hand's state is not one of 0 to 4")
-    whole = np.isfinite(known[:, 0]) & (known[:, 0] == np.round(known[:, 0])) & (np.abs(known[:, 0]) < 2**53)
-    _refuse(table, ~whole, "the person is not a whole number")
+    _refuse(table, ~np.isin(states, range(len(HandState))).all(axis=1), "a hand's state is not one of 0 to 4")
     with np.errstate(invalid="ignore"):
         far = (joints[..., 3] > 0) & ~(np.abs(joints[..., :3]) <= FARTHEST).all(axis=2)
     skeletons = [
-        Skeleton(
-            time,
-            frame[:, :3],
-            frame[:, 3].astype(np.int8),
-            (HandState(int(left)), HandState(int(right))),
-            int(person),
+        Skeleton(time, frame[:, :3], frame[:, 3].astype(np.int8), (HandState(int(left)), HandState(int(right))), person)
+        for time, frame, (left, right), person in zip(
+            times.tolist(), joints, states, [0] * len(times) if persons is None else persons, strict=True
         )
-        for time, frame, (person, left, right) in zip(times.tolist(), joints, known, strict=True)
     ]
     return skeletons, _far(table, times, far)
 

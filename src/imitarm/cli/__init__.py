@@ -16,6 +16,8 @@ from imitarm import __version__
 from imitarm.errors import ImitarmError
 
 COMMANDS = {
+    "capture": "take a person's motion from a camera or a file, record it and check it",
+    "calibrate": "measure a person's arm, find where the sensor is, choose how the robot follows",
     "lint": "check demonstrations and say what is wrong with them",
     "learn": "learn a skill from demonstrations",
     "reproduce": "let a simulated arm do what a skill has learnt, around obstacles",

@@ -1,0 +1,164 @@
+"""``imitarm capture``: take a person's motion from a source, record it, check it, send it on."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imitarm.capture.checks import check, repaired
+from imitarm.capture.finding import Finding
+from imitarm.capture.people import PersonFilter
+from imitarm.capture.recorder import SkeletonRecorder
+from imitarm.capture.recording import SkeletonRecording
+from imitarm.capture.skeleton import Skeleton, SkeletonSource
+from imitarm.capture.sources import live, open_source
+from imitarm.cli.gathering import add_side_and_person, gather, show_findings, source_help
+from imitarm.cli.screen import remark, say, show_table
+from imitarm.errors import InputError, TaskFailedError
+
+EPILOG = """\
+examples:
+  imitarm capture webcam:0 --seconds 20 --out wave.csv
+  imitarm capture kinect.csv --check
+  imitarm capture wave.csv --trim 2.5 9 --repair --out wave_cut.csv
+  imitarm capture synthetic:7 --out made_up.csv
+  imitarm capture kinect2 --send 127.0.0.1:7400
+
+What comes is written at once: a program that is killed leaves FILE.part, which can be read. Ctrl-C ends a live source
+and keeps what was recorded. Exit status 2 when --check finds an error.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what the command takes."""
+    parser.add_argument("source", metavar="SOURCE", help=source_help())
+    add_side_and_person(parser)
+    parser.add_argument("--seconds", type=float, metavar="S", help="how long; default: to the end, or till Ctrl-C")
+    parser.add_argument("--check", action="store_true", help="exit status 2 when there is an error among the findings")
+    parser.add_argument("--realtime", action="store_true", help="replay a recording at the pace it was recorded at")
+    output = parser.add_argument_group("output")
+    output.add_argument("--out", type=Path, metavar="FILE", help="record into this file; default: none")
+    output.add_argument("--force", action="store_true", help="replace a file that is there")
+    output.add_argument(
+        "--trim", type=float, nargs=2, metavar=("A", "B"), help="keep what is between A and B seconds from the start"
+    )
+    output.add_argument(
+        "--repair",
+        action="store_true",
+        help="keep one person, drop frames that are not later than the one before, exchange swapped sides back",
+    )
+    output.add_argument("--send", metavar="HOST:PORT", help="send the skeletons on over UDP, as they come")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Capture, record, print what came; return 2 when it was to be checked and there is an error.
+
+    Raises:
+        InputError: when an option, the source or the place for the recording is wrong.
+        TaskFailedError: when nobody was seen.
+    """
+    _check_options(arguments)
+    going_on = live(arguments.source)
+    with ExitStack() as stack:
+        source = open_source(arguments.source, realtime=arguments.realtime or arguments.send is not None)
+        recorded = source if isinstance(source, SkeletonRecording) else None
+        source = stack.enter_context(_chosen(source, arguments.person))
+        receivers = _receivers(arguments, source.name, stack)
+
+        def pass_on(skeleton: Skeleton) -> None:
+            for receiver in receivers:
+                receiver(skeleton)
+
+        if going_on and arguments.seconds is None:
+            remark("capturing; press Ctrl-C to end")
+        total = recorded.duration if recorded is not None else None
+        taken, _ = gather(source, arguments.seconds, "capturing", live=going_on, total=total, on_skeleton=pass_on)
+    if not taken:
+        raise TaskFailedError(
+            f"{arguments.source}: nobody was seen, nothing is written; stand 1.5 to 3 m before the sensor"
+        )
+    found = recorded.findings if recorded is not None else ()
+    recording = _finished(SkeletonRecording(taken, name=source.name, findings=found), arguments)
+    findings = check(recording, arguments.side)
+    _show(recording, arguments.side)
+    show_findings(findings)
+    if arguments.out is not None:
+        say(f"wrote {arguments.out}")
+    return 2 if arguments.check and _has_error(findings) else 0
+
+
+def _check_options(arguments: argparse.Namespace) -> None:
+    """Find out before the work what would only fail after it."""
+    out: Path | None = arguments.out
+    if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
+        raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
+    if arguments.trim is not None and not 0.0 <= arguments.trim[0] < arguments.trim[1] < np.inf:
+        raise InputError(f"--trim must be two times, the first one earlier, got {arguments.trim}")
+    if out is not None and not out.parent.is_dir():
+        raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
+    if out is not None and out.exists() and not arguments.force:
+        raise InputError(f"--out {out}: is there already; name another file, or replace it with --force")
+
+
+def _chosen(source: SkeletonSource, person: int | None) -> SkeletonSource:
+    """Return all that a source sees, or one person of it; a recording says who is in it."""
+    if person is None:
+        return source
+    if isinstance(source, SkeletonRecording):
+        return source.person(person)
+    return PersonFilter(source, person=person)
+
+
+def _receivers(arguments: argparse.Namespace, name: str, stack: ExitStack) -> list[Any]:
+    """Open what every skeleton goes to: a file, a socket."""
+    receivers = []
+    if arguments.out is not None:
+        recorder = SkeletonRecorder(arguments.out, source=name, replace=arguments.force)
+        receivers.append(stack.enter_context(recorder).write)
+    if arguments.send is not None:
+        host, colon, port = arguments.send.rpartition(":")
+        if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65536:
+            raise InputError(f"--send {arguments.send}: must be HOST:PORT, for example 127.0.0.1:7400")
+        sender = importlib.import_module("imitarm.capture.stream").UdpSkeletonSender(host, int(port))
+        stack.callback(sender.close)
+        receivers.append(sender.send)
+    return receivers
+
+
+def _finished(recording: SkeletonRecording, arguments: argparse.Namespace) -> SkeletonRecording:
+    """Return the recording cut and mended as asked, and written again where that changed it."""
+    done = recording
+    if arguments.trim is not None:
+        done = done.trim(*arguments.trim)
+    if arguments.repair:
+        done, notes = repaired(done)
+        for note in notes:
+            remark(f"repaired: {note}")
+    if arguments.out is not None and done is not recording:
+        done.save(arguments.out)
+    return done
+
+
+def _show(recording: SkeletonRecording, side: str) -> None:
+    """Print what was captured."""
+    arms = [skeleton.arm(side).confidence[:3].min() for skeleton in recording.skeletons]
+    tracked, lost = np.mean(np.array(arms) >= 1.0), np.mean(np.array(arms) == 0.0)
+    show_table(
+        ["captured", recording.name],
+        [
+            ("frames", str(len(recording))),
+            ("duration", f"{recording.duration:.2f} s"),
+            ("rate", f"{recording.rate:.1f} frames a second"),
+            ("persons", ", ".join(str(person) for person in recording.persons)),
+            (f"{side} arm", f"tracked in {100 * tracked:.0f} % of the frames, lost in {100 * lost:.0f} %"),
+        ],
+    )
+
+
+def _has_error(findings: list[Finding]) -> bool:
+    return any(finding.severity == "error" for finding in findings)
