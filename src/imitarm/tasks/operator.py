@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 _HELD = 0.05  # [m] a cube farther than this from the gripper is not in it
 _MISSED = 0.026  # [m] fingers that closed farther than this hold nothing
-_CLOSED, _OPENED = 0.036, 0.055  # [m] fingers that look closed on a cube, and open again
+_CLOSED, _OPENED = 0.036, 0.045  # [m] fingers that look closed on a cube, and open again
 _GRIP_ABOVE = 0.005  # [m] above a cube's middle it is gripped: the finger tips stay off the table
 _AT_REST = 1e-3  # [m] corrections smaller than this are not made
 _FAR = 0.03  # [m] a longer sub-movement is aimed once, a shorter one is a cautious part of what is missing
@@ -30,6 +30,7 @@ _SCATTER = 0.04  # standard deviation of a sub-movement over its length (signal-
 _LONGEST_MEMORY = 3.0  # [s]
 _CLEAR = 0.03  # [m] what is carried keeps this much above what it passes over
 _LOWEST_TRAVEL = 0.085  # [m] height of the empty gripper on its way
+_LET_GO = 0.0015  # [m] so far above the tower a cube is meant to be let go, so as not to press on it
 _NEAR = 0.012  # [m] across, that is near enough to begin to go down
 _BRISK = 0.035  # [m] down to so far above where care is needed, a person goes briskly
 _STEP_DOWN = 0.025  # [m] how far ahead a person who lowers something with care looks
@@ -133,8 +134,8 @@ class Operator:
     *Eye.* At each look, about 7 a second, the person acts on the :class:`Sight` of ``delay`` ago, with noise of about a
     millimetre and a bias. What is expected of the gripper is what was seen of it, and what the hand has been
     told since and a little before: :math:`\hat p = p(t-\delta) + \rho\,(h_{end} - h(t-\delta-\lambda))`, with
-    :math:`\lambda` the lag to which the person is used. The next sub-movement is :math:`d = g\,(p_{goal}-\hat p)/\rho`, g below
-    1 for what is short and 1 for long ways.
+    :math:`\lambda` the lag to which the person is used. The next sub-movement is
+    :math:`d = g\,(p_{goal}-\hat p)/\rho`, g below 1 for what is short and 1 for long ways.
 
     *Plan.* For each cube: across above it, down while it looks well aligned, close the hand, up, across above
     the tower, down until it is seen to stand, open the hand, up. The hand closes or opens when the gripper looks
@@ -311,9 +312,9 @@ class _Plan:
         """Lower the cube; open the hand when it is seen to stand where it should."""
         if self._lost():
             return None, False
-        goal = self._offset() + self.below + [0.0, 0.0, SIDE - 0.001]
+        goal = self._offset() + self.below + [0.0, 0.0, SIDE + _LET_GO]
         away = self._across(goal)
-        if away < self.tolerance and self.cube[2] - self.below[2] - SIDE < 0.003:
+        if away < self.tolerance and self.cube[2] - self.below[2] - SIDE < 3.0 * _LET_GO:
             self.operator.closed = False
             self._turn_to("open")
             return None, True
@@ -322,18 +323,19 @@ class _Plan:
         return self._lowered(goal, away, 1.5 * self.habits.tolerance)
 
     def open(self) -> tuple[Array | None, bool]:
-        """Wait until the fingers look open."""
-        waited = self.operator.in_phase(self.now)
-        if self.view.opening > _OPENED and waited > self.habits.delay + 0.5 * self.habits.dwell:
+        """Wait until the fingers are seen to have let go."""
+        if self.view.opening > _OPENED:
             self._turn_to("leave")
         return None, True
 
     def leave(self) -> tuple[Array | None, bool]:
-        """Go straight up, then see what is next."""
+        """Go up, the cube in the middle between the fingers until they are above it; then see what is next."""
         height = max(self._travel_height(), self.below[2] + 0.5 * SIDE + 0.055)
         if self.tool[2] > height - 0.015:
             self._turn_to("begin")
-        return np.array([self.tool[0], self.tool[1], height]), self.tool[2] < self.cube[2] + 0.03
+        around = self.tool[2] < self.cube[2] + 0.03 and self._across(self.cube) < 0.03
+        x, y = self.cube[:2] if around else self.tool[:2]
+        return np.array([x, y, height]), False
 
     def _turn_to(self, phase: str) -> None:
         self.operator.go_on(phase, self.now)

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 N_CUBES = 4
 SIDE = 0.032  # [m] of a cube
-OPEN, CLOSED = 0.07, 0.0  # [m] what the gripper is asked for; a cube stops the fingers on their way
+OPEN, CLOSED = 0.08, 0.0  # [m] what the gripper is asked for; a cube stops the fingers on their way
 LOOKING_DOWN = (0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0)  # wxyz: the tool looks down, its fingers close along the base's x
 FAILURES = (
     "protective stop",
@@ -191,7 +191,7 @@ class StackTask:
         if before is not None and history.held != before and not touched[before] and _free_below(cubes, before):
             history.lost.add(before)
 
-    def judge(self, robot: SimulatedRobot, history: History) -> Verdict:
+    def judge(self, robot: SimulatedRobot, history: History) -> Verdict:  # noqa: PLR0911 (one for each way to fail)
         """Return the verdict on how things are now.
 
         The failures, in this order: the robot stopped to protect itself; a tower that has stood does so no more; a
