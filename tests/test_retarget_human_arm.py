@@ -11,6 +11,7 @@ from imitarm.retarget.human_arm import (
     dh_transform,
     hand_rotation,
     human_arm_angles,
+    human_arm_frames,
     human_arm_jacobian,
     human_arm_pose,
 )
@@ -140,3 +141,16 @@ def test_a_carried_rotation_turns_with_the_forearm_and_no_more(seed):
     fresh = carried(None, None, after)
     np.testing.assert_allclose(fresh[:, 0], after)
     assert np.linalg.det(fresh) > 0.999
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_the_denavit_hartenberg_table_has_the_chain_of_the_module(seed):
+    q = np.random.default_rng(seed).uniform(-3.0, 3.0, 7)
+    frames = human_arm_frames(q, LENGTHS)
+    elbow, wrist, hand = human_arm_pose(q, LENGTHS)
+    np.testing.assert_allclose(frames[3, :3, 3], elbow, atol=1e-12)
+    np.testing.assert_allclose(frames[5, :3, 3], wrist, atol=1e-12)
+    np.testing.assert_allclose(frames[7, :3, :3], hand, atol=1e-12)
+    printed = human_arm_frames(q, LENGTHS, as_printed=True)
+    assert np.abs(printed[7, :3, :3] @ printed[7, :3, :3].T - np.eye(3)).max() > 1e-3

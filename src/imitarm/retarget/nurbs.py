@@ -130,7 +130,8 @@ class NURBS:
         at = np.asarray(u, dtype=float)
         flat = at.reshape(-1)
         table = np.column_stack([self.control_points * self.weights[:, None], self.weights])
-        knots, parts, found = self.knots, [], []
+        knots, parts = self.knots, []
+        found: list[Array] = []
         for r in range(order + 1):
             first, values = basis_functions(knots, self.degree - r, flat)
             parts.append(np.einsum("ka,kad->kd", values, table[first[:, None] + np.arange(self.degree - r + 1)]))

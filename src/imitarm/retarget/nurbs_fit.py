@@ -47,8 +47,9 @@ def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
 class _Problem:
     """The samples, the basis functions at them, and all of the normal equations that no confidence changes."""
 
-    def __init__(self, first: Indices, values: Array, points: Array, n_control: int) -> None:
-        self.first, self.values, self.points, self.n_control = first, values, points, n_control
+    def __init__(self, first: Indices, values: Array, points: Array, rows: Array) -> None:
+        self.first, self.values, self.points, self.rows = first, values, points, rows
+        self.n_control = n_control = len(rows) + 2
         self.order, self.dim = order, dim = values.shape[1], points.shape[1]
         self.reached = first[:, None] + np.arange(order)  # which control points each sample depends on
         pairs = [(a, b) for a in range(order) for b in range(a + 1)]
@@ -57,7 +58,7 @@ class _Problem:
         self._products = values[:, a] * values[:, b]
         self._places = (self.reached[:, :, None] * dim + np.arange(dim)).ravel()
         self._moments = (values[:, :, None] * points[:, None, :]).reshape(len(first), -1)
-        self.bend = _bend_band(n_control, order)
+        self.bend = _bend_band(rows, order)
 
     def normal(self, confidence: Array) -> tuple[Array, Array]:
         """Return the lower band of R^T C R, shape (degree + 1, n), and R^T C Q, shape (n, d)."""
@@ -73,7 +74,7 @@ class _Problem:
     def with_weights(self, weights: Array) -> _Problem:
         """Return the same samples for a rational curve with weights (n,)."""
         weighted = self.values * weights[self.reached]
-        return _Problem(self.first, weighted / weighted.sum(axis=1, keepdims=True), self.points, self.n_control)
+        return _Problem(self.first, weighted / weighted.sum(axis=1, keepdims=True), self.points, self.rows)
 
 
 def fit_nurbs(
@@ -90,11 +91,12 @@ def fit_nurbs(
 ) -> NURBS:
     r"""Fit a curve to a motion, each sample by how far it is believed (METHODS A.6).
 
-    .. math:: \min_P \sum_k c_k \Bigl|\sum_i R_{ik} P_i - Q_k\Bigr|^2 + \mu \sum_j |P_{j+1} - 2 P_j + P_{j-1}|^2,
+    .. math:: \min_P \sum_k c_k \Bigl|\sum_i R_{ik} P_i - Q_k\Bigr|^2 + \mu \sum_j |(D P)_j|^2,
         \qquad R_{ik} = \frac{N_i(t_k)\, w_i}{\sum_j N_j(t_k)\, w_j}
 
-    The parameter is the time itself, not the length of the chord: the speed is part of the motion. The normal equations
-    have a band of width p, so the time it takes grows with the number of samples only.
+    with D the second differences of :func:`bends`. The parameter is the time itself, not the length of the chord: the
+    speed is part of the motion. The normal equations have a band of width p, so the time it takes grows with the number
+    of samples only; ``"gcv"`` takes longer, since it needs the inverse.
 
     Args:
         times: strictly increasing, shape (k,) [s].
@@ -121,7 +123,7 @@ def fit_nurbs(
     knots = averaged_knots(believed, n, degree)
     knots[: degree + 1], knots[-degree - 1 :] = t[0], t[-1]
     first, values = basis_functions(knots, degree, t)
-    problem = _Problem(first, values, q, n)
+    problem = _Problem(first, values, q, bends(knots, degree))
     used = c
     mu = _strength(problem, c, smoothing, sigma)
     control = _solve(problem, c, mu)
@@ -175,12 +177,27 @@ def _check_options(smoothing: Smoothing, sigma: float | None) -> None:
         raise InputError("fit_nurbs: smoothing='morozov' needs sigma, the standard deviation of a sample")
 
 
-def _bend_band(n: int, order: int) -> Array:
-    """Return the lower band of D^T D, with D the second differences of n control points, shape (order, n)."""
+def bends(knots: Array, degree: int) -> Array:
+    r"""Return the second differences D of the control points, shape (n - 2, 3): row j acts on points j, j+1, j+2.
+
+    Control points stand over the means of p knots, :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`, which crowd at the
+    ends. Plain differences :math:`P_{j+1} - 2 P_j + P_{j-1}` would take a straight steady motion for a bent one there
+    and slow it down, so they are divided ones, :math:`h (\frac{P_{j+1} - P_j}{g_{j+1} - g_j} - \frac{P_j -
+    P_{j-1}}{g_j - g_{j-1}})` with h the mean distance: where knots are even, they are the plain ones.
+    """
+    means = np.convolve(knots[1:-1], np.full(degree, 1.0 / degree), "valid")
+    apart = np.diff(means)
+    share = apart.mean() / apart
+    return np.column_stack([share[:-1], -share[:-1] - share[1:], share[1:]])
+
+
+def _bend_band(rows: Array, order: int) -> Array:
+    """Return the lower band of D^T D, shape (order, n)."""
+    n = len(rows) + 2
     band = np.zeros((order, n))
-    for shift, values in enumerate(((1.0, 4.0, 1.0), (-2.0, -2.0), (1.0,))):
-        for j, value in enumerate(values):
-            band[shift, j : n - 2 + j] += value
+    for shift in range(3):
+        for j in range(3 - shift):
+            band[shift, j : n - 2 + j] += rows[:, j] * rows[:, j + shift]
     return band
 
 
@@ -257,10 +274,12 @@ def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
     np.put_along_axis(basis, problem.reached, problem.values, axis=1)
     middle = problem.points - problem.points.mean(axis=0)  # the origin must not matter
     weights = np.ones(n)
-    bend = np.diff(np.eye(n), 2, axis=0)
+    bend = np.zeros((n - 2, n))
+    np.put_along_axis(bend, np.arange(n - 2)[:, None] + np.arange(3), problem.rows, axis=1)
+    stiff = mu * bend.T @ bend
     for _ in range(_RATIONAL_PASSES):
         share = (confidence / np.square(basis @ weights))[:, None] * basis
-        inverse = np.linalg.pinv(basis.T @ share + mu * bend.T @ bend)
+        inverse = np.linalg.pinv(basis.T @ share + stiff)
         cost = np.zeros((n, n))
         for axis in middle.T:
             cross = share.T @ (axis[:, None] * basis)

@@ -87,13 +87,13 @@ def fit_rotations(
 
 
 def _continuous(vectors: Array) -> Array:
-    """Return rotation vectors (k, 3) of which none jumps by a turn where the angle passes pi."""
+    """Return rotation vectors (k, 3) of which none jumps by a turn where the angle passes pi, from the least one on."""
     length = np.sqrt(np.sum(vectors * vectors, axis=1))
     if not length.max() > 0.5 * math.pi:  # two such can't be half a turn apart
         return vectors
-    result = vectors.copy()
-    for k in range(1, len(result)):
+    result, middle = vectors.copy(), int(np.argmin(length))
+    for k, beside in [(k, k - 1) for k in range(middle + 1, len(length))] + [(k, k + 1) for k in range(middle)[::-1]]:
         if length[k] > 1e-9:
-            turns = np.round((result[k - 1] @ vectors[k] / length[k] - length[k]) / (2.0 * math.pi))
+            turns = np.round((result[beside] @ vectors[k] / length[k] - length[k]) / (2.0 * math.pi))
             result[k] = vectors[k] * (1.0 + turns * 2.0 * math.pi / length[k])
     return result

@@ -138,7 +138,7 @@ class ThesisRetargeter(Retargeter):
             velocity = self._drive(target)
             state = "following" if self._silence <= _SHOWN else "holding"
             closed = self._estimate.closed
-            elbow = _direction(self._estimate.elbow - self._estimate.shoulder)
+            elbow = self._estimate.upper_arm
         self._q = np.clip(self._q + self.dt * velocity, self.arm.lower, self.arm.upper)
         self.command = Command(self.command.time + self.dt, self._q, velocity, closed, state, target, elbow)
         return self._q
@@ -223,8 +223,3 @@ def _faults(as_printed: bool | Collection[str]) -> frozenset[str]:
         if name not in PRINTED:
             raise UnknownNameError.among("as_printed", name, PRINTED)
     return frozenset(names)
-
-
-def _direction(vector: Array) -> Array | None:
-    length = math.sqrt(float(vector @ vector))
-    return vector / length if length > 1e-6 else None
