@@ -14,7 +14,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_solver import ElbowTask, IKSolver
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
 from imitarm.kinematics.posture import ANGLE_LENGTH
-from imitarm.kinematics.sew import one_angle
+from imitarm.kinematics.sew import sew_derivatives
 from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.engagement import Engagement
@@ -169,16 +169,16 @@ class ModernRetargeter(Retargeter):
         """Return where the elbow should be; None when it is free, or one of the two angles is lost."""
         if self._elbow == 0.0:
             return None
-        person = one_angle(np.array([estimate.shoulder, estimate.elbow, estimate.wrist]))
-        if person is None:
+        person = sew_derivatives(estimate.shoulder, estimate.elbow, estimate.wrist)
+        if math.isnan(person.angle):
             return None
         if self._offset is None:
-            robot = one_angle(self.arm.sew_points(self._q))
-            if robot is None:
+            robot = sew_derivatives(*self.arm.sew_points(self._q))
+            if math.isnan(robot.angle):
                 return None
-            self._offset = robot.angle - person.angle
-        confidence = estimate.confidence[0] * min(1.0, person.bend / _BENT)
-        angle = math.remainder(person.angle + self._offset, math.tau)
+            self._offset = float(robot.angle - person.angle)
+        confidence = estimate.confidence[0] * min(1.0, float(person.bend) / _BENT)
+        angle = math.remainder(float(person.angle) + self._offset, math.tau)
         return ElbowTask(angle, self._elbow, confidence, _SWING_GAIN, _SWING_RATE)
 
     def _reach(self, target: Pose, ahead: Array, elbow: ElbowTask | None) -> None:
