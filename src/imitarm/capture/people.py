@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from imitarm.capture.skeleton import JOINT, Skeleton, SkeletonSource
 from imitarm.errors import InputError
 
+Array = NDArray[np.float64]
+
 PATIENCE = 2.0  # [s] so long the one who is followed may be out of sight
-_FASTEST = 6.0  # [m/s] of a torso; what goes faster is another person under the same number
+_FASTEST = 2.5  # [m/s] of a torso; what goes faster is another person under the same number
 _SLACK = 0.3  # [m] and may jump so far by error
 _TORSO = np.array([JOINT[name] for name in ("spine_shoulder", "spine_mid", "neck")])
 
@@ -46,7 +48,8 @@ class PersonFilter(SkeletonSource):
         self.passed_over = 0
         self._source, self._only, self._patience = source, person, patience
         self._seen = -math.inf
-        self._place: tuple[float, NDArray[np.float64]] | None = None  # when and where the torso was last
+        self._place: tuple[float, Array] | None = None  # when and where the torso was last
+        self._stranger: Array | None = None  # where one was seen who bears the same number
 
     @property
     def over(self) -> bool:
@@ -84,22 +87,33 @@ class PersonFilter(SkeletonSource):
         elif torso is None:  # nobody begins to be followed by a hand alone
             return False
         else:
-            self._place = None
+            self._place = self._stranger = None
         self.followed = skeleton.person
         self._seen = max(self._seen, skeleton.time) if near else skeleton.time
         if torso is not None:
             self._place = (skeleton.time, torso)
         return True
 
-    def _can_be_there(self, time: float, torso: NDArray[np.float64] | None) -> bool:
+    def _can_be_there(self, time: float, torso: Array | None) -> bool:
+        """Whether the one who is followed can have gone there, and it is not a stranger who was seen elsewhere."""
         if torso is None or self._place is None:
-            return True
+            return self._stranger is None
         before, place = self._place
-        way = torso - place
-        return float(np.sqrt(way @ way)) <= _SLACK + _FASTEST * abs(time - before)
+        way = _distance(torso, place)
+        near = way <= _SLACK + _FASTEST * abs(time - before)
+        if near and (self._stranger is None or way < _distance(torso, self._stranger)):
+            self._stranger = None
+            return True
+        self._stranger = torso
+        return False
 
 
-def _torso(skeleton: Skeleton) -> NDArray[np.float64] | None:
+def _distance(a: Array, b: Array) -> float:
+    way = a - b
+    return math.sqrt(float(way @ way))
+
+
+def _torso(skeleton: Skeleton) -> Array | None:
     """Return where a person is: the first joint of the torso that is seen, else the middle of the shoulders."""
     for point in skeleton.positions[_TORSO]:
         if point[0] == point[0]:  # not nan
