@@ -54,7 +54,9 @@ def gather(
     began = clock.monotonic()
     expected = total if seconds is None else seconds
     stopped = False
-    with progress_bar() as progress:
+    progress = progress_bar()
+    progress.disable = not progress.console.is_terminal
+    with progress:
         task = progress.add_task(what, total=expected)
         try:
             while not source.over:

@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from imitarm.capture.recording import SkeletonRecording, read_recording
+from imitarm.cli import main
+from recording_samples import Listed, changed, exchanged, same, skeletons
+
+
+@pytest.fixture
+def wave(tmp_path):
+    path = tmp_path / "wave.csv"
+    SkeletonRecording(skeletons(90)).save(path)
+    return path
+
+
+def test_a_recording_is_shown_and_kept(wave, tmp_path, capsys):
+    out = tmp_path / "out.csv"
+    assert main(["capture", str(wave), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    for part in ("90", "2.97 s", "30.0 frames a second", "tracked in 100 %", "0 errors, 0 warnings, 0 notes", "wrote"):
+        assert part in text
+    assert all(map(same, read_recording(out).skeletons, read_recording(wave).skeletons))
+
+
+def test_real_gestures_pass_the_check(real_data, tmp_path, capsys):
+    for i, path in enumerate(sorted((real_data / "kinect_gestures").glob("*.csv"))):
+        assert main(["capture", str(path), "--check", "--out", str(tmp_path / f"{i}.csv")]) == 0
+        assert "0 errors, 0 warnings" in capsys.readouterr().out
+        assert len(read_recording(tmp_path / f"{i}.csv")) == len(read_recording(path))
+
+
+def test_trim_repair_and_one_person(tmp_path, capsys):
+    frames = [exchanged(s) if i == 40 else s for i, s in enumerate(skeletons(90, person=1))]
+    frames[50] = changed(frames[50], time=frames[49].time)
+    both = sorted(frames + skeletons(60, person=2, away=0.8, start=0.5), key=lambda s: s.time)
+    source, out = tmp_path / "two.csv", tmp_path / "out.csv"
+    SkeletonRecording(both).save(source)
+    assert main(["capture", str(source), "--out", str(out), "--trim", "0.5", "2", "--repair"]) == 0
+    shown = capsys.readouterr()
+    assert "kept person 1" in shown.err and "exchanged left and right back in 1 frames" in shown.err
+    back = read_recording(out)
+    assert back.persons == (1,) and back.duration == pytest.approx(1.5, abs=0.05)
+    assert main(["capture", str(source), "--out", str(out), "--person", "2", "--force"]) == 0
+    assert read_recording(out).persons == (2,) and len(read_recording(out)) == 60
+    assert main(["capture", str(source), "--person", "3"]) == 2
+    assert "person 3 is not in it; there is: 1, 2" in capsys.readouterr().err
+
+
+def test_a_check_that_finds_an_error_is_told_by_the_exit_status(tmp_path, capsys):
+    path = tmp_path / "slow.csv"
+    SkeletonRecording(skeletons(30, rate=5.0)).save(path)
+    assert main(["capture", str(path)]) == 0
+    assert main(["capture", str(path), "--check"]) == 2
+    assert "5.0 frames a second" in capsys.readouterr().out
+
+
+def test_a_made_up_person_for_some_seconds(tmp_path):
+    out = tmp_path / "made_up.csv"
+    assert main(["capture", "synthetic:4", "--seconds", "2", "--out", str(out)]) == 0
+    recording = read_recording(out)
+    assert 1.8 < recording.duration <= 2.0 and len(recording) > 50
+
+
+def test_skeletons_are_sent_on(wave, monkeypatch):
+    sent = []
+
+    class Sender:
+        def __init__(self, host, port):
+            self.send = sent.append
+            sent.append((host, port))
+
+        def close(self):
+            sent.append("closed")
+
+    stand_in = ModuleType("stream")
+    stand_in.UdpSkeletonSender = Sender
+    monkeypatch.setitem(sys.modules, "imitarm.capture.stream", stand_in)
+    assert main(["capture", str(wave), "--seconds", "0.2", "--send", "127.0.0.1:7400"]) == 0
+    assert sent[0] == ("127.0.0.1", 7400) and sent[-1] == "closed" and len(sent) == 2 + 7
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--out", "{}/no/a.csv"], "there is no folder"),
+        (["--out", "{}/wave.csv"], "is there already; name another file, or replace it with --force"),
+        (["--seconds", "0"], "--seconds must be above 0"),
+        (["--trim", "3", "1"], "--trim must be two times"),
+        (["--trim", "7", "9"], "no frame between 7 and 9 s"),
+        (["--send", "7400"], "must be HOST:PORT"),
+    ],
+)
+def test_a_wrong_option_is_one_message(wave, tmp_path, capsys, options, message):
+    before = wave.read_bytes()
+    assert main(["capture", str(wave), *(option.format(tmp_path) for option in options)]) == 2
+    text = capsys.readouterr().err
+    assert message in text and text.startswith("imitarm: error: ") and "bug" not in text
+    assert wave.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["wave.csv"]
+
+
+def test_a_truncated_file_is_named(wave, capsys):
+    wave.write_bytes(wave.read_bytes()[:-300])
+    assert main(["capture", str(wave)]) == 2
+    assert "wave.csv, line 99" in capsys.readouterr().err
+
+
+def test_nobody_there_is_a_failure_and_leaves_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("imitarm.cli.capture.open_source", lambda word, realtime: Listed([None, None]))
+    assert main(["capture", "webcam:0", "--out", str(tmp_path / "a.csv")]) == 1
+    assert "nobody was seen, nothing is written" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_source_that_fails_loses_nothing(tmp_path, capsys, monkeypatch):
+    class Unplugged(Listed):
+        def read(self, timeout=1.0):
+            if len(self.items) == 1:
+                raise OSError("camera unplugged")
+            return super().read(timeout)
+
+    monkeypatch.setattr("imitarm.cli.capture.open_source", lambda word, realtime: Unplugged(skeletons(20)))
+    assert main(["capture", "webcam:0", "--out", str(tmp_path / "a.csv")]) == 2
+    assert "camera unplugged" in capsys.readouterr().err
+    assert len(read_recording(tmp_path / "a.csv")) == 19
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs signals")
+@pytest.mark.parametrize(("kind", "name"), [(signal.SIGINT, "live.csv"), (signal.SIGKILL, "live.csv.part")])
+def test_a_capture_that_is_ended_keeps_what_came(tmp_path, kind, name):
+    """Ctrl-C closes the recording; kill -9 leaves its part."""
+    out = tmp_path / "live.csv"
+    words = ["capture", "synthetic:1", "--realtime", "--out", str(out)]
+    code = f"import sys; from imitarm.cli import main; sys.exit(main({words!r}))"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        part, until = tmp_path / "live.csv.part", time.monotonic() + 30
+        while time.monotonic() < until and (not part.exists() or part.stat().st_size < 40_000):
+            time.sleep(0.02)
+        process.send_signal(kind)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == (0 if kind == signal.SIGINT else -kind), errors
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    times = [s.time for s in read_recording(tmp_path / name).skeletons]
+    assert len(times) > 5 and (np.diff(times) > 0).all()
