@@ -110,7 +110,7 @@ def test_baerlocher_damping_keeps_the_norm_of_the_scaled_velocity(seed):
     twist = rng.normal(size=6) * 10.0 ** rng.uniform(-3, 2)
     task = IKSolver(SAWYER, "dls", dt=DT, max_speed=1e9).task(q, twist)
     free = task._replace(lower=np.full(7, -np.inf), upper=np.full(7, np.inf))
-    squares, basis = np.linalg.eigh((scaled := task.jacobian * task.max_velocity) @ scaled.T)
+    squares, basis = np.linalg.eigh((scaled := task.jacobian) @ scaled.T)
     least, d = np.sqrt(max(squares[0], 0.0)), np.linalg.norm(task.twist)
     damping = 0.0 if least >= d else least * (d - least) if least >= d / 2 else d * d / 4
     expected = scaled.T @ (basis @ ((basis.T @ task.twist) / (squares + damping)))

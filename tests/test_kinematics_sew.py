@@ -115,12 +115,12 @@ def test_many_arms_at_once_are_each_arm_alone():
     angles = sew_angle(points[..., 0, :], points[..., 1, :], points[..., 2, :])
     assert angles.shape == (4, 5)
     for index in np.ndindex(4, 5):
-        assert angles[index] == pytest.approx(one_angle(points[index]).angle, abs=1e-12)
+        assert angles[index] == pytest.approx(one_angle(*points[index].tolist()).angle, abs=1e-12)
 
 
 def test_a_straight_arm_has_no_angle():
     straight = np.array([[0, 0, 0], [0.3, 0, 0], [0.6, 0, 0.0]])
-    assert np.isnan(sew_angle(*straight)) and one_angle(straight) is None
+    assert np.isnan(sew_angle(*straight)) and one_angle(*straight.tolist()) is None
     angle, jacobian = sew_jacobian(straight, np.zeros((3, 3, 7)))
     assert np.isnan(angle) and np.isnan(jacobian).all()
     lost = np.full(3, np.nan)

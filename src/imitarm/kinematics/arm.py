@@ -130,7 +130,9 @@ class ArmModel:
         self._source, self._spec, self._model = source, file.spec, model
         self._qpos = columns(model.jnt_qposadr[joints])
         self._dofs = columns(model.jnt_dofadr[joints])
-        self._scratch = ArmMemory(model, posture, self._qpos, self._dofs)
+        self.landmarks = Landmarks.find(model, np.array(joints))
+        marked = () if self.landmarks is None else self.landmarks.sites
+        self._scratch = ArmMemory(model, posture, self._qpos, self._dofs, marked)
         self._joints = np.array(joints)
         self._flange = model.site("flange").id
         names = [model.site(i).name for i in range(model.nsite)]
@@ -149,7 +151,6 @@ class ArmModel:
             self.tool_to_flange = self.forward_kinematics(self.home).inverse() @ self.tool_pose(self.home)
         self._cover = SphereCover(whole, self._joints)
         self.sphere_bodies = self._cover.bodies
-        self.landmarks = Landmarks.find(model, self._joints)
         self._sealed = True
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -208,13 +209,32 @@ class ArmModel:
             qpos[model.jnt_qposadr[model.joint(prefix + name).id]] = value
         return qpos
 
+    def at(self, q: ArrayLike) -> ArmMemory:
+        """Return this thread's working memory with kinematics at ``q``: for loops that ask for many things of a posture.
+
+        It is computed only when the posture is a new one, and holds until the next is asked for.
+        """
+        memory = self._scratch
+        memory.move_to(self._checked(q, "q"))
+        return memory
+
+    def site(self, frame: str) -> int:
+        """Return the index of the site of a frame, ``"tool"`` or ``"flange"``, in :meth:`at`.
+
+        Raises:
+            UnknownNameError: when the frame is not known.
+        """
+        if frame not in {"tool", "flange"}:
+            raise UnknownNameError.among("frame", frame, ("tool", "flange"))
+        return self._tool if frame == "tool" else self._flange
+
     def forward_kinematics(self, q: ArrayLike) -> Pose:
         """Return the pose of the flange: ``flange_to_base``."""
-        return self._at(q).site_pose(self._flange)
+        return self.at(q).site_pose(self._flange)
 
     def tool_pose(self, q: ArrayLike) -> Pose:
         """Return the pose of the tool's tip: ``tool_to_base``."""
-        return self._at(q).site_pose(self._tool)
+        return self.at(q).site_pose(self._tool)
 
     def tool_path(self, joints: ArrayLike) -> tuple[Array, Array]:
         """Return the poses of the tool's tip for many postures.
@@ -225,17 +245,17 @@ class ArmModel:
         Returns:
             positions (n, 3) [m] and quaternions wxyz (n, 4).
         """
-        poses = [self._at(q).site_pose(self._tool) for q in np.atleast_2d(np.asarray(joints, dtype=float))]
+        poses = [self.at(q).site_pose(self._tool) for q in np.atleast_2d(np.asarray(joints, dtype=float))]
         positions = np.array([pose.position for pose in poses]).reshape(-1, 3)
         return positions, np.array([pose.quaternion for pose in poses]).reshape(-1, 4)
 
     def jacobian(self, q: ArrayLike) -> Array:
         """Return the Jacobian of the flange, shape (6, n_joints), linear rows first, in the base frame."""
-        return np.array(self._at(q).site_jacobian(self._flange))
+        return np.array(self.at(q).site_jacobian(self._flange))
 
     def tool_jacobian(self, q: ArrayLike) -> Array:
         """Return the Jacobian of the tool's tip, shape (6, n_joints), linear rows first, in the base frame."""
-        return np.array(self._at(q).site_jacobian(self._tool))
+        return np.array(self.at(q).site_jacobian(self._tool))
 
     def point_jacobian(self, q: ArrayLike, body: str, point: ArrayLike) -> Array:
         """Return the Jacobian of a point that moves with ``body``.
@@ -255,7 +275,7 @@ class ArmModel:
         if index < 0:
             known = [self._model.body(i).name for i in range(1, self._model.nbody)]
             raise UnknownNameError.among(f"body of {self.name}:", body, known)
-        scratch = self._at(q)
+        scratch = self.at(q)
         position = np.asarray(point, dtype=float).reshape(3, 1)
         mujoco.mj_jac(self._model, scratch.data, scratch.linear, None, position, index)
         return np.array(scratch.linear[:, self._dofs])
@@ -266,11 +286,12 @@ class ArmModel:
         Raises:
             InputError: when the arm's file does not say where they are.
         """
-        return self.marked().points(self._at(q))
+        return np.array(self.at(q).sites[list(self.marked().sites)])
 
     def sew_jacobians(self, q: ArrayLike) -> Array:
         """Return the Jacobians of shoulder, elbow and wrist, shape (3, 3, n_joints) [m/rad]; as ``sew_points``."""
-        return self.marked().jacobians(self._model, self._at(q), self._dofs)
+        self.marked()
+        return np.array(self.at(q).marked_jacobians()).reshape(3, 3, -1)
 
     def marked(self) -> Landmarks:
         """Return ``landmarks``.
@@ -294,7 +315,7 @@ class ArmModel:
         Returns:
             centers (m, 3) [m] in the base frame and radii (m,) [m].
         """
-        return self._cover.centers(self._at(q).data), self._cover.radii
+        return self._cover.centers(self.at(q).data), self._cover.radii
 
     @property
     def tool_spheres(self) -> Array:
@@ -306,13 +327,18 @@ class ArmModel:
         rigid = self._cover.follows_last_joint
         return np.column_stack([self.tool_pose(self.home).inverse().apply(centers[rigid]), radii[rigid]])
 
-    def sphere_jacobians(self, q: ArrayLike) -> Array:
-        """Return the Jacobians of the spheres' centers, shape (m, 3, n_joints) [m/rad]."""
-        return self._cover.jacobians(self._at(q).data)
+    @property
+    def sphere_links(self) -> NDArray[np.int_]:
+        """By how many joints each sphere is moved, shape (m,): n_joints for those that move with the flange."""
+        return self._cover.links
+
+    def sphere_jacobians(self, q: ArrayLike, chosen: NDArray[np.int_] | None = None) -> Array:
+        """Return the Jacobians of the spheres' centers, of all or of some, shape (m, 3, n_joints) [m/rad]."""
+        return self._cover.jacobians(self.at(q).data, chosen)
 
     def gravity_torque(self, q: ArrayLike) -> Array:
         """Return the torques g(q) that hold arm and tool against gravity, shape (n_joints,) [N m]."""
-        return self._recursive_newton_euler(self._at(q), None, None)
+        return self._recursive_newton_euler(self.at(q), None, None)
 
     def inverse_dynamics(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Return the torques of a motion by the recursive Newton-Euler algorithm.
@@ -326,11 +352,11 @@ class ArmModel:
             shape (n_joints,) [N m]; without rotor inertia, damping and friction of the joints.
         """
         velocity, acceleration = self._checked(qd, "qd"), self._checked(qdd, "qdd")
-        return self._recursive_newton_euler(self._at(q), velocity, acceleration)
+        return self._recursive_newton_euler(self.at(q), velocity, acceleration)
 
     def mass_matrix(self, q: ArrayLike) -> Array:
         """Return the rigid-body inertia M(q), shape (n_joints, n_joints) [kg m^2], without rotor inertia."""
-        scratch = self._at(q)
+        scratch = self.at(q)
         full = np.zeros((self._model.nv, self._model.nv))
         mujoco.mj_crb(self._model, scratch.data)
         mujoco.mj_fullM(self._model, scratch.data, full)
@@ -355,15 +381,9 @@ class ArmModel:
         array = np.asarray(values, dtype=float)
         if array.shape != self.lower.shape:
             raise InputError(f"{self.name}: {what} needs {self.n_joints} numbers, got shape {array.shape}")
-        if not math.isfinite(float(array.dot(array))):
+        if not math.isfinite(sum(array.tolist())):
             raise InputError(f"{self.name}: {what} must be finite numbers, got {array}")
         return array
-
-    def _at(self, q: ArrayLike) -> ArmMemory:
-        """Return the working memory with kinematics at ``q``, computed only when the posture is a new one."""
-        memory = self._scratch
-        memory.move_to(self._checked(q, "q"))
-        return memory
 
     def _recursive_newton_euler(self, scratch: ArmMemory, velocity: Array | None, acceleration: Array | None) -> Array:
         data = scratch.data

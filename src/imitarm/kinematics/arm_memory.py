@@ -22,17 +22,37 @@ class ArmMemory(threading.local):
         jacobian: of the site that was asked for last, shape (6, nv), linear rows first.
         linear: its first three rows.
         angular: its last three rows.
+        sites: where the sites are, shape (nsite, 3) [m].
         force: shape (nv,).
     """
 
-    def __init__(self, model: mujoco.MjModel, home: Array, positions: Columns, joints: Columns) -> None:
-        """Begin at ``home`` (nq,); the arm's joints stand at ``positions`` in qpos and at ``joints`` in qvel."""
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        home: Array,
+        positions: Columns,
+        joints: Columns,
+        marked: tuple[int, ...] = (),
+    ) -> None:
+        """Begin at ``home``.
+
+        Args:
+            model: the arm.
+            home: shape (nq,).
+            positions: where the arm's joints stand in qpos.
+            joints: where they stand in qvel.
+            marked: sites of which :meth:`marked_jacobians` are asked for.
+        """
         self.data = mujoco.MjData(model)
         self.data.qpos[:] = home
         self.jacobian = np.zeros((6, model.nv))
         self.linear, self.angular = self.jacobian[:3], self.jacobian[3:]
         self.force = np.zeros(model.nv)
         self._model, self._positions, self._joints, self._posture = model, positions, joints, b""
+        stacked = np.zeros((len(marked), 3, model.nv))
+        self._stacked = stacked.reshape(-1, model.nv)[:, joints]
+        self._marked = list(zip(marked, stacked, strict=True))
+        self.sites = self.data.site_xpos
         self._qpos = self.data.qpos  # asking for it each time takes as long as the kinematics of a link
 
     def move_to(self, q: Array) -> None:
@@ -54,6 +74,12 @@ class ArmMemory(threading.local):
         """Return the Jacobian of a site, shape (6, n), as a view that the next one overwrites."""
         mujoco.mj_jacSite(self._model, self.data, self.linear, self.angular, site)
         return self.jacobian[:, self._joints]
+
+    def marked_jacobians(self) -> Array:
+        """Return the Jacobians of the marked sites below each other, (3 m, n), as a view that the next ones overwrite."""
+        for site, rows in self._marked:
+            mujoco.mj_jacSite(self._model, self.data, rows, None, site)
+        return self._stacked
 
 
 def columns(indices: NDArray[np.int32]) -> Columns:

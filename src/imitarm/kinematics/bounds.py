@@ -146,16 +146,16 @@ class WristBound:
         self._step = self._acceleration * dt
         self._most = float(arm.max_velocity[self.joint])
 
-    def at(self, q: Array) -> tuple[float, float] | None:
-        """Return the side on which the wrist is and the least velocity to that side [rad/s]; None: any will do."""
+    def at(self, q: Array) -> tuple[int, float, float] | None:
+        """Return the joint, the side on which it is, and its least velocity to that side [rad/s]; None: any will do."""
         position = float(q[self.joint])
         away = position - math.pi * round(position / math.pi)
         side = 1.0 if away >= 0.0 else -1.0
         way = abs(away) - WRIST_MARGIN
         if way <= 0.0:
-            return side, -_RETURN * way
+            return self.joint, side, -_RETURN * way
         least = self._step - math.sqrt(self._step * self._step + 2.0 * self._acceleration * way)
-        return (side, least) if least > -self._most else None
+        return (self.joint, side, least) if least > -self._most else None
 
 
 def clearance_rows(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import NamedTuple
 
 import daqp
@@ -27,8 +28,9 @@ _EYE = np.eye(6)
 class Task(NamedTuple):
     """What the methods see: the weighted task, and the box of admissible joint velocities."""
 
-    jacobian: Array  # weighted, (6, n); for the QP with the elbow's row (7, n)
+    jacobian: Array  # weighted, (6, n); with the elbow's row (7, n); for "dls" in joints scaled by max_velocity
     twist: Array  # weighted and clamped, (6,) or (7,)
+    square: float  # squared norm of the first six
     lower: Array
     upper: Array
     max_velocity: Array
@@ -52,7 +54,7 @@ def quadratic_program(task: Task) -> Array:
         effort += _POSTURE
         linear += _POSTURE * task.posture
     np.negative(linear, out=linear)
-    hessian.ravel()[:: n + 1] += effort
+    hessian += effort * _eye(n)
     velocity = _least_cost(task, hessian, linear)
     if task.wrist is not None:
         joint, side, least = task.wrist
@@ -64,36 +66,40 @@ def quadratic_program(task: Task) -> Array:
 
 
 def _least_cost(task: Task, hessian: Array, linear: Array) -> Array:
-    """Minimise v^T H v / 2 + f^T v; MuJoCo's projected Newton method needs half of the time where a box is all."""
+    """Minimise v^T H v / 2 + f^T v inside the box and under the rows, exactly."""
     n = len(linear)
-    if task.rows is None:
-        velocity = np.zeros(n)
-        memory = np.empty((n, n + 7))
-        solved = mujoco.mju_boxQP(velocity, memory, None, hessian, linear, task.lower, task.upper) >= 0
-        matrix, upper, lower, sense = np.empty((0, n)), task.upper, task.lower, np.zeros(n, dtype=np.intc)
-    else:
-        solved, (matrix, least) = False, task.rows
-        upper = np.concatenate((task.upper, np.full(len(least), 1e30)))
-        lower = np.concatenate((task.lower, least))
+    matrix, lower, upper = _no_rows(n), task.lower, task.upper
+    sense = np.zeros(n, dtype=np.intc)
+    if task.rows is not None:
+        matrix, least = task.rows
+        upper = np.concatenate((upper, np.full(len(least), 1e30)))
+        lower = np.concatenate((lower, least))
         sense = np.zeros(n + len(least), dtype=np.intc)
         sense[n:] = _SOFT
-    if not solved:
-        velocity, _, status, _ = daqp.solve(hessian, linear, matrix, upper, lower, sense, rho_soft=_SLACK)
-        if status <= 0:
-            # the box is never empty and rows are soft: only lost digits can bring us here, and standing is safe
-            velocity = np.zeros(n)
+    velocity, _, status, _ = daqp.solve(hessian, linear, matrix, upper, lower, sense, rho_soft=_SLACK)
+    if status <= 0:
+        # the box is never empty and rows are soft: only lost digits can bring us here, and standing is safe
+        velocity = np.zeros(n)
     velocity = np.maximum(velocity, task.lower)
     return np.minimum(velocity, task.upper, out=velocity)
 
 
+@cache
+def _eye(n: int) -> Array:
+    return np.eye(n)
+
+
+@cache
+def _no_rows(n: int) -> Array:
+    return np.empty((0, n))
+
+
 def damped_least_squares(task: Task) -> Array:
     """Thesis Eq 3.8 and 3.9: one damping for all directions, as little as keeps the joints' speed in bounds."""
-    scaled = task.jacobian * task.max_velocity
+    scaled, square = task.jacobian, task.square
     gram = scaled.dot(scaled.T)
-    square = float(task.twist.dot(task.twist))
-    plain = task.posture is None and task.small_angle is None
-    if plain and _is_above(gram, max(square, _CLEAR)):
-        return _undamped(task, scaled, gram)
+    if task.posture is None and task.small_angle is None and _is_above(gram, max(square, _CLEAR)):
+        return _undamped(task, gram)
     squares, basis, _ = lapack.dsyev(gram)
     least = math.sqrt(max(float(squares[0]), 0.0))
     d = math.sqrt(square)
@@ -108,7 +114,7 @@ def damped_least_squares(task: Task) -> Array:
     along /= np.maximum(squares + damping, _NULL)
     result = basis.dot(along).dot(scaled)
     result *= task.max_velocity
-    return _within_box(task, result, scaled, squares, basis)
+    return _within_box(task, result, task.max_velocity, squares, basis)
 
 
 def _is_above(gram: Array, bound: float) -> bool:
@@ -117,12 +123,12 @@ def _is_above(gram: Array, bound: float) -> bool:
     return mujoco.mju_cholFactor(rest, _NULL) == len(rest)
 
 
-def _undamped(task: Task, scaled: Array, gram: Array) -> Array:
+def _undamped(task: Task, gram: Array) -> Array:
     """Solve without damping; no joint can then be too fast, since the norm is at most 1 in scaled joints."""
     along = np.empty(6)
     mujoco.mju_cholFactor(gram, 0.0)
     mujoco.mju_cholSolve(along, gram, task.twist)
-    result = along.dot(scaled)
+    result = along.dot(task.jacobian)
     result *= task.max_velocity
     np.maximum(result, task.lower, out=result)
     return np.minimum(result, task.upper, out=result)
@@ -135,17 +141,16 @@ def filtered_svd(task: Task) -> Array:
     damping = np.maximum(_FILTER * _FILTER - squares, 0.0)
     along = task.twist.dot(basis) / np.maximum(squares + damping, _NULL)
     result = basis.dot(along).dot(task.jacobian)
-    return _within_box(task, result, task.jacobian, squares, basis)
+    return _within_box(task, result, 1.0, squares, basis)
 
 
-def _within_box(task: Task, result: Array, jacobian: Array, squares: Array, basis: Array) -> Array:
+def _within_box(task: Task, result: Array, scale: Array | float, squares: Array, basis: Array) -> Array:
     """Add the drift to the posture in the null space, then keep the limits: direction first, then each joint."""
     if task.posture is not None:
-        scale = task.max_velocity if jacobian is not task.jacobian else np.ones_like(task.posture)
         drift = task.posture / scale
         usable = squares > 1e-8
-        used = (basis.T @ (jacobian @ drift))[usable] / squares[usable]
-        result = result + scale * (drift - jacobian.T @ (basis[:, usable] @ used))
+        used = (basis.T @ (task.jacobian @ drift))[usable] / squares[usable]
+        result = result + scale * (drift - task.jacobian.T @ (basis[:, usable] @ used))
     excess = float((np.abs(result) / task.max_velocity).max())
     if excess > 1.0:
         result = result / excess

@@ -11,16 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_memory import ArmMemory
 from imitarm.kinematics.bounds import VelocityBox, WristBound
 from imitarm.kinematics.ik_methods import METHODS, Task
 from imitarm.kinematics.posture import ANGLE_LENGTH
-from imitarm.kinematics.sew import CONVENTIONS, one_angle
+from imitarm.kinematics.sew import one_angle
 
 Array = NDArray[np.float64]
 Rows = tuple[ArrayLike, ArrayLike]
 
 _WEIGHTS = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
-_COLUMN = _WEIGHTS[:, None]
 _MAX_SPEED = {"dls": 0.6, "qp": 2.0, "svd": 0.6}  # [m/s] clamp of the weighted twist
 _REFERENCE = 0.04  # squared length below which the direction that the elbow's angle is measured from fades
 
@@ -103,8 +103,6 @@ class IKSolver:
     ) -> None:
         if method not in METHODS:
             raise UnknownNameError.among("IK method", method, METHODS)
-        if frame not in {"tool", "flange"}:
-            raise UnknownNameError.among("frame", frame, ("tool", "flange"))
         if small_angle not in {None, "thesis"}:
             raise UnknownNameError.among("small_angle", small_angle, ("thesis", None))
         if not 0.0 < dt < math.inf:
@@ -115,8 +113,12 @@ class IKSolver:
             )
         self.arm, self.method = arm, method
         self._solve = METHODS[method]
-        self._jacobian = arm.tool_jacobian if frame == "tool" else arm.jacobian
+        self._site = arm.site(frame)
         self._max_speed = _MAX_SPEED[method] if max_speed is None else max_speed
+        self._most = self._max_speed * self._max_speed
+        # rows weighted; for "dls" the columns too, whose joints are counted in shares of their velocity limit
+        joints = arm.max_velocity if method == "dls" else np.ones(arm.n_joints)
+        self._scale = np.outer(_WEIGHTS, joints)
         self._posture_gain, self._small_angle, self._max_velocity = posture_gain, small_angle, arm.max_velocity
         self._box = VelocityBox(arm, dt, singularity_bounds=singularity_bounds)
         self._wrist = WristBound(arm, dt) if singularity_bounds and method == "qp" else None
@@ -147,7 +149,8 @@ class IKSolver:
         """Do what :meth:`solve` does, and report what could not be done; same arguments."""
         task = self.task(q, twist, velocity=velocity, q_ref=q_ref, rows=rows, sew=sew)
         result = self._solve(task)
-        error = (task.twist - task.jacobian @ result)[:6] / _WEIGHTS
+        moved = self.arm.at(q).site_jacobian(self._site) @ result
+        error = task.twist[:6] / _WEIGHTS - moved
         near = 1e-9 * task.max_velocity
         limited = (result >= task.upper - near) | (result <= task.lower + near)
         slack = np.zeros(0) if task.rows is None else np.maximum(0.0, task.rows[1] - task.rows[0] @ result)
@@ -164,16 +167,19 @@ class IKSolver:
         sew: ElbowTask | None = None,
     ) -> Task:
         """Check the input and weight the task; same arguments."""
-        wanted = np.array(twist, dtype=float)
-        if wanted.shape != (6,) or not math.isfinite(float(wanted.dot(wanted))):
+        wanted = np.asarray(twist, dtype=float)
+        if wanted.shape != (6,):
             raise InputError(f"solve_ik: twist must be 6 finite numbers (linear, angular), got {twist!r}")
+        wanted = wanted * _WEIGHTS
+        square = float(wanted.dot(wanted))
+        if not math.isfinite(square):
+            raise InputError(f"solve_ik: twist must be 6 finite numbers (linear, angular), got {twist!r}")
+        if square > self._most:
+            wanted *= self._max_speed / math.sqrt(square)
+            square = self._most
         position = np.asarray(q, dtype=float)
-        jacobian = self._jacobian(position)
-        jacobian *= _COLUMN
-        wanted *= _WEIGHTS
-        speed = math.sqrt(float(wanted.dot(wanted)))
-        if speed > self._max_speed:
-            wanted *= self._max_speed / speed
+        memory = self.arm.at(position)
+        jacobian = memory.site_jacobian(self._site) * self._scale
         previous = None if velocity is None else self._joints(velocity, "velocity")
         lower, upper = self._box.at(position, previous)
         posture = None
@@ -182,42 +188,48 @@ class IKSolver:
             posture = np.minimum(np.maximum(posture, lower), upper)
         checked = None if rows is None else self._checked_rows(rows)
         if sew is not None:
-            jacobian, wanted = self._with_elbow(position, jacobian, wanted, sew)
-        wrist = self._wrist
-        near = None if wrist is None else wrist.at(position)
-        bound = None if wrist is None or near is None else (wrist.joint, *near)
+            jacobian, wanted = self._with_elbow(memory, jacobian, wanted, sew)
+        bound = None if self._wrist is None else self._wrist.at(position)
         return Task(
-            jacobian, wanted, lower, upper, self._max_velocity, previous, posture, checked, self._small_angle, bound
+            jacobian,
+            wanted,
+            square,
+            lower,
+            upper,
+            self._max_velocity,
+            previous,
+            posture,
+            checked,
+            self._small_angle,
+            bound,
         )
 
-    def _with_elbow(self, q: Array, jacobian: Array, wanted: Array, sew: ElbowTask) -> tuple[Array, Array]:
+    def _with_elbow(self, memory: ArmMemory, jacobian: Array, wanted: Array, sew: ElbowTask) -> tuple[Array, Array]:
         """Add the elbow's row to the task; nothing where its angle is lost."""
         angle, weight, confidence, gain, max_rate, convention = sew
         if self.method != "qp":
             raise InputError(f"solve_ik: method {self.method!r} can't lead the elbow; use method='qp'")
         if not (math.isfinite(angle) and weight >= 0.0 and confidence >= 0.0 and gain >= 0.0 and max_rate >= 0.0):
             raise InputError(f"solve_ik: sew needs a finite angle and numbers that are not negative, got {sew!r}")
-        if convention not in CONVENTIONS:
-            raise UnknownNameError.among("convention of the SEW angle", convention, CONVENTIONS)
-        if weight * confidence == 0.0:
-            return jacobian, wanted
-        now = one_angle(self.arm.sew_points(q), convention)
+        sites = self.arm.marked().sites
+        now = one_angle(*(memory.sites[site].tolist() for site in sites), convention)
         if now is None:
             return jacobian, wanted
         share = math.sqrt(weight * confidence * now.bend * min(1.0, now.reference / _REFERENCE))
         rate = gain * math.remainder(angle - now.angle, math.tau)
         gradient = np.array(now.shoulder + now.elbow + now.wrist)
         gradient *= share
-        row = gradient.dot(self.arm.sew_jacobians(q).reshape(9, -1))
-        extended, target = np.empty((7, len(row))), np.empty(7)
-        extended[:6], extended[6] = jacobian, row
-        target[:6], target[6] = wanted, share * min(max(rate, -max_rate), max_rate)
+        extended, target = np.empty((7, len(self._max_velocity))), np.empty(7)
+        extended[:6] = jacobian
+        extended[6] = gradient.dot(memory.marked_jacobians())
+        target[:6] = wanted
+        target[6] = share * min(max(rate, -max_rate), max_rate)
         return extended, target
 
     def _joints(self, values: ArrayLike, what: str) -> Array:
         array = np.asarray(values, dtype=float)
         n = self.arm.n_joints
-        if array.shape != (n,) or not math.isfinite(float(array.dot(array))):
+        if array.shape != (n,) or not math.isfinite(sum(array.tolist())):
             raise InputError(f"solve_ik: {what} must be {n} finite numbers, got {values!r}")
         return array
 

@@ -1,4 +1,4 @@
-"""Shoulder, elbow and wrist of a robot arm: where they are, how they move, and the joints that bend there."""
+"""Shoulder, elbow and wrist of a robot arm, and the joints that bend there."""
 
 from __future__ import annotations
 
@@ -7,10 +7,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-
-from imitarm.kinematics.arm_memory import ArmMemory, Columns
-
-Array = NDArray[np.float64]
 
 NAMES = ("shoulder", "elbow", "wrist")
 """Sites of an arm's file that mark the three points."""
@@ -49,14 +45,3 @@ class Landmarks:
         numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "elbow_straight")
         straight = float(model.numeric_data[model.numeric_adr[numeric]]) if numeric >= 0 else 0.0
         return cls((sites[0], sites[1], sites[2]), bodies.index(owners[1]), bodies.index(owners[2]), straight)
-
-    def points(self, memory: ArmMemory) -> Array:
-        """Return where they are, shape (3, 3) [m]: shoulder, elbow, wrist."""
-        return np.array(memory.data.site_xpos[list(self.sites)])
-
-    def jacobians(self, model: mujoco.MjModel, memory: ArmMemory, joints: Columns) -> Array:
-        """Return their Jacobians, shape (3, 3, n_joints) [m/rad]."""
-        stacked = np.empty((3, 3, model.nv))
-        for site, jacobian in zip(self.sites, stacked, strict=True):
-            mujoco.mj_jacSite(model, memory.data, jacobian, None, site)
-        return np.array(stacked[:, :, joints])

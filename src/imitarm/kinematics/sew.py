@@ -10,7 +10,7 @@ where no wrist goes. Here it points behind the base (METHODS A.9).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,10 +22,8 @@ Array = NDArray[np.float64]
 # Three components, either floats or arrays of one shape: the same formulas serve one instant and many.
 Vector = tuple[Any, Any, Any]
 
-BEHIND = (-1.0, 0.0, 0.0)
-"""Where the stereographic angle is lost: the wrist straight behind the shoulder, base frame."""
 UP = (0.0, 0.0, 1.0)
-"""An elbow that hangs straight down has the angle pi, one that is lifted straight up 0 (wrist in front)."""
+"""With the wrist ahead of the shoulder an elbow that is lifted straight up has the angle 0, one that hangs has pi."""
 _LOST = 1e-12  # squared sine below which an angle is only rounding
 
 
@@ -108,24 +106,28 @@ def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereogr
     Returns:
         angle [rad] and its Jacobian, shape (n,); nan where the angle is lost.
     """
-    found = one_angle(points, convention)
+    found = one_angle(*points.tolist(), convention)
     if found is None:
         return math.nan, np.full(jacobians.shape[-1], math.nan)
     gradient = np.array(found.shoulder + found.elbow + found.wrist)
     return found.angle, gradient.dot(jacobians.reshape(9, -1))
 
 
-def one_angle(points: Array, convention: str = "stereographic") -> SewAngle | None:
+def one_angle(
+    shoulder: Sequence[float], elbow: Sequence[float], wrist: Sequence[float], convention: str = "stereographic"
+) -> SewAngle | None:
     """Return the angle of one arm with derivatives as triples of floats, many times quicker than for arrays.
 
     Args:
-        points: of shoulder, elbow and wrist, shape (3, 3) [m].
+        shoulder: three floats [m].
+        elbow: three floats [m].
+        wrist: three floats [m].
         convention: as for :func:`sew_angle`.
 
     Returns:
         None where the angle is lost.
     """
-    (sx, sy, sz), (ex, ey, ez), (wx, wy, wz) = points.tolist()
+    (sx, sy, sz), (ex, ey, ez), (wx, wy, wz) = shoulder, elbow, wrist
     try:
         found = _formula(convention)(math, (ex - sx, ey - sy, ez - sz), (wx - sx, wy - sy, wz - sz))
     except ZeroDivisionError:
@@ -134,25 +136,32 @@ def one_angle(points: Array, convention: str = "stereographic") -> SewAngle | No
 
 
 def _stereographic(m: Any, e: Vector, w: Vector) -> SewAngle:
-    """Value and derivatives (METHODS A.9), verified by finite differences."""
+    """Value and derivatives (METHODS A.9); with e_t = -x and e_r = z many of the products are single terms."""
     length = m.sqrt(_dot(w, w))
-    along = _times(1.0 / length, w)
+    along = x, y, z = w[0] / length, w[1] / length, w[2] / length
     to_wrist = _dot(along, e)
-    p = _minus(e, _times(to_wrist, along))
+    p = e[0] - to_wrist * x, e[1] - to_wrist * y, e[2] - to_wrist * z
     p_squared = _dot(p, p)
-    k_r = _cross(_minus(along, BEHIND), UP)
-    k_x = _cross(k_r, w)
+    k0, k1 = y, -1.0 - x  # k_r = (along - e_t) x e_r, whose third component is 0
+    k_x = k1 * z, -k0 * z, k0 * y - k1 * x  # k_r x along
     k_squared = _dot(k_x, k_x)
-    per_k = 1.0 / m.sqrt(k_squared)
-    e_x = _times(per_k, k_x)
+    size = m.sqrt(k_squared)
+    e_x = k_x[0] / size, k_x[1] / size, k_x[2] / size
     e_y = _cross(along, e_x)
-    angle = m.atan2(_dot(e_y, e), _dot(e_x, e)) if m is math else m.arctan2(_dot(e_y, e), _dot(e_x, e))
-    by_elbow = _times(1.0 / p_squared, _cross(along, p))
-    turn = _cross(UP, _cross(w, e_y))  # the reference turns with the direction to the wrist ...
-    turn = _times(1.0 / length, _minus(turn, _times(_dot(along, turn), along)))
-    swing = _cross(e_y, k_r)  # ... and with the wrist itself
-    by_wrist = _minus(_times(-to_wrist / length, by_elbow), _times(per_k, _plus(turn, swing)))
-    return _found(angle, by_elbow, by_wrist, e, w, length, p_squared, k_squared / (length * length))
+    by_elbow = _cross(along, p)
+    by_elbow = b0, b1, b2 = by_elbow[0] / p_squared, by_elbow[1] / p_squared, by_elbow[2] / p_squared
+    # The reference turns because k_r follows the direction to the wrist, -P (e_r x (along x e_y)), where
+    # along x e_y = -e_x, and because the wrist itself moves, e_y x k_r.
+    t0, t1 = e_x[1], -e_x[0]
+    off = x * t0 + y * t1
+    c = 1.0 / (size * length)
+    n0 = c * (t0 - off * x - e_y[2] * k1)
+    n1 = c * (t1 - off * y + e_y[2] * k0)
+    n2 = c * (-off * z + e_y[0] * k1 - e_y[1] * k0)
+    share = to_wrist / length
+    by_wrist = -share * b0 - n0, -share * b1 - n1, -share * b2 - n2
+    angle = (m.atan2 if m is math else m.arctan2)(_dot(e_y, e), _dot(e_x, e))
+    return _found(angle, by_elbow, by_wrist, e, w, length, p_squared, k_squared)
 
 
 def _conventional(m: Any, e: Vector, w: Vector) -> SewAngle:
@@ -173,9 +182,9 @@ def _conventional(m: Any, e: Vector, w: Vector) -> SewAngle:
 def _found(
     angle: Any, by_elbow: Vector, by_wrist: Vector, e: Vector, w: Vector, length: Any, p_squared: Any, reference: Any
 ) -> SewAngle:
-    forearm = _minus(w, e)
-    bend = p_squared * length * length / (_dot(e, e) * _dot(forearm, forearm))  # |e x f|^2 = |e x w|^2
-    by_shoulder = _times(-1.0, _plus(by_elbow, by_wrist))
+    f0, f1, f2 = w[0] - e[0], w[1] - e[1], w[2] - e[2]
+    bend = p_squared * length * length / (_dot(e, e) * (f0 * f0 + f1 * f1 + f2 * f2))  # |e x f|^2 = |e x w|^2
+    by_shoulder = -by_elbow[0] - by_wrist[0], -by_elbow[1] - by_wrist[1], -by_elbow[2] - by_wrist[2]
     return SewAngle(angle, by_shoulder, by_elbow, by_wrist, bend, reference)
 
 
@@ -202,10 +211,6 @@ def _dot(a: Vector, b: Vector) -> Any:
 
 def _cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _plus(a: Vector, b: Vector) -> Vector:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def _minus(a: Vector, b: Vector) -> Vector:

@@ -24,6 +24,7 @@ class SphereCover:
     Attributes:
         bodies: for each sphere the name of the body that carries it.
         radii: shape (m,) [m].
+        links: by how many of the arm's joints each sphere is moved, shape (m,).
         follows_last_joint: which spheres move rigidly with the flange, shape (m,).
     """
 
@@ -46,6 +47,7 @@ class SphereCover:
         self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
         moves = [[_carries(model, int(model.jnt_bodyid[joint]), body) for joint in joints] for body in owners]
         self._moves = np.array(moves, dtype=float).reshape(len(owners), 1, len(joints))
+        self.links = self._moves[:, 0].sum(axis=1).astype(int)
         self.follows_last_joint = self._moves[:, 0, -1] > 0.0
 
     def centers(self, data: mujoco.MjData) -> Array:
@@ -53,8 +55,11 @@ class SphereCover:
         turned = data.xmat[self._owners].reshape(-1, 3, 3) @ self._centers
         return np.asarray(data.xpos[self._owners] + turned[:, :, 0])
 
-    def jacobians(self, data: mujoco.MjData) -> Array:
-        """Return the Jacobians of the centers, shape (m, 3, n_joints) [m/rad]."""
+    def jacobians(self, data: mujoco.MjData, chosen: NDArray[np.int_] | None = None) -> Array:
+        """Return the Jacobians of the centers, shape (m, 3, n_joints) [m/rad]; of the ``chosen`` spheres only."""
+        centers, moves = self.centers(data), self._moves
+        if chosen is not None:
+            centers, moves = centers[chosen], moves[chosen]
         axes, anchors = data.xaxis[self._joints].T, data.xanchor[self._joints].T
         x, y, z = axes
         # Column j is a_j x (c - o_j). All the cross products with c at once: c times the stacked matrices [a_j]x^T.
@@ -62,10 +67,10 @@ class SphereCover:
         crosses = np.stack((zero, z, -y, -z, zero, x, y, -x, zero)).reshape(3, -1)
         u, v, w = anchors
         offsets = np.stack((y * w - z * v, z * u - x * w, x * v - y * u))
-        columns = (self.centers(data) @ crosses).reshape(-1, *axes.shape) - offsets
+        columns = (centers @ crosses).reshape(-1, *axes.shape) - offsets
         if self._slides.any():
             columns[:, :, self._slides] = axes[:, self._slides]
-        return np.asarray(columns * self._moves)
+        return np.asarray(columns * moves)
 
 
 def _carries(model: mujoco.MjModel, carrier: int, body: int) -> bool:

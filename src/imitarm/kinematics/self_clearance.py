@@ -1,0 +1,141 @@
+"""Keeping the arm off itself: distances between its links, and rows for the inverse kinematics."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.bounds import clearance_rows
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int_]
+
+_INFLUENCE = 0.15  # [m] beyond the clearance, links farther apart get no row
+
+
+class SelfClearance:
+    r"""Keeps links that are not neighbours, and the tool, off each other.
+
+    The arm is covered by spheres (``ArmModel.collision_spheres``). For the spheres i and j of two links, with centres
+    c and radii r, the distance and its gradient are
+
+    .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
+
+    and a row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets it shrink no faster than exponentially (METHODS A.9).
+    Every two links that are near have one row, for their nearest spheres; of those the ``n_rows`` nearest are taken.
+
+    Not watched are links that are joined by a joint, and spheres that are nearer than the clearance in the arm's home
+    posture. What the arm stands on is no part of it: put it into the scene.
+
+    Args:
+        arm: the arm with its tool.
+        clearance: least distance [m].
+        n_rows: how many pairs of links at most have a row.
+        gain: xi [1/s].
+
+    Raises:
+        InputError: when a number can't be used.
+    """
+
+    def __init__(self, arm: ArmModel, clearance: float = 0.02, *, n_rows: int = 6, gain: float = 5.0) -> None:
+        if not (0.0 <= clearance < math.inf and n_rows >= 1 and 0.0 < gain < math.inf):
+            raise InputError(
+                "SelfClearance: needs clearance >= 0 [m], n_rows >= 1 and gain > 0 [1/s], "
+                f"got {clearance}, {n_rows} and {gain}"
+            )
+        self.arm, self.clearance = arm, clearance
+        self._n_rows, self._gain = n_rows, gain
+        centers, radii = arm.collision_spheres(arm.home)
+        links = arm.sphere_links
+        sums = radii[:, None] + radii
+        apart = np.linalg.norm(centers[:, None] - centers, axis=2) - sums
+        # the sphere that is farther out comes first, so every pair occurs once
+        outer, inner = np.nonzero((links[:, None] > links + 1) & (apart >= clearance))
+        pair_of_links = links[outer] * (arm.n_joints + 1) + links[inner]
+        order = np.argsort(pair_of_links, kind="stable")
+        self._outer, self._inner = outer[order], inner[order]
+        self._flat = self._outer * len(radii) + self._inner
+        self._sums = sums[self._outer, self._inner]
+        self._coarse_sums = self._sums.astype(np.float32)
+        starts = np.flatnonzero(np.diff(pair_of_links[order], prepend=-1))
+        self._starts, self._ends = starts, np.append(starts[1:], len(order))
+
+    @property
+    def n_pairs(self) -> int:
+        """How many pairs of spheres are watched."""
+        return len(self._sums)
+
+    def distance(self, q: ArrayLike) -> float:
+        """Return the least distance between any two watched spheres [m]; negative where they overlap.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+
+        Returns:
+            inf when the arm has no two links that could touch.
+        """
+        if not self.n_pairs:
+            return math.inf
+        centers, _ = self.arm.collision_spheres(q)
+        return float((np.linalg.norm(centers[self._outer] - centers[self._inner], axis=1) - self._sums).min())
+
+    def nearest(self, q: ArrayLike) -> tuple[Indices, Array]:
+        """Return the nearest spheres of every two links that are near, the nearest first.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+
+        Returns:
+            indices of the two spheres (k, 2), and their distances (k,) [m]; at most ``n_rows``.
+        """
+        pairs, _, distances = self._found(q)
+        return pairs, distances
+
+    def rows(self, q: ArrayLike) -> tuple[Array, Array] | None:
+        """Return inequalities ``A v >= lower`` on the joint velocity for ``solve_ik(..., rows=...)``.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+
+        Returns:
+            ``A`` (k, n_joints) and ``lower`` (k,), k at most ``n_rows``; None when nothing is near.
+        """
+        pairs, normals, distances = self._found(q)
+        if not len(pairs):
+            return None
+        jacobians = self.arm.sphere_jacobians(q, pairs.ravel()).reshape(len(pairs), 2, 3, -1)
+        relative = jacobians[:, 0] - jacobians[:, 1]
+        return clearance_rows(relative, normals, distances, clearance=self.clearance, gain=self._gain)
+
+    def _found(self, q: ArrayLike) -> tuple[Indices, Array, Array]:
+        """Return the nearest pairs (k, 2), their normals (k, 3) and distances (k,)."""
+        if not self.n_pairs:
+            return np.zeros((0, 2), dtype=int), np.zeros((0, 3)), np.zeros(0)
+        centers, _ = self.arm.collision_spheres(q)
+        coarse = self._coarse_distances(centers)
+        least = np.minimum.reduceat(coarse, self._starts)
+        order = np.argsort(least)[: self._n_rows]
+        order = order[least[order] < self.clearance + _INFLUENCE].tolist()
+        best = [int(self._starts[k]) + int(coarse[self._starts[k] : self._ends[k]].argmin()) for k in order]
+        outer, inner = self._outer[best], self._inner[best]
+        between = centers[outer] - centers[inner]
+        lengths = np.sqrt(np.einsum("ij,ij->i", between, between))
+        return np.stack((outer, inner), axis=1), between / lengths[:, None], lengths - self._sums[best]
+
+    def _coarse_distances(self, centers: Array) -> NDArray[np.float32]:
+        """Return the distances of all watched pairs, in single precision: good to some um, which tells who is near."""
+        points = centers.astype(np.float32)
+        squares = np.einsum("ij,ij->i", points, points)
+        products = points @ points.T
+        products *= -2.0
+        products += squares
+        products += squares[:, None]
+        distances = products.ravel().take(self._flat)
+        np.maximum(distances, 0.0, out=distances)
+        np.sqrt(distances, out=distances)
+        distances -= self._coarse_sums
+        return distances

@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik import solve_ik
+from imitarm.kinematics.self_clearance import SelfClearance
+
+ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
+CLEARANCES = {name: SelfClearance(arm) for name, arm in ARMS.items()}
+either = pytest.mark.parametrize("name", list(ARMS))
+seeds = st.integers(0, 2**32 - 1)
+
+
+def folded(name, seed):
+    """Postures near to limits, where arms meet themselves."""
+    arm, rng = ARMS[name], np.random.default_rng(seed)
+    return rng.uniform(arm.lower, arm.upper)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.sampled_from(list(ARMS)), seeds)
+def test_the_nearest_pairs_are_those_of_all_pairs_looked_at_one_by_one(name, seed):
+    arm, own = ARMS[name], CLEARANCES[name]
+    q = folded(name, seed)
+    centers, radii = arm.collision_spheres(q)
+    at_home, _ = arm.collision_spheres(arm.home)
+    links = arm.sphere_links
+    best: dict[tuple[int, int], float] = {}
+    for i in range(len(radii)):
+        for j in np.flatnonzero(links < links[i] - 1):
+            if np.linalg.norm(at_home[i] - at_home[j]) - radii[i] - radii[j] >= own.clearance:
+                gap = np.linalg.norm(centers[i] - centers[j]) - radii[i] - radii[j]
+                key = (links[i], links[j])
+                best[key] = min(best.get(key, np.inf), gap)
+    near = sorted(gap for gap in best.values() if gap < own.clearance + 0.15)[:6]
+    pairs, distances = own.nearest(q)
+    assert np.allclose(distances, near, atol=1e-9)
+    assert own.distance(q) == pytest.approx(min(best.values()), abs=1e-9)
+    for (i, j), gap in zip(pairs, distances, strict=True):
+        assert gap == pytest.approx(np.linalg.norm(centers[i] - centers[j]) - radii[i] - radii[j], abs=1e-9)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.sampled_from(list(ARMS)), seeds)
+def test_rows_are_the_gradients_of_the_distances(name, seed):
+    arm, own = ARMS[name], CLEARANCES[name]
+    q = folded(name, seed)
+    pairs, distances = own.nearest(q)
+    assume(len(pairs) > 0)
+    rows, lower = own.rows(q)
+    assert np.allclose(lower, -5.0 * (distances - 0.02))
+    h = 1e-6
+
+    def gaps(posture):
+        centers, radii = arm.collision_spheres(posture)
+        return np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
+
+    for joint, step in enumerate(h * np.eye(7)):
+        assert np.allclose(rows[:, joint], (gaps(q + step) - gaps(q - step)) / (2 * h), atol=1e-7)
+
+
+@either
+def test_home_is_clear_of_what_is_watched(name):
+    own = CLEARANCES[name]
+    assert own.n_pairs > 1000
+    assert own.distance(ARMS[name].home) >= own.clearance
+    links = ARMS[name].sphere_links
+    pairs, _ = own.nearest(ARMS[name].home)
+    assert all(links[i] > links[j] + 1 for i, j in pairs)
+
+
+@pytest.mark.parametrize(
+    ("name", "fold"), [("sawyer", [0, -1.0, 0, 2.9, 0, 1.4, 0]), ("panda", [0, -0.9, 0, -3.0, 0, 0.4, 0.8])]
+)
+def test_an_arm_that_is_led_into_itself_stops_short(name, fold):
+    arm, own = ARMS[name], CLEARANCES[name]
+    target = arm.tool_pose(np.array(fold))
+
+    def least(rows):
+        q, velocity, nearest = arm.home.copy(), np.zeros(7), np.inf
+        for _ in range(500):
+            twist = 3.0 * arm.tool_pose(q).error_to(target)
+            velocity = solve_ik(
+                arm,
+                q,
+                twist,
+                velocity=velocity,
+                max_speed=0.4,
+                rows=own.rows(q) if rows else None,
+                q_ref=np.array(fold),
+            )
+            q = q + 0.01 * velocity
+            nearest = min(nearest, own.distance(q))
+        return nearest
+
+    assert least(rows=False) < 0.0  # without the rows it runs into itself
+    assert least(rows=True) > own.clearance - 0.003
+
+
+def test_few_rows_are_asked_for_and_none_when_nothing_is_near(tmp_path):
+    one = SelfClearance(ARMS["panda"], n_rows=1)
+    q = np.array([0, -0.9, 0, -3.0, 0, 0.4, 0.8])
+    assert one.rows(q)[0].shape == (1, 7)
+    assert one.nearest(q)[1][0] == CLEARANCES["panda"].nearest(q)[1][0]
+    file = tmp_path / "two.xml"
+    file.write_text(
+        "<mujoco><worldbody><body><joint/><geom size='.1'/><body pos='0 0 .3'><joint axis='0 1 0'/><geom size='.1'/>"
+        "</body></body></worldbody></mujoco>"
+    )
+    two = SelfClearance(ArmModel.load(file))
+    assert two.n_pairs == 0 and two.rows([0, 0]) is None and two.distance([0, 0]) == np.inf
+
+
+@pytest.mark.parametrize("options", [{"clearance": -0.1}, {"clearance": np.nan}, {"n_rows": 0}, {"gain": 0.0}])
+def test_what_can_not_be_used_is_refused(options):
+    with pytest.raises(InputError, match="SelfClearance: needs"):
+        SelfClearance(ARMS["panda"], **options)
