@@ -7,39 +7,93 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.capture.skeleton import JOINT, JOINTS, HandState, Skeleton, Tracking
+from imitarm.capture.skeleton import JOINT, JOINTS, SIDES, HandState, Skeleton, Tracking
 from imitarm.errors import InputError
 
 Array = NDArray[np.float64]
 
-WHITE = 0.12  # share of sigma that is new in every frame: in real Kinect recordings the rest changes slowly
-MEMORY = 0.35  # [s] time constant of the rest, which is smooth: two low-pass filters in a row
+# Measured in real recordings of a Kinect v2 (docs/capture.md); tests/test_capture_noise.py compares.
+WAY = 0.08  # [m] a joint has to move so far for its error to become another one
+MEMORY = 5.0  # [s] in which the error of a joint at rest becomes another one
 DEPTH = 1.4  # the error along the line of sight over that across it
-_HAND_PARTS = np.array([JOINT[f"{part}_{side}"] for side in ("left", "right") for part in ("hand_tip", "thumb")])
-_RESTLESS = 2.0  # the tips of hands are seen worse
+TIPS = 1.5  # the error of finger tips and thumbs over that of other joints
+_WHITE = {"elbow": (0.02, 0.40), "wrist": (0.02, 0.40), "hand": (0.075, 0.12), "hand_tip": (0.14, 0.08)}
+_WHITE |= {"thumb": (0.16, 0.30)}  # of sigma, and of TIPS: at rest, and more for each m/s
+_WHITE_BODY = (0.01, 0.20)
+# the error of the second goes along with that of the first: correlation
+_MIDDLE_CHAIN = (
+    ("spine_base", "spine_mid", 0.9),
+    ("spine_mid", "spine_shoulder", 0.9),
+    ("spine_shoulder", "neck", 0.9),
+    ("neck", "head", 0.8),
+)
+_SIDE_CHAIN = (
+    ("spine_shoulder", "shoulder", 0.7),
+    ("shoulder", "elbow", 0.4),
+    ("elbow", "wrist", 0.95),
+    ("wrist", "hand", 0.6),
+    ("hand", "hand_tip", 0.8),
+    ("wrist", "thumb", 0.5),
+    ("spine_base", "hip", 0.9),
+    ("hip", "knee", 0.7),
+    ("knee", "ankle", 0.7),
+    ("ankle", "foot", 0.7),
+)
+
 _ARM = {
     side: np.array([JOINT[f"{part}_{side}"] for part in ("elbow", "wrist", "hand", "hand_tip", "thumb")])
-    for side in ("left", "right")
+    for side in SIDES
 }
 _HIDDEN = 3.0  # an inferred joint's error over that of a tracked one
 _SKIPPED, _SLIPPED = 0.03, 0.01  # share of frame intervals that are twice as long; of frames that are lost
 _MISREAD = 0.02  # share of frames in which the hand state begins to be misread, for one or two frames
 _DROP_LENGTH = (2, 20)  # [frames] of a dropout
+_NOBODY, _LOST = 0.1, 0.3  # share of dropouts in which nobody is seen; of the rest, in which the arm is lost
 _TORSO = 0.16  # [m] half the width of what hides a hand that is behind it
 _BEFORE = math.radians(3.0)  # a hand in line with the elbow hides it
+
+
+def _mixing() -> Array:
+    """Return what makes independent errors of the joints into correlated ones, rows of unit length, shape (25, 25)."""
+    rows = np.eye(len(JOINTS))
+    sides = [
+        (near if near in JOINT else f"{near}_{side}", f"{far}_{side}", share)
+        for side in SIDES
+        for near, far, share in _SIDE_CHAIN
+    ]
+    for near, far, correlation in (*_MIDDLE_CHAIN, *sides):
+        rows[JOINT[far]] *= math.sqrt(1.0 - correlation**2)
+        rows[JOINT[far]] += correlation * rows[JOINT[near]]
+    return rows
+
+
+def _white_shares() -> Array:
+    """Return white noise over sigma at rest and for each m/s, shape (2, 25)."""
+    return np.array([_WHITE.get(name.removesuffix("_left").removesuffix("_right"), _WHITE_BODY) for name in JOINTS]).T
+
+
+_MIXING, _WHITE_SHARES = _mixing(), _white_shares()
+_SHAPE = (len(JOINTS), 3)
 
 
 class SkeletonCamera:
     r"""A skeleton camera with the faults of a real one (METHODS B, "noise model").
 
-    A joint is seen at :math:`x + b + c(t) + n`: ``c`` a smooth Gauss-Markov process of second order, ``n`` white,
-    together with standard deviation ``sigma`` on each axis across the line of sight and 1.4 of it along; ``b`` a bias
-    of the elbow's depth. In real recordings of a Kinect v2 the white part is 0.2 to 3 mm, a small share of the 1 to
-    2 cm by which limbs change their lengths: ``docs/capture.md``.
+    A joint is seen at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma`` on each axis
+    across the line of sight, 1.4 of it along, half as much again for finger tips and thumbs. It is a Matern process
+    of order 3/2, not over time but over time and way together,
 
-    * Frames come at ``rate``, with 1.5 ms of jitter; 3 % of the intervals are twice as long, 1 % of the frames
-      show nobody.
-    * Dropouts: at ``dropout`` a second an arm is inferred (error three times as large) or lost for 2 to 20 frames.
+    .. math:: du = dt / 5\,\mathrm{s} + |dx| / 8\,\mathrm{cm}, \qquad
+              \mathrm{E}\,[c(0)\,c(u)] = \sigma^2 (1 + u)\,e^{-u},
+
+    because in recordings of a Kinect v2 a bone hardly changes its length while the arm is at rest, and by all of its
+    1 to 2 cm within a way of 10 to 20 cm. ``M`` lets neighbours share their errors: a forearm keeps its length
+    better than an upper arm. ``n`` is white and grows with a joint's speed: at elbow and wrist, with ``sigma`` of
+    12 mm, from 0.2 mm at rest by 5 mm for each m/s. ``b`` is a bias of the elbow's depth.
+
+    * Frames come at ``rate`` with ``jitter``; 3 % of the intervals are twice as long, 1 % of the frames show nobody.
+    * Dropouts: at ``dropout`` a second an arm is inferred (error three times as large), or lost, or nobody is
+      seen at all, for 2 to 20 frames.
     * Occlusion: a forearm behind the torso, and an elbow behind its own hand, are inferred.
     * The hand's state is misread for one or two frames now and then.
 
@@ -47,9 +101,14 @@ class SkeletonCamera:
         seed: of everything random.
         sigma: [m].
         rate: frames a second [Hz].
-        dropout: dropouts of the arm a second [Hz].
+        jitter: standard deviation of the time between frames [s].
+        dropout: dropouts of each arm a second [Hz].
+        occlusion: whether what is behind something else is inferred.
         elbow_bias: largest bias of the elbow's depth [m]; the person's own is uniform within it.
         faultless: no dropouts, occlusions, jitter, misreadings; with ``sigma=0`` and ``elbow_bias=0`` the truth.
+
+    Raises:
+        InputError: when a value is that of no camera.
     """
 
     def __init__(
@@ -58,27 +117,39 @@ class SkeletonCamera:
         *,
         sigma: float = 0.012,
         rate: float = 30.0,
+        jitter: float = 0.0015,
         dropout: float = 0.1,
+        occlusion: bool = True,
         elbow_bias: float = 0.02,
         faultless: bool = False,
     ) -> None:
         if not (0.0 <= sigma <= 0.1 and 1.0 <= rate <= 200.0 and 0.0 <= dropout <= 5.0 and 0.0 <= elbow_bias <= 0.1):
             raise InputError("SkeletonCamera: needs sigma and elbow_bias to 0.1 m, rate 1 to 200 Hz, dropout to 5 Hz")
+        if not 0.0 <= jitter <= 0.2 / rate:
+            raise InputError(
+                f"SkeletonCamera: jitter must be 0 to a fifth of the period at {rate:g} Hz, got {jitter!r} s"
+            )
         self._rng = np.random.default_rng([30311, seed])
-        self.sigma, self.rate, self.dropout, self.faultless = sigma, rate, dropout, faultless
+        self.sigma, self.rate, self.jitter, self.dropout = sigma, rate, jitter, dropout
+        self.occlusion, self.faultless = occlusion, faultless
         self._bias = self._rng.uniform(-elbow_bias, elbow_bias)
         self._scale = np.tile([1.0, 1.0, DEPTH], (len(JOINTS), 1))
-        self._scale[_HAND_PARTS] *= _RESTLESS
-        self._drive = self._rng.normal(size=(len(JOINTS), 3))
-        self._slow = math.sqrt(0.5) * (self._drive + self._rng.normal(size=self._drive.shape))
-        self._time = -math.inf
-        self._dropped = {"left": (0, Tracking.INFERRED), "right": (0, Tracking.INFERRED)}
+        self._scale[[JOINT[f"{part}_{side}"] for part in ("hand_tip", "thumb") for side in SIDES]] *= TIPS
+        self._slow, self._slope = self._rng.normal(size=(2, *_SHAPE))
+        self._time, self._last = -math.inf, np.zeros(_SHAPE)
+        self._dropped = dict.fromkeys(SIDES, (0, Tracking.INFERRED))
+        self._nobody = 0
         self._misread = [(0, HandState.UNKNOWN), (0, HandState.UNKNOWN)]
+
+    @classmethod
+    def from_seed(cls, seed: int, *, rate: float = 30.0) -> SkeletonCamera:
+        """Return camera number ``seed``: its sigma is between 1 and 2 cm, the rest as usual."""
+        return cls(seed, sigma=float(np.random.default_rng([30314, seed]).uniform(0.01, 0.02)), rate=rate)
 
     @classmethod
     def ideal(cls, rate: float = 30.0) -> SkeletonCamera:
         """Return a camera that sees the truth."""
-        return cls(0, sigma=0.0, rate=rate, dropout=0.0, elbow_bias=0.0, faultless=True)
+        return cls(0, sigma=0.0, rate=rate, jitter=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
 
     def next_time(self, time: float) -> float:
         """Return when the frame after one at ``time`` is exposed [s]."""
@@ -87,7 +158,7 @@ class SkeletonCamera:
             return time + period
         if self._rng.random() < _SKIPPED:
             period *= 2.0
-        return time + period + float(np.clip(self._rng.normal(0.0, 0.0015), -0.004, 0.004))
+        return time + period + self.jitter * float(np.clip(self._rng.normal(), -2.7, 2.7))
 
     def see(self, truth: Skeleton) -> Skeleton | None:
         """Return the skeleton the camera reports, or None when it reports none.
@@ -96,31 +167,53 @@ class SkeletonCamera:
             truth: of one instant; later than that of the call before.
         """
         period = max(truth.time - self._time, 0.0) if math.isfinite(self._time) else 0.0
-        self._time = truth.time
-        keep = math.exp(-period / MEMORY)
-        self._drive = keep * self._drive + math.sqrt(1.0 - keep * keep) * self._rng.normal(size=self._slow.shape)
-        self._slow = keep * self._slow + (1.0 - keep) * math.sqrt(2.0) * self._drive
-        white = self._rng.normal(size=self._slow.shape)
-        error = math.sqrt(1.0 - WHITE**2) * self._slow + WHITE * white
+        error = self._error(truth.positions, period)
+        self._time, self._last = truth.time, truth.positions
         tracking = np.array(truth.tracking)
         if not self.faultless:
-            if self._rng.random() < _SLIPPED:
+            if self._nobody > 0 or self._rng.random() < _SLIPPED:
+                self._nobody = max(self._nobody - 1, 0)
                 return None
             self._drop(tracking, period)
-            self._hide(truth.positions, tracking)
+            if self._nobody > 0:
+                self._nobody -= 1
+                return None
+            if self.occlusion:
+                self._hide(truth.positions, tracking)
         scale = self.sigma * self._scale * np.where(tracking == Tracking.INFERRED, _HIDDEN, 1.0)[:, None]
         positions = truth.positions + error * scale
-        for side in ("left", "right"):
+        for side in SIDES:
             positions[JOINT[f"elbow_{side}"], 2] += self._bias
         hands = truth.hand_states if self.faultless else (self._read(truth, 0), self._read(truth, 1))
         return Skeleton(truth.time, positions, tracking, hands, truth.person)
+
+    def _error(self, points: Array, period: float) -> Array:
+        """Return the errors of this frame over sigma and scale, shape (25, 3)."""
+        step = points - self._last if period > 0.0 else np.zeros(_SHAPE)
+        way = np.nan_to_num(np.sqrt(np.sum(step * step, axis=1)))[:, None]
+        u = period / MEMORY + way / WAY
+        # exact step of the process (slow, slope) with unit covariance: A = e^-u [[1+u, u], [-u, 1-u]], Q = 1 - A A^T
+        keep = np.exp(-u)
+        s, v = self._slow, self._slope
+        q_ss, q_sv = 1.0 - keep**2 * ((1.0 + u) ** 2 + u * u), 2.0 * (keep * u) ** 2
+        q_vv = np.maximum(1.0 - keep**2 * ((1.0 - u) ** 2 + u * u), 1e-300)
+        new, other, white = self._rng.normal(size=(3, *_SHAPE))
+        self._slow = keep * ((1.0 + u) * s + u * v) + (
+            q_sv / np.sqrt(q_vv) * new + np.sqrt(np.maximum(q_ss - q_sv**2 / q_vv, 0.0)) * other
+        )
+        self._slope = keep * ((1.0 - u) * v - u * s) + np.sqrt(q_vv) * new
+        at_rest, with_speed = _WHITE_SHARES
+        speed = way[:, 0] / period if period > 0.0 else 0.0
+        return np.asarray(_MIXING @ self._slow + (at_rest + with_speed * speed)[:, None] * white)
 
     def _drop(self, tracking: NDArray[np.int8], period: float) -> None:
         for side, index in _ARM.items():
             left, kind = self._dropped[side]
             if left == 0 and self._rng.random() < self.dropout * period:
                 left = int(self._rng.integers(_DROP_LENGTH[0], _DROP_LENGTH[1] + 1))
-                kind = Tracking.LOST if self._rng.random() < 0.3 else Tracking.INFERRED
+                kind = Tracking.LOST if self._rng.random() < _LOST else Tracking.INFERRED
+                if self._rng.random() < _NOBODY:
+                    left, self._nobody = 0, left
             if left > 0:
                 tracking[index] = kind
             self._dropped[side] = (max(left - 1, 0), kind)
