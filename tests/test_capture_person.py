@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from imitarm import InputError
-from imitarm.capture.person import Person
+from imitarm.capture.person import Person, _hand_along
 from imitarm.capture.skeleton import HandState
 
 PEOPLE = [Person.from_seed(seed) for seed in range(10)]
@@ -66,6 +66,40 @@ def test_swivel_turns_the_elbow_about_the_line_to_the_wrist():
     assert abs(down[0]) < 1e-12
     assert out[0] > 0.0  # outwards is to larger x for the right arm of somebody who faces the sensor
     assert abs(out[1]) < 1e-12
+
+
+unit = st.floats(-1.0, 1.0)
+
+
+@given(st.tuples(unit, unit, unit), st.tuples(unit, unit, unit))
+def test_elbow_and_hand_never_jump(to, step):
+    """A millimetre of the wrist's way moves the elbow, and the thumb, by millimetres: but for an arm straight back."""
+    person = PEOPLE[4]
+    way = 0.75 * person.reach * np.array(to) / max(np.linalg.norm(to), 1e-3)
+    assume(np.linalg.norm(way) > 0.2)
+    near = way + 1e-3 * np.array(step)
+    one, other = (person.skeleton(0.0, person.shoulder("right") + w).arm().points for w in (way, near))
+    back = (one[1:3] - one[:2]) @ [0.0, 0.0, 1.0] / np.linalg.norm(one[1:3] - one[:2], axis=1)
+    assume(max(*back, way[2] / np.linalg.norm(way)) < 0.8)
+    assert np.linalg.norm(other - one, axis=1).max() < 0.015
+
+
+def test_the_hand_of_a_raised_forearm_goes_on_as_that_of_one_that_points_forward():
+    person, thumbs = PEOPLE[4], []
+    for angle in np.linspace(-0.45 * np.pi, 0.6 * np.pi, 60):  # from hanging over forward to behind the vertical
+        rotation = _hand_along(np.array([0.0, np.sin(angle), -np.cos(angle)]))
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
+        thumbs.append(rotation[:, 1])
+        np.testing.assert_allclose(thumbs[-1], [0.0, np.cos(angle), np.sin(angle)], atol=1e-12)
+    assert person.skeleton(0.0, person.shoulder("right") + [0.0, 0.0, -0.4]).arm().points[5, 1] > 0.0
+
+
+def test_the_elbow_of_a_hanging_arm_is_behind_it_and_of_a_raised_one_before_it():
+    person = PEOPLE[5]
+    for up, before in ((-1.0, False), (1.0, True)):
+        elbow, _ = person.elbow(np.zeros(3), np.array([0.0, 0.45 * up, 0.0]), 0.0)
+        assert (elbow[2] < -0.02) == before
+        assert before or elbow[2] > 0.02
 
 
 def test_a_given_hand_and_fist_are_shown():

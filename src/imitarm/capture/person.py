@@ -33,6 +33,7 @@ _HEIGHTS = {
     "foot": 0.01,
 }
 _HALF_HIPS, _FOOT = 0.0955, 0.10
+_FORWARD = np.array([0.0, 0.0, -1.0])
 _TO_HAND, _TO_TIP, _TO_THUMB = 0.45, 0.85, (0.35, 0.35)  # of the hand's length, from the wrist: as a Kinect has them
 
 
@@ -41,7 +42,8 @@ class Person:
     r"""A made-up person before a sensor, upright and facing it, in the sensor's frame (x left, y up, z away).
 
     An arm is two straight bones. Where the wrist W is given, the elbow is on a circle about the line from shoulder to
-    wrist; with :math:`\hat d` down and :math:`\hat o` outwards, both at right angles to that line, it is at
+    wrist; with :math:`\hat d` down and :math:`\hat o` outwards, both at right angles to that line (those of an arm that
+    points forward, turned by the smallest rotation to where it points), it is at
 
     .. math:: E = S + a\,\hat w + h\,(\cos\psi\,\hat d + \sin\psi\,\hat o), \qquad
               a = \frac{L_U^2 + r^2 - L_F^2}{2r},\quad h = \sqrt{L_U^2 - a^2},\quad r = |W - S| .
@@ -133,7 +135,7 @@ class Person:
                 on the way there.
             swivel: psi [rad]; None: as this person carries the elbow.
             hand: rotation of the hand in the sensor's frame, shape (3, 3), its x along the hand, its y towards the
-                thumb; None: in line with the forearm, the thumb up.
+                thumb; None: in line with the forearm, the thumb up as far as that goes.
             closed: whether the hand is a fist.
             side: of the arm that moves.
 
@@ -162,11 +164,7 @@ class Person:
         r = float(np.clip(distance, nearest, self.reach))
         a = (self.upper_arm**2 + r * r - self.forearm**2) / (2.0 * r)
         h = math.sqrt(max(self.upper_arm**2 - a * a, 0.0))
-        down = np.array([0.0, -1.0, 0.0])
-        down = down - along * (down @ along)
-        if np.linalg.norm(down) < 1e-3:  # the arm points up or down: the elbow is carried backwards
-            down = np.array([0.0, 0.0, 1.0]) - along * along[2]
-        down /= np.linalg.norm(down)
+        down = _turned(np.array([0.0, -1.0, 0.0]), along)
         out = np.cross(down, along) if side == "right" else np.cross(along, down)
         return shoulder + a * along + h * (math.cos(swivel) * down + math.sin(swivel) * out), shoulder + r * along
 
@@ -215,9 +213,20 @@ def _outwards(side: str) -> float:
 
 
 def _hand_along(forearm: Array) -> Array:
-    """Return the rotation of a hand in line with the forearm, its thumb as far up as it goes."""
+    """Return the rotation of a hand in line with the forearm; its thumb is up when the forearm points forward."""
     x = forearm / np.linalg.norm(forearm)
-    up = np.array([0.0, 1.0, 0.0]) if abs(x[1]) < 0.95 else np.array([0.0, 0.0, 1.0])
-    y = up - x * (up @ x)
-    y /= np.linalg.norm(y)
+    y = _turned(np.array([0.0, 1.0, 0.0]), x)
     return np.stack([x, y, np.cross(x, y)], axis=1)
+
+
+def _turned(vector: Array, way: Array) -> Array:
+    """Return a vector across the person's forward turned by the smallest rotation that turns forward into ``way``.
+
+    So what is up or down beside an arm that points forward goes along without a jump wherever the arm points, but
+    straight back.
+    """
+    both = way + _FORWARD
+    square = float(both @ both)
+    turned = vector - (2.0 * float(way @ vector) / square) * both if square > 1e-12 else -vector
+    turned = turned - float(way @ turned) * way
+    return np.asarray(turned / np.sqrt(turned @ turned))
