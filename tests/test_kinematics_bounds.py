@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.bounds import clearance_rows, velocity_box
+from imitarm.kinematics.bounds import ELBOW_MARGIN, clearance_rows, velocity_box
 
 ARMS = {name: ArmModel.load(name) for name in ("sawyer", "panda")}
 SAWYER = ARMS["sawyer"]
@@ -60,3 +61,96 @@ def test_a_moving_obstacle_pushes_its_rows():
     )
     assert still[1] == pytest.approx([-0.4])
     assert coming[1] == pytest.approx([-0.1])
+
+
+def thesis_box(arm, q, dt, velocity):
+    """The bounds of METHODS A.9 as written, joint by joint, an independent statement."""
+    lower, upper = [], []
+    for a, most, low, high, x, before in zip(
+        arm.max_acceleration, arm.max_velocity, arm.lower, arm.upper, q, velocity, strict=True
+    ):
+
+        def bound(way, before, a=a, most=most):
+            stopping = -a * dt + np.sqrt((a * dt) ** 2 + 2 * a * max(way, 0.0))
+            return min(most, before + a * dt, max(stopping, before - a * dt))
+
+        upper.append(bound(high - x, before))
+        lower.append(-bound(x - low, -before))
+    return np.array(lower), np.array(upper)
+
+
+@settings(deadline=None, max_examples=200)
+@given(seeds, st.sampled_from(list(ARMS)))
+def test_the_box_is_the_formula_wherever_the_arm_is(seed, name):
+    arm, rng = ARMS[name], np.random.default_rng(seed)
+    q = rng.uniform(arm.lower, arm.upper) * (0.3 if seed % 2 else 1.0)  # far from all limits, or anywhere
+    q = np.clip(q, arm.lower, arm.upper)
+    velocity = rng.uniform(-1, 1, 7) * arm.max_velocity
+    assert np.allclose(velocity_box(arm, q, DT, velocity), thesis_box(arm, q, DT, velocity), atol=1e-12)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seeds, st.sampled_from([0.001, 0.01, 0.05]), st.sampled_from(list(ARMS)))
+def test_the_elbow_keeps_its_side_and_its_margin(seed, dt, name):
+    """METHODS A.8: the hard bound is one more limit of position, so the box stays never-empty with it."""
+    arm, rng = ARMS[name], np.random.default_rng(seed)
+    elbow, straight = arm.landmarks.elbow, arm.landmarks.elbow_straight
+    q, velocity = rng.uniform(arm.lower, arm.upper), np.zeros(7)
+    side = 1.0 if q[elbow] >= straight else -1.0
+    away = side * (q[elbow] - straight)
+    for _ in range(200):
+        lower, upper = velocity_box(arm, q, dt, velocity, singularity_bounds=True)
+        assert np.all(lower <= upper)
+        towards = np.where(rng.random() < 0.5, upper, lower)
+        towards[elbow] = (lower if side > 0.0 else upper)[elbow]  # the elbow always tries to stretch
+        chosen = np.where(rng.random(7) < 0.9, towards, rng.uniform(lower, upper))
+        assert np.all(np.abs(chosen - velocity) <= arm.max_acceleration * dt + 1e-12)
+        velocity, q = chosen, q + dt * chosen
+        now = side * (q[elbow] - straight)
+        assert now >= min(away, ELBOW_MARGIN) - 1e-9  # one that begins nearer comes no nearer
+        away = now
+        assert np.all(q <= arm.upper + 1e-9) and np.all(q >= arm.lower - 1e-9)
+
+
+def test_an_elbow_that_begins_stretched_can_only_bend_on():
+    lower, upper = velocity_box(SAWYER, np.zeros(7), DT, singularity_bounds=True)
+    assert lower[3] == 0.0 and upper[3] > 0.0
+    bent = np.array([0, 0, 0, -0.01, 0, 0, 0.0])
+    lower, upper = velocity_box(SAWYER, bent, DT, singularity_bounds=True)
+    assert upper[3] == 0.0 and lower[3] < 0.0
+    free = velocity_box(SAWYER, bent, DT)
+    assert np.array_equal(np.delete(lower, 3), np.delete(free[0], 3))
+
+
+def test_an_arm_without_an_elbow_has_no_singularity_bounds(tmp_path):
+    file = tmp_path / "turntable.xml"
+    file.write_text(
+        "<mujoco><worldbody><body name='plate'><joint name='turn'/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    with pytest.raises(InputError, match="add sites named"):
+        velocity_box(ArmModel.load(file), [0.0], DT, singularity_bounds=True)
+
+
+def pink_box(arm, q, dt, velocity):
+    """The same limits as a known library states them (METHODS A.9): each is right alone, together they can be empty."""
+    a, most = arm.max_acceleration, arm.max_velocity
+
+    def step(way, before):
+        stopping = dt * np.sqrt(2 * a * np.maximum(way, 0.0))
+        return np.minimum.reduce([most * dt, 0.5 * way, a * dt * dt + before * dt, stopping])
+
+    return -step(q - arm.lower, -velocity) / dt, step(arm.upper - q, velocity) / dt
+
+
+def test_bounds_that_do_not_fit_together_leave_no_velocity_and_ours_always_do():
+    """METHODS A.9 and G: a joint led to its limit as fast as each box lets it."""
+    stuck = dict.fromkeys(("pink", "ours"), 0)
+    for which, box in (("pink", pink_box), ("ours", lambda *a: velocity_box(*a))):
+        q, velocity = np.array(SAWYER.home), np.zeros(7)
+        for _ in range(400):
+            lower, upper = box(SAWYER, q, DT, velocity)
+            stuck[which] += bool(np.any(lower > upper + 1e-12))
+            velocity = np.maximum(upper, lower)
+            q = np.clip(q + DT * velocity, SAWYER.lower, SAWYER.upper)
+    assert stuck["ours"] == 0
+    assert stuck["pink"] > 0

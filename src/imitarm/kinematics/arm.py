@@ -210,7 +210,7 @@ class ArmModel:
         return qpos
 
     def at(self, q: ArrayLike) -> ArmMemory:
-        """Return this thread's working memory with kinematics at ``q``: for loops that ask for many things of a posture.
+        """Return this thread's working memory with kinematics at ``q``, for loops that ask for much of one posture.
 
         It is computed only when the posture is a new one, and holds until the next is asked for.
         """

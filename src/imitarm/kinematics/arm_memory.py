@@ -76,7 +76,7 @@ class ArmMemory(threading.local):
         return self.jacobian[:, self._joints]
 
     def marked_jacobians(self) -> Array:
-        """Return the Jacobians of the marked sites below each other, (3 m, n), as a view that the next ones overwrite."""
+        """Return the Jacobians of the marked sites below each other, (3 m, n): a view that the next ones overwrite."""
         for site, rows in self._marked:
             mujoco.mj_jacSite(self._model, self.data, rows, None, site)
         return self._stacked

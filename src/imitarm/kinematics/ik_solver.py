@@ -51,7 +51,8 @@ class ElbowTask(NamedTuple):
 
     Attributes:
         angle: wanted :func:`~imitarm.kinematics.sew.sew_angle` [rad].
-        weight: :math:`w_\psi` [m^2] beside the tool's task, whose weight is 1; 0: the elbow is free.
+        weight: :math:`w_\psi` [m^2] beside the tool's task, whose weight is 1; much more than the default moves
+            the tool where the accelerations are at their limits; 0: the elbow is free.
         confidence: c, 0 to 1: how surely the wanted angle is known.
         gain: k [1/s].
         max_rate: the wanted rate of the angle is cut to this [rad/s].
@@ -59,7 +60,7 @@ class ElbowTask(NamedTuple):
     """
 
     angle: float
-    weight: float = 0.05
+    weight: float = 0.003
     confidence: float = 1.0
     gain: float = 5.0
     max_rate: float = 2.0

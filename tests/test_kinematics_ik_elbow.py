@@ -1,0 +1,230 @@
+"""The elbow's angle, the bounds at singularities, and what METHODS A.8 says about them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from imitarm.errors import InputError, UnknownNameError
+from imitarm.kinematics import ik_methods
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik import METHODS, ElbowTask, IKSolver, solve_ik
+from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.sew import sew_angle, sew_derivatives
+
+ARMS = {name: ArmModel.load(name, tool="brush") for name in ("sawyer", "panda")}
+SAWYER = ARMS["sawyer"]
+WEIGHTS = np.array([[1], [1], [1], [0.3], [0.3], [0.3]])
+DT = 0.01
+either = pytest.mark.parametrize("name", list(ARMS))
+seeds = st.integers(0, 2**32 - 1)
+
+
+def wrapped(angle):
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def least_singular_value(arm, q):
+    return np.linalg.svd(WEIGHTS * arm.jacobian(q), compute_uv=False)[-1]
+
+
+@either
+@pytest.mark.parametrize("change", [-0.5, 0.4])
+@pytest.mark.parametrize("convention", ["stereographic", "conventional"])
+def test_the_elbow_swings_to_its_angle_while_the_tool_stands_still(name, change, convention):
+    arm = ARMS[name]
+    q, velocity, start = arm.home.copy(), np.zeros(7), arm.tool_pose(arm.home)
+    wanted = wrapped(sew_angle(*arm.sew_points(q), convention=convention) + change)
+    solver = IKSolver(arm, dt=DT)
+    for _ in range(400):
+        task = ElbowTask(wanted, convention=convention)
+        twist = 10.0 * arm.tool_pose(q).error_to(start)
+        velocity = solver.solve(q, twist, velocity=velocity, sew=task)
+        q = q + DT * velocity
+        assert np.linalg.norm(arm.tool_pose(q).error_to(start)) < 0.01
+    assert abs(wrapped(sew_angle(*arm.sew_points(q), convention=convention) - wanted)) < 1e-3
+    assert np.linalg.norm(arm.tool_pose(q).error_to(start)) < 1e-4
+
+
+@settings(deadline=None, max_examples=40)
+@given(seeds, st.sampled_from(list(ARMS)))
+def test_the_elbow_has_the_documented_cost(seed, name):
+    """An independent solver finds no better point in the box."""
+    arm, rng = ARMS[name], np.random.default_rng(seed)
+    q = rng.uniform(arm.lower, arm.upper)
+    before, twist = 0.3 * rng.normal(size=7), 0.3 * rng.normal(size=6)
+    elbow = ElbowTask(rng.uniform(-3, 3), weight=rng.uniform(0.01, 1.0), confidence=rng.random())
+    ours = solve_ik(arm, q, twist, velocity=before, sew=elbow, max_speed=1e9)
+    task = IKSolver(arm, max_speed=1e9).task(q, twist, velocity=before)
+    state = sew_derivatives(*arm.sew_points(q))
+    jacobian = np.concatenate((state.shoulder, state.elbow, state.wrist)) @ arm.sew_jacobians(q).reshape(9, 7)
+    s, e, w = arm.sew_points(q)
+    sine = np.linalg.norm(np.cross(e - s, w - e)) / (np.linalg.norm(e - s) * np.linalg.norm(w - e))
+    weight = elbow.weight * elbow.confidence * sine**2 * min(1.0, state.reference / 0.04)
+    rate = np.clip(5.0 * wrapped(elbow.angle - state.angle), -2.0, 2.0)
+
+    def cost(v):
+        miss = WEIGHTS[:, 0] * (arm.tool_jacobian(q) @ v - twist)
+        small = ik_methods._EFFORT * v @ v + ik_methods._CHANGE * np.sum((v - before) ** 2)
+        return 0.5 * (miss @ miss + weight * (jacobian @ v - rate) ** 2 + small)
+
+    other = minimize(cost, ours, bounds=list(zip(task.lower, task.upper, strict=True)), method="L-BFGS-B")
+    assert cost(ours) <= other.fun + 1e-8
+
+
+def test_no_confidence_is_no_task_and_a_lost_angle_does_no_harm():
+    twist = [0.1, 0.05, 0, 0, 0, 0.1]
+    free = solve_ik(SAWYER, SAWYER.home, twist)
+    assert np.allclose(solve_ik(SAWYER, SAWYER.home, twist, sew=ElbowTask(2.0, confidence=0.0)), free, atol=1e-9)
+    assert not np.allclose(solve_ik(SAWYER, SAWYER.home, twist, sew=ElbowTask(2.0)), free, atol=1e-3)
+    panda = ARMS["panda"]
+    straight = np.array([0.2, 0.3, 0, panda.landmarks.elbow_straight, 0, 1.5, 0])
+    led = solve_ik(panda, straight, twist, sew=ElbowTask(2.0))
+    assert np.allclose(led, solve_ik(panda, straight, twist), atol=1e-3)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seeds, st.sampled_from(list(ARMS)), st.sampled_from([0.002, 0.01, 0.03]))
+def test_no_limit_is_ever_broken_with_everything_on(seed, name, dt):
+    """Wild targets for tool and elbow; position, velocity, acceleration and the elbow's bound all hold."""
+    arm, rng = ARMS[name], np.random.default_rng(seed)
+    elbow, straight = arm.landmarks.elbow, arm.landmarks.elbow_straight
+    q, velocity = arm.home.copy(), np.zeros(7)
+    side = np.sign(q[elbow] - straight)
+    solver = IKSolver(arm, dt=dt, singularity_bounds=True)
+    for step in range(200):
+        if step % 20 == 0:
+            twist = rng.normal(size=6) * 10.0 ** rng.uniform(-2, 1)
+            angle = rng.uniform(-np.pi, np.pi)
+            q_ref = rng.uniform(arm.lower, arm.upper) if rng.random() < 0.5 else None
+        new = solver.solve(q, twist, velocity=velocity, q_ref=q_ref, sew=ElbowTask(angle, weight=rng.random()))
+        assert np.all(np.abs(new) <= arm.max_velocity * (1 + 1e-12))
+        assert np.all(np.abs(new - velocity) <= arm.max_acceleration * dt + 1e-9)
+        velocity, q = new, q + dt * new
+        assert np.all(q <= arm.upper + 1e-9) and np.all(q >= arm.lower - 1e-9)
+        assert side * (q[elbow] - straight) >= 0.15 - 1e-9
+
+
+@either
+@pytest.mark.parametrize("method", list(METHODS))
+def test_every_method_keeps_the_elbow_bent_beyond_the_reach(name, method):
+    arm = ARMS[name]
+    elbow, straight = arm.landmarks.elbow, arm.landmarks.elbow_straight
+    target = Pose(arm.tool_pose(arm.home).position + [0.7, 0, 0], arm.tool_pose(arm.home).quaternion)
+
+    def most_stretched(singularity_bounds):
+        q, least, smallest = arm.home.copy(), np.inf, np.inf
+        for _ in range(300):
+            twist = 5.0 * arm.tool_pose(q).error_to(target)
+            q = q + DT * solve_ik(arm, q, twist, method=method, dt=DT, singularity_bounds=singularity_bounds)
+            least = min(least, abs(q[elbow] - straight))
+            smallest = min(smallest, least_singular_value(arm, q))
+        return least, smallest
+
+    (free, free_value), (kept, kept_value) = most_stretched(False), most_stretched(True)
+    assert kept >= 0.15 - 1e-9
+    if method == "qp":
+        assert free < 0.05 and kept_value > free_value
+
+
+@either
+def test_the_wrist_keeps_off_its_singular_position_where_the_task_can_spare_it(name):
+    """The elbow is free: the arm has a choice, and takes the one without the singularity."""
+    arm = ARMS[name]
+    wrist = arm.landmarks.wrist
+    start = arm.home.copy()
+    start[wrist] = 0.3
+    axis = arm.tool_jacobian(start)[:, wrist]
+
+    def led(singularity_bounds):
+        q, velocity, least = start.copy(), np.zeros(7), np.inf
+        reached = arm.tool_pose(start)
+        for _ in range(60):  # first turns the wrist's joint towards its singular position, if nothing holds it back
+            velocity = solve_ik(arm, q, -0.5 * axis, velocity=velocity, dt=DT, singularity_bounds=singularity_bounds)
+            q = q + DT * velocity
+            least = min(least, abs(q[wrist]))
+        return least, reached
+
+    assert led(True)[0] > led(False)[0]
+
+
+def test_the_wrist_bound_gives_way_to_a_task_that_needs_to_pass():
+    """Soft: a hand that has to turn through the singular position does, so nobody is locked in."""
+    start, end = SAWYER.home.copy(), SAWYER.home.copy()
+    start[5], end[5] = 0.4, -0.4
+    target = SAWYER.tool_pose(end)
+    q, velocity = start.copy(), np.zeros(7)
+    for _ in range(800):
+        twist = 4.0 * SAWYER.tool_pose(q).error_to(target)
+        velocity = solve_ik(SAWYER, q, twist, velocity=velocity, dt=DT, singularity_bounds=True)
+        q = q + DT * velocity
+    assert np.linalg.norm(SAWYER.tool_pose(q).error_to(target)) < 0.02
+
+
+def test_joints_offset_from_zero_barely_help_on_the_sawyer():
+    """METHODS A.8: what the thesis's offset of all joints can and can't do; orders of magnitude."""
+    table = {0.0: 0.0, 0.01: 2.0e-4, 0.05: 9.9e-4, 0.1: 2.0e-3, 0.2: 4.4e-3}
+    flange = ArmModel.load("sawyer")
+    for offset, expected in table.items():
+        assert least_singular_value(flange, np.full(7, offset)) == pytest.approx(expected, rel=0.6, abs=1e-9)
+    rng = np.random.default_rng(0)
+    random = [least_singular_value(flange, rng.uniform(flange.lower, flange.upper)) for _ in range(300)]
+    assert np.median(random) > 15 * table[0.2]
+
+
+def test_only_elbow_and_wrist_of_the_sawyer_matter():
+    """METHODS A.8: with one joint at zero and the others anywhere, only joints 3 and 5 cost the arm a direction."""
+    flange, rng = ArmModel.load("sawyer"), np.random.default_rng(1)
+    postures = rng.uniform(flange.lower, flange.upper, (250, 7))
+    medians = []
+    for joint in range(7):
+        postures_there = postures.copy()
+        postures_there[:, joint] = 0.0
+        medians.append(np.median([least_singular_value(flange, q) for q in postures_there]))
+    anywhere = np.median([least_singular_value(flange, q) for q in postures])
+    assert max(medians[3], medians[5]) < 0.7 * anywhere
+    assert min(np.delete(medians, [3, 5])) > 0.85 * anywhere
+
+
+def test_the_panda_is_stretched_inside_its_range_not_at_zero():
+    """Its elbow's axis stands beside both links, so the arm is longest, and singular, at -0.467 rad."""
+    arm = ArmModel.load("panda")
+    straight = arm.landmarks.elbow_straight
+    angles = straight + np.linspace(-0.3, 0.3, 61)
+    lengths = []
+    for angle in angles:
+        s, _, w = arm.sew_points([0.3, 0.4, 0.1, angle, 0.5, 1.2, 0.3])
+        lengths.append(np.linalg.norm(w - s))
+    assert angles[np.argmax(lengths)] == pytest.approx(straight, abs=1e-6)
+    assert least_singular_value(arm, np.array([0.3, 0.4, 0.1, straight, 0.5, 1.2, 0.3])) < 0.02
+    assert arm.lower[3] < straight < arm.upper[3]
+
+
+def test_a_solver_kept_is_the_function_called():
+    rng = np.random.default_rng(0)
+    for method in METHODS:
+        solver = IKSolver(SAWYER, method, dt=0.02, frame="flange", max_speed=0.3)
+        for _ in range(20):
+            q, twist = rng.uniform(SAWYER.lower, SAWYER.upper), rng.normal(size=6)
+            called = solve_ik(SAWYER, q, twist, method=method, dt=0.02, frame="flange", max_speed=0.3)
+            assert np.array_equal(solver.solve(q, twist), called)
+            assert np.array_equal(solver.step(q, twist).velocity, called)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "said"),
+    [
+        ({"sew": ElbowTask(np.nan)}, InputError, "finite angle"),
+        ({"sew": ElbowTask(0.1, weight=-1.0)}, InputError, "not negative"),
+        ({"sew": ElbowTask(0.1, convention="polar")}, UnknownNameError, "conventional, stereographic"),
+        ({"sew": ElbowTask(0.1), "method": "dls"}, InputError, "can't lead the elbow"),
+        ({"posture_gain": np.inf}, InputError, "posture_gain must be finite"),
+        ({"max_speed": -1.0}, InputError, "max_speed not negative"),
+    ],
+)
+def test_what_can_not_be_used_is_refused(options, error, said):
+    with pytest.raises(error, match=said):
+        solve_ik(SAWYER, SAWYER.home, np.zeros(6), **options)
