@@ -18,7 +18,7 @@ from imitarm.retarget.rotation_curve import RotationCurve, fit_rotations
 Array = NDArray[np.float64]
 
 _DEGREE = 3
-_MU = 1.0  # strength of the live curve: what cross validation finds for 1 cm of noise
+_MU = 1.0  # strength of the live curve; cross validation takes longer than a frame and finds about this
 _SIGMA = 0.012  # [m] of a Kinect; what is 2.5 of it off the curve counts for less
 _LATE = 0.02  # share by which the clock follows frames that come later than usual
 _RESTART = 0.25  # [s] a source whose clock is off by more has begun anew
