@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from imitarm.tasks.stack import StackTask
 from imitarm.tasks.sweep import DEMONSTRATIONS, SCENES, SweepTask
 
-TASKS: dict[str, type[SweepTask]] = {"sweep": SweepTask}
+TASKS: dict[str, type[SweepTask] | type[StackTask]] = {"stack": StackTask, "sweep": SweepTask}
 
-__all__ = ["DEMONSTRATIONS", "SCENES", "TASKS", "SweepTask"]
+__all__ = ["DEMONSTRATIONS", "SCENES", "TASKS", "StackTask", "SweepTask"]

@@ -132,12 +132,12 @@ class StackTask:
             _add_cube(spec, i + 1, place, turn)
         return spec
 
-    def robot(self, arm: ArmModel | None = None, *, control: Control = "position") -> SimulatedRobot:
+    def robot(self, arm: ArmModel | None = None, *, control: Control = "torque") -> SimulatedRobot:
         """Return the simulated robot with its open gripper above the table.
 
         Args:
             arm: the arm, when it is loaded already.
-            control: of the drives.
+            control: of the drives; computed torque, the softer of the two, by default: contacts are to be expected.
         """
         arm = self.arm() if arm is None else arm
         robot = SimulatedRobot(arm, world=self.world(arm), control=control, q=self.start_posture(arm))
