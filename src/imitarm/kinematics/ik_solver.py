@@ -212,8 +212,8 @@ class IKSolver:
             raise InputError(f"solve_ik: method {self.method!r} can't lead the elbow; use method='qp'")
         if not (math.isfinite(angle) and weight >= 0.0 and confidence >= 0.0 and gain >= 0.0 and max_rate >= 0.0):
             raise InputError(f"solve_ik: sew needs a finite angle and numbers that are not negative, got {sew!r}")
-        sites = self.arm.marked().sites
-        now = one_angle(*(memory.sites[site].tolist() for site in sites), convention)
+        shoulder, elbow, wrist = (memory.sites[site].tolist() for site in self.arm.marked().sites)
+        now = one_angle(shoulder, elbow, wrist, convention)
         if now is None:
             return jacobian, wanted
         share = math.sqrt(weight * confidence * now.bend * min(1.0, now.reference / _REFERENCE))

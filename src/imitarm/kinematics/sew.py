@@ -106,7 +106,8 @@ def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereogr
     Returns:
         angle [rad] and its Jacobian, shape (n,); nan where the angle is lost.
     """
-    found = one_angle(*points.tolist(), convention)
+    shoulder, elbow, wrist = points.tolist()
+    found = one_angle(shoulder, elbow, wrist, convention)
     if found is None:
         return math.nan, np.full(jacobians.shape[-1], math.nan)
     gradient = np.array(found.shoulder + found.elbow + found.wrist)
