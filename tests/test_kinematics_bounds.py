@@ -145,7 +145,7 @@ def pink_box(arm, q, dt, velocity):
 def test_bounds_that_do_not_fit_together_leave_no_velocity_and_ours_always_do():
     """METHODS A.9 and G: a joint led to its limit as fast as each box lets it."""
     stuck = dict.fromkeys(("pink", "ours"), 0)
-    for which, box in (("pink", pink_box), ("ours", lambda *a: velocity_box(*a))):
+    for which, box in (("pink", pink_box), ("ours", velocity_box)):
         q, velocity = np.array(SAWYER.home), np.zeros(7)
         for _ in range(400):
             lower, upper = box(SAWYER, q, DT, velocity)
