@@ -23,6 +23,7 @@ REST = 1.0  # [s] with a still hand at the beginning, so that a robot can take h
 _INSIDE = np.array([[-0.15, 0.5], [-0.7, 0.1], [0.7, 1.0]])  # direction from the shoulder: out, up, forward
 _AWAY = (0.55, 0.85)  # of the reach
 _SPEED = (0.25, 0.55)  # [m/s] mean speed of a reach
+_UPPER_ARM = (0.1, 0.6)  # [m]
 _MARKERS = ("right_shoulder", "right_elbow", "hand_left", "hand_right", "middle_middle", "thumb_middle")
 
 
@@ -104,14 +105,23 @@ class MotionCapture:
     source: str
 
     @classmethod
-    def load(cls, path: str | Path) -> MotionCapture:
+    def load(cls, path: str | Path, *, to_body: ArrayLike | None = None) -> MotionCapture:
         """Read markers of a right arm from a file of tab-separated values in millimetres.
 
         The wrist is taken midway between the two markers at the hand's near end.
 
+        Args:
+            path: the file.
+            to_body: rotation from the file's axes to forward, left and up of the person, shape (3, 3); None: the
+                file's axes are these.
+
         Raises:
-            FileFormatError: when the file is not such a recording, naming what is missing and in which line.
+            FileFormatError: when the file is not such a recording, naming what is wrong and in which line.
+            InputError: when ``to_body`` is no rotation.
         """
+        turn = np.eye(3) if to_body is None else np.array(to_body, dtype=float)
+        if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0.0:
+            raise InputError(f"MotionCapture: to_body must be a rotation of shape (3, 3), got {to_body!r}")
         path = Path(path)
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
@@ -126,23 +136,36 @@ class MotionCapture:
         if missing:
             raise FileFormatError(f"{path}, line {header + 1}: marker {missing[0]!r} is missing")
         columns = [2 + 3 * names.index(name) for name in _MARKERS]
-        rows = [_row(path, i + 1, lines[i], columns) for i in range(first + 1, len(lines)) if lines[i].strip()]
-        if len(rows) < 2:
-            raise FileFormatError(f"{path}: holds {len(rows)} frames; at least 2 are needed")
-        table = np.array(rows)
-        s, e, left, right, tip, thumb = np.moveaxis(table[:, 1:].reshape(len(table), -1, 3) * 1e-3, 1, 0)
+        filled = [i for i in range(first + 1, len(lines)) if lines[i].strip()]
+        if len(filled) < 2:
+            raise FileFormatError(f"{path}: holds {len(filled)} frames; at least 2 are needed")
+        table = np.array([_row(path, i + 1, lines[i], columns) for i in filled])
+        back = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
+        if len(back):
+            raise FileFormatError(f"{path}, line {filled[back[0] + 1] + 1}: time does not increase; sort the frames")
+        s, e, left, right, tip, thumb = np.moveaxis(table[:, 1:].reshape(len(table), -1, 3) * 1e-3 @ turn.T, 1, 0)
+        upper = float(np.median(np.linalg.norm(e - s, axis=1)))
+        if not _UPPER_ARM[0] < upper < _UPPER_ARM[1]:
+            raise FileFormatError(
+                f"{path}: an upper arm of {upper:.3g} m, if its numbers are millimetres; export positions in mm"
+            )
         return cls(table[:, 0], np.stack([s, e, 0.5 * (left + right), tip, thumb], axis=1), path.name)
 
     def truth(self, person: Person) -> Truth:
-        """Return the motion as done by ``person`` before a sensor; the arm is the captured one, bones and all."""
+        """Return the motion as done by ``person`` before a sensor; the arm is the captured one, bones and all.
+
+        Between frames it is interpolated, before the first and after the last one it is still. The rest of the body
+        stands upright where the person stands.
+        """
         to_sensor = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
         points = self.points @ to_sensor.T
         points = points + (person.shoulder("right", 0.0) - points[:, 0].mean(axis=0))
-        flat = points.reshape(len(points), -1)
+        times = self.times - self.times[0]
 
         def truth(time: float) -> Skeleton:
-            now = np.array([np.interp(time - self.times[0], self.times - self.times[0], c) for c in flat.T])
-            s, e, w, tip, thumb = now.reshape(5, 3)
+            after = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1))
+            share = float(np.clip((time - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0))
+            s, e, w, tip, thumb = points[after - 1] + share * (points[after] - points[after - 1])
             body = person.skeleton(time, w)
             positions = np.array(body.positions)
             for name, point in zip(

@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Callable
+from functools import partial
 
 from imitarm.capture.camera_model import SkeletonCamera
-from imitarm.capture.motions import Truth, reaching
+from imitarm.capture.drawing import DRAWINGS, drawing
+from imitarm.capture.motions import REACHES, Truth, reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
-from imitarm.errors import InputError
+from imitarm.errors import InputError, UnknownNameError
+
+MOTIONS: dict[str, Callable[..., Truth]] = {
+    **{kind: partial(reaching, kind=kind) for kind in REACHES},
+    **{kind: partial(drawing, kind=kind) for kind in DRAWINGS},
+}
+"""What a made-up person can be asked to do, by name: each takes a person, a seed and ``duration`` [s]."""
 
 
 class SyntheticSource(SkeletonSource):
     """A made-up person before a made-up camera; the same seeds give the same skeletons.
+
+    What is seen can be compared with what is true::
+
+        source = SyntheticSource.from_seed(3, kind="edge")
+        for seen in source:
+            error = seen.positions - source.truth(seen.time).positions
 
     Args:
         truth: where every joint truly is at each time.
@@ -20,6 +35,12 @@ class SyntheticSource(SkeletonSource):
         duration: [s].
         realtime: give each skeleton when its time has come, as a camera does; else as fast as it is asked.
         name: for messages.
+
+    Attributes:
+        truth: as given.
+
+    Raises:
+        InputError: when the duration is not positive, or longer than a day.
     """
 
     def __init__(
@@ -42,10 +63,22 @@ class SyntheticSource(SkeletonSource):
     def from_seed(
         cls, seed: int, *, duration: float = 12.0, kind: str = "inside", realtime: bool = False
     ) -> SyntheticSource:
-        """Return person number ``seed``, who reaches about, before a camera of usual noise."""
-        person = Person.from_seed(seed)
-        truth = reaching(person, seed, duration=duration, kind=kind)
-        return cls(truth, SkeletonCamera(seed), duration, realtime=realtime, name=f"synthetic:{seed}")
+        """Return person number ``seed`` in motion before camera number ``seed``, whose noise is 1 to 2 cm.
+
+        Args:
+            seed: of person, motion and camera.
+            duration: [s]; the first second is still.
+            kind: of motion, one of :data:`MOTIONS`.
+            realtime: give each skeleton when its time has come.
+
+        Raises:
+            UnknownNameError: when there is no such motion.
+        """
+        if kind not in MOTIONS:
+            raise UnknownNameError.among("motion", kind, MOTIONS)
+        truth = MOTIONS[kind](Person.from_seed(seed), seed, duration=duration)
+        name = f"synthetic:{seed}" if kind == "inside" else f"synthetic:{seed}:{kind}"
+        return cls(truth, SkeletonCamera.from_seed(seed), duration, realtime=realtime, name=name)
 
     @property
     def over(self) -> bool:
@@ -60,10 +93,9 @@ class SyntheticSource(SkeletonSource):
             now = clock.monotonic()
             self._started = now if self._started is None else self._started
             wait = self._started + self._next - now
+            clock.sleep(min(max(wait, 0.0), max(timeout, 0.0)))
             if wait > timeout:
-                clock.sleep(timeout)
                 return None
-            clock.sleep(max(wait, 0.0))
         seen = self._camera.see(self.truth(self._next))
         self._next = self._camera.next_time(self._next)
         return seen
