@@ -23,7 +23,7 @@ def test_minimum_jerk_passes_its_points_and_rests_at_the_ends():
 
 @pytest.mark.parametrize("kind", ["inside", "edge"])
 def test_a_reach_begins_at_rest_and_moves_as_people_do(kind):
-    for seed in range(5):
+    for seed in range(3):
         path = wrists(reaching(PERSON, seed, duration=10.0, kind=kind), 10.0)
         speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / 0.01
         assert speed[:80].max() < 0.05  # tremor and sway only

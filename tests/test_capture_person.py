@@ -116,3 +116,31 @@ def test_a_given_hand_and_fist_are_shown():
 def test_a_wrist_nowhere_is_refused():
     with pytest.raises(InputError, match="wrist"):
         PEOPLE[0].skeleton(0.0, [np.nan, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"swivel": np.inf},
+        {"hand": np.eye(2)},
+        {"hand": 2.0 * np.eye(3)},
+        {"hand": np.diag([1.0, 1.0, -1.0])},
+        {"hand": np.full((3, 3), np.nan)},
+        {"side": "middle"},
+    ],
+)
+def test_impossible_arms_are_refused(options):
+    with pytest.raises(InputError, match=f"Person.skeleton: {next(iter(options))}|unknown side"):
+        PEOPLE[0].skeleton(0.0, [0.3, 0.0, 2.0], **options)
+
+
+def test_a_hand_trembles_by_up_to_a_millimetre_and_the_body_sways():
+    for person in PEOPLE[:4]:
+        shoulder = np.array([person.shoulder("right", t) for t in np.arange(0.0, 30.0, 0.05)])
+        assert 0.001 < np.ptp(shoulder[:, [0, 2]], axis=0).max() < 0.010
+        wanted = person.shoulder("right") + [0.0, -0.1, -0.35]
+        shake = np.array([person.skeleton(t, wanted).arm().wrist - wanted for t in np.arange(0.0, 4.0, 0.01)])
+        assert 0.0003 < np.linalg.norm(shake, axis=1).max() < 0.0016
+        power = np.square(np.abs(np.fft.rfft(shake - shake.mean(axis=0), axis=0))).sum(axis=1)
+        hertz = np.fft.rfftfreq(len(shake), 0.01)
+        assert power[(hertz > 3.5) & (hertz < 9.5)].sum() > 0.95 * power.sum()

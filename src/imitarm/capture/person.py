@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.capture.skeleton import JOINT, JOINTS, HandState, Skeleton
+from imitarm.capture.skeleton import JOINT, JOINTS, SIDES, HandState, Skeleton
 from imitarm.errors import InputError, UnknownNameError
 
 Array = NDArray[np.float64]
@@ -140,11 +141,16 @@ class Person:
             side: of the arm that moves.
 
         Raises:
-            InputError: when the wrist is not three finite numbers.
+            InputError: when the wrist is not three finite numbers, the swivel is none, or the hand no rotation.
+            UnknownNameError: when ``side`` is neither left nor right.
         """
         wanted = np.asarray(wrist, dtype=float)
         if wanted.shape != (3,) or not np.isfinite(wanted).all():
             raise InputError(f"Person.skeleton: wrist must be 3 finite numbers [m], got {wrist!r}")
+        if swivel is not None and not math.isfinite(swivel):
+            raise InputError(f"Person.skeleton: swivel must be a finite angle [rad], got {swivel!r}")
+        if hand is not None and not _is_rotation(np.asarray(hand, dtype=float)):
+            raise InputError(f"Person.skeleton: hand must be a rotation of shape (3, 3), got {hand!r}")
         points = self._body(time)
         other = "left" if side == "right" else "right"
         hanging = self.shoulder(other, time) + np.array([_outwards(other) * 0.06, -0.97 * self.reach, -0.05])
@@ -174,17 +180,7 @@ class Person:
         return np.array([x, 0.0, z])
 
     def _body(self, time: float) -> Array:
-        points = np.empty((len(JOINTS), 3))
-        middle, height = self._middle(time), self.stature
-        for name, share in _HEIGHTS.items():
-            y = share * height - SENSOR_HEIGHT
-            if name in JOINT:
-                points[JOINT[name]] = middle + [0.0, y, 0.0]
-                continue
-            forward = -_FOOT * height if name == "foot" else 0.0
-            for side in ("left", "right"):
-                points[JOINT[f"{name}_{side}"]] = middle + [_outwards(side) * _HALF_HIPS * height, y, forward]
-        return points
+        return _standing(self.stature) + self._middle(time)
 
     def _place_arm(
         self, points: Array, side: str, time: float, wrist: Array, swivel: float | None, hand: ArrayLike | None
@@ -205,11 +201,33 @@ class Person:
             points[JOINT[f"{name}_{side}"]] = point
 
 
+@lru_cache(maxsize=64)
+def _standing(stature: float) -> Array:
+    """Return an upright body without arms above the floor's point between its feet, shape (25, 3) [m]."""
+    points = np.zeros((len(JOINTS), 3))
+    for name, share in _HEIGHTS.items():
+        y = share * stature - SENSOR_HEIGHT
+        if name in JOINT:
+            points[JOINT[name]] = [0.0, y, 0.0]
+            continue
+        forward = -_FOOT * stature if name == "foot" else 0.0
+        for side in SIDES:
+            points[JOINT[f"{name}_{side}"]] = [_outwards(side) * _HALF_HIPS * stature, y, forward]
+    points.setflags(write=False)
+    return points
+
+
 def _outwards(side: str) -> float:
     """Return the sign of x on which a side of a person who faces the sensor is."""
-    if side not in {"left", "right"}:
-        raise UnknownNameError.among("side", side, ("left", "right"))
+    if side not in SIDES:
+        raise UnknownNameError.among("side", side, SIDES)
     return 1.0 if side == "right" else -1.0
+
+
+def _is_rotation(matrix: Array) -> bool:
+    if matrix.shape != (3, 3) or not np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-6:
+        return False
+    return bool(np.cross(matrix[:, 0], matrix[:, 1]) @ matrix[:, 2] > 0.0)
 
 
 def _hand_along(forearm: Array) -> Array:
