@@ -29,7 +29,7 @@ def test_the_nearest_pairs_are_those_of_all_pairs_looked_at_one_by_one(name, see
     q = folded(name, seed)
     centers, radii = arm.collision_spheres(q)
     at_home, _ = arm.collision_spheres(arm.home)
-    links = arm.sphere_links
+    links = arm.cover.links
     best: dict[tuple[int, int], float] = {}
     for i in range(len(radii)):
         for j in np.flatnonzero(links < links[i] - 1):
@@ -69,7 +69,7 @@ def test_home_is_clear_of_what_is_watched(name):
     own = CLEARANCES[name]
     assert own.n_pairs > 1000
     assert own.distance(ARMS[name].home) >= own.clearance
-    links = ARMS[name].sphere_links
+    links = ARMS[name].cover.links
     pairs, _ = own.nearest(ARMS[name].home)
     assert all(links[i] > links[j] + 1 for i, j in pairs)
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.arm_file import ArmFile, quiet, read_arm
 from imitarm.kinematics.arm_limits import compiled
-from imitarm.kinematics.arm_memory import ArmMemory, columns
+from imitarm.kinematics.arm_memory import ArmMemories, ArmMemory, columns
 from imitarm.kinematics.landmarks import Landmarks
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.spheres import SphereCover
@@ -66,6 +66,7 @@ class ArmModel:
         tool_to_flange: where the tool's tip is; the identity when there is no tool.
         tool_radius: radius of the cylinder about the tool's axis that holds the tool's head [m]; 0 without a tool.
         sphere_bodies: for each sphere of :meth:`collision_spheres` the name of its body.
+        cover: the spheres themselves.
         landmarks: shoulder, elbow and wrist, from sites of these names in the file; None when it has none.
     """
 
@@ -80,6 +81,7 @@ class ArmModel:
     tool_to_flange: Pose
     tool_radius: float
     sphere_bodies: tuple[str, ...]
+    cover: SphereCover
     landmarks: Landmarks | None
 
     @classmethod
@@ -132,7 +134,7 @@ class ArmModel:
         self._dofs = columns(model.jnt_dofadr[joints])
         self.landmarks = Landmarks.find(model, np.array(joints))
         marked = () if self.landmarks is None else self.landmarks.sites
-        self._scratch = ArmMemory(model, posture, self._qpos, self._dofs, marked)
+        self._memories = ArmMemories(model, posture, self._qpos, self._dofs, marked)
         self._joints = np.array(joints)
         self._flange = model.site("flange").id
         names = [model.site(i).name for i in range(model.nsite)]
@@ -149,8 +151,8 @@ class ArmModel:
         self.tool_to_flange = Pose.identity()
         if self.has_tool:
             self.tool_to_flange = self.forward_kinematics(self.home).inverse() @ self.tool_pose(self.home)
-        self._cover = SphereCover(whole, self._joints)
-        self.sphere_bodies = self._cover.bodies
+        self.cover = SphereCover(whole, self._joints)
+        self.sphere_bodies = self.cover.bodies
         self._sealed = True
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -200,7 +202,7 @@ class ArmModel:
             shape (model.nq,).
         """
         qpos = np.array(model.qpos0)
-        mine, home = self._model, self._scratch.data.qpos
+        mine, home = self._model, self._memories.mine.data.qpos
         for joint in range(mine.njnt):  # fingers too
             address = model.jnt_qposadr[model.joint(prefix + mine.joint(joint).name).id]
             qpos[address] = home[mine.jnt_qposadr[joint]]
@@ -214,7 +216,7 @@ class ArmModel:
 
         It is computed only when the posture is a new one, and holds until the next is asked for.
         """
-        memory = self._scratch
+        memory = self._memories.mine
         memory.move_to(self._checked(q, "q"))
         return memory
 
@@ -315,7 +317,7 @@ class ArmModel:
         Returns:
             centers (m, 3) [m] in the base frame and radii (m,) [m].
         """
-        return self._cover.centers(self.at(q).data), self._cover.radii
+        return self.cover.centers(self.at(q).data), self.cover.radii
 
     @property
     def tool_spheres(self) -> Array:
@@ -324,17 +326,12 @@ class ArmModel:
         Rows x y z r in the tool's frame, shape (m, 4) [m]; what a policy keeps clear of obstacles.
         """
         centers, radii = self.collision_spheres(self.home)
-        rigid = self._cover.follows_last_joint
+        rigid = self.cover.follows_last_joint
         return np.column_stack([self.tool_pose(self.home).inverse().apply(centers[rigid]), radii[rigid]])
 
-    @property
-    def sphere_links(self) -> NDArray[np.int_]:
-        """By how many joints each sphere is moved, shape (m,): n_joints for those that move with the flange."""
-        return self._cover.links
-
-    def sphere_jacobians(self, q: ArrayLike, chosen: NDArray[np.int_] | None = None) -> Array:
-        """Return the Jacobians of the spheres' centers, of all or of some, shape (m, 3, n_joints) [m/rad]."""
-        return self._cover.jacobians(self.at(q).data, chosen)
+    def sphere_jacobians(self, q: ArrayLike) -> Array:
+        """Return the Jacobians of the spheres' centers, shape (m, 3, n_joints) [m/rad]."""
+        return self.cover.jacobians(self.at(q).data)
 
     def gravity_torque(self, q: ArrayLike) -> Array:
         """Return the torques g(q) that hold arm and tool against gravity, shape (n_joints,) [N m]."""

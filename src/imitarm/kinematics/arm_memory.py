@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,8 +15,8 @@ Array = NDArray[np.float64]
 Columns = slice | NDArray[np.int32]
 
 
-class ArmMemory(threading.local):
-    """MuJoCo's working memory, and the posture it holds.
+class ArmMemory:
+    """MuJoCo's working memory, and the posture it holds; for one thread.
 
     Attributes:
         data: kinematics of the posture.
@@ -80,6 +81,14 @@ class ArmMemory(threading.local):
         for site, rows in self._marked:
             mujoco.mj_jacSite(self._model, self.data, rows, None, site)
         return self._stacked
+
+
+class ArmMemories(threading.local):
+    """The working memory of the thread that asks."""
+
+    def __init__(self, *arguments: Any) -> None:
+        """Take what :class:`ArmMemory` takes."""
+        self.mine = ArmMemory(*arguments)
 
 
 def columns(indices: NDArray[np.int32]) -> Columns:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import cache
+from operator import le
 from typing import NamedTuple
 
 import daqp
@@ -53,20 +54,22 @@ def quadratic_program(task: Task) -> Array:
     if task.posture is not None:
         effort += _POSTURE
         linear += _POSTURE * task.posture
-    np.negative(linear, out=linear)
     hessian += effort * _eye(n)
     velocity = _least_cost(task, hessian, linear)
     if task.wrist is not None:
         joint, side, least = task.wrist
         if side * velocity[joint] < least:  # the price is convex, so where it is paid at all it stands in full
             hessian[joint, joint] += _WRIST
-            linear[joint] -= _WRIST * side * least
+            linear[joint] += _WRIST * side * least
             velocity = _least_cost(task, hessian, linear)
     return velocity
 
 
 def _least_cost(task: Task, hessian: Array, linear: Array) -> Array:
-    """Minimise v^T H v / 2 + f^T v inside the box and under the rows, exactly."""
+    """Minimise v^T H v / 2 - f^T v inside the box and under the rows, exactly."""
+    free = _unconstrained(task, hessian, linear)
+    if free is not None:
+        return free
     n = len(linear)
     matrix, lower, upper = _no_rows(n), task.lower, task.upper
     sense = np.zeros(n, dtype=np.intc)
@@ -76,12 +79,26 @@ def _least_cost(task: Task, hessian: Array, linear: Array) -> Array:
         lower = np.concatenate((lower, least))
         sense = np.zeros(n + len(least), dtype=np.intc)
         sense[n:] = _SOFT
-    velocity, _, status, _ = daqp.solve(hessian, linear, matrix, upper, lower, sense, rho_soft=_SLACK)
+    velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, sense, rho_soft=_SLACK)
     if status <= 0:
         # the box is never empty and rows are soft: only lost digits can bring us here, and standing is safe
         velocity = np.zeros(n)
     velocity = np.maximum(velocity, task.lower)
     return np.minimum(velocity, task.upper, out=velocity)
+
+
+def _unconstrained(task: Task, hessian: Array, linear: Array) -> Array | None:
+    """Return the minimum without limits when it keeps them all: most steps need no more, in half of the time."""
+    factor, velocity = hessian.copy(), np.empty(len(linear))
+    if mujoco.mju_cholFactor(factor, _NULL) < len(linear):
+        return None
+    mujoco.mju_cholSolve(velocity, factor, linear)
+    values = velocity.tolist()
+    if not all(map(le, task.lower.tolist(), values)) or not all(map(le, values, task.upper.tolist())):
+        return None
+    if task.rows is not None and (task.rows[0].dot(velocity) < task.rows[1]).any():
+        return None
+    return velocity
 
 
 @cache

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.bounds import clearance_rows
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int_]
@@ -50,7 +49,7 @@ class SelfClearance:
         self.arm, self.clearance = arm, clearance
         self._n_rows, self._gain = n_rows, gain
         centers, radii = arm.collision_spheres(arm.home)
-        links = arm.sphere_links
+        links = arm.cover.links
         sums = radii[:, None] + radii
         apart = np.linalg.norm(centers[:, None] - centers, axis=2) - sums
         # the sphere that is farther out comes first, so every pair occurs once
@@ -58,11 +57,13 @@ class SelfClearance:
         pair_of_links = links[outer] * (arm.n_joints + 1) + links[inner]
         order = np.argsort(pair_of_links, kind="stable")
         self._outer, self._inner = outer[order], inner[order]
-        self._flat = self._outer * len(radii) + self._inner
+        self._flat = self._outer * len(radii) + self._inner  # in the matrix of all distances
         self._sums = sums[self._outer, self._inner]
         self._coarse_sums = self._sums.astype(np.float32)
-        starts = np.flatnonzero(np.diff(pair_of_links[order], prepend=-1))
-        self._starts, self._ends = starts, np.append(starts[1:], len(order))
+        self._starts = np.flatnonzero(np.diff(pair_of_links[order], prepend=-1))
+        ends = [*self._starts.tolist(), len(order)][1:]
+        self._groups = [slice(a, b) for a, b in zip(self._starts.tolist(), ends, strict=True)]
+        self._near = np.float32(clearance + _INFLUENCE)
 
     @property
     def n_pairs(self) -> int:
@@ -92,8 +93,8 @@ class SelfClearance:
         Returns:
             indices of the two spheres (k, 2), and their distances (k,) [m]; at most ``n_rows``.
         """
-        pairs, _, distances = self._found(q)
-        return pairs, distances
+        outer, inner, _, _, distances = self._found(q)
+        return np.stack((outer, inner), axis=1), distances
 
     def rows(self, q: ArrayLike) -> tuple[Array, Array] | None:
         """Return inequalities ``A v >= lower`` on the joint velocity for ``solve_ik(..., rows=...)``.
@@ -104,34 +105,34 @@ class SelfClearance:
         Returns:
             ``A`` (k, n_joints) and ``lower`` (k,), k at most ``n_rows``; None when nothing is near.
         """
-        pairs, normals, distances = self._found(q)
-        if not len(pairs):
+        outer, inner, centers, normals, distances = self._found(q)
+        if not len(outer):
             return None
-        jacobians = self.arm.sphere_jacobians(q, pairs.ravel()).reshape(len(pairs), 2, 3, -1)
-        relative = jacobians[:, 0] - jacobians[:, 1]
-        return clearance_rows(relative, normals, distances, clearance=self.clearance, gain=self._gain)
+        rows = self.arm.cover.parting(self.arm.at(q).data, outer, inner, centers, normals)
+        return rows, -self._gain * (distances - self.clearance)
 
-    def _found(self, q: ArrayLike) -> tuple[Indices, Array, Array]:
-        """Return the nearest pairs (k, 2), their normals (k, 3) and distances (k,)."""
-        if not self.n_pairs:
-            return np.zeros((0, 2), dtype=int), np.zeros((0, 3)), np.zeros(0)
+    def _found(self, q: ArrayLike) -> tuple[Indices, Indices, Array, Array, Array]:
+        """Return the nearest pairs: outer and inner spheres, centres of the outer, normals and distances."""
         centers, _ = self.arm.collision_spheres(q)
-        coarse = self._coarse_distances(centers)
-        least = np.minimum.reduceat(coarse, self._starts)
-        order = np.argsort(least)[: self._n_rows]
-        order = order[least[order] < self.clearance + _INFLUENCE].tolist()
-        best = [int(self._starts[k]) + int(coarse[self._starts[k] : self._ends[k]].argmin()) for k in order]
+        best: list[int] = []
+        if self._groups:
+            coarse = self._coarse_distances(centers)
+            least = np.minimum.reduceat(coarse, self._starts)
+            for group in least.argsort()[: self._n_rows].tolist():
+                if least[group] < self._near:
+                    part = self._groups[group]
+                    best.append(part.start + int(coarse[part].argmin()))
         outer, inner = self._outer[best], self._inner[best]
-        between = centers[outer] - centers[inner]
-        lengths = np.sqrt(np.einsum("ij,ij->i", between, between))
-        return np.stack((outer, inner), axis=1), between / lengths[:, None], lengths - self._sums[best]
+        outer_centers = centers[outer]
+        between = outer_centers - centers[inner]
+        lengths = np.sqrt((between * between).sum(axis=1))
+        return outer, inner, outer_centers, between / lengths[:, None], lengths - self._sums[best]
 
     def _coarse_distances(self, centers: Array) -> NDArray[np.float32]:
         """Return the distances of all watched pairs, in single precision: good to some um, which tells who is near."""
         points = centers.astype(np.float32)
-        squares = np.einsum("ij,ij->i", points, points)
-        products = points @ points.T
-        products *= -2.0
+        squares = (points * points).sum(axis=1)
+        products = points @ (-2.0 * points).T
         products += squares
         products += squares[:, None]
         distances = products.ravel().take(self._flat)
