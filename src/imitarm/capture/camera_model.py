@@ -12,7 +12,7 @@ from imitarm.errors import InputError
 
 Array = NDArray[np.float64]
 
-# Measured in real recordings of a Kinect v2 (docs/capture.md); tests/test_capture_noise.py compares.
+# As measured in real recordings of a Kinect v2: tests/test_capture_noise.py compares.
 WAY = 0.08  # [m] a joint has to move so far for its error to become another one
 MEMORY = 5.0  # [s] in which the error of a joint at rest becomes another one
 DEPTH = 1.4  # the error along the line of sight over that across it

@@ -171,7 +171,7 @@ class Person:
         a = (self.upper_arm**2 + r * r - self.forearm**2) / (2.0 * r)
         h = math.sqrt(max(self.upper_arm**2 - a * a, 0.0))
         down = _turned(np.array([0.0, -1.0, 0.0]), along)
-        out = np.cross(down, along) if side == "right" else np.cross(along, down)
+        out = _cross(down, along) if side == "right" else _cross(along, down)
         return shoulder + a * along + h * (math.cos(swivel) * down + math.sin(swivel) * out), shoulder + r * along
 
     def _middle(self, time: float) -> Array:
@@ -227,14 +227,20 @@ def _outwards(side: str) -> float:
 def _is_rotation(matrix: Array) -> bool:
     if matrix.shape != (3, 3) or not np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-6:
         return False
-    return bool(np.cross(matrix[:, 0], matrix[:, 1]) @ matrix[:, 2] > 0.0)
+    return bool(_cross(matrix[:, 0], matrix[:, 1]) @ matrix[:, 2] > 0.0)
 
 
 def _hand_along(forearm: Array) -> Array:
     """Return the rotation of a hand in line with the forearm; its thumb is up when the forearm points forward."""
     x = forearm / np.linalg.norm(forearm)
     y = _turned(np.array([0.0, 1.0, 0.0]), x)
-    return np.stack([x, y, np.cross(x, y)], axis=1)
+    return np.array([x, y, _cross(x, y)]).T
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return the cross product of two vectors (3,); numpy's own is made for many of them."""
+    (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
+    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
 def _turned(vector: Array, way: Array) -> Array:
