@@ -100,8 +100,8 @@ class Habits:
             gain=rng.uniform(0.45, 0.7),
             noise=rng.uniform(0.5e-3, 1.2e-3),
             bias=(float(across), float(along), float(up)),
-            speed=rng.uniform(0.25, 0.42),
-            fine_speed=rng.uniform(0.06, 0.10),
+            speed=rng.uniform(0.20, 0.34),
+            fine_speed=rng.uniform(0.045, 0.08),
             tolerance=rng.uniform(0.0045, 0.0065),
             sense_of_lag=rng.uniform(0.12, 0.22),
             dwell=rng.uniform(0.15, 0.35),
@@ -170,7 +170,7 @@ class Operator:
         self._seen: deque[Sight] = deque()
         self._settled = np.zeros(3)  # displacement of the hand by sub-movements that are forgotten
         self._pulses: list[_Pulse] = []
-        self._next_look = self.habits.begin
+        self._next_look, self._aimed_until = self.habits.begin, 0.0
         self.phase, self.number, self._since = "begin", 1, 0.0
         self.closed = self.finished = False
         self._last = -math.inf
@@ -218,18 +218,20 @@ class Operator:
         way = (goal - expected) / self._scale
         length = float(np.linalg.norm(way))
         share = 1.0 if length > _FAR and not fine else habits.gain
-        if length * share < _AT_REST:
+        if length * share < _AT_REST or now < self._aimed_until:
             return
         way = way * share * (1.0 + _SCATTER * self._rng.normal(size=3))
         duration = share * length / (habits.fine_speed if fine else habits.speed) + 0.25
         self._pulses.append(_Pulse(now, duration, way))
+        if share == 1.0:
+            self._aimed_until = now + duration
         for pulse in [p for p in self._pulses if p.start + p.duration < now - _LONGEST_MEMORY]:
             self._settled += pulse.way
             self._pulses.remove(pulse)
 
     def go_on(self, phase: str, now: float) -> None:
         """Turn to the next part of the plan."""
-        self.phase, self._since = phase, now
+        self.phase, self._since, self._aimed_until = phase, now, now
 
     def in_phase(self, now: float) -> float:
         """Return for how long the person has been about the same [s]."""
