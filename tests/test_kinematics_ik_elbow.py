@@ -64,7 +64,7 @@ def test_the_elbow_has_the_documented_cost(seed, name):
     s, e, w = arm.sew_points(q)
     sine = np.linalg.norm(np.cross(e - s, w - e)) / (np.linalg.norm(e - s) * np.linalg.norm(w - e))
     weight = elbow.weight * elbow.confidence * sine**2 * min(1.0, state.reference / 0.04)
-    rate = np.clip(5.0 * wrapped(elbow.angle - state.angle), -2.0, 2.0)
+    rate = np.clip(5.0 * wrapped(elbow.angle - state.angle), -1.0, 1.0)
 
     def cost(v):
         miss = WEIGHTS[:, 0] * (arm.tool_jacobian(q) @ v - twist)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib.metadata import version
 from itertools import cycle
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,40 +19,60 @@ from imitarm.kinematics.self_clearance import SelfClearance
 Array = NDArray[np.float64]
 
 DT = 0.01
-_TWIST = np.array([0.05, 0.02, -0.03, 0.1, 0.0, 0.05])  # a hand's usual speed
-_ELBOW = ElbowTask(0.3)
+_ELBOW = ElbowTask(-0.3)  # a little higher than at home
 
 
-def _sawyer() -> tuple[ArmModel, list[Array]]:
-    """Return the arm with its gripper and postures about its home; no two calls in turn ask for the same one."""
-    arm = ArmModel.load("sawyer", tool="gripper")
-    return arm, list(arm.home + 0.1 * np.random.default_rng(0).normal(size=(64, arm.n_joints)))
+class State(NamedTuple):
+    """What a control loop knows at one of its steps."""
+
+    q: Array
+    twist: Array
+    velocity: Array
+
+
+def on_the_way(solver: IKSolver, n: int = 64, sew: ElbowTask | None = None) -> list[State]:
+    """Return the states of a control loop in which the tool goes round at a hand's usual speed."""
+    q, velocity, states = solver.arm.home, np.zeros(solver.arm.n_joints), []
+    for step in range(n + 50):  # the first steps, from rest, are left out
+        turn = 0.05 * step
+        twist = np.array([0.1 * np.cos(turn), 0.1 * np.sin(turn), 0.03, 0.2 * np.cos(turn), 0.0, 0.1])
+        states.append(State(q, twist, velocity))
+        velocity = solver.solve(q, twist, velocity=velocity, sew=sew)
+        q = q + DT * velocity
+    return states[-n:]
 
 
 def damped_step() -> Row:
     """One step of damped least squares inside the limits of position and velocity."""
-    arm, postures = _sawyer()
-    solver, q = IKSolver(arm, "dls", dt=DT), cycle(postures)
+    solver = IKSolver(ArmModel.load("sawyer", tool="gripper"), "dls", dt=DT)
+    states = on_the_way(solver)
+    turns = cycle(states)
+
+    def step() -> Array:
+        q, twist, _ = next(turns)
+        return solver.solve(q, twist)
 
     def check() -> tuple[bool, str]:
-        missing = max(np.linalg.norm(arm.tool_jacobian(p) @ solver.solve(p, _TWIST) - _TWIST) for p in postures)
+        missing = max(np.linalg.norm(solver.step(q, twist).error) for q, twist, _ in states)
         return bool(missing < 1e-9), f"the tool moves as asked to {missing:.0e}"
 
-    return Row("IK step, dls", lambda: solver.solve(next(q), _TWIST), most_seconds=20e-6, check=check, repeats=41)
+    return Row("IK step, dls", step, most_seconds=20e-6, check=check, repeats=41)
 
 
 def quadratic_step() -> Row:
     """One step of the QP: limits of position, velocity, acceleration and singularity, and the elbow's angle."""
-    arm, postures = _sawyer()
-    solver, q = IKSolver(arm, dt=DT, singularity_bounds=True), cycle(postures)
-    before = solver.solve(arm.home, _TWIST)
+    solver = IKSolver(ArmModel.load("sawyer", tool="gripper"), dt=DT, singularity_bounds=True)
+    states = on_the_way(solver, sew=_ELBOW)
+    turns = cycle(states)
 
     def step() -> Array:
-        return solver.solve(next(q), _TWIST, velocity=before, sew=_ELBOW)
+        q, twist, velocity = next(turns)
+        return solver.solve(q, twist, velocity=velocity, sew=_ELBOW)
 
     def check() -> tuple[bool, str]:
-        most = max(np.max(np.abs(step() - before) / (arm.max_acceleration * DT)) for _ in postures)
-        return bool(most <= 1.0 + 1e-9), f"accelerates with {100 * most:.0f} % of what it may, never more"
+        most = solver.arm.max_acceleration * DT
+        used = max(np.max(np.abs(solver.solve(q, t, velocity=v, sew=_ELBOW) - v) / most) for q, t, v in states)
+        return bool(used <= 1.0 + 1e-9), f"accelerates with {100 * used:.0f} % of what it may, never more"
 
     name = "IK step, qp with all limits and the elbow"
     return Row(name, step, most_seconds=60e-6, check=check, repeats=41)
@@ -59,30 +80,31 @@ def quadratic_step() -> Row:
 
 def self_clearance_rows() -> Row:
     """Rows that keep the arm and its gripper off themselves."""
-    arm, postures = _sawyer()
-    own, q = SelfClearance(arm), cycle(postures)
+    arm = ArmModel.load("sawyer", tool="gripper")
+    own, turns = SelfClearance(arm), cycle(on_the_way(IKSolver(arm, dt=DT)))
 
     def check() -> tuple[bool, str]:
         return own.n_pairs > 0, f"{own.n_pairs} pairs of spheres watched"
 
-    return Row("self clearance rows", lambda: own.rows(next(q)), most_seconds=200e-6, check=check, repeats=41)
+    return Row("self clearance rows", lambda: own.rows(next(turns).q), most_seconds=150e-6, check=check, repeats=41)
 
 
 def steps_against_mink() -> Row:
     """From posture and target to velocity: position and velocity limits on both sides, ours the acceleration too."""
-    arm, postures = _sawyer()
-    target = arm.tool_pose(arm.home + 0.05)
-    solver, q, theirs = IKSolver(arm, dt=DT), cycle(postures), cycle(postures)
-    before = np.zeros(arm.n_joints)
+    arm = ArmModel.load("sawyer", tool="gripper")
+    solver = IKSolver(arm, dt=DT)
+    states = on_the_way(solver)
+    target = arm.tool_pose(states[-1].q + 0.01)
+    turns, theirs = cycle(states), cycle(states)
 
     def step() -> Array:
-        posture = next(q)
-        return solver.solve(posture, arm.tool_pose(posture).error_to(target) / DT, velocity=before)
+        q, _, velocity = next(turns)
+        return solver.solve(q, 5.0 * arm.tool_pose(q).error_to(target), velocity=velocity)
 
     name = "IK step, pose to velocity, qp (ours also keeps accelerations)"
-    peer, check = _mink(arm, postures, target)
+    peer, check = _mink(arm, [state.q for state in states], target)
     return Row(
-        name, step, lambda: peer(next(theirs)), f"mink {version('mink')}", least_ratio=1.0, check=check, repeats=41
+        name, step, lambda: peer(next(theirs).q), f"mink {version('mink')}", least_ratio=1.0, check=check, repeats=41
     )
 
 

@@ -38,6 +38,7 @@ class VelocityBox:
 
     def __init__(self, arm: ArmModel, dt: float, *, singularity_bounds: bool = False) -> None:
         self._most, self._least = arm.max_velocity, -arm.max_velocity
+        self._least.setflags(write=False)
         self._step = arm.max_acceleration * dt
         self._squared, self._double = self._step * self._step, 2.0 * arm.max_acceleration
         room = self._most * self._most / self._double + self._most * dt  # beyond it v_b is more than v_max
@@ -59,7 +60,7 @@ class VelocityBox:
             velocity: of the step before, shape (n_joints,) [rad/s]; None: from any velocity, at any acceleration.
 
         Returns:
-            lower and upper, each of shape (n_joints,) [rad/s].
+            lower and upper, each of shape (n_joints,) [rad/s]; not to be written to.
         """
         values = q.tolist()
         side = 1 if self._elbow >= 0 and values[self._elbow] < self._straight else 0
@@ -67,7 +68,7 @@ class VelocityBox:
             if not low <= value <= high:
                 return self._near_a_limit(q, velocity, self._ends[side])
         if velocity is None:
-            return self._least.copy(), self._most.copy()
+            return self._least, self._most
         lower = np.minimum(velocity, self._most)
         lower -= self._step
         upper = np.maximum(velocity, self._least)
@@ -116,7 +117,8 @@ def velocity_box(
         InputError: with ``singularity_bounds``, when the arm does not say where its elbow is.
     """
     before = None if velocity is None else np.asarray(velocity, dtype=float)
-    return _box(arm, dt, singularity_bounds).at(np.asarray(q, dtype=float), before)
+    lower, upper = _box(arm, dt, singularity_bounds).at(np.asarray(q, dtype=float), before)
+    return lower.copy(), upper.copy()
 
 
 @lru_cache(maxsize=32)

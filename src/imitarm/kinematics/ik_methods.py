@@ -71,7 +71,7 @@ def _least_cost(task: Task, hessian: Array, linear: Array) -> Array:
     if free is not None:
         return free
     n = len(linear)
-    matrix, lower, upper = _no_rows(n), task.lower, task.upper
+    matrix, lower, upper = _no_rows(n), task.lower.copy(), task.upper.copy()  # it takes none that is read-only
     sense = np.zeros(n, dtype=np.intc)
     if task.rows is not None:
         matrix, least = task.rows
@@ -147,6 +147,8 @@ def _undamped(task: Task, gram: Array) -> Array:
     mujoco.mju_cholSolve(along, gram, task.twist)
     result = along.dot(task.jacobian)
     result *= task.max_velocity
+    if task.upper is task.max_velocity:  # no limit is near, so the box holds no more than that
+        return result
     np.maximum(result, task.lower, out=result)
     return np.minimum(result, task.upper, out=result)
 

@@ -60,10 +60,10 @@ class ElbowTask(NamedTuple):
     """
 
     angle: float
-    weight: float = 0.003
+    weight: float = 0.001
     confidence: float = 1.0
     gain: float = 5.0
-    max_rate: float = 2.0
+    max_rate: float = 1.0
     convention: str = "stereographic"
 
 
