@@ -64,7 +64,8 @@ class Drives:
         self._servos = np.setdiff1d(np.flatnonzero(servos), self._ids)
         names = {model.actuator(i).name for i in range(model.nu)}
         self._gripper = model.actuator(GRIPPER).id if GRIPPER in names else None
-        self._opening_wanted = np.nan
+        self._opening_wanted: float | None = None
+        self._stiff: bool | None = None
         self._guided_damping = _GUIDED_DAMPING * np.minimum(arm.max_torque, 100.0)
         self._every, self._torque = np.zeros(model.nv), np.zeros(model.nv)
         data.qpos[:] = arm.posture(model)
@@ -110,7 +111,7 @@ class Drives:
         """Give the torque that holds the arm still, and let a gripper's servos keep its opening; without a step."""
         self._use_servos(False)
         self._data.ctrl[self._servos] = self._data.actuator_length[self._servos]
-        self._opening_wanted = np.nan
+        self._opening_wanted = None
         self._data.ctrl[self._ids] = self._data.qfrc_bias[self._dof]
         mujoco.mj_forward(self._model, self._data)
 
@@ -156,12 +157,15 @@ class Drives:
     def _prepare(self, stiff: bool) -> None:
         """Before a step: let the drives be what they are to be, and the fingers go on."""
         self._use_servos(stiff)
-        if self._gripper is not None and np.isfinite(self._opening_wanted):  # nothing was asked: as it is
+        if self._opening_wanted is not None:
             now, most = float(self._data.ctrl[self._gripper]), FINGER_SPEED * self._model.opt.timestep
             self._data.ctrl[self._gripper] = now + min(max(self._opening_wanted - now, -most), most)
 
     def _use_servos(self, stiff: bool) -> None:
         """Let the drives be position servos, or plain sources of torque."""
+        if stiff is self._stiff:
+            return
+        self._stiff = stiff
         gain, bias = self._model.actuator_gainprm, self._model.actuator_biasprm
         gain[self._ids, 0] = self._stiffness if stiff else 1.0
         bias[self._ids, 1] = -self._stiffness if stiff else 0.0
