@@ -161,3 +161,20 @@ def test_what_can_not_be_used_is_refused(tmp_path):
         sew_angle(*np.eye(3), convention="polar")
     with pytest.raises(InputError, match="3 coordinates"):
         sew_angle(np.zeros(2), np.zeros(3), np.zeros(3))
+
+
+def test_an_arm_whose_joints_are_not_side_by_side_is_right_too(tmp_path):
+    """A fan on the first link has a joint of its own, which stands between the arm's."""
+    file = tmp_path / "fan.xml"
+    link = "<body pos='0 0 .3'><joint name='j{0}' axis='0 1 0'/><geom size='.1'/><site name='{1}'/>{2}</body>"
+    arm_xml = link.format(2, "shoulder", link.format(3, "elbow", link.format(4, "wrist", "")))
+    fan = "<body pos='0 .2 0'><joint name='fan'/><geom size='.05'/></body>"
+    file.write_text(
+        f"<mujoco><worldbody><body><joint name='j1'/><geom size='.1'/>{fan}{arm_xml}</body></worldbody></mujoco>"
+    )
+    arm, q, h = ArmModel.load(file), np.array([0.1, 0.2, 0.5, 0.3]), 1e-6
+    assert arm.joint_names == ("j1", "j2", "j3", "j4")
+    jacobians = arm.sew_jacobians(q)
+    for joint, step in enumerate(h * np.eye(4)):
+        slope = (arm.sew_points(q + step) - arm.sew_points(q - step)) / (2 * h)
+        assert np.allclose(jacobians[:, :, joint], slope, atol=1e-8)

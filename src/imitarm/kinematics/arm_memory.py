@@ -51,7 +51,11 @@ class ArmMemory:
         self.force = np.zeros(model.nv)
         self._model, self._positions, self._joints, self._posture = model, positions, joints, b""
         stacked = np.zeros((len(marked), 3, model.nv))
-        self._stacked = stacked.reshape(-1, model.nv)[:, joints]
+        self._stacked = stacked.reshape(-1, model.nv)
+        # views, where the joints stand side by side: asking for them anew each time takes as long as the computing
+        self._views = None
+        if isinstance(joints, slice):
+            self._views = self.jacobian[:, joints], self._stacked[:, joints]
         self._marked = list(zip(marked, stacked, strict=True))
         self.sites = self.data.site_xpos
         self._qpos = self.data.qpos  # asking for it each time takes as long as the kinematics of a link
@@ -74,13 +78,13 @@ class ArmMemory:
     def site_jacobian(self, site: int) -> Array:
         """Return the Jacobian of a site, shape (6, n), as a view that the next one overwrites."""
         mujoco.mj_jacSite(self._model, self.data, self.linear, self.angular, site)
-        return self.jacobian[:, self._joints]
+        return self.jacobian[:, self._joints] if self._views is None else self._views[0]
 
     def marked_jacobians(self) -> Array:
         """Return the Jacobians of the marked sites below each other, (3 m, n): a view that the next ones overwrite."""
         for site, rows in self._marked:
             mujoco.mj_jacSite(self._model, self.data, rows, None, site)
-        return self._stacked
+        return self._stacked[:, self._joints] if self._views is None else self._views[1]
 
 
 class ArmMemories(threading.local):

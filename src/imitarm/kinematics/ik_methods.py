@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import cache
-from operator import le
 from typing import NamedTuple
 
 import daqp
@@ -54,7 +53,7 @@ def quadratic_program(task: Task) -> Array:
     if task.posture is not None:
         effort += _POSTURE
         linear += _POSTURE * task.posture
-    hessian += effort * _eye(n)
+    hessian += _scaled_eye(n, effort)
     velocity = _least_cost(task, hessian, linear)
     if task.wrist is not None:
         joint, side, least = task.wrist
@@ -93,17 +92,17 @@ def _unconstrained(task: Task, hessian: Array, linear: Array) -> Array | None:
     if mujoco.mju_cholFactor(factor, _NULL) < len(linear):
         return None
     mujoco.mju_cholSolve(velocity, factor, linear)
-    values = velocity.tolist()
-    if not all(map(le, task.lower.tolist(), values)) or not all(map(le, values, task.upper.tolist())):
-        return None
+    for low, value, high in zip(task.lower.tolist(), velocity.tolist(), task.upper.tolist(), strict=True):
+        if not low <= value <= high:
+            return None
     if task.rows is not None and (task.rows[0].dot(velocity) < task.rows[1]).any():
         return None
     return velocity
 
 
 @cache
-def _eye(n: int) -> Array:
-    return np.eye(n)
+def _scaled_eye(n: int, factor: float) -> Array:
+    return factor * np.eye(n)
 
 
 @cache
@@ -137,7 +136,7 @@ def damped_least_squares(task: Task) -> Array:
 def _is_above(gram: Array, bound: float) -> bool:
     """Return whether all eigenvalues are above ``bound``: then, and only then, a Cholesky factor of the rest exists."""
     rest = gram - bound * _EYE
-    return mujoco.mju_cholFactor(rest, _NULL) == len(rest)
+    return mujoco.mju_cholFactor(rest, _NULL) == 6
 
 
 def _undamped(task: Task, gram: Array) -> Array:
