@@ -15,7 +15,6 @@ def test_a_step_does_what_it_is_timed_for(row):
 
 
 def test_the_peer_is_asked_for_the_same_motion():
-    pytest.importorskip("mink")
     row = ik_rows.steps_against_mink()
     assert row.peer_name.startswith("mink ")
     assert row.ours().shape == (7,) and row.peer().shape == (9,)  # theirs moves the fingers too

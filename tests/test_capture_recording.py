@@ -237,6 +237,11 @@ def test_one_person_of_several():
         recording.person(2)
 
 
+def test_every_loop_over_a_recording_is_over_all_of_it():
+    recording = SkeletonRecording(skeletons(5))
+    assert len(list(recording)) == len(list(recording)) == 5
+
+
 def test_it_replays_once_and_again_after_rewind():
     recording = SkeletonRecording(skeletons(4))
     assert len(list(recording)) == 4 and recording.over and recording.read() is None

@@ -45,10 +45,19 @@ def test_a_word_leads_to_its_source_which_is_imported_only_then(word, module, na
     assert live(word) == (not word.startswith("video"))
 
 
+@pytest.mark.parametrize("word", ["webcam:0", "video:{}", "udp:7400", "kinect2", "azure"])
+def test_what_can_not_be_opened_yet_says_so_and_is_not_offered(word, tmp_path):
+    film = tmp_path / "film.mp4"
+    film.write_bytes(b"x")
+    with pytest.raises(InputError, match="can't be opened by this version yet; give a recording"):
+        open_source(word.format(film))
+    assert not any(word.partition(":")[0] in known for known in sources.WORDS)
+
+
 @pytest.mark.parametrize(
     ("word", "error", "message"),
     [
-        ("kinect3", UnknownNameError, "unknown source 'kinect3'; known: .*kinect2.*synthetic:SEED"),
+        ("kinect3", UnknownNameError, "unknown source 'kinect3'; known: FILE, synthetic:SEED"),
         ("camera:0", UnknownNameError, "unknown source 'camera:0'"),
         ("synthetic", InputError, "the seed is missing; say synthetic:"),
         ("udp:", InputError, "the port is missing"),
@@ -67,7 +76,7 @@ def test_a_word_that_is_wrong_says_what_to_do(word, error, message):
 
 def test_every_word_is_explained_and_opened():
     kinds = {word.partition(":")[0] for word in sources.WORDS} - {"FILE"}
-    assert kinds == set(sources._OPENERS)
+    assert kinds <= set(sources._OPENERS)
 
 
 def test_a_retargeter_is_given_one_person_with_the_sides_right():

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -70,24 +69,6 @@ def test_a_made_up_person_for_some_seconds(tmp_path):
     assert 1.8 < recording.duration <= 2.0 and len(recording) > 50
 
 
-def test_skeletons_are_sent_on(wave, monkeypatch):
-    sent = []
-
-    class Sender:
-        def __init__(self, host, port):
-            self.send = sent.append
-            sent.append((host, port))
-
-        def close(self):
-            sent.append("closed")
-
-    stand_in = ModuleType("stream")
-    stand_in.UdpSkeletonSender = Sender
-    monkeypatch.setitem(sys.modules, "imitarm.capture.stream", stand_in)
-    assert main(["capture", str(wave), "--seconds", "0.2", "--send", "127.0.0.1:7400"]) == 0
-    assert sent[0] == ("127.0.0.1", 7400) and sent[-1] == "closed" and len(sent) == 2 + 7
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -96,7 +77,6 @@ def test_skeletons_are_sent_on(wave, monkeypatch):
         (["--seconds", "0"], "--seconds must be above 0"),
         (["--trim", "3", "1"], "--trim must be two times"),
         (["--trim", "7", "9"], "no frame between 7 and 9 s"),
-        (["--send", "7400"], "must be HOST:PORT"),
     ],
 )
 def test_a_wrong_option_is_one_message(wave, tmp_path, capsys, options, message):

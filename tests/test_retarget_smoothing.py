@@ -23,6 +23,19 @@ def test_it_is_calm_at_rest_and_quick_in_motion():
     np.testing.assert_allclose(moving.velocity, [0.8, 0.0, 0.0], atol=1e-3)
 
 
+def test_the_usual_speed_estimate_is_too_large_on_a_steady_motion_and_ours_is_not():
+    path, speed = 0.8 * np.arange(120) * T, 0.0
+    smooth = path[0]
+    for x in path[1:]:  # the difference to the smoothed value, which is behind
+        speed += smoothing_share(3.0, T) * ((x - smooth) / T - speed)
+        smooth += smoothing_share(1.0 + 10.0 * speed, T) * (x - smooth)
+    one = OneEuro(derivative_cutoff=3.0)
+    for k, x in enumerate(path):
+        one.filter(k * T, np.array([x]))
+    assert speed > 1.2 * 0.8
+    np.testing.assert_allclose(one.velocity, [0.8], rtol=1e-6)
+
+
 def test_units_are_metres_a_beta_meant_for_millimetres_does_nothing():
     path = np.arange(300)[:, None] * T * np.array([0.8, 0.0, 0.0])
     lag = {}

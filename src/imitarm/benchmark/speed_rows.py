@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark import avoidance, families, ik_rows
+from imitarm.benchmark import avoidance, families, ik_rows, retarget_rows
 from imitarm.benchmark.timing import Row
 from imitarm.skills import DMP, GMR, GaussianMixture
 from imitarm.trajectory import Trajectory
@@ -301,5 +301,6 @@ ROWS: tuple[Callable[[], Row], ...] = (
     avoidance_of_one,
     avoidance_of_three,
     *ik_rows.ROWS,
+    *retarget_rows.ROWS,
     importing,
 )

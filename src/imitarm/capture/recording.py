@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +125,11 @@ class SkeletonRecording(SkeletonSource):
         """Replay from the first frame again."""
         self._next = 0
         self._began: float | None = None
+
+    def __iter__(self) -> Iterator[Skeleton]:
+        if self.over:  # so that a second loop is over all of it, too
+            self.rewind()
+        return super().__iter__()
 
     @property
     def over(self) -> bool:

@@ -198,7 +198,7 @@ class SkeletonSource(ABC):
 
     Iterating gives skeletons in the order of their times until the source is over::
 
-        with KinectRecording(path) as source:
+        with open_source("synthetic:7") as source:
             for skeleton in source:
                 ...
 

@@ -17,13 +17,8 @@ from imitarm.errors import InputError, UnknownNameError
 WORDS = {
     "FILE": "a recording: imitarm's own or a table of the Kinect SDK",
     "synthetic:SEED": "a made-up person before a made-up camera",
-    "video:FILE": "a person in a video, found by MediaPipe",
-    "webcam:N": "a person before webcam N, found by MediaPipe",
-    "udp:PORT": "skeletons that another process sends",
-    "kinect2": "a Kinect v2",
-    "azure": "an Azure Kinect",
 }
-"""What a source may be called."""
+"""What a source may be called. Cameras and streams have their words below, but no version could open one yet."""
 
 
 def open_source(word: str | Path, *, realtime: bool = False) -> SkeletonSource:
@@ -77,7 +72,15 @@ def _number(kind: str, text: str, largest: int) -> int:
 
 def _made(module: str, name: str, *values: object, **options: object) -> SkeletonSource:
     """Make a source whose module is imported only now: it may need a driver, or much time."""
-    return cast(SkeletonSource, getattr(importlib.import_module(f"imitarm.capture.{module}"), name)(*values, **options))
+    try:
+        home = importlib.import_module(f"imitarm.capture.{module}")
+    except ModuleNotFoundError as error:
+        if error.name != f"imitarm.capture.{module}":
+            raise
+        raise InputError(
+            "cameras and streams can't be opened by this version yet; give a recording or synthetic:SEED"
+        ) from error
+    return cast(SkeletonSource, getattr(home, name)(*values, **options))
 
 
 def _synthetic(rest: str, realtime: bool) -> SkeletonSource:

@@ -23,10 +23,8 @@ from imitarm.table import read_table
 
 EPILOG = """\
 examples:
-  imitarm calibrate limbs webcam:0
   imitarm calibrate limbs wave.csv --side left --out left.json
   imitarm calibrate sensor pairs.csv
-  imitarm calibrate sensor --source kinect2 --points points.csv
   imitarm calibrate clutch --robot sawyer --anchor shoulder --orientation upright
 
 Each adds to the calibration file what it measures and leaves the rest of it as it is.

@@ -1,12 +1,11 @@
-"""``imitarm capture``: take a person's motion from a source, record it, check it, send it on."""
+"""``imitarm capture``: take a person's motion from a source, record it, check it."""
 
 from __future__ import annotations
 
 import argparse
-import importlib
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,11 +22,9 @@ from imitarm.errors import InputError, TaskFailedError
 
 EPILOG = """\
 examples:
-  imitarm capture webcam:0 --seconds 20 --out wave.csv
   imitarm capture kinect.csv --check
   imitarm capture wave.csv --trim 2.5 9 --repair --out wave_cut.csv
   imitarm capture synthetic:7 --out made_up.csv
-  imitarm capture kinect2 --send 127.0.0.1:7400
 
 What comes is written at once: a program that is killed leaves FILE.part, which can be read. Ctrl-C ends a live source
 and keeps what was recorded. Exit status 2 when --check finds an error.
@@ -52,7 +49,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="keep one person, drop frames that are not later than the one before, exchange swapped sides back",
     )
-    output.add_argument("--send", metavar="HOST:PORT", help="send the skeletons on over UDP, as they come")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -65,19 +61,17 @@ def run(arguments: argparse.Namespace) -> int:
     _check_options(arguments)
     going_on = live(arguments.source)
     with ExitStack() as stack:
-        source = open_source(arguments.source, realtime=arguments.realtime or arguments.send is not None)
+        source = open_source(arguments.source, realtime=arguments.realtime)
         recorded = source if isinstance(source, SkeletonRecording) else None
         source = stack.enter_context(_chosen(source, arguments.person))
-        receivers = _receivers(arguments, source.name, stack)
-
-        def pass_on(skeleton: Skeleton) -> None:
-            for receiver in receivers:
-                receiver(skeleton)
-
+        write: Callable[[Skeleton], None] | None = None
+        if arguments.out is not None:
+            recorder = SkeletonRecorder(arguments.out, source=source.name, replace=arguments.force)
+            write = stack.enter_context(recorder).write
         if going_on and arguments.seconds is None:
             remark("capturing; press Ctrl-C to end")
         total = recorded.duration if recorded is not None else None
-        taken, _ = gather(source, arguments.seconds, "capturing", live=going_on, total=total, on_skeleton=pass_on)
+        taken, _ = gather(source, arguments.seconds, "capturing", live=going_on, total=total, on_skeleton=write)
     if not taken:
         raise TaskFailedError(
             f"{arguments.source}: nobody was seen, nothing is written; stand 1.5 to 3 m before the sensor"
@@ -112,22 +106,6 @@ def _chosen(source: SkeletonSource, person: int | None) -> SkeletonSource:
     if isinstance(source, SkeletonRecording):
         return source.person(person)
     return PersonFilter(source, person=person)
-
-
-def _receivers(arguments: argparse.Namespace, name: str, stack: ExitStack) -> list[Any]:
-    """Open what every skeleton goes to: a file, a socket."""
-    receivers = []
-    if arguments.out is not None:
-        recorder = SkeletonRecorder(arguments.out, source=name, replace=arguments.force)
-        receivers.append(stack.enter_context(recorder).write)
-    if arguments.send is not None:
-        host, colon, port = arguments.send.rpartition(":")
-        if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65536:
-            raise InputError(f"--send {arguments.send}: must be HOST:PORT, for example 127.0.0.1:7400")
-        sender = importlib.import_module("imitarm.capture.stream").UdpSkeletonSender(host, int(port))
-        stack.callback(sender.close)
-        receivers.append(sender.send)
-    return receivers
 
 
 def _finished(recording: SkeletonRecording, arguments: argparse.Namespace) -> SkeletonRecording:

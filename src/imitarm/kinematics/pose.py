@@ -1,7 +1,7 @@
 """Positions and rotations: quaternions (w, x, y, z) as arrays, and the typed :class:`Pose`.
 
 All functions take and return arrays with any leading shape and are vectorised over it. Where a control step calls one
-with a single rotation, plain numbers are used: arrays of four take twenty times as long.
+with a single rotation, plain numbers are used: for an array of four the calls alone take longer.
 Rotation vectors (axis times angle) are in rad. Twists are ``(6,)``: linear velocity [m/s] first,
 then angular velocity [rad/s], both in the base frame.
 """

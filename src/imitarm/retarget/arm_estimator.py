@@ -116,9 +116,10 @@ class ArmEstimator:
             return None
         points = arm.points @ self._rotation.T + self._origin
         confidence = arm.confidence
-        shoulder, (elbow, wrist) = points[0], correct_limbs(points[0], points[1], points[2], self.lengths)
         if self._limbs == "fit":
             shoulder, elbow, wrist = fit_limbs(points[:3], confidence[:3], self.lengths)
+        else:
+            shoulder, (elbow, wrist) = points[0], correct_limbs(points[0], points[1], points[2], self.lengths)
         elbow_known, wrist_known = float(confidence[1]), float(min(confidence[2], confidence[0]))
         if gap > GAP:
             self._hand = None

@@ -240,5 +240,5 @@ def carried(rotation: Array | None, before: Array | None, after: Array) -> Array
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return the cross product of two vectors (3,): np.cross takes ten times as long."""
+    """Return the cross product of two vectors (3,): np.cross takes longer for two."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

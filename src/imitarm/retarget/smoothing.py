@@ -30,7 +30,7 @@ class OneEuro:
 
     The speed is that of the vector, not of each axis, so the filter is the same in every direction. It is taken from
     two measured values; the usual difference to the smoothed value before holds the filter's own lag, and comes out
-    too large (by 40 % on a steady motion at 30 Hz), which matters to whoever leads with it. A value with a confidence
+    too large on a steady motion, which matters to whoever leads with it. A value with a confidence
     c below 1 is taken over by c times as much.
 
     Args:
@@ -139,7 +139,7 @@ class Hampel:
             return True
         values = np.array([value for _, value in seen])
         half = len(values) // 2
-        middle = np.sort(values, axis=0)[half]  # np.median takes ten times as long on so few values
+        middle = np.sort(values, axis=0)[half]  # np.median takes longer on so few values
         difference = values - middle
         away = np.sqrt(np.einsum("ij,ij->i", difference, difference)).tolist()
         return bool(away[-1] <= max(4.0 * 1.4826 * sorted(away)[half], self.least))
