@@ -1,0 +1,170 @@
+"""What the joint positions alone tell of a robot's motion: path, torques, limits, smoothness, singularity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.posture import ANGLE_LENGTH
+
+Array = NDArray[np.float64]
+
+HIGHEST = 20.0  # [Hz] of the spectrum that counts for smoothness
+QUIET = 0.05  # what is smaller than this share of the spectrum's beginning does not count
+_PADDING = 4  # powers of two by which a spectrum is drawn finer
+_ROUNDING = 1e-6  # share by which a limit of velocity or acceleration may be passed: what rounding does to differences
+_ROUNDED = 1e-9  # [rad] the same of a position
+
+
+@dataclass(frozen=True, eq=False)
+class ArmMotion:
+    """A motion of an arm, and what belongs to each of its postures.
+
+    Attributes:
+        dt: sampling period [s].
+        joints: shape (n, n_joints) [rad].
+        tool: positions of the tool, shape (n, 3) [m].
+        quaternions: rotations of the tool, wxyz, shape (n, 4).
+        sew: shoulder, elbow and wrist, shape (n, 3, 3) [m]; nan for an arm that does not say where they are.
+        torques: that the motion takes, by inverse dynamics, shape (n, n_joints) [N m].
+        gravity: the part of them that holds the weight, shape (n, n_joints) [N m].
+        least_singular: smallest singular value of the tool's Jacobian, 1 rad counting as 0.3 m, shape (n,) [m/rad].
+    """
+
+    dt: float
+    joints: Array
+    tool: Array
+    quaternions: Array
+    sew: Array
+    torques: Array
+    gravity: Array
+    least_singular: Array
+
+    @classmethod
+    def of(cls, arm: ArmModel, times: ArrayLike, joints: ArrayLike) -> ArmMotion:
+        """Take a motion apart.
+
+        Velocity and acceleration are central differences of the positions; the motion begins at rest.
+
+        Args:
+            arm: whose motion.
+            times: evenly spaced, shape (n,) [s], at least 4.
+            joints: shape (n, n_joints) [rad].
+
+        Raises:
+            InputError: when there are fewer than 4 samples, they are not evenly spaced, or a position is not finite.
+        """
+        t, q = np.asarray(times, dtype=float), np.asarray(joints, dtype=float)
+        if len(t) < 4 or q.shape != (len(t), arm.n_joints):
+            raise InputError(f"ArmMotion: needs 4 samples of {arm.n_joints} joints, got {t.shape} and {q.shape}")
+        dt = float(t[-1] - t[0]) / (len(t) - 1)
+        if not np.allclose(np.diff(t), dt, rtol=1e-3, atol=1e-6) or not np.isfinite(q).all():
+            raise InputError("ArmMotion: times must be evenly spaced and positions finite")
+        velocity = np.gradient(q, dt, axis=0)
+        acceleration = np.empty_like(q)
+        acceleration[1:-1] = np.diff(q, 2, axis=0) / dt**2
+        acceleration[0], acceleration[-1] = acceleration[1], acceleration[-2]
+        n, marked, site = len(t), arm.landmarks is not None, arm.site("tool")
+        tool, quaternions, sew = np.empty((n, 3)), np.empty((n, 4)), np.full((n, 3, 3), np.nan)
+        jacobians, torques, gravity = np.empty((n, 6, arm.n_joints)), np.empty_like(q), np.empty_like(q)
+        for i, posture in enumerate(q):  # all of one posture at once: its kinematics is computed once
+            pose = arm.tool_pose(posture)
+            tool[i], quaternions[i] = pose.position, pose.quaternion
+            jacobians[i] = arm.at(posture).site_jacobian(site)
+            if marked:
+                sew[i] = arm.sew_points(posture)
+            torques[i] = arm.inverse_dynamics(posture, velocity[i], acceleration[i])
+            gravity[i] = arm.gravity_torque(posture)
+        jacobians[:, 3:] *= ANGLE_LENGTH
+        least = np.asarray(np.linalg.svd(jacobians, compute_uv=False)[:, -1], dtype=float)
+        return cls(dt, q, tool, quaternions, sew, torques, gravity, least)
+
+
+@dataclass(frozen=True)
+class Violations:
+    """In how many frames a motion is beyond what its arm allows, and by how much.
+
+    Attributes:
+        position: frames in which a joint is beyond its range.
+        velocity: frames into which a joint moved faster than it may.
+        acceleration: frames in which a joint's velocity changed faster than it may.
+        position_excess: by how much the worst joint is beyond its range [rad]; 0 when none is.
+        velocity_ratio: largest velocity over the one allowed.
+        acceleration_ratio: largest acceleration over the one allowed.
+    """
+
+    position: int
+    velocity: int
+    acceleration: int
+    position_excess: float
+    velocity_ratio: float
+    acceleration_ratio: float
+
+
+def violations(arm: ArmModel, joints: ArrayLike, dt: float) -> Violations:
+    """Count what breaks a limit, by finite differences of the positions alone; the motion begins at rest.
+
+    Args:
+        arm: whose limits.
+        joints: shape (n, n_joints) [rad].
+        dt: sampling period [s].
+    """
+    q = np.asarray(joints, dtype=float)
+    velocity = np.diff(q, axis=0) / dt
+    acceleration = np.diff(velocity, axis=0, prepend=np.zeros((1, q.shape[1]))) / dt
+    beyond = np.maximum(q - arm.upper, arm.lower - q).max(axis=1)
+    fast = (np.abs(velocity) / arm.max_velocity).max(axis=1)
+    sudden = (np.abs(acceleration) / arm.max_acceleration).max(axis=1)
+    return Violations(
+        int(np.sum(beyond > _ROUNDED)),
+        int(np.sum(fast > 1.0 + _ROUNDING)),
+        int(np.sum(sudden > 1.0 + _ROUNDING)),
+        max(float(beyond.max()), 0.0),
+        float(fast.max()),
+        float(sudden.max()),
+    )
+
+
+def path_length(positions: ArrayLike) -> float:
+    """Return the length of the polyline through positions (n, 3) [m]."""
+    return float(np.linalg.norm(np.diff(np.asarray(positions, dtype=float), axis=0), axis=1).sum())
+
+
+def jerk_rms(positions: ArrayLike, dt: float) -> float:
+    """Return the root mean square over time of the length of the third difference of (n, d), in its unit over s^3."""
+    jerk = np.diff(np.asarray(positions, dtype=float), 3, axis=0) / dt**3
+    return float(np.sqrt(np.mean(np.sum(jerk * jerk, axis=1))))
+
+
+def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
+    r"""Return how smooth a motion is by the length of its speed's spectrum: 0 is smoothest (METHODS F).
+
+    .. math:: -\int_0^{\omega_c} \sqrt{\left(\tfrac{1}{\omega_c}\right)^2
+              + \left(\tfrac{d\hat V}{d\omega}\right)^2}\, d\omega, \qquad \hat V = |V(\omega)| / |V(0)|
+
+    with :math:`\omega_c` the largest frequency up to 20 Hz where :math:`\hat V` is above 0.05. It depends on how many
+    movements a recording holds, so compare only motions of one recording.
+
+    Args:
+        speed: of a point, shape (n,) [m/s].
+        dt: sampling period [s].
+
+    Returns:
+        Without unit; nan for a point that does not move.
+    """
+    v = np.asarray(speed, dtype=float)
+    n = 2 ** (int(np.ceil(np.log2(len(v)))) + _PADDING)
+    spectrum = np.abs(np.fft.rfft(v, n))
+    if not spectrum[0] > 0.0:
+        return float("nan")
+    frequency = np.fft.rfftfreq(n, dt)
+    size = spectrum / spectrum[0]
+    last = int(np.flatnonzero((frequency <= HIGHEST) & (size > QUIET))[-1])
+    if last == 0:
+        return float("nan")
+    steps = np.diff(frequency[: last + 1]) / frequency[last]
+    return -float(np.sum(np.hypot(steps, np.diff(size[: last + 1]))))

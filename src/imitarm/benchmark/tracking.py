@@ -1,0 +1,267 @@
+"""How well a robot's tool and elbow follow a person's, measured against where the person's arm truly was."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.capture.motions import Truth
+from imitarm.kinematics.pose import (
+    matrix_to_quaternion,
+    quaternion_conjugate,
+    quaternion_multiply,
+)
+from imitarm.kinematics.sew import sew_derivatives
+from imitarm.retarget.correspondence import Correspondence
+from imitarm.retarget.human_arm import hand_rotation
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LED = ("following", "coasting", "holding")
+"""States of a retargeter in which its clutch is engaged."""
+LAGS = np.round(np.arange(-0.10, 0.801, 0.01), 2)  # [s] among which the best constant lag is sought
+_BENT = 0.04  # squared sine of the angle at an elbow below which where it is on its circle is not asked
+_MOVES = 1e-3  # [m] a hand that moves less has no lag
+
+
+@dataclass(frozen=True, eq=False)
+class TrueArm:
+    """Where a person's arm truly was, in the axes of the robot's base.
+
+    Attributes:
+        times: on the clock of the run it is compared with, shape (n,) [s].
+        shoulder: shape (n, 3) [m].
+        elbow: shape (n, 3) [m].
+        wrist: shape (n, 3) [m].
+        hand: rotation, wxyz, shape (n, 4).
+    """
+
+    times: Array
+    shoulder: Array
+    elbow: Array
+    wrist: Array
+    hand: Array
+
+    @classmethod
+    def of(cls, truth: Truth, times: ArrayLike, correspondence: Correspondence, *, start: float = 0.0) -> TrueArm:
+        """Ask a person in motion where the arm was.
+
+        Args:
+            truth: the person; asked in the order of the times.
+            times: of a run, shape (n,) [s].
+            correspondence: which arm, and how the sensor stands.
+            start: the person's time at the run's time 0, which is that of its first skeleton [s].
+        """
+        t = np.asarray(times, dtype=float)
+        points = np.array([truth(start + time).arm(correspondence.side).points for time in t])
+        points = correspondence.sensor_to_base.apply(points)
+        hands, hand = np.empty((len(t), 3, 3)), np.eye(3)
+        for i, arm in enumerate(points):
+            found = hand_rotation(arm[2], arm[4], arm[5])
+            hand = hand if found is None else found
+            hands[i] = hand
+        return cls(t, points[:, 0], points[:, 1], points[:, 2], matrix_to_quaternion(hands))
+
+    def wrist_at(self, times: Array) -> Array:
+        """Return where the wrist was at times (m,) [s], shape (m, 3) [m]; beyond the ends where it was there."""
+        return np.column_stack([np.interp(times, self.times, column) for column in self.wrist.T])
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """When a run followed the person, and what it took hold of.
+
+    Attributes:
+        led: whether the clutch is engaged, shape (n,).
+        since: for each frame the frame just before the clutch was engaged, shape (n,); meaningless while it is not.
+        count: how often it was engaged.
+    """
+
+    led: Mask
+    since: NDArray[np.intp]
+    count: int
+
+    @classmethod
+    def of(cls, states: ArrayLike, *, first_only: bool = False) -> Hold:
+        """Find it in the states of a run, shape (n,).
+
+        Args:
+            states: see :data:`imitarm.retarget.retargeter.STATES`.
+            first_only: judge all that comes after the first engagement by it, as if the person had never been let go.
+        """
+        led = np.isin(np.asarray(states), LED)
+        begins = np.flatnonzero(led & ~np.concatenate([[False], led[:-1]]))
+        frames = np.arange(len(led))
+        if len(begins) == 0:
+            return cls(led, np.zeros(len(led), dtype=np.intp), 0)
+        if first_only:
+            before = np.full(len(led), max(int(begins[0]) - 1, 0), dtype=np.intp)
+            return cls(frames >= begins[0], before, 1)
+        which = np.maximum(np.searchsorted(begins, frames, side="right") - 1, 0)
+        return cls(led, np.maximum(begins[which] - 1, 0), len(begins))
+
+
+def reference_positions(true: TrueArm, tool: Array, hold: Hold, scale: float, lag: float = 0.0) -> Array:
+    r"""Return where the tool should be by the clutch's law with the true hand (METHODS A.5).
+
+    .. math:: p(t) = p_{home} + \rho\,(W(t - lag) - W(t_e))
+
+    with :math:`t_e` the moment the clutch engaged, and :math:`p_{home}` where the tool was then.
+
+    Args:
+        true: the person's arm, in the axes of the base.
+        tool: where the tool was, shape (n, 3) [m].
+        hold: when the clutch was engaged.
+        scale: rho.
+        lag: by which the tool may be late [s].
+
+    Returns:
+        shape (n, 3) [m]; meaningless where the clutch is not engaged.
+    """
+    return tool[hold.since] + scale * (true.wrist_at(true.times - lag) - true.wrist[hold.since])
+
+
+def reference_rotations(true: TrueArm, quaternions: Array, hold: Hold, orientation: str) -> Array:
+    """Return how the tool should be turned by the clutch's law with the true hand, wxyz, shape (n, 4).
+
+    Args:
+        true: the person's arm, in the axes of the base.
+        quaternions: of the tool, wxyz, shape (n, 4).
+        hold: when the clutch was engaged.
+        orientation: ``"hand"``, ``"upright"`` or ``"fixed"``, see
+            :class:`~imitarm.retarget.correspondence.Correspondence`.
+    """
+    home = quaternions[hold.since]
+    if orientation == "fixed":
+        return home
+    turn = quaternion_multiply(true.hand, quaternion_conjugate(true.hand[hold.since]))
+    if orientation == "upright":
+        turn = turn * np.array([1.0, 0.0, 0.0, 1.0])
+        length = np.linalg.norm(turn, axis=1, keepdims=True)
+        turn = np.where(length < 1e-9, [1.0, 0.0, 0.0, 0.0], turn / np.maximum(length, 1e-9))
+    return quaternion_multiply(turn, home)
+
+
+def rms(errors: ArrayLike) -> float:
+    """Return the root mean square of numbers (n,) or of the lengths of vectors (n, d); nan of none."""
+    values = np.asarray(errors, dtype=float)
+    if len(values) == 0:
+        return float("nan")
+    squares = values * values if values.ndim == 1 else np.sum(values * values, axis=1)
+    return float(np.sqrt(np.mean(squares)))
+
+
+def best_lag(true: TrueArm, tool: Array, hold: Hold, scale: float) -> tuple[float, float]:
+    """Return the constant lag with which the tool follows best [s], and the RMS error that is left then [m].
+
+    The lags from -0.1 to 0.8 s are tried, and the least of the parabola through the best and its neighbours is taken.
+    Both are nan when the clutch was never engaged; the lag also when the hand did not move.
+    """
+    led = hold.led
+    if not led.any():
+        return float("nan"), float("nan")
+    errors = np.array([rms((tool - reference_positions(true, tool, hold, scale, lag))[led]) for lag in LAGS])
+    if not np.ptp(true.wrist[led], axis=0).max() > _MOVES:
+        return float("nan"), float(errors[np.argmin(np.abs(LAGS))])
+    i = int(np.argmin(errors))
+    if i in {0, len(LAGS) - 1}:
+        return float(LAGS[i]), float(errors[i])
+    before, here, after = errors[i - 1 : i + 2] ** 2
+    curved = before - 2.0 * here + after
+    shift = 0.5 * (before - after) / curved if curved > 0.0 else 0.0
+    lag = float(LAGS[i] + shift * (LAGS[1] - LAGS[0]))
+    return lag, rms((tool - reference_positions(true, tool, hold, scale, lag))[led])
+
+
+def rotation_errors(first: Array, second: Array) -> Array:
+    """Return the angles between rotations, wxyz (n, 4), shape (n,) [rad]."""
+    both = quaternion_multiply(quaternion_conjugate(first), second)
+    return 2.0 * np.arctan2(np.linalg.norm(both[:, 1:], axis=1), np.abs(both[:, 0]))
+
+
+def elbow_direction_errors(true: TrueArm, sew: Array, hold: Hold) -> Array:
+    """Return the angle between where the robot's upper arm points and where it should, shape (n,) [rad].
+
+    It should have turned since the clutch engaged by the smallest rotation that turned the person's upper arm.
+
+    Args:
+        true: the person's arm, in the axes of the base.
+        sew: the robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
+        hold: when the clutch was engaged.
+    """
+    person, robot = _unit(true.elbow - true.shoulder), _unit(sew[:, 1] - sew[:, 0])
+    wanted = _turned(person[hold.since], person, robot[hold.since])
+    return np.arctan2(np.linalg.norm(np.cross(wanted, robot), axis=1), np.sum(wanted * robot, axis=1))
+
+
+def elbow_angle_errors(true: TrueArm, sew: Array, hold: Hold) -> Array:
+    """Return by how much the robot's SEW angle changed otherwise than the person's since the clutch engaged.
+
+    Args:
+        true: the person's arm, in the axes of the base.
+        sew: the robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
+        hold: when the clutch was engaged.
+
+    Returns:
+        shape (n,) [rad], 0 to pi; nan where one of the arms is so straight that its elbow's angle says little.
+    """
+    person = sew_derivatives(true.shoulder, true.elbow, true.wrist)
+    robot = sew_derivatives(sew[:, 0], sew[:, 1], sew[:, 2])
+    off = (robot.angle - robot.angle[hold.since]) - (person.angle - person.angle[hold.since])
+    bent = (person.bend > _BENT) & (robot.bend > _BENT)
+    return np.where(bent, np.abs(np.angle(np.exp(1j * np.nan_to_num(off)))), np.nan)
+
+
+def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, rest: float = 0.5) -> float:
+    """Return when a point came within ``radius`` [m] of where it was, on average, in the last ``rest`` seconds.
+
+    Args:
+        times: shape (n,) [s].
+        positions: shape (n, 3) [m].
+        radius: [m].
+        rest: [s].
+    """
+    t, p = np.asarray(times, dtype=float), np.asarray(positions, dtype=float)
+    away = np.linalg.norm(p - p[t >= t[-1] - rest].mean(axis=0), axis=1)
+    outside = np.flatnonzero(away > radius)
+    return float(t[0] if len(outside) == 0 else t[min(outside[-1] + 1, len(t) - 1)])
+
+
+def settling_time(
+    times: ArrayLike, positions: ArrayLike, goal: ArrayLike, end: float, radius: float = 0.01, stay: float = 0.5
+) -> float:
+    """Return how long after ``end`` a point comes within ``radius`` of the goal to stay there for ``stay`` seconds.
+
+    Args:
+        times: evenly spaced, shape (n,) [s].
+        positions: shape (n, 3) [m].
+        goal: shape (3,) [m].
+        end: when the motion that leads there was over [s].
+        radius: [m].
+        stay: [s].
+
+    Returns:
+        [s], at least 0; nan when it does not come, or the recording is over before it has stayed.
+    """
+    t = np.asarray(times, dtype=float)
+    inside = np.linalg.norm(np.asarray(positions, dtype=float) - np.asarray(goal, dtype=float), axis=1) <= radius
+    steps = max(round(stay / float(t[1] - t[0])), 1)
+    count = np.concatenate([[0], np.cumsum(inside)])
+    stays = count[steps:] - count[:-steps] == steps
+    found = np.flatnonzero(stays & (t[: len(stays)] >= end - 1e-9))
+    return float("nan") if len(found) == 0 else max(float(t[found[0]]) - end, 0.0)
+
+
+def _unit(vectors: Array) -> Array:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _turned(before: Array, after: Array, vectors: Array) -> Array:
+    """Return vectors (n, 3) turned by the smallest rotations that turn unit vectors ``before`` into ``after``."""
+    both = before + after
+    share = np.sum(both * vectors, axis=1) / np.maximum(1.0 + np.sum(before * after, axis=1), 1e-12)
+    return vectors - share[:, None] * both + 2.0 * np.sum(before * vectors, axis=1, keepdims=True) * after
