@@ -31,6 +31,7 @@ def test_a_file_and_a_made_up_person(tmp_path, monkeypatch):
         ("webcam:2", "mediapipe", "MediaPipeSource", (2,)),
         ("video:{}", "mediapipe", "MediaPipeSource", ("{}",)),
         ("udp:7400", "stream", "UdpSource", (7400,)),
+        ("udp:0.0.0.0:7400", "stream", "UdpSource", (7400, "0.0.0.0")),
         ("kinect2", "kinect", "KinectV2Source", ()),
         ("azure", "kinect", "AzureKinectSource", ()),
     ],
@@ -45,7 +46,7 @@ def test_a_word_leads_to_its_source_which_is_imported_only_then(word, module, na
     assert live(word) == (not word.startswith("video"))
 
 
-@pytest.mark.parametrize("word", ["webcam:0", "video:{}", "udp:7400", "kinect2", "azure"])
+@pytest.mark.parametrize("word", ["webcam:0", "video:{}", "kinect2", "azure"])
 def test_what_can_not_be_opened_yet_says_so_and_is_not_offered(word, tmp_path):
     film = tmp_path / "film.mp4"
     film.write_bytes(b"x")
@@ -57,7 +58,7 @@ def test_what_can_not_be_opened_yet_says_so_and_is_not_offered(word, tmp_path):
 @pytest.mark.parametrize(
     ("word", "error", "message"),
     [
-        ("kinect3", UnknownNameError, "unknown source 'kinect3'; known: FILE, synthetic:SEED"),
+        ("kinect3", UnknownNameError, "unknown source 'kinect3'; known: FILE, synthetic:SEED, udp:PORT"),
         ("camera:0", UnknownNameError, "unknown source 'camera:0'"),
         ("synthetic", InputError, "the seed is missing; say synthetic:"),
         ("udp:", InputError, "the port is missing"),

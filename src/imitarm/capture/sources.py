@@ -17,6 +17,7 @@ from imitarm.errors import InputError, UnknownNameError
 WORDS = {
     "FILE": "a recording: imitarm's own or a table of the Kinect SDK",
     "synthetic:SEED": "a made-up person before a made-up camera",
+    "udp:PORT": "what 'imitarm capture --send' sends; udp:ADDRESS:PORT hears other machines too",
 }
 """What a source may be called. Cameras and streams have their words below, but no version could open one yet."""
 
@@ -96,7 +97,9 @@ def _video(rest: str, realtime: bool) -> SkeletonSource:
 
 
 def _udp(rest: str, realtime: bool) -> SkeletonSource:
-    return _made("stream", "UdpSource", _number("udp", rest, 65535))
+    host, colon, port = rest.rpartition(":")
+    number = _number("udp", port, 65535)
+    return _made("stream", "UdpSource", number, host) if colon else _made("stream", "UdpSource", number)
 
 
 _OPENERS: dict[str, Callable[[str, bool], SkeletonSource]] = {

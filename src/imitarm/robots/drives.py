@@ -94,6 +94,11 @@ class Drives:
         """Opening between the gripper's fingers [m]; nan without a gripper."""
         return float("nan") if self._gripper is None else float(self._data.actuator_length[self._gripper])
 
+    @property
+    def widest_opening(self) -> float:
+        """Opening of the gripper when it is wide open [m]; nan without a gripper."""
+        return float("nan") if self._gripper is None else float(self._model.actuator_ctrlrange[self._gripper, 1])
+
     def grasp(self, opening: float) -> None:
         """Let the gripper's servo go to ``opening`` [m] at 0.12 m/s; it presses with at most its own force.
 

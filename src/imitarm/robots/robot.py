@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _TOUCHED = 1e-9  # relative change of a velocity above which a limit is said to have changed it
-_FOLLOWING_ERROR = 0.1  # [rad] a joint so far from its set-point is held by something
 
 
 def limit_velocity(
@@ -79,6 +78,8 @@ class Robot(ABC):
         fault: why the robot has stopped to protect itself and what is near it, in words; empty when all is well.
     """
 
+    following_error: ClassVar[float] = 0.1  # [rad] a joint so far from its set-point is held by something
+
     def __init__(self, arm: ArmModel, q: ArrayLike) -> None:
         self.arm = arm
         self.clamped: tuple[str, ...] = ()
@@ -133,7 +134,7 @@ class Robot(ABC):
         self.velocity = allowed
         state = self.state()
         behind = np.abs(self.set_point - state.q)
-        if behind.max() > _FOLLOWING_ERROR:
+        if behind.max() > self.following_error:
             i = int(behind.argmax())
             self._begin(state.q)
             self.fault = f"protective stop: {self.arm.joint_names[i]} was held {behind[i]:.2f} rad from its set-point"
@@ -156,6 +157,11 @@ class Robot(ABC):
     @property
     def opening(self) -> float:
         """Measured opening between the gripper's fingers [m]; nan without a gripper."""
+        return float("nan")
+
+    @property
+    def widest_opening(self) -> float:
+        """Opening of the gripper when it is wide open [m]; nan without a gripper."""
         return float("nan")
 
     def clearance(self) -> float:

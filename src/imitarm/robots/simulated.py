@@ -153,6 +153,11 @@ class SimulatedRobot(Robot):
         """Opening between the gripper's fingers [m]; nan without a gripper."""
         return self._drives.opening
 
+    @property
+    def widest_opening(self) -> float:
+        """Opening of the gripper when it is wide open [m]; nan without a gripper."""
+        return self._drives.widest_opening
+
     def clearance(self) -> float:
         """Return the smallest distance from the arm or its tool to an obstacle [m].
 

@@ -1,0 +1,160 @@
+"""Skeletons over UDP: SkeletonSender gives away what a source sees, UdpSource is the source at the other end."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from imitarm.capture.skeleton import HandState, Skeleton, SkeletonSource, Tracking
+from imitarm.datagram import Encoder, now_ns
+from imitarm.gate import Gate
+from imitarm.messages import SkeletonFrame
+from imitarm.sockets import LOOPBACK, Address, connected, listening, try_to_send, wait_for, waiting
+
+_LONGEST_WAIT = 60_000_000_000  # [ns] what a datagram can say
+
+
+class SkeletonSender:
+    """Sends skeletons to one address, each in a datagram of its own; nothing is waited for and nothing sent twice.
+
+    A lost skeleton is lost: the next one is a thirtieth of a second away, and newer.
+
+    Args:
+        address: host and port of the receiver.
+        clock_ns: the time to stamp with [ns].
+
+    Attributes:
+        sent: how many went out.
+        failed: how many did not, because nobody listens or the system could not take them.
+
+    Raises:
+        InputError: when there is no such host.
+    """
+
+    def __init__(self, address: Address, *, clock_ns: Callable[[], int] = now_ns) -> None:
+        self.sent = self.failed = 0
+        self._clock_ns = clock_ns
+        self._encoder = Encoder()
+        self._socket = connected(address)
+
+    def send(self, skeleton: Skeleton, exposed_ns: int | None = None) -> bool:
+        """Send a skeleton; return whether it went out.
+
+        Args:
+            skeleton: to send.
+            exposed_ns: when the camera saw it, on the sender's clock [ns]; None: just now.
+        """
+        now = self._clock_ns()
+        waited = 0 if exposed_ns is None else min(max(now - exposed_ns, 0), _LONGEST_WAIT)
+        gone = try_to_send(self._socket, self._encoder.encode(frame_of(skeleton, waited), now))
+        self.sent += gone
+        self.failed += not gone
+        return gone
+
+    def close(self) -> None:
+        """Let go of the socket; a second call does nothing."""
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def frame_of(skeleton: Skeleton, waited_ns: int = 0) -> SkeletonFrame:
+    """Return a skeleton as it is sent: what is lost is 0, since nothing on the wire may be nan.
+
+    Args:
+        skeleton: to send.
+        waited_ns: between exposure and sending [ns].
+    """
+    seen = skeleton.tracking != Tracking.LOST
+    positions = np.where(seen[:, None], skeleton.positions, 0.0)
+    left, right = skeleton.hand_states
+    return SkeletonFrame(skeleton.time, positions, skeleton.tracking, (left, right), skeleton.person, waited_ns)
+
+
+class Arrival(NamedTuple):
+    """How the skeleton that was read last has come.
+
+    Attributes:
+        waited: between exposure and sending [s].
+        queued: on the way, beyond the quickest way there was [s].
+        received_ns: when it was received [ns].
+    """
+
+    waited: float
+    queued: float
+    received_ns: int
+
+
+class UdpSource(SkeletonSource):
+    """Skeletons that a :class:`SkeletonSender` sends, live.
+
+    What is late, damaged, foreign or hostile is dropped and counted by a :class:`~imitarm.gate.Gate`. A sender that is
+    killed and started again goes on after half a second of silence; its times are moved so that they go on, too, with
+    the gap in them, and every retargeter takes hold anew.
+
+    Args:
+        port: to listen at; 0: any that is free.
+        host: address of this machine to listen at; the usual one hears this machine only.
+        clock_ns: the time of receiving [ns].
+
+    Attributes:
+        gate: what it has let in and dropped.
+        arrival: how the skeleton that was read last has come; None before.
+
+    Raises:
+        InputError: when the port is taken, or the address is not one of this machine's.
+    """
+
+    def __init__(self, port: int, host: str = LOOPBACK, *, clock_ns: Callable[[], int] = now_ns) -> None:
+        self._socket = listening((host, port))
+        self.address: Address = self._socket.getsockname()
+        self.name = f"udp:{port}" if host == LOOPBACK else f"udp:{host}:{port}"
+        self.gate = Gate()
+        self.arrival: Arrival | None = None
+        self._clock_ns = clock_ns
+        self._sessions, self._shift = 1, 0.0
+        self._time = 0.0  # of the last skeleton
+        self._closed = False
+
+    @property
+    def over(self) -> bool:
+        """Whether it was closed: a stream has no end of its own."""
+        return self._closed
+
+    def close(self) -> None:
+        """Stop listening; a second call does nothing."""
+        self._closed = True
+        self._socket.close()
+
+    def read(self, timeout: float = 1.0) -> Skeleton | None:
+        """Return the next skeleton; None when none came within ``timeout`` seconds, or it was closed."""
+        until = clock.monotonic() + timeout
+        while not self._closed:
+            for data, _ in waiting(self._socket):
+                now = self._clock_ns()
+                came = self.gate.open(data, now, SkeletonFrame)
+                if came is not None and isinstance(came[1], SkeletonFrame):
+                    return self._skeleton(came[1], now)
+            left = until - clock.monotonic()
+            if left <= 0.0:
+                break
+            wait_for(self._socket, left)
+        return None
+
+    def _skeleton(self, frame: SkeletonFrame, now: int) -> Skeleton:
+        """Return what was sent, at a time that goes on from one session to the next."""
+        if self.gate.sessions != self._sessions:
+            self._sessions = self.gate.sessions
+            silent = 0.0 if self.arrival is None else 1e-9 * (now - self.arrival.received_ns)
+            self._shift = self._time + silent - frame.time
+        self.arrival = Arrival(1e-9 * frame.waited_ns, self.gate.age, now)
+        self._time = frame.time + self._shift
+        left, right = frame.hands
+        return Skeleton(self._time, frame.positions, frame.tracking, (HandState(left), HandState(right)), frame.person)
