@@ -1,13 +1,15 @@
 """Drawing: 3-D playback, figures, and the report, one HTML page that opens offline.
 
 ``FrameRecorder`` notes a simulation while it runs, ``SceneResult``, ``LearningSummary`` and ``Report`` say what came
-of it, ``write_report`` writes the page. viser and matplotlib are only imported when something is drawn.
+of it, ``write_report`` writes the page. :mod:`imitarm.viewer.retarget_report` does the same for a person's motion that
+became a robot's. viser and matplotlib are only imported when something is drawn.
 """
 
 from __future__ import annotations
 
 from imitarm.viewer.content import LearningSummary, Report, SceneResult
 from imitarm.viewer.data import as_data
+from imitarm.viewer.person import PersonMark
 from imitarm.viewer.recording import FrameRecorder, Recording
 from imitarm.viewer.report import report_html, write_report
 from imitarm.viewer.scene3d import ComponentMark, PathMark, playback_html
@@ -19,6 +21,7 @@ __all__ = [
     "FrameRecorder",
     "LearningSummary",
     "PathMark",
+    "PersonMark",
     "Recording",
     "Report",
     "SceneResult",

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Final
+from typing import Any, Final
 
 from imitarm.demonstrations import Alignment, Finding
 from imitarm.viewer import charts, plots
-from imitarm.viewer.content import LearningSummary, Report
+from imitarm.viewer.content import LearningSummary
 from imitarm.viewer.markup import MM, facts, figure
 
-_WORDS: Final = {
+WORDS: Final = {
     "Demonstration": "One recording of a person showing the motion: here, by guiding the arm's tool.",
     "Learnt path": "What all demonstrations have in common. It is what the robot does when nothing is in the way.",
     "Gaussian component": "One of the pieces that the learnt motion is made of, drawn as an ellipse that holds 95 % of "
@@ -27,6 +27,7 @@ _WORDS: Final = {
     "Rated torque": "The torque that a joint's motor can give for a long time. Staying below it means that a real arm "
     "could do this motion.",
 }
+"""The words of a report of reproductions in plain language."""
 
 
 def learning_section(learning: LearningSummary) -> str:
@@ -92,15 +93,20 @@ def _alignment(alignment: Alignment) -> str:
     )
 
 
-def provenance_section(report: Report) -> str:
-    """Return the words that the page uses, and what is needed to do the same again."""
-    plain = {key: value for key, value in report.provenance.items() if not isinstance(value, Mapping)}
+def provenance_section(provenance: Mapping[str, Any], words: Mapping[str, str]) -> str:
+    """Return what is needed to do the same again, and the ``words`` that the page uses.
+
+    Args:
+        provenance: by name; values that are mappings become cards of their own.
+        words: what each word on the page means.
+    """
+    plain = {key: value for key, value in provenance.items() if not isinstance(value, Mapping)}
     groups = [f'<div class="card"><h3>This run</h3>{facts(plain)}</div>'] if plain else []
-    for key, value in report.provenance.items():
+    for key, value in provenance.items():
         if isinstance(value, Mapping):
             groups.append(f'<div class="card"><h3>{escape(str(key))}</h3>{facts(value)}</div>')
     again = f'<h2>How it was made</h2><div class="columns">{"".join(groups)}</div>' if groups else ""
     return (
         f'<section id="provenance">{again}<details class="card"><summary>The words on this page</summary>'
-        f"{facts(_WORDS)}</details></section>"
+        f"{facts(words)}</details></section>"
     )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.viewer import palette
 from imitarm.viewer.canvas import INK, MM, canvas, thin_extremes
+from imitarm.viewer.small_multiples import JointCurve, small_multiples
 
 Array = NDArray[np.float64]
 
@@ -81,56 +80,13 @@ def torques(
         An SVG element.
     """
     t, tau, rated = np.asarray(times, float), np.asarray(values, float), np.asarray(limits, float)
-    n_joints = tau.shape[1]
-    names = list(joint_names) or [f"joint {i + 1}" for i in range(n_joints)]
-    columns = min(n_joints, 4)
-    rows = -(-n_joints // columns)
-    size = (5.5, 0.3 + 1.15 * rows)
-    with canvas(name, f"Torques of {n_joints} joints over time, with the rated torques", size) as drawing:
-        paper = drawing.axes(0.0, 0.0, *size, xlim=(0.0, size[0]), ylim=(0.0, size[1]))  # its units are inches
-        paper.set_axis_off()
-        for i in range(n_joints):
-            row, column = divmod(i, columns)
-            left = 0.58 + (size[0] - 0.26) / columns * column
-            bottom = size[1] - 1.15 * row - 0.94
-            panel = _Panel(left, bottom, (size[0] - 0.26) / columns - 0.42, 0.68)
-            panel.draw(paper, names[i], t, tau[:, i], rated[i])
-        paper.text(size[0] / 2, 0.06, "time [s]", ha="center")
-        paper.text(0.08, size[1] / 2, "torque [N m]", ha="center", va="center", rotation=90)
-    return drawing.svg
-
-
-@dataclass(frozen=True)
-class _Panel:
-    """A small chart on a paper whose units are inches: matplotlib's own axes take ten times as long, for each joint."""
-
-    left: float
-    bottom: float
-    width: float
-    height: float
-
-    def draw(self, paper: Any, title: str, times: Array, torque: Array, rated: float) -> None:
-        """Draw the torque of one joint [N m] over ``times`` [s], between its rated limits."""
-        peak = float(np.abs(torque).max())
-        most = 1.12 * max(rated, peak)
-        middle, right = self.bottom + 0.5 * self.height, self.left + self.width
-        kept = thin_extremes(torque, 160)
-        span = max(float(times[-1] - times[0]), 1e-9)
-        across = self.left + self.width * (times[kept] - times[0]) / span
-        paper.plot(across, middle + 0.5 * self.height * torque[kept] / most, color=palette.ADAPTED, lw=1.1)
-        small = {"fontsize": 7.5}
-        for value in (-rated, 0.0, rated):
-            y = middle + 0.5 * self.height * value / most
-            look = {"color": palette.LIMIT, "lw": 1.0, "ls": "--"} if value else {"color": INK, "lw": 0.6, "alpha": 0.3}
-            paper.plot([self.left, right], [y, y], **look)
-            paper.text(self.left - 0.04, y, f"{value:.3g}", ha="right", va="center", **small)
-        paper.plot(
-            [self.left, self.left, right], [self.bottom + self.height, self.bottom, self.bottom], color=INK, lw=0.6
-        )
-        for x, value in ((self.left, times[0]), (right, times[-1])):
-            paper.text(x, self.bottom - 0.04, f"{value:.3g}", ha="center", va="top", **small)
-        share = f"{title}: {100.0 * peak / rated:.0f} %".replace("$", r"\$")
-        paper.text(self.left, self.bottom + self.height + 0.05, share, fontsize=8.0)
+    names = list(joint_names) or [f"joint {i + 1}" for i in range(tau.shape[1])]
+    curves = [
+        JointCurve(f"{names[i]}: {100.0 * np.abs(tau[:, i]).max() / rated[i]:.0f} %", tau[:, i], -rated[i], rated[i])
+        for i in range(tau.shape[1])
+    ]
+    text = f"Torques of {len(curves)} joints over time, with the rated torques"
+    return small_multiples(name, text, "torque [N m]", t, curves)
 
 
 def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacement") -> str:

@@ -60,7 +60,7 @@ def as_data(report: Report) -> dict[str, Any]:
             "alignment": _alignment_data(learning.alignment) if learning.alignment is not None else None,
             "details": dict(learning.details),
         }
-    return _plain(data)
+    return plain(data)
 
 
 def _alignment_data(alignment: Alignment) -> dict[str, Any]:
@@ -73,12 +73,12 @@ def _alignment_data(alignment: Alignment) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return ``value`` with NumPy numbers and mappings as Python's own and numbers that are not finite as None."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, int | np.integer):

@@ -20,19 +20,19 @@ from numpy.typing import NDArray
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.pose import matrix_to_quaternion
 from imitarm.viewer import palette
+from imitarm.viewer.nodes import STEP, Mover, lit, node_name
+from imitarm.viewer.person import PersonMark, draw_person
 from imitarm.viewer.recording import Recording
 from imitarm.viewer.stage import Camera, Part, body_parts, floor_height, points_to_see
 
 Array = NDArray[np.float64]
 
-_STEP: Final = 2.0**-13  # [m], [-] poses are rounded to this (0.12 mm): a file of round numbers is a third as large
 _REST: Final = 1.5  # [s] how long the last picture stands before the playback starts again
 _CHI2_95: Final = 7.815  # 95 % of a 3-D Gaussian is within sqrt(7.815) sigma
 # viser warns of slow drawing with a note that hides the arm, and fades the picture in frame by frame: for ever, then
 _STYLE: Final = "<style>.mantine-Notifications-root{display:none!important}canvas{opacity:1!important}</style>"
 _MANY: Final = 24  # so many equal bodies are drawn as one batch: small in the file, late on a slow machine
 _PATH_POINTS: Final = 160
-_EXPOSURE: Final = 0.7
 _BACKDROP: Final = {False: ((246, 247, 249), (221, 225, 231)), True: ((38, 42, 50), (20, 22, 27))}  # dark: top, bottom
 
 
@@ -57,59 +57,26 @@ class ComponentMark:
     opacity: float = 0.22
 
 
-class _Mover:
-    """Something drawn whose poses follow those of bodies of the recording."""
-
-    def __init__(self, handle: Any, poses: Mapping[str, NDArray[Any]]) -> None:
-        self._handle, self._poses = handle, poses
-        self._changed = {
-            name: np.any(values[1:] != values[:-1], axis=tuple(range(1, values.ndim))).tolist()
-            for name, values in poses.items()
-        }
-
-    def show(self, frame: int) -> None:
-        """Send the poses of a frame, not the first, where they differ from the frame before."""
-        for name, values in self._poses.items():
-            if self._changed[name][frame - 1]:
-                setattr(self._handle, name, values[frame])
-
-
-def _node(kind: str, *names: object) -> str:
-    """Return a name for viser's tree, where a slash means a child and would split a body's name."""
-    return f"/{kind}/" + " ".join(str(name).replace("/", "|") for name in names)
-
-
-def _lit(rgba: Sequence[float], *, linear: bool = False) -> tuple[float, float, float]:
-    """Return the colour that looks like ``rgba`` under viser's lights, which are brighter than MuJoCo's.
-
-    Batches take ``linear`` light where meshes take sRGB.
-    """
-    srgb = np.asarray(rgba[:3], dtype=float)
-    light = _EXPOSURE * np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    shown = light if linear else np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return float(shown[0]), float(shown[1]), float(shown[2])
-
-
 def _add_mesh(server: Any, name: str, part: Part) -> None:
     opacity = part.rgba[3]
     server.scene.add_mesh_simple(
         name,
         part.mesh.vertices,
         part.mesh.faces,
-        color=_lit(part.rgba),
+        color=lit(part.rgba),
         opacity=opacity if opacity < 1.0 else None,
         side="double" if opacity < 1.0 or not np.ptp(part.mesh.vertices, axis=0).all() else "front",
         cast_shadow=opacity >= 1.0,
     )
 
 
-def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[Part]]) -> list[_Mover]:
+def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[Part]]) -> list[Mover]:
     """Draw every body at its first pose and return those that move.
 
     Many equal things (crumbs, parts in a box) become one batch, or they would fill the page with messages.
     """
-    positions = np.round(recording.positions / _STEP) * _STEP
-    quaternions = np.round(recording.quaternions / _STEP) * _STEP
+    positions = np.round(recording.positions / STEP) * STEP
+    quaternions = np.round(recording.quaternions / STEP) * STEP
     alike: dict[tuple[bytes, tuple[float, ...]], list[int]] = {}
     for body, its_parts in parts.items():
         if len(its_parts) == 1:
@@ -123,21 +90,21 @@ def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[Par
             "batched_wxyzs": quaternions[:, bodies].astype(np.float32),
         }
         handle = server.scene.add_batched_meshes_simple(
-            _node("bodies", "batch", number, recording.model.body(bodies[0]).name),
+            node_name("bodies", "batch", number, recording.model.body(bodies[0]).name),
             part.mesh.vertices,
             part.mesh.faces,
             poses["batched_wxyzs"][0],
             poses["batched_positions"][0],
-            batched_colors=_lit(part.rgba, linear=True),
+            batched_colors=lit(part.rgba, linear=True),
             lod="off",
         )
-        movers.append(_Mover(handle, poses))
+        movers.append(Mover(handle, poses))
     for body in sorted(set(parts).difference(*batches)):
-        name = _node("bodies", body, recording.model.body(body).name)
+        name = node_name("bodies", body, recording.model.body(body).name)
         handle = server.scene.add_frame(name, show_axes=False, position=positions[0, body], wxyz=quaternions[0, body])
         for number, part in enumerate(parts[body]):
             _add_mesh(server, f"{name}/{number}", part)
-        movers.append(_Mover(handle, {"position": positions[:, body], "wxyz": quaternions[:, body]}))
+        movers.append(Mover(handle, {"position": positions[:, body], "wxyz": quaternions[:, body]}))
     return movers
 
 
@@ -171,7 +138,7 @@ def _draw_paths(server: Any, paths: Sequence[PathMark]) -> None:
         points = np.asarray(path.positions, dtype=float)
         points = points[np.unique(np.linspace(0, len(points) - 1, min(len(points), _PATH_POINTS)).round().astype(int))]
         server.scene.add_line_segments(
-            _node("paths", path.name),
+            node_name("paths", path.name),
             np.stack([points[:-1], points[1:]], axis=1),
             palette.rgb(path.colour),
             thickness=path.thickness,
@@ -184,7 +151,7 @@ def _draw_components(server: Any, components: Sequence[ComponentMark]) -> None:
         axes[:, 0] *= np.linalg.det(axes)  # a rotation, not a mirror
         semi_axes = np.sqrt(_CHI2_95 * np.maximum(variances, 0.0))
         server.scene.add_icosphere(
-            _node("components", component.name),
+            node_name("components", component.name),
             1.0,
             palette.rgb(component.colour),
             opacity=component.opacity,
@@ -239,6 +206,7 @@ def playback_html(
     *,
     paths: Sequence[PathMark] = (),
     components: Sequence[ComponentMark] = (),
+    persons: Sequence[PersonMark] = (),
     camera: Camera | None = None,
     dark: bool = False,
 ) -> str:
@@ -248,6 +216,7 @@ def playback_html(
         recording: what moves, and the model it moves in. Geoms of the groups 0 to 2 are drawn.
         paths: lines to draw.
         components: Gaussian components to draw as translucent ellipsoids.
+        persons: people to draw, with as many frames as the recording has.
         camera: where the view begins; None shows the whole model.
         dark: dark controls and background.
 
@@ -255,14 +224,20 @@ def playback_html(
         The page; it can be saved, opened from disk without a network, or put in an iframe.
 
     Raises:
-        InputError: when viser is not installed.
+        InputError: when viser is not installed, or a person has not as many frames as the recording.
         TaskFailedError: when no port on this machine could be opened.
     """
+    for person in persons:
+        if len(person) != len(recording):
+            raise InputError(f"3-D playback: {person.name} has {len(person)} frames, the recording {len(recording)}")
     parts = body_parts(recording.model)
-    view = camera or Camera.around(points_to_see(recording, parts, [path.positions for path in paths]))
+    near = [*(path.positions for path in paths), *(person.points_to_see for person in persons)]
+    view = camera or Camera.around(points_to_see(recording, parts, near))
     with _server() as server:
         _draw_stage(server, floor_height(recording, parts), view, dark=dark)
         movers = _draw_bodies(server, recording, parts)
+        for person in persons:
+            movers += draw_person(server, person)
         _draw_paths(server, paths)
         _draw_components(server, components)
         serializer = server.get_scene_serializer()

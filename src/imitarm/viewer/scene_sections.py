@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from html import escape
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from imitarm.viewer import charts, palette, plots
 from imitarm.viewer.content import Report, SceneResult
-from imitarm.viewer.markup import MM, facts, figure, mark, number, scene_id, script_text
+from imitarm.viewer.markup import MM, facts, figure, mark, number, scene_id
+from imitarm.viewer.panels import Key, Panel, player_card, tabbed
+
+_KEYS: Final = (
+    Key(palette.NOMINAL, "learnt path"),
+    Key(palette.ADAPTED, "adapted path"),
+    Key(palette.MEASURED, "path of the robot's tool, measured"),
+    Key(palette.UNMOVED, "component, unmoved", blob=True),
+    Key(palette.MOVED, "component, moved", blob=True),
+)
 
 
 def scenes_section(report: Report, players: Mapping[str, str]) -> str:
@@ -23,21 +32,11 @@ def scenes_section(report: Report, players: Mapping[str, str]) -> str:
     if not report.scenes:
         return ""
     first = next((i for i, scene in enumerate(report.scenes) if scene.scene.obstacles), 0)
-    tabs, panels = [], []
-    for i, scene in enumerate(report.scenes):
-        anchor, chosen = scene_id(i, scene.name), "true" if i == first else "false"
-        tabs.append(
-            f'<button type="button" role="tab" id="tab-{anchor}" aria-controls="{anchor}" aria-selected="{chosen}">'
-            f"{escape(scene.title)}</button>"
-        )
-        panels.append(
-            f'<section class="scene" role="tabpanel" id="{anchor}" aria-labelledby="tab-{anchor}">'
-            f"{_scene(i, scene, players.get(scene.name))}</section>"
-        )
-    return (
-        '<section id="scenes"><h2>Scene by scene</h2>'
-        f'<div role="tablist" aria-label="Scenes">{"".join(tabs)}</div>{"".join(panels)}</section>'
-    )
+    panels = [
+        Panel(scene_id(i, scene.name), scene.title, _scene(i, scene, players.get(scene.name)))
+        for i, scene in enumerate(report.scenes)
+    ]
+    return f'<section id="scenes"><h2>Scene by scene</h2>{tabbed(panels, "Scenes", first)}</section>'
 
 
 def _scene(index: int, scene: SceneResult, player: str | None) -> str:
@@ -45,31 +44,9 @@ def _scene(index: int, scene: SceneResult, player: str | None) -> str:
     words = " ".join(text for text in (scene.caption, scene.reason) if text)
     parts = [f"<h3>{escape(scene.title)} {verdict}</h3>", f"<p>{escape(words)}</p>" if words else ""]
     if player is not None:
-        parts.append(_player(scene, player))
+        parts.append(player_card(f"3-D playback: {scene.title}", player, _KEYS))
     parts.append(f'<div class="columns">{"".join(_scene_figures(index, scene))}</div>')
     return "".join(parts)
-
-
-def _player(scene: SceneResult, player: str) -> str:
-    legend = (
-        ("", palette.NOMINAL, "learnt path"),
-        ("", palette.ADAPTED, "adapted path"),
-        ("", palette.MEASURED, "path of the robot's tool, measured"),
-        ("blob", palette.UNMOVED, "component, unmoved"),
-        ("blob", palette.MOVED, "component, moved"),
-    )
-    items = "".join(
-        f'<li><i class="{kind}" style="{"background" if kind else "color"}:{colour}"></i>{label}</li>'
-        for kind, colour, label in legend
-    )
-    return (
-        f'<div class="card player" data-title="{escape(f"3-D playback: {scene.title}", quote=True)}">'
-        '<button type="button">Show in 3-D</button>'
-        "<noscript>The 3-D playback needs JavaScript.</noscript>"
-        f'<script type="application/json">{script_text(player)}</script></div>'
-        f'<ul class="legend">{items}</ul><p class="caption">Drag to turn, right-drag to shift, scroll to come nearer. '
-        "The bar below the picture stops, winds and slows down the playback.</p>"
-    )
 
 
 def _scene_figures(index: int, scene: SceneResult) -> Iterable[str]:

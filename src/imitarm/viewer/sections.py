@@ -9,6 +9,7 @@ import numpy as np
 
 from imitarm.viewer.content import Report
 from imitarm.viewer.markup import MM, mark, number, scene_id
+from imitarm.viewer.panels import heading
 
 
 def header(report: Report) -> str:
@@ -34,14 +35,7 @@ def header(report: Report) -> str:
             "to plan around the obstacles (median)",
         ),
     ]
-    cards = "".join(f'<div class="card"><dt>{escape(label)}</dt><dd>{value}</dd></div>' for value, label in tiles)
-    summary = f"<p>{escape(report.summary)}</p>" if report.summary else ""
-    return (
-        f"<header><h1>{escape(report.title)}</h1>"
-        f'<p class="verdict {"good" if report.passed else "bad"}"><span>{"✓" if report.passed else "✗"} '
-        f"{escape(report.verdict)}</span></p>{summary}"
-        f'<dl class="tiles">{cards if obstructed else ""}</dl></header>'
-    )
+    return heading(report.title, report.verdict, report.passed, report.summary, tiles if obstructed else ())
 
 
 def table_section(report: Report, download: str) -> str:
