@@ -2,20 +2,32 @@
 
 from collections.abc import Mapping
 
+from imitarm.retarget.adaptive_control import AdaptiveControl
 from imitarm.retarget.correspondence import FACING, Correspondence
+from imitarm.retarget.demonstration_modification import DemonstrationModification
+from imitarm.retarget.incremental_ik import IncrementalIK
 from imitarm.retarget.limbs import LimbLengths, measure_limbs
 from imitarm.retarget.modern import ModernRetargeter
 from imitarm.retarget.retargeter import Command, Retargeter, Retargeting, retarget
 from imitarm.retarget.thesis import ThesisRetargeter
 
-RETARGETERS: Mapping[str, type[Retargeter]] = {"modern": ModernRetargeter, "thesis": ThesisRetargeter}
+RETARGETERS: Mapping[str, type[Retargeter]] = {
+    "modern": ModernRetargeter,
+    "thesis": ThesisRetargeter,
+    "m1": DemonstrationModification,
+    "m2": AdaptiveControl,
+    "m3": IncrementalIK,
+}
 """All methods by name."""
 
 __all__ = [
     "FACING",
     "RETARGETERS",
+    "AdaptiveControl",
     "Command",
     "Correspondence",
+    "DemonstrationModification",
+    "IncrementalIK",
     "LimbLengths",
     "ModernRetargeter",
     "Retargeter",

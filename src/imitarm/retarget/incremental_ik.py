@@ -1,0 +1,100 @@
+"""IncrementalIK: rival M3, resolved rates that feed the tool's deviation back; no treatment of singularities."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.pose import Pose
+from imitarm.retarget.arm_estimator import ArmEstimate
+from imitarm.retarget.correspondence import Clutch, Correspondence
+from imitarm.retarget.rival import RivalRetargeter
+from imitarm.scene import Scene
+
+Array = NDArray[np.float64]
+
+_RCOND = 1e-6  # only what is numerically no direction at all is left out
+
+
+class IncrementalIK(RivalRetargeter):
+    r"""Rival M3: our reading of "incremental inverse kinematics" in the thesis (METHODS B).
+
+    The thesis cites Ijspeert et al. 2002 for it. That paper is the one on movement primitives, and its abstract has
+    no incremental inverse kinematics; so this is no one's published method, but what the name says: once a frame
+
+    .. math:: \Delta q = J^+ \left(\Delta x_d + K\,e\right), \qquad e = \log(T_d\,T(q)^{-1}),
+
+    with :math:`\Delta x_d` the way of the target from the last frame to this one and e the deviation from where the
+    target was, spread evenly over the control steps of one frame. The pseudo-inverse is the plain one: its smallest
+    singular value is inverted however small it is, so near the edge of reach the step explodes. Each joint is cut to
+    its velocity limit by itself, which turns the tool's motion aside, and then to its limits of position; ``notes``
+    counts how often (``"caps"`` joints and steps, ``"capped_steps"`` steps).
+
+    The layer of movement primitives that the cited paper would add is left out: it belongs to the learnt skill, which
+    stands beside this floor (:mod:`imitarm.skills`), can be put behind every method alike, and would compare
+    primitives, not mappings.
+
+    Args:
+        arm: the robot's arm with its tool.
+        correspondence: what of the person's arm stands for what of the robot's.
+        dt: control period [s].
+        scene: not heeded.
+        velocity_scaling: scale every step as a whole so that no joint exceeds its limit, instead of cutting joints.
+        gain: K, share of the deviation that one frame makes up for.
+
+    Raises:
+        InputError: when the gain is not in (0, 1].
+    """
+
+    name: ClassVar[str] = "m3"
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        correspondence: Correspondence | None = None,
+        *,
+        dt: float = 0.01,
+        scene: Scene | None = None,
+        velocity_scaling: bool = False,
+        gain: float = 0.5,
+    ) -> None:
+        if not 0.0 < gain <= 1.0:
+            raise InputError(f"IncrementalIK: gain must be above 0 and at most 1, got {gain!r}")
+        self._gain = gain
+        super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
+
+    def _restart(self, q: Array) -> None:
+        self._target: Pose | None = None
+        self._share, self._left = np.zeros(self.arm.n_joints), 0
+
+    def _engaged(self, estimate: ArmEstimate, clutch: Clutch) -> None:
+        self._target = clutch.home
+
+    def _advance(self, estimate: ArmEstimate | None, clutch: Clutch) -> Array:
+        if estimate is not None:
+            target = clutch.target(estimate.wrist, estimate.hand)
+            steps = max(round(self._period / self.dt), 1)
+            self._share, self._left = self._increment(target) / steps, steps
+            self._target = target
+        if self._left <= 0:
+            return self._q
+        self._left -= 1
+        return self._q + self._capped(self._share)
+
+    def _increment(self, target: Pose) -> Array:
+        """Return the joints' way of one frame, shape (n_joints,) [rad]."""
+        before = target if self._target is None else self._target
+        twist = before.error_to(target) + self._gain * self.arm.tool_pose(self._q).error_to(before)
+        return np.asarray(np.linalg.pinv(self.arm.tool_jacobian(self._q), rcond=_RCOND) @ twist)
+
+    def _capped(self, step: Array) -> Array:
+        """Cut each joint to its velocity limit by itself; with scaling that is left to the scaling of the step."""
+        most = self.dt * self.arm.max_velocity
+        over = int(np.count_nonzero(np.abs(step) > most * (1.0 + 1e-9)))
+        self.counts["caps"] += over
+        self.counts["capped_steps"] += over > 0
+        return step if self.velocity_scaling else np.clip(step, -most, most)

@@ -1,0 +1,164 @@
+r"""JointMapping: the person's joint angles as the robot's, for methods that map joints and not the tool."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.pose import quaternion_to_matrix
+from imitarm.retarget.arm_estimator import ArmEstimate
+from imitarm.retarget.correspondence import Clutch
+from imitarm.retarget.human_arm import AXES, human_arm_angles, human_arm_pose
+from imitarm.retarget.limbs import LimbLengths
+
+Array = NDArray[np.float64]
+
+_STRETCHED = ((0.0,) * 7, (0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0))
+"""Postures in which an arm may be stretched forward: Sawyer's zero; the Panda's, which points up at zero; mirrored."""
+_ALIGNED = 0.999  # cosine between a joint's axis and that of the person's
+_ANY = LimbLengths(0.3, 0.26)  # of an arm of which only rotations are asked
+_AHEAD = np.array([1.0, 0.0, 0.0])
+
+
+class JointMapping:
+    r"""Maps the seven angles of a person's arm onto seven joints with the same order of axes (METHODS A.2).
+
+    With the arm stretched forward a person's joints turn about z, y, x, y, x, y, x
+    (:mod:`imitarm.retarget.human_arm`). Sawyer's do so at zero, the Panda's when its second joint is at a right angle
+    and with some senses reversed; so with that posture :math:`q^*` and the senses :math:`\sigma_i = \pm 1` it is
+
+    .. math:: q_i = q^*_i + \sigma_i\,\theta_i \quad\text{(absolute)}, \qquad
+              q_i = q_{i,0} + \sigma_i\,(\theta_i - \theta_{i,0}) \quad\text{(relative)},
+
+    relative to where person and robot were when the person took hold. That holds for shoulder and elbow, i = 1 to 4.
+    The last three follow in closed form from the rotation that the tool should have: the hand's own, when the mapping
+    is absolute and the correspondence follows the whole hand, else the clutch's target. The lengths of the links play
+    no part, so the tool is not where the hand is: that is the price of mapping joints.
+
+    Angles are continued from frame to frame without a jump of a turn; an angle that can't be seen is held.
+
+    Args:
+        arm: the robot's arm.
+        relative: see above.
+
+    Raises:
+        InputError: when the arm has not the axes of a person's arm.
+    """
+
+    def __init__(self, arm: ArmModel, *, relative: bool) -> None:
+        self.arm, self.relative = arm, relative
+        self.zero, self.sense = _chain_of(arm)
+        stretched = arm.tool_pose(self.zero).rotation
+        self._tool_to_hand = stretched.T  # chain(theta) = R_tool(q) R_tool(q*)^T
+        self.start(arm.home)
+
+    def start(self, q: Array) -> None:
+        """Forget the person; the robot is at ``q``, shape (7,) [rad]."""
+        self._q = np.array(q, dtype=float)
+        self._person: Array | None = None  # angles of the last frame
+        self._origin: tuple[Array, Array] | None = None  # robot's joints and person's angles when engaged
+
+    def joints(self, estimate: ArmEstimate, clutch: Clutch) -> Array:
+        """Return the joints for one frame of the person's arm, not limited, shape (7,) [rad].
+
+        Args:
+            estimate: of the person's arm.
+            clutch: engaged.
+        """
+        hand = quaternion_to_matrix(estimate.hand)
+        theta = self.angles(estimate.elbow - estimate.shoulder, estimate.wrist - estimate.elbow, hand)
+        whole = not self.relative and clutch.correspondence.orientation == "hand"
+        wanted = hand if whole else clutch.target(estimate.wrist, estimate.hand).rotation @ self._tool_to_hand
+        return self.onto_robot(theta, wanted)
+
+    def angles(self, upper: Array, forearm: Array, hand: Array) -> Array:
+        """Return the person's angles, continued from the last ones, shape (7,) [rad].
+
+        Args:
+            upper: from shoulder to elbow, shape (3,), of any length.
+            forearm: from elbow to wrist, shape (3,), of any length.
+            hand: rotation of the hand, shape (3, 3).
+        """
+        before = self._person
+        theta = human_arm_angles(_unit(upper), _unit(forearm), hand, before)
+        if before is not None:
+            theta = continued(theta, before)
+        self._person = theta
+        return theta
+
+    def onto_robot(self, theta: Array, hand: Array) -> Array:
+        """Return the robot's joints for a person's angles, shape (7,) [rad].
+
+        Args:
+            theta: the person's angles, shape (7,) [rad].
+            hand: wanted rotation of the robot's hand: the tool's times that of the stretched arm back, shape (3, 3).
+        """
+        if self._origin is None:
+            self._origin = self._q, theta
+        q0, theta0 = self._origin if self.relative else (self.zero, np.zeros(7))
+        q = q0 + self.sense * (theta - theta0)
+        q[:4] = continued(q[:4], self._q[:4], self.arm.lower[:4], self.arm.upper[:4])
+        chain = self.sense * (q - self.zero)
+        _, _, forearm = human_arm_pose(np.concatenate([chain[:4], np.zeros(3)]), _ANY)
+        held = np.concatenate([np.zeros(4), self.sense[4:] * (self._q[4:] - self.zero[4:])])
+        wrist = human_arm_angles(_AHEAD, _AHEAD, forearm.T @ hand, held)[4:]  # of an arm whose forearm is ahead
+        q[4:] = self.zero[4:] + self.sense[4:] * wrist
+        q[4:] = continued(q[4:], self._q[4:])
+        self._q = q
+        return q
+
+
+class Approach:
+    """Goes to a goal that is far away at limited speed, then with it: the mapping may begin anywhere.
+
+    Args:
+        arm: whose velocity limits.
+        dt: control period [s].
+        share: of the velocity limits while it approaches.
+    """
+
+    def __init__(self, arm: ArmModel, dt: float, share: float = 0.6) -> None:
+        self._most = share * dt * arm.max_velocity
+        self.active = True
+
+    def towards(self, q: Array, goal: Array) -> Array:
+        """Return where to be one period after ``q``: on the way to ``goal``, or there once it has been reached."""
+        if self.active:
+            reached = q + np.clip(goal - q, -self._most, self._most)
+            self.active = bool((reached != goal).any())
+            return np.asarray(reached)
+        return goal
+
+
+def continued(angles: Array, before: Array, lower: Array | None = None, upper: Array | None = None) -> Array:
+    """Return angles less whole turns, so that each is the nearest to the one before, shape (n,) [rad].
+
+    With limits, an angle beyond them is turned back into them by a whole turn where that helps.
+    """
+    near = before + (angles - before + np.pi) % (2.0 * np.pi) - np.pi
+    if lower is None or upper is None:
+        return np.asarray(near)
+    turned = near - 2.0 * np.pi * np.sign(near)
+    outside = (near < lower) | (near > upper)
+    return np.where(outside & (turned >= lower) & (turned <= upper), turned, near)
+
+
+def _chain_of(arm: ArmModel) -> tuple[Array, Array]:
+    """Return the posture in which the arm is stretched forward like a person's, and the joints' senses, (7,) each."""
+    axes = np.eye(3)[["xyz".index(name) for name in AXES]]
+    if arm.n_joints == len(AXES):
+        for stretched in _STRETCHED:
+            cosines = np.sum(arm.jacobian(stretched)[3:].T * axes, axis=1)
+            if np.abs(cosines).min() > _ALIGNED:
+                return np.array(stretched), np.sign(cosines)
+    raise InputError(
+        f"{arm.name}: its joints are not those of a person's arm (seven, that turn about z, y, x, y, x, y, x when it "
+        "is stretched forward), so a person's angles can't be its own; take a method that moves the tool: modern, "
+        "thesis, m3"
+    )
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / max(float(np.sqrt(vector @ vector)), 1e-9))
