@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from typing import TypeVar
 
 from imitarm.datagram import Header, decode
-from imitarm.messages import DatagramError, Message
+from imitarm.messages import DatagramError, JointCommand, JointState, SkeletonFrame
+
+Kind = TypeVar("Kind", SkeletonFrame, JointCommand, JointState)
 
 REASONS = {
     "length": "not as long as it must be",
@@ -65,20 +68,20 @@ class Gate:
         self._heard = self._window = 0
         self._least = [0, 0]  # of receiving less sending, in this window of time and the one before [ns]
 
-    def open(self, data: bytes, now_ns: int, *kinds: type[Message]) -> tuple[Header, Message] | None:
+    def open(self, data: bytes, now_ns: int, kind: type[Kind]) -> tuple[Header, Kind] | None:
         """Return what a datagram says, or None when it is dropped.
 
         Args:
             data: as received.
             now_ns: when, on the receiver's clock [ns].
-            kinds: that are wanted; none: all.
+            kind: that is wanted.
         """
         try:
             header, message = decode(data)
         except DatagramError as error:
             self.dropped[error.reason] += 1
             return None
-        if kinds and not isinstance(message, kinds):
+        if not isinstance(message, kind):
             self.dropped["kind"] += 1
             return None
         return (header, message) if self.admit(header, now_ns) else None

@@ -162,7 +162,7 @@ class JointState:
     """
 
     KIND: ClassVar[int] = 3
-    BODY: ClassVar[struct.Struct] = struct.Struct("<BB2xIIIIQQQddd4x92s")
+    BODY: ClassVar[struct.Struct] = struct.Struct("<BB2xIIIIQQQddd92s")
     NUMBERS: ClassVar[int] = 5 * MAX_JOINTS
 
     status: Status

@@ -9,8 +9,8 @@ from collections.abc import Callable
 class Pace:
     """Ticks at multiples of a period, counted from its first tick.
 
-    A tick that comes a whole period late or more is not made up for: a burst of steps would move an arm faster than
-    each of them says. The missed ones are counted and left out, and the rhythm stays.
+    When a tick comes a whole period late or more, the missed ones are counted and left out, and the rhythm stays: a
+    burst of steps would move an arm faster than each of them says.
 
     Args:
         period: [s].

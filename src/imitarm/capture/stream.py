@@ -140,7 +140,7 @@ class UdpSource(SkeletonSource):
             for data, _ in waiting(self._socket):
                 now = self._clock_ns()
                 came = self.gate.open(data, now, SkeletonFrame)
-                if came is not None and isinstance(came[1], SkeletonFrame):
+                if came is not None:
                     return self._skeleton(came[1], now)
             left = until - clock.monotonic()
             if left <= 0.0:

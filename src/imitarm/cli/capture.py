@@ -1,4 +1,4 @@
-"""``imitarm capture``: take a person's motion from a source, record it, check it."""
+"""``imitarm capture``: take a person's motion from a source, record it, send it, check it."""
 
 from __future__ import annotations
 
@@ -16,15 +16,18 @@ from imitarm.capture.recorder import SkeletonRecorder
 from imitarm.capture.recording import SkeletonRecording
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
 from imitarm.capture.sources import live, open_source
+from imitarm.capture.stream import SkeletonSender
 from imitarm.cli.gathering import add_side_and_person, gather, show_findings, source_help
 from imitarm.cli.screen import remark, say, show_table
 from imitarm.errors import InputError, TaskFailedError
+from imitarm.sockets import parse_address
 
 EPILOG = """\
 examples:
   imitarm capture kinect.csv --check
   imitarm capture wave.csv --trim 2.5 9 --repair --out wave_cut.csv
   imitarm capture synthetic:7 --out made_up.csv
+  imitarm capture synthetic:7 --send 127.0.0.1:7400
 
 What comes is written at once: a program that is killed leaves FILE.part, which can be read. Ctrl-C ends a live source
 and keeps what was recorded. Exit status 2 when --check finds an error.
@@ -41,6 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=Path, metavar="FILE", help="record into this file; default: none")
     output.add_argument("--force", action="store_true", help="replace a file that is there")
+    output.add_argument(
+        "--send",
+        metavar="HOST:PORT",
+        help="send each skeleton there, at the pace it happened, for 'udp:PORT' to receive",
+    )
     output.add_argument(
         "--trim", type=float, nargs=2, metavar=("A", "B"), help="keep what is between A and B seconds from the start"
     )
@@ -61,17 +69,26 @@ def run(arguments: argparse.Namespace) -> int:
     _check_options(arguments)
     going_on = live(arguments.source)
     with ExitStack() as stack:
-        source = open_source(arguments.source, realtime=arguments.realtime)
+        source = open_source(arguments.source, realtime=arguments.realtime or arguments.send is not None)
         recorded = source if isinstance(source, SkeletonRecording) else None
         source = stack.enter_context(_chosen(source, arguments.person))
-        write: Callable[[Skeleton], None] | None = None
+        given: list[Callable[[Skeleton], object]] = []
+        if arguments.send is not None:  # first: who waits for it waits for nothing else
+            sender = stack.enter_context(SkeletonSender(parse_address(arguments.send)))
+            stack.callback(_tell_sent, sender, arguments.send)
+            given.append(sender.send)
         if arguments.out is not None:
             recorder = SkeletonRecorder(arguments.out, source=source.name, replace=arguments.force)
-            write = stack.enter_context(recorder).write
+            given.append(stack.enter_context(recorder).write)
+
+        def give(skeleton: Skeleton) -> None:
+            for one in given:
+                one(skeleton)
+
         if going_on and arguments.seconds is None:
             remark("capturing; press Ctrl-C to end")
         total = recorded.duration if recorded is not None else None
-        taken, _ = gather(source, arguments.seconds, "capturing", live=going_on, total=total, on_skeleton=write)
+        taken, _ = gather(source, arguments.seconds, "capturing", live=going_on, total=total, on_skeleton=give)
     if not taken:
         raise TaskFailedError(
             f"{arguments.source}: nobody was seen, nothing is written; stand 1.5 to 3 m before the sensor"
@@ -84,6 +101,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         say(f"wrote {arguments.out}")
     return 2 if arguments.check and _has_error(findings) else 0
+
+
+def _tell_sent(sender: SkeletonSender, address: str) -> None:
+    """Say how many skeletons went out."""
+    unheard = f"; nobody listened to {sender.failed} more" if sender.failed else ""
+    remark(f"sent {sender.sent} skeletons to {address}{unheard}")
 
 
 def _check_options(arguments: argparse.Namespace) -> None:

@@ -1,11 +1,13 @@
-"""Bodies that move: simulated and real."""
+"""Bodies that move: simulated and real, here and at the other end of a wire."""
 
 from __future__ import annotations
 
 from imitarm.robots.robot import Robot, limit_velocity
+from imitarm.robots.server import RobotServer
 from imitarm.robots.simulated import SimulatedRobot
+from imitarm.robots.udp import UdpRobot
 from imitarm.robots.world import arm_world
 
-ROBOTS: dict[str, type[Robot]] = {"simulated": SimulatedRobot}
+ROBOTS: dict[str, type[Robot]] = {"simulated": SimulatedRobot, "udp": UdpRobot}
 
-__all__ = ["ROBOTS", "Robot", "SimulatedRobot", "arm_world", "limit_velocity"]
+__all__ = ["ROBOTS", "Robot", "RobotServer", "SimulatedRobot", "UdpRobot", "arm_world", "limit_velocity"]

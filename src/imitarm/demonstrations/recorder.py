@@ -1,0 +1,129 @@
+"""DemonstrationRecorder: writes a motion to a file as it happens, nothing is lost when the program is killed."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.trajectory import FORMAT, VERSION, Demonstration
+
+Array = NDArray[np.float64]
+
+PART = ".part"
+"""What is added to a file's name while it is being written."""
+
+
+class DemonstrationRecorder:
+    """Writes to ``PATH.part``, one whole sample a line, and makes a demonstration of it when it is closed.
+
+    Each line is handed to the operating system before :meth:`write` returns: a program that is killed leaves
+    ``PATH.part``, which :meth:`Demonstration.load <imitarm.trajectory.Demonstration.load>` reads as it is. An older
+    file ``PATH`` stays whole until the new one is.
+
+    Args:
+        path: where to.
+        arm: that moves; its tool's poses are written, and its joints.
+        task: what is shown.
+        source: where it comes from.
+        replace: an existing file may be replaced.
+
+    Attributes:
+        path: where to.
+        n_samples: written so far.
+
+    Raises:
+        InputError: when the file is there already and may not be replaced, another recorder has left or is writing
+            ``PATH.part``, or it can't be written.
+    """
+
+    def __init__(
+        self, path: str | Path, arm: ArmModel, *, task: str = "", source: str = "", replace: bool = False
+    ) -> None:
+        self.path, self.n_samples = Path(path), 0
+        self._arm, self._task, self._source = arm, task, source
+        self._part = self.path.with_name(self.path.name + PART)
+        self._time = -np.inf
+        if self.path.exists() and not replace:
+            raise InputError(f"{path}: is there already; name another file, or say that it may be replaced")
+        try:
+            self._file: TextIOWrapper | None = self._part.open("x", encoding="utf-8", newline="\n")
+            self._file.write(self._header())
+            self._file.flush()
+        except FileExistsError as error:
+            raise InputError(
+                f"{self._part}: was left by a recording that was not closed, or is being written; give it another "
+                "name to keep it, or remove it"
+            ) from error
+        except OSError as error:
+            raise InputError(f"{self._part}: can't be written: {error.strerror or error}") from error
+
+    def _header(self) -> str:
+        remarks = {
+            "format": FORMAT,
+            "version": VERSION,
+            "units": "m s rad",
+            "frame": "tool_to_base",
+            "task": " ".join(self._task.split()),
+            "source": " ".join(self._source.split()),
+        }
+        names = ("t", "x", "y", "z", "qw", "qx", "qy", "qz", *self._arm.joint_names)
+        return "\n".join([*(f"# {key}: {value}" for key, value in remarks.items()), ",".join(names), ""])
+
+    def write(self, time: float, q: Array) -> None:
+        """Add a sample; one that is not later than the last is left out.
+
+        Args:
+            time: [s].
+            q: joint positions, shape (n_joints,) [rad].
+
+        Raises:
+            InputError: when the recorder is closed, or the disk is full.
+        """
+        if self._file is None:
+            raise InputError(f"{self.path}: this recorder is closed; make another one")
+        if time <= self._time:
+            return
+        pose = self._arm.tool_pose(q)
+        values = [time, *pose.position.tolist(), *pose.quaternion.tolist(), *q.tolist()]
+        try:
+            self._file.write(",".join(map(repr, values)) + "\n")
+            self._file.flush()
+        except OSError as error:
+            raise InputError(f"{self._part}: can't be written: {error.strerror or error}") from error
+        self._time = time
+        self.n_samples += 1
+
+    def close(self) -> None:
+        """Write the demonstration under its name; fewer than two samples make none, and leave no file.
+
+        A second call does nothing.
+
+        Raises:
+            InputError: when that is not possible; what was written stays in ``PATH.part``.
+        """
+        if self._file is None:
+            return
+        file, self._file = self._file, None
+        try:
+            with file:
+                file.flush()
+                os.fsync(file.fileno())
+            if self.n_samples >= 2:
+                replace(Demonstration.load(self._part), source=self._source).save(self.path)
+            self._part.unlink()
+        except OSError as error:
+            raise InputError(f"{self.path}: can't be written: {error.strerror or error}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

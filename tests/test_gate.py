@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imitarm.datagram import Encoder, Header
+from imitarm.gate import REASONS, Gate
+from imitarm.messages import JointCommand, SkeletonFrame
+from wire_samples import MS, command, skeleton_frame
+
+PERIOD = 10 * MS
+
+
+def header(sequence, time, session=1):
+    return Header(1, 0, session, sequence & 0xFFFFFFFF, time)
+
+
+def test_in_order_everything_comes_in():
+    gate = Gate()
+    assert all(gate.admit(header(k, k * PERIOD), k * PERIOD + 5) for k in range(1000))
+    assert gate.admitted == 1000 and not gate.dropped and gate.age == 0.0
+
+
+@given(first=st.integers(0, 2**32 - 1), shuffled=st.permutations(range(12)), repeats=st.lists(st.integers(0, 11)))
+def test_only_what_is_newer_comes_in_whatever_the_order_also_around_the_end_of_all_numbers(first, shuffled, repeats):
+    gate, newest = Gate(), -1
+    for k in [*shuffled, *repeats]:
+        admitted = gate.admit(header(first + k, 0), 50 * MS)
+        assert admitted == (k > newest)
+        newest = max(newest, k)
+    assert gate.admitted + gate.dropped["order"] + gate.dropped["duplicate"] == 12 + len(repeats)
+
+
+@given(offset=st.integers(-(10**15), 10**15), seed=st.integers(0, 2**32 - 1))
+def test_clocks_may_differ_by_anything_and_age_is_the_time_in_a_queue(offset, seed):
+    rng, gate = np.random.default_rng(seed), Gate()
+    start = 2 * 10**15
+    gate.admit(header(0, start + offset), start + 2 * MS)  # the quickest: 2 ms on its way
+    for k in range(1, 50):
+        sent, queued = start + k * PERIOD, int(rng.integers(0, 200)) * MS
+        admitted = gate.admit(header(k, sent + offset), sent + 2 * MS + queued)
+        assert admitted == (queued <= 100 * MS)
+        if admitted:
+            assert abs(gate.age - 1e-9 * queued) < 1e-9
+
+
+def test_the_quickest_is_found_though_the_first_was_slow():
+    gate = Gate()
+    gate.admit(header(0, 0), 80 * MS)  # 78 ms queued, which can't be known yet
+    gate.admit(header(1, 100 * MS), 102 * MS)
+    assert not gate.admit(header(2, 200 * MS), 310 * MS)
+    assert gate.dropped == {"stale": 1}
+
+
+def test_clocks_may_drift_apart_for_hours():
+    """50 millionths: 180 ms an hour, more than the age that is allowed."""
+    gate = Gate()
+    for k in range(2 * 3600):
+        sent = k * 1000 * MS
+        assert gate.admit(header(k, sent), sent + sent // 20_000), k
+    assert gate.age < 0.01
+
+
+def test_a_time_in_the_future_does_not_make_the_others_look_late():
+    gate = Gate()
+    gate.admit(header(0, 1000 * MS), 1000 * MS)
+    assert not gate.admit(header(1, 2**63), 1010 * MS)
+    assert gate.admit(header(2, 1020 * MS), 1020 * MS)
+    assert gate.dropped == {"clock": 1}
+
+
+def test_two_senders_are_never_mixed():
+    gate = Gate()
+    admitted = []
+    for k in range(400):
+        for session in (1, 2):
+            if gate.admit(header(k, k * PERIOD, session), k * PERIOD):
+                admitted.append(session)
+    assert set(admitted) == {1} and gate.dropped == {"foreign": 400}
+
+
+def test_a_sender_that_was_started_again_is_let_in_after_half_a_second_of_silence_and_the_old_one_never_again():
+    gate = Gate()
+    for k in range(10):
+        gate.admit(header(k + 5000, k * PERIOD, 1), k * PERIOD)
+    begin = 9 * PERIOD
+    assert not gate.admit(header(0, 0, 2), begin + 400 * MS)
+    assert gate.admit(header(1, 110 * MS, 2), begin + 510 * MS)  # its clock and its numbers begin anew
+    assert gate.sessions == 2 and gate.session == 2
+    for late in (begin + 520 * MS, begin + 5000 * MS):
+        assert not gate.admit(header(6000, late, 1), late)  # a late or a replayed one of the first
+    assert gate.dropped == {"foreign": 1, "retired": 2}
+
+
+def test_without_patience_only_begin_changes_the_session():
+    gate = Gate(patience=np.inf)
+    gate.begin(7)
+    assert not gate.admit(header(0, 0, 8), 10**15)
+    assert gate.admit(header(0, 0, 7), 10**15)
+
+
+@given(data=st.binary(max_size=900))
+def test_bytes_that_are_nothing_are_counted_and_change_nothing(data):
+    gate = Gate()
+    assert gate.open(data, 0, SkeletonFrame) is None
+    assert sum(gate.dropped.values()) == 1 and set(gate.dropped) <= set(REASONS)
+    assert gate.session is None
+
+
+def test_another_kind_is_not_wanted():
+    gate = Gate()
+    encoder = Encoder(3)
+    assert gate.open(encoder.encode(command(), 0), 0, SkeletonFrame) is None
+    opened = gate.open(encoder.encode(skeleton_frame(), 0), 0, SkeletonFrame)
+    assert opened is not None and gate.dropped == {"kind": 1}
+    assert gate.open(encoder.encode(command(), 0), 0, JointCommand) is not None
