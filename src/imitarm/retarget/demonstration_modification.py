@@ -2,26 +2,56 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from imitarm.capture.skeleton import Skeleton
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.retarget.advice import COUNTED, Advice
 from imitarm.retarget.arm_estimator import ArmEstimate
 from imitarm.retarget.correspondence import Clutch, Correspondence
+from imitarm.retarget.infeasible import Constraint, Infeasible
 from imitarm.retarget.joint_mapping import Approach, JointMapping
-from imitarm.retarget.rival import RivalRetargeter
+from imitarm.retarget.retargeter import Command, Retargeting, in_order
+from imitarm.retarget.rival import HOLD, RivalRetargeter
+from imitarm.retarget.shown_motion import ShownMotion, holds
 from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
 
+ROUNDS = 5
+SECONDS_A_SEGMENT = 5.0  # [s] that a teacher takes to advise on one segment, besides watching it
+
 
 class DemonstrationModification(RivalRetargeter):
-    """Rival M1: our reading of "demonstration modification" in the thesis (METHODS B).
+    r"""Rival M1: our reading of "demonstration modification" in the thesis (METHODS B).
 
-    Step by step it is the uncorrected mapping of the person's joints, cut at the limits of position: the method itself
-    is an offline one.
+    It stands for Argall's advice operators, by which corrected data are made from an execution and a teacher's advice
+    on a segment of it, and for Mueller et al. 2018, who annotate constraints and replace key frames that violate them.
+    The paper that the thesis cites is on policies of a mobile robot; what can be advised for an arm, and the
+    machine that here stands in for the teacher, are ours.
+
+    The method is an offline one. :meth:`run` takes the whole recording:
+
+    1. the person's joint angles in closed form are the robot's
+       (:class:`~imitarm.retarget.joint_mapping.JointMapping`);
+    2. :class:`~imitarm.retarget.infeasible.Infeasible` says where the arm can't do that;
+    3. for each such segment, widened by 0.2 s, the first that clears it is taken of: slower, wrist pulled in, elbow
+       turned; else its key frames are repaired (:mod:`imitarm.retarget.advice_operators`);
+    4. up to five rounds; what is still infeasible then is counted, and cut at the limits of position.
+
+    :meth:`step` is the mapping of step 1, uncorrected, cut at the limits of position, for what must be live.
+
+    In ``notes`` of a run: ``"rounds"``; ``"segments"`` advised on, over all rounds; ``"slowed"``, ``"pulled_in"``,
+    ``"elbow_turned"`` and ``"repaired"`` of them; ``"missed_keys"``, key frames for which no sample was found;
+    ``"infeasible_before"`` and ``"infeasible_after"``, samples; ``"failures"``, segments that are left;
+    ``"execution_time"`` and, without slowing and approach, ``"shown_time"`` of the motion [s]; ``"teaching_time"`` [s],
+    the length of each segment and 5 s in each round.
 
     Args:
         arm: the robot's arm with its tool.
@@ -31,9 +61,12 @@ class DemonstrationModification(RivalRetargeter):
         velocity_scaling: scale every step as a whole so that no joint exceeds its velocity limit.
         relative: map the change of the person's joints since the hold was taken; else the joints themselves, which are
             approached at limited speed. See :class:`~imitarm.retarget.joint_mapping.JointMapping`.
+        constraints: more that must hold, by name, for example ``{"table": above(0.02)}``.
+        advice_time: that a teacher takes for each segment besides watching it [s].
+        seed: of the samples that repair key frames.
 
     Raises:
-        InputError: when the arm has not the axes of a person's arm.
+        InputError: when the arm has not the axes of a person's arm, or a number can't be used.
     """
 
     name: ClassVar[str] = "m1"
@@ -47,8 +80,15 @@ class DemonstrationModification(RivalRetargeter):
         scene: Scene | None = None,
         velocity_scaling: bool = False,
         relative: bool = True,
+        constraints: Mapping[str, Constraint] | None = None,
+        advice_time: float = SECONDS_A_SEGMENT,
+        seed: int = 0,
     ) -> None:
+        if not 0.0 <= advice_time < np.inf:
+            raise InputError(f"DemonstrationModification: advice_time must not be negative [s], got {advice_time!r}")
         self._mapping = JointMapping(arm, relative=relative)
+        self.infeasible = Infeasible(arm, dt, self._mapping.reach, constraints)
+        self._advice_time, self._seed = advice_time, seed
         super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
 
     def _restart(self, q: Array) -> None:
@@ -70,3 +110,76 @@ class DemonstrationModification(RivalRetargeter):
         step = (self._goal - self._q) / self._left
         self._left -= 1
         return np.asarray(self._q + step)
+
+    def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
+        """Retarget a whole recording, correct it, and say in ``notes`` what that took.
+
+        Where the motion is slowed, the result is longer than the recording. Its targets are where the tool should be
+        at that moment of what was shown: they are slowed with it, and otherwise not corrected.
+
+        Args:
+            skeletons: in the order of their times.
+            q: where the arm is at first, shape (n_joints,) [rad]; None: ``arm.home``.
+
+        Raises:
+            InputError: when there are fewer than two skeletons, or times do not increase.
+        """
+        frames = in_order(skeletons)
+        self.start(self.arm.home if q is None else q)
+        rng = np.random.default_rng(self._seed)
+        commands, now = [self.command], frames[0].time
+        lessons: list[Advice] = []
+        performed = 0
+        for estimates in holds(frames, self.correspondence, HOLD):
+            first, last = estimates[0], estimates[-1]
+            self._rest(commands, first.time - now)
+            clutch = self.correspondence.engage(first.wrist, first.hand, self.arm.tool_pose(self._q))
+            self._mapping.start(self._q)
+            lessons.append(Advice(self._mapping, clutch, self.infeasible, rng))
+            motion = lessons[-1].corrected(ShownMotion.through(estimates, self.dt), ROUNDS)
+            performed -= len(commands)
+            self._perform(commands, motion, clutch)
+            performed += len(commands)
+            now = last.time
+        self._rest(commands, frames[-1].time - now)
+        return Retargeting.of(self, commands, {**self.notes, **self._notes_of(lessons, performed)})
+
+    def _notes_of(self, lessons: Sequence[Advice], performed: int) -> dict[str, float]:
+        """Return what a run came to, over all holds."""
+        counts = {name: sum(lesson.counts[name] for lesson in lessons) for name in COUNTED}
+        watched = counts.pop("advised_time")
+        return {
+            "rounds": float(max((lesson.rounds for lesson in lessons), default=0)),
+            **counts,
+            "execution_time": self.dt * performed,
+            "teaching_time": watched + self._advice_time * counts["segments"],
+        }
+
+    def _rest(self, commands: list[Command], duration: float) -> None:
+        """Stand still for a while, at the end or between two holds."""
+        state = "stopped" if self._held else "waiting"
+        for _ in range(round(duration / self.dt)):
+            self._order(commands, Command(0.0, self._q, self._q, None, state), self._q)
+
+    def _perform(self, commands: list[Command], motion: ShownMotion, clutch: Clutch) -> None:
+        """Go to where the motion begins, at limited speed, then through it."""
+        self._held = True
+        approach = Approach(self.arm, self.dt)
+        start = np.clip(motion.joints[0], self.arm.lower, self.arm.upper)
+        at = self._q
+        path: list[tuple[int, Array]] = []
+        while (at != start).any():
+            at = approach.towards(at, start)
+            path.append((0, at))
+        for i, q in (*path, *enumerate(motion.joints)):
+            estimate = motion.estimate(i)
+            target = clutch.target(motion.shown[i], motion.hands[i])
+            done = Command(0.0, q, q, motion.closed[i], "following", target, estimate.upper_arm)
+            self._order(commands, done, q)
+
+    def _order(self, commands: list[Command], command: Command, wanted: Array) -> None:
+        """Append a command that leads to joints (n_joints,) [rad], as far as limits let it."""
+        before, self._q = self._q, self._limited(wanted)
+        velocity = (self._q - before) / self.dt
+        self.command = replace(command, time=self.command.time + self.dt, q=self._q, velocity=velocity)
+        commands.append(self.command)

@@ -43,6 +43,11 @@ class JointMapping:
         arm: the robot's arm.
         relative: see above.
 
+    Attributes:
+        zero: the posture in which the arm is stretched forward, shape (7,) [rad].
+        sense: of each joint against the person's, 1 or -1, shape (7,).
+        reach: from the robot's shoulder to its wrist in that posture [m]; inf when its file marks neither.
+
     Raises:
         InputError: when the arm has not the axes of a person's arm.
     """
@@ -52,6 +57,8 @@ class JointMapping:
         self.zero, self.sense = _chain_of(arm)
         stretched = arm.tool_pose(self.zero).rotation
         self._tool_to_hand = stretched.T  # chain(theta) = R_tool(q) R_tool(q*)^T
+        ends = None if arm.landmarks is None else arm.sew_points(self.zero)
+        self.reach = float("inf") if ends is None else float(np.linalg.norm(ends[2] - ends[0]))
         self.start(arm.home)
 
     def start(self, q: Array) -> None:
@@ -59,6 +66,13 @@ class JointMapping:
         self._q = np.array(q, dtype=float)
         self._person: Array | None = None  # angles of the last frame
         self._origin: tuple[Array, Array] | None = None  # robot's joints and person's angles when engaged
+
+    def resume(self, q: Array) -> None:
+        """Go on from joints ``q``, shape (7,) [rad], with the same origin: to map a part of a motion anew."""
+        self._q = np.array(q, dtype=float)
+        if self._origin is not None:
+            q0, theta0 = self._from
+            self._person = theta0 + self.sense * (self._q - q0)
 
     def joints(self, estimate: ArmEstimate, clutch: Clutch) -> Array:
         """Return the joints for one frame of the person's arm, not limited, shape (7,) [rad].
@@ -72,6 +86,13 @@ class JointMapping:
         whole = not self.relative and clutch.correspondence.orientation == "hand"
         wanted = hand if whole else clutch.target(estimate.wrist, estimate.hand).rotation @ self._tool_to_hand
         return self.onto_robot(theta, wanted)
+
+    @property
+    def _from(self) -> tuple[Array, Array]:
+        """The robot's joints and the person's angles from which the mapping counts."""
+        if self.relative and self._origin is not None:
+            return self._origin
+        return self.zero, np.zeros(7)
 
     def angles(self, upper: Array, forearm: Array, hand: Array) -> Array:
         """Return the person's angles, continued from the last ones, shape (7,) [rad].
@@ -97,7 +118,7 @@ class JointMapping:
         """
         if self._origin is None:
             self._origin = self._q, theta
-        q0, theta0 = self._origin if self.relative else (self.zero, np.zeros(7))
+        q0, theta0 = self._from
         q = q0 + self.sense * (theta - theta0)
         q[:4] = continued(q[:4], self._q[:4], self.arm.lower[:4], self.arm.upper[:4])
         chain = self.sense * (q - self.zero)
