@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imitarm.pace import Pace
+from wire_samples import MS, Clock
+
+
+class Time(Clock):
+    """A clock that sleeping sets on, a little too far as systems do."""
+
+    def __init__(self, late=0):
+        super().__init__()
+        self.late = late
+
+    def sleep(self, seconds):
+        self.ns += round(1e9 * seconds) + self.late
+
+
+def test_it_does_not_drift():
+    time = Time(late=300_000)
+    pace = Pace(0.01, clock_ns=time, sleep=time.sleep)
+    begin = time.ns
+    for _ in range(1001):
+        pace.wait()
+        time.ns += 2 * MS
+    assert pace.ticks == 1001 and pace.overruns == 0
+    assert abs(time.ns - begin - 1000 * 10 * MS) <= 3 * MS
+
+
+@given(work=st.lists(st.integers(0, 80), min_size=1, max_size=40))
+def test_missed_ticks_are_left_out_and_counted_and_the_rhythm_stays(work):
+    time = Time()
+    pace = Pace(0.01, clock_ns=time, sleep=time.sleep)
+    begin = time.ns
+    for made, busy in enumerate(work, start=1):
+        missed = pace.wait()
+        assert pace.ticks == made + pace.overruns
+        late = (time.ns - begin) - (pace.ticks - 1) * 10 * MS
+        assert 0 <= late < 10 * MS
+        assert missed == 0 or late + missed * 10 * MS >= 10 * MS
+        time.ns += busy * MS
+
+
+def test_the_first_tick_is_now():
+    time = Time()
+    pace = Pace(0.5, clock_ns=time, sleep=time.sleep)
+    assert pace.left == 0.0 and pace.wait() == 0
+    assert abs(pace.left - 0.5) < 1e-9
