@@ -18,8 +18,12 @@ WORDS = {
     "FILE": "a recording: imitarm's own or a table of the Kinect SDK",
     "synthetic:SEED": "a made-up person before a made-up camera",
     "udp:PORT": "what 'imitarm capture --send' sends; udp:ADDRESS:PORT hears other machines too",
+    "video:FILE": "the person in a video, by MediaPipe",
+    "webcam:NUMBER": "the person before a webcam, by MediaPipe; 0 is the first",
+    "kinect2": "a Kinect v2",
+    "azure": "an Azure Kinect",
 }
-"""What a source may be called. Cameras and streams have their words below, but no version could open one yet."""
+"""What a source may be called."""
 
 
 def open_source(word: str | Path, *, realtime: bool = False) -> SkeletonSource:
@@ -73,14 +77,7 @@ def _number(kind: str, text: str, largest: int) -> int:
 
 def _made(module: str, name: str, *values: object, **options: object) -> SkeletonSource:
     """Make a source whose module is imported only now: it may need a driver, or much time."""
-    try:
-        home = importlib.import_module(f"imitarm.capture.{module}")
-    except ModuleNotFoundError as error:
-        if error.name != f"imitarm.capture.{module}":
-            raise
-        raise InputError(
-            "cameras and streams can't be opened by this version yet; give a recording or synthetic:SEED"
-        ) from error
+    home = importlib.import_module(f"imitarm.capture.{module}")
     return cast(SkeletonSource, getattr(home, name)(*values, **options))
 
 
@@ -93,7 +90,7 @@ def _synthetic(rest: str, realtime: bool) -> SkeletonSource:
 def _video(rest: str, realtime: bool) -> SkeletonSource:
     if not Path(rest).is_file():
         raise InputError(f"source video:{rest}: there is no such file; check the path")
-    return _made("mediapipe", "MediaPipeSource", rest)
+    return _made("mediapipe", "MediaPipeSource", rest, realtime=realtime)
 
 
 def _udp(rest: str, realtime: bool) -> SkeletonSource:
