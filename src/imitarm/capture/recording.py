@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imitarm.capture import kinect_csv, native
+from imitarm.capture import kinect_csv, mocap_tsv, native
 from imitarm.capture.finding import Finding
 from imitarm.capture.recorder import PART, SkeletonRecorder
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
@@ -153,7 +153,7 @@ class SkeletonRecording(SkeletonSource):
 
 
 def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecording:
-    """Read a recording: imitarm's own format or a table of the Kinect SDK, told by what is in the file.
+    """Read a recording: imitarm's own format, a table of the Kinect SDK, or motion capture; the content tells which.
 
     Args:
         path: the file; also the ``.part`` of a recorder that was killed.
@@ -168,6 +168,10 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
     if not path.exists() and part.exists():
         raise InputError(f"{path}: is not there, but {part} is, left by a recording that was not closed; read that one")
     content = read_bytes(path)
-    reader = native if native.recognises(content[:65536]) else kinect_csv
-    skeletons, findings, _ = reader.read(str(path), content)
+    head = content[:65536]
+    if mocap_tsv.recognises(head):
+        skeletons, findings, _ = mocap_tsv.read(str(path), content)
+    else:
+        reader = native if native.recognises(head) else kinect_csv
+        skeletons, findings, _ = reader.read(str(path), content)
     return SkeletonRecording(skeletons, name=path.name, realtime=realtime, findings=findings)

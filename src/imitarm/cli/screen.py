@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TextIO
 
 from rich.console import Console
@@ -13,6 +15,7 @@ from rich.status import Status
 from rich.table import Table
 
 _WIDTH_IN_FILES = 160  # columns when nobody watches: a path must not be broken
+_LONG = 2.0  # [s] shorter work needs no progress bar
 
 
 def _console(stream: TextIO) -> Console:
@@ -61,3 +64,30 @@ def progress_bar() -> Progress:
     """Show how much is done and how long it will still take, while the ``with`` block runs."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     return Progress(*columns, console=_console(sys.stderr), transient=True)
+
+
+@contextmanager
+def watched(what: str, share: Callable[[], float]) -> Iterator[None]:
+    """Show how far something has come that can't tell itself, while the ``with`` block runs, once it takes 2 s.
+
+    Args:
+        what: is going on.
+        share: that is done, 0 to 1; asked five times a second from another thread.
+    """
+    over = threading.Event()
+
+    def watch() -> None:
+        if over.wait(_LONG):
+            return
+        with progress_bar() as progress:
+            task = progress.add_task(what, total=1.0)
+            while not over.wait(0.2):
+                progress.update(task, completed=min(max(share(), 0.0), 1.0))
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()

@@ -107,8 +107,8 @@ class PersonMark:
         """Put a recorded person beside a robot, turned as the correspondence says, so that both move alike.
 
         Args:
-            skeletons: in the order of their times, at least one; gaps are gaps: after a quarter of a second without a
-                skeleton nobody is drawn.
+            skeletons: in the order of their times, at least one. In gaps, after a quarter of a second without a
+                skeleton, nobody is drawn; after the last one the person stands still.
             times: of the frames to draw, since the first skeleton, shape (n_frames,) [s].
             sensor_to_base: only its rotation counts here.
             side: of the arm that is followed.
@@ -123,9 +123,10 @@ class PersonMark:
             raise InputError(f"PersonMark {name}: there is no skeleton to draw")
         at = np.array([skeleton.time for skeleton in skeletons]) - skeletons[0].time
         turned = np.array([skeleton.positions for skeleton in skeletons]) @ sensor_to_base.rotation.T
-        newest = np.searchsorted(at, np.asarray(times, dtype=float) + 1e-9, side="right") - 1
+        t = np.minimum(np.asarray(times, dtype=float), at[-1])
+        newest = np.searchsorted(at, t + 1e-9, side="right") - 1
         tracking = np.array([skeleton.tracking for skeleton in skeletons])[newest]
-        tracking[np.asarray(times, dtype=float) - at[newest] > _GONE] = Tracking.LOST
+        tracking[t - at[newest] > _GONE] = Tracking.LOST
         return cls(name, (turned + _shift(turned, place, floor))[newest], tracking, side)
 
     @property
@@ -217,18 +218,12 @@ def _body(person: PersonMark) -> tuple[tuple[Array, Array, Array], NDArray[np.in
     spine, nod = p["spine_shoulder"] - p["spine_base"], p["head"] - p["neck"]
     length = np.linalg.norm(spine, axis=1)
     half = np.stack([np.full(len(person), _TRUNK[0]), np.full(len(person), _TRUNK[1]), 0.58 * length], axis=1)
-    shoulders = np.minimum(t["shoulder_left"], t["shoulder_right"])
-    return (
+    poses = (
         np.stack([p["head"], 0.5 * (p["spine_shoulder"] + p["spine_base"])], axis=1),
         np.stack([_upright(nod, across), _upright(spine, across)], axis=1),
         np.stack([np.broadcast_to(_HEAD, half.shape), half], axis=1),
-    ), np.stack(
-        [
-            np.minimum(np.minimum(t["head"], t["neck"]), shoulders),
-            np.minimum(np.minimum(t["spine_base"], t["spine_shoulder"]), shoulders),
-        ],
-        axis=1,
     )
+    return poses, np.stack([t["head"], np.minimum(t["spine_base"], t["spine_shoulder"])], axis=1)
 
 
 def _upright(up: Array, across: Array) -> Array:

@@ -113,9 +113,10 @@ def playback(report: RetargetReport, method: MethodResult, *, dark: bool = False
     )
     paths = [PathMark("path of the tool", run.arm.tool_path(run.joints)[0], palette.ADAPTED, 0.006)]
     aimed = np.asarray(np.isfinite(run.targets[0]).all(axis=1))
-    for i, (first, last) in enumerate(retarget_charts.stretches(aimed)):
-        if aimed[first] and last > first:
-            paths.append(PathMark(f"target {i + 1}", run.targets[0][first : last + 1], palette.DEMONSTRATION, 0.004))
+    followed = [(first, last) for first, last in retarget_charts.stretches(aimed) if aimed[first] and last > first]
+    for i, (first, last) in enumerate(followed):
+        positions = run.targets[0][first : last + 1]
+        paths.append(PathMark(f"target {i + 1}", positions, palette.DEMONSTRATION, 0.004))
     near = [*(path.positions for path in paths), person.points_to_see]
     camera = Camera.around(points_to_see(recording, body_parts(recording.model), near), direction=_VIEW)
     return playback_html(recording, paths=paths, persons=[person], camera=camera, dark=dark)
@@ -199,8 +200,8 @@ def _method(method: MethodResult, player: str, key: str) -> str:
     return (
         f"<h3>{escape(method.title)} on {escape(run.arm.name)}</h3>"
         + (f"<p>{escape(method.caption)}</p>" if method.caption else "")
+        + (f'<ul class="plain">{notes}</ul><br>' if notes else "")
         + player_card(f"Person and robot side by side: {method.title}", player, _KEYS)
-        + (f'<ul class="plain">{notes}</ul>' if notes else "")
         + f'<div class="columns">{"".join(cards)}</div>'
     )
 

@@ -1,0 +1,143 @@
+"""How good a retargeting is: the figures that ``imitarm retarget`` prints and its report shows, and what to warn of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.benchmark.mapping_metrics import MappingMetrics, measure
+from imitarm.benchmark.seen_arm import seen_arm, target_lag
+from imitarm.benchmark.tracking import TrueArm
+from imitarm.capture.motions import Truth
+from imitarm.capture.skeleton import Skeleton
+from imitarm.retarget import Correspondence, Retargeting
+from imitarm.retarget.retargeter import STATES
+from imitarm.viewer.retarget_content import Measure, MethodResult, PlainTable
+
+Array = NDArray[np.float64]
+
+TITLES = {
+    "modern": "modern",
+    "thesis": "thesis",
+    "m1": "M1, our reading",
+    "m2": "M2, our reading",
+    "m3": "M3, our reading",
+}
+CAPTIONS = {
+    "modern": "What we would use on a robot: every limit kept, the elbow followed, losses of sight survived.",
+    "thesis": "The thesis's Chapter 3, corrected: damped least squares towards a smooth curve.",
+    "m1": "Our reading of demonstration modification: the person's joint angles, corrected where they do not do.",
+    "m2": "Our reading of a discrete-time adaptive controller that follows the person's joint angles.",
+    "m3": "Our reading of incremental inverse kinematics, without a treatment of singularities.",
+}
+_FAR = 0.05  # [m] a tool farther from its target has not reached it
+_DEGREES = 180.0 / np.pi
+
+
+def judged(
+    run: Retargeting, skeletons: Sequence[Skeleton], correspondence: Correspondence, truth: Truth | None = None
+) -> tuple[MethodResult, MappingMetrics]:
+    """Measure what a method made of a recording.
+
+    Args:
+        run: of the method.
+        skeletons: of the person.
+        correspondence: that the method was given.
+        truth: where the person truly was, when that is known; None: what the camera saw stands for it.
+
+    Returns:
+        the result for the report, and the metrics in SI units.
+    """
+    if truth is None:
+        true = seen_arm(skeletons, run.times, correspondence)
+    else:
+        true = TrueArm.of(truth, run.times, correspondence, start=skeletons[0].time)
+    metrics = measure(run, correspondence, true)
+    result = MethodResult(
+        name=run.method,
+        title=TITLES.get(run.method, run.method),
+        run=run,
+        measures=_measures(run, metrics, "hand as seen" if truth is None else "true hand"),
+        tables=[_torques(run, metrics)],
+        notes=warnings_of(run, metrics),
+        caption=CAPTIONS.get(run.method, ""),
+    )
+    return result, metrics
+
+
+def _measures(run: Retargeting, m: MappingMetrics, hand: str) -> list[Measure]:
+    """Return the figures of merit, in the units in which people think."""
+    tool = run.arm.tool_path(run.joints)[0]
+    shares = [Measure(state, 100.0 * float(np.mean(run.states == state)), "% of the time", 1) for state in STATES]
+    return [
+        Measure("duration", m.duration, "s", 2),
+        *shares,
+        Measure("hold taken", m.engagements, "times", 0),
+        Measure("tool to its own target, RMS", 1e3 * m.target_rms, "mm", 1, "less"),
+        Measure("lag behind its own target", 1e3 * target_lag(run.times, tool, run.targets[0]), "ms", 0, "less"),
+        Measure(f"tool to the {hand}, RMS", 1e3 * m.tool_rms, "mm", 1, "less"),
+        Measure("the same without its lag", 1e3 * m.tool_rms_without_lag, "mm", 1, "less"),
+        Measure(f"lag behind the {hand}", 1e3 * m.lag, "ms", 0),
+        Measure("upper arm's direction, RMS error", _DEGREES * m.elbow_direction_rms, "°", 1, "less"),
+        Measure("beyond a limit of position", m.position_violations, "frames", 0, "less", fault=True),
+        Measure("beyond a limit of velocity", m.velocity_violations, "frames", 0, "less", fault=True),
+        Measure("beyond a limit of acceleration", m.acceleration_violations, "frames", 0, "less", fault=True),
+        Measure("highest velocity", 100.0 * m.velocity_ratio, "% of the limit", 0, "less"),
+        Measure("highest acceleration", 100.0 * m.acceleration_ratio, "% of the limit", 0, "less"),
+        Measure("jerk of the joints, RMS", m.joint_jerk_rms, "rad/s³", 0, "less"),
+        Measure("least singular value", m.least_singular, "m/rad", 3, "more"),
+        Measure("path of the tool", m.path_length, "m", 2),
+        Measure("highest torque", 100.0 * m.peak_torque_ratio, "% of the rated", 0, "less"),
+    ]
+
+
+def _torques(run: Retargeting, m: MappingMetrics) -> PlainTable:
+    """Return the torques of each joint."""
+    columns = (m.mean_torque, m.mean_gravity_torque, m.mean_motion_torque, m.rms_torque, run.arm.max_torque)
+    rows = [
+        (name, *(f"{value:.2f}" if np.isfinite(value) else "–" for value in values))
+        for name, *values in zip(run.arm.joint_names, *columns, strict=True)
+    ]
+    return PlainTable(
+        "Torques [N m]",
+        ("Joint", "Mean", "holds the weight", "moves", "RMS", "Rated"),
+        tuple(rows),
+        "By inverse dynamics, without friction. Means are of absolute values, so the two parts need not add up.",
+    )
+
+
+def warnings_of(run: Retargeting, m: MappingMetrics) -> list[str]:
+    """Return what the user should know of a run, a sentence each."""
+    dt = float(run.times[1] - run.times[0])
+    lines = []
+    if not m.engagements:
+        lines.append("never took hold: the arm was not seen for half a second on end")
+    stopped = int(np.sum(run.states == "stopped")) + _waiting_again(run.states)
+    if stopped:
+        lines.append(f"stopped or waited for {stopped * dt:.1f} s on the way, because the arm was not seen")
+    away = np.linalg.norm(run.arm.tool_path(run.joints)[0] - run.targets[0], axis=1)
+    far = np.isfinite(away) & (away > _FAR)
+    if far.any():
+        lines.append(
+            f"the tool was more than {1e2 * _FAR:.0f} cm from its target for {far.sum() * dt:.1f} s (at most "
+            f"{1e2 * float(away[far].max()):.0f} cm): out of reach, or quicker than the joints may"
+        )
+    broken = {
+        "position": m.position_violations,
+        "velocity": m.velocity_violations,
+        "acceleration": m.acceleration_violations,
+    }
+    beyond = [f"{what} in {count} frames" for what, count in broken.items() if count]
+    if beyond:
+        lines.append(f"breaks limits of {', '.join(beyond)}: no real arm would do this")
+    if run.closed.any():
+        lines.append("the hand closed on the way; a demonstration holds no gripper, so that is not kept")
+    return lines
+
+
+def _waiting_again(states: NDArray[np.str_]) -> int:
+    """Return in how many frames the robot waited after it had once followed."""
+    led = np.flatnonzero(states == "following")
+    return int(np.sum(states[led[0] :] == "waiting")) if len(led) else 0

@@ -1,0 +1,104 @@
+r"""Fitting: where a robot should begin, and how much smaller it should move, so that a recorded motion is in its reach.
+
+A motion that is still to come can't be fitted; a recording can. The tool will be at
+
+.. math:: p(t) = p_0 + \rho\,(W(t) - W_0)
+
+with W the person's wrist in the base's axes and :math:`W_0` where it is when the clutch engages. The middle of the
+motion is put near where the robot's tool is at home, and the scale is made smaller until the arm reaches the six
+outermost points of the motion and its start, with its tool turned as at home and well off its singularities.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError, UnreachableError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik import find_posture, solve_ik
+from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.posture import ANGLE_LENGTH
+
+Array = NDArray[np.float64]
+
+_SHRINK: Final = 0.85  # from one scale that is tried to the next
+_SMALLEST: Final = 0.15
+_EASY, _POSSIBLE = 0.1, 0.05  # [m/rad] least singular value where an arm begins; where it goes
+_STILL: Final = 1e-3  # [rad/s] faster is not standing
+_MIDDLES: Final = np.array(
+    [[0.0, 0.0, 0.0], [0.0, 0.0, 0.15], [0.1, 0.0, 0.1], [-0.1, 0.0, 0.1], [0.0, 0.0, -0.1], [0.0, 0.15, 0.1]]
+)  # [m] from the tool at home
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where the robot begins, ``q`` (n_joints,) [rad], and the ``scale`` of its motion."""
+
+    q: Array
+    scale: float
+
+
+def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: float = 1.0) -> Fit:
+    """Find a start and a scale with which a recorded motion is in the arm's reach.
+
+    Args:
+        arm: the robot's.
+        wrist: the person's, along the axes of the base, shape (n, 3) [m].
+        start: where it is when the clutch engages, shape (3,) [m].
+        scale: the largest one to try.
+
+    Returns:
+        The largest scale that was found to do, and a start.
+
+    Raises:
+        InputError: when the wrist was never seen.
+        UnreachableError: when the motion does not fit at a seventh of its size.
+    """
+    path, begin = np.asarray(wrist, dtype=float), np.asarray(start, dtype=float)
+    path = path[np.isfinite(path).all(axis=1)]
+    if not len(path) or not np.isfinite(begin).all():
+        raise InputError("fit: the wrist was never seen, so nothing can be fitted")
+    middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
+    outermost = path[np.unique(np.concatenate([path.argmin(axis=0), path.argmax(axis=0)]))]
+    home = arm.tool_pose(arm.home)
+    tried = scale
+    while tried >= _SMALLEST:
+        for shift in _MIDDLES:
+            centre = home.position + shift
+            first = _posture(arm, Pose(centre + tried * (begin - middle), home.quaternion), arm.home, _EASY)
+            if first is None or not _stands(arm, first):
+                continue
+            if all(
+                _posture(arm, Pose(centre + tried * (point - middle), home.quaternion), first, _POSSIBLE) is not None
+                for point in outermost
+            ):
+                return Fit(first, tried)
+        tried *= _SHRINK
+    span = np.ptp(path, axis=0)
+    raise UnreachableError(
+        f"fit: a motion of {span[0]:.2f} x {span[1]:.2f} x {span[2]:.2f} m is not in reach of {arm.name} even at a "
+        f"scale of {_SMALLEST:g}; cut it by --trim, or choose another arm"
+    )
+
+
+def _posture(arm: ArmModel, tool_to_base: Pose, near: Array, least: float) -> Array | None:
+    """Return a posture near another one, shape (n_joints,); None if there is none so far from a singularity."""
+    try:
+        q = find_posture(arm, tool_to_base, q0=near, restarts=2)
+    except UnreachableError:
+        return None
+    jacobian = arm.tool_jacobian(q)
+    jacobian[3:] *= ANGLE_LENGTH
+    return q if float(np.linalg.svd(jacobian, compute_uv=False)[-1]) >= least else None
+
+
+def _stands(arm: ArmModel, q: Array) -> bool:
+    """Whether an arm that keeps off its singularities stands still at a posture, and does not move off by itself."""
+    if arm.landmarks is None:
+        return True
+    velocity = solve_ik(arm, q, np.zeros(6), velocity=np.zeros(arm.n_joints), singularity_bounds=True)
+    return float(np.abs(velocity).max()) <= _STILL
