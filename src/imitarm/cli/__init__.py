@@ -18,6 +18,7 @@ from imitarm.errors import ImitarmError
 COMMANDS = {
     "capture": "take a person's motion from a camera or a file, record it and check it",
     "calibrate": "measure a person's arm, find where the sensor is, choose how the robot follows",
+    "retarget": "turn a person's motion into a robot's, ready to learn from",
     "lint": "check demonstrations and say what is wrong with them",
     "learn": "learn a skill from demonstrations",
     "reproduce": "let a simulated arm do what a skill has learnt, around obstacles",
