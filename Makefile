@@ -3,12 +3,15 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 JOBS   ?= 2
+# `make MEDIAPIPE= unit` goes without; the tests of real video are skipped then
+MEDIAPIPE ?= mediapipe
+VIDEOS := .cache/pose2sim
 export MPLBACKEND = Agg
 # one thread for each numerical library: this work is many small matrices, and the tests already run side by side
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo install test lint types floors unit format bench clean
+.PHONY: help demo install test lint types floors unit mediapipe format bench clean
 
 help:  ## list the tasks
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -30,8 +33,10 @@ types: $(VENV)/.dev  ## strict types of src
 floors: $(VENV)/.dev  ## no import goes up
 	$(BIN)/lint-imports
 
-unit: $(VENV)/.dev  ## the tests
+unit: $(VENV)/.dev $(MEDIAPIPE)  ## the tests
 	$(BIN)/pytest -n $(JOBS)
+
+mediapipe: .venv-mediapipe/imitarm-mediapipe.txt $(VIDEOS)/cam04.mp4  ## video and webcam: MediaPipe's own environment, and real video for the tests
 
 format: $(VENV)/.dev  ## mend what can be mended mechanically
 	$(BIN)/ruff check --fix .
@@ -41,7 +46,7 @@ bench: $(VENV)/.bench  ## speed against installed peers, as ratios
 	$(BIN)/python -m imitarm.benchmark.speed
 
 clean:  ## remove the environment and everything made
-	rm -rf $(VENV) demo .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-mediapipe .cache demo .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "imitarm needs Python 3.11 or newer; say make PYTHON=python3.11")'
@@ -59,3 +64,10 @@ $(VENV)/.dev: $(BIN)/python pyproject.toml
 $(VENV)/.bench: $(VENV)/.dev pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[dev,bench]'
 	@touch $@
+
+# order-only: neither changes with what imitarm needs
+.venv-mediapipe/imitarm-mediapipe.txt: src/imitarm/capture/mediapipe_environment.py | $(VENV)/.dev
+	$(BIN)/python -m imitarm.capture.mediapipe_environment .venv-mediapipe
+
+$(VIDEOS)/cam04.mp4: tests/fetch_videos.py | $(VENV)/.dev
+	$(BIN)/python tests/fetch_videos.py
