@@ -1,21 +1,16 @@
-"""How often a method keeps its clearance, over hundreds of seeded scenes: ``python -m imitarm.benchmark.avoidance``.
+"""How often a method keeps its clearance, over hundreds of seeded scenes: ``imitarm benchmark avoidance``.
 
 Success is judged on 4000 points of the path that would be executed, not on the samples that the method planned with.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
 from imitarm.benchmark.families import (
     CLEARANCE,
@@ -26,6 +21,8 @@ from imitarm.benchmark.families import (
     s_shaped_demonstrations,
     sparse_clutter,
 )
+from imitarm.benchmark.intervals import wilson_interval
+from imitarm.benchmark.tables import Table
 from imitarm.policies.adaptation import METHODS, Adaptation, adapt
 from imitarm.skills.gmm import DegenerateAxisWarning
 from imitarm.skills.skill import Skill
@@ -34,6 +31,10 @@ Array = NDArray[np.float64]
 
 SLACK = 0.0005  # [m] a path that keeps the asked clearance less this counts as keeping it
 _DENSE = 4000
+_COLUMNS = (
+    *("", "scenes", "method", "right answer % (95 %)>", "collision-free %>", "least mm>", "RMSE mm>", "unmoved %>"),
+    "ms>",
+)
 
 
 @dataclass(frozen=True)
@@ -57,21 +58,6 @@ class Outcome:
     rmse: float
     unmoved: float
     seconds: float
-
-
-def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the Wilson score interval of a rate (95 % by default).
-
-    Args:
-        successes: how often it went well, 0 to ``trials``.
-        trials: how often it was tried, at least 1.
-        z: normal quantile of the confidence.
-    """
-    p = successes / trials
-    centre = p + z * z / (2 * trials)
-    spread = z * np.sqrt(p * (1 - p) / trials + z * z / (4 * trials**2))
-    scale = 1 + z * z / trials
-    return max(0.0, float((centre - spread) / scale)), min(1.0, float((centre + spread) / scale))
 
 
 def learn(*, planar: bool) -> tuple[Skill, Array]:
@@ -140,41 +126,35 @@ def _row(dimension: str, family: str, solvable: bool, method: str, outcomes: Seq
     ]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run every method over every family and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m imitarm.benchmark.avoidance", description=__doc__)
-    parser.add_argument("--seeds", type=int, default=200, help="scenes in each family (default 200)")
-    parser.add_argument("--first", type=int, default=2000, help="first seed (default 2000: the test seeds)")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
-    arguments = parser.parse_args(argv)
-    console = Console()
-    table = Table(
-        title=f"{arguments.seeds} scenes a row, {1e3 * CLEARANCE:.0f} mm asked of a {2e3 * TOOL_RADIUS:.0f} mm tool"
-    )
-    for heading in (
-        "",
-        "scenes",
-        "method",
-        "right answer % (95 %)",
-        "collision-free %",
-        "least mm",
-        "RMSE mm",
-        "unmoved %",
-        "ms",
-    ):
-        table.add_column(heading, justify="left" if heading in ("", "scenes", "method") else "right")
-    for planar in (True, False):
-        skill, path = learn(planar=planar)
+def success_table(
+    seeds: int,
+    first: int = 2000,
+    methods: Sequence[str] = tuple(METHODS),
+    on_done: Callable[[int, int], None] | None = None,
+) -> Table:
+    """Run every method over every family.
+
+    Args:
+        seeds: scenes in each family.
+        first: first seed; 2000 and on are the test seeds.
+        methods: of :data:`imitarm.policies.adaptation.METHODS`.
+        on_done: is told how many rows are done, and of how many.
+    """
+    rows: list[tuple[str, ...]] = []
+    planned = [(planar, *learn(planar=planar)) for planar in (True, False)]
+    total = sum(len(_families(path, planar)) for planar, _, path in planned) * len(methods)
+    for planar, skill, path in planned:
+        dimension = "2-D" if planar else "3-D"
         for family, solvable, make in _families(path, planar):
-            cases = [make(arguments.first + i) for i in range(arguments.seeds)]
-            for method in arguments.methods:
-                label = f"{'2-D' if planar else '3-D'} {family}, {method}"
-                outcomes = run_family(skill, track(cases, label, console=console, transient=True), method)
-                table.add_row(*_row("2-D" if planar else "3-D", family, solvable, method, outcomes))
-    console.print(table)
-    console.print("right answer: solved with the asked clearance (less 0.5 mm), or refused where it can't be solved")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            cases = [make(first + i) for i in range(seeds)]
+            for method in methods:
+                outcomes = run_family(skill, cases, method)
+                rows.append(tuple(_row(dimension, family, solvable, method, outcomes)))
+                if on_done is not None:
+                    on_done(len(rows), total)
+    return Table(
+        f"{seeds} scenes a row, {1e3 * CLEARANCE:.0f} mm asked of a {2e3 * TOOL_RADIUS:.0f} mm tool",
+        _COLUMNS,
+        tuple(rows),
+        "right answer: solved with the asked clearance (less 0.5 mm), or refused where it can't be solved",
+    )

@@ -1,83 +1,102 @@
-"""How often four cubes are stacked: made-up people in the loop, every method, a camera of a given noise.
-
-``python -m imitarm.benchmark.stacking --people 10 --repeats 5 --sigma 12`` prints rates with 95 % intervals.
-"""
+"""Stacking with a method in the loop: a made-up person, a noisy camera, real contact; one trial at a time."""
 
 from __future__ import annotations
 
-import argparse
-import multiprocessing
-import os
-import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
-from imitarm.benchmark.avoidance import wilson_interval
+from imitarm.benchmark.mapping_methods import method
+from imitarm.benchmark.motion_measures import violations
 from imitarm.capture.camera_model import SkeletonCamera
-from imitarm.retarget import RETARGETERS
-from imitarm.tasks.stack_trial import SIGMA, StackResult, stack_once
-
-Trial = tuple[str, int, int, float]
-"""Method, seed of the person, which repeat, sigma of the camera [m]."""
+from imitarm.kinematics.arm import ArmModel
+from imitarm.tasks.stack_trial import DT, stack_once
 
 
-def run_trial(trial: Trial) -> StackResult:
-    """Run one trial; what :func:`~imitarm.tasks.stack_trial.stack_once` needs, as plain values."""
-    method, person, repeat, sigma = trial
-    return stack_once(person, repeat, RETARGETERS[method], camera=partial(SkeletonCamera, sigma=sigma))
+@dataclass(frozen=True)
+class StackingTrial:
+    """Which trial, as plain values.
+
+    Attributes:
+        method: one of :data:`imitarm.benchmark.mapping_methods.METHODS`.
+        person: seed of the person.
+        repeat: which of this person's trials.
+        sigma: of the camera's error [m]; None: 1 to 2 cm, by the seed.
+    """
+
+    method: str
+    person: int
+    repeat: int
+    sigma: float | None = None
+
+    @property
+    def camera(self) -> Callable[[int], SkeletonCamera]:
+        """Makes the camera from a seed: one with all the faults of a real one."""
+        return SkeletonCamera.from_seed if self.sigma is None else partial(SkeletonCamera, sigma=self.sigma)
 
 
-def summary(method: str, results: Sequence[StackResult]) -> list[str]:
-    """Return one row of the table: method, rate, interval, median time and path of the successes, failures by class."""
-    done = [result for result in results if result.success]
-    low, high = wilson_interval(len(done), len(results))
-    failures = Counter(result.failure for result in results if not result.success)
-    return [
-        method,
-        f"{len(done)} of {len(results)}",
-        f"{100 * low:.0f} to {100 * high:.0f}",
-        f"{np.median([result.time for result in done]):.0f}" if done else "-",
-        f"{np.median([result.path_length for result in done]):.2f}" if done else "-",
-        ", ".join(f"{n} {what}" for what, n in failures.most_common()) or "none",
-    ]
+@dataclass(frozen=True)
+class TrialOutcome:
+    """What came of a trial, as plain values; torques are those of the drives, contacts included.
+
+    Attributes:
+        success: whether four cubes stand in order.
+        failure: one of :data:`imitarm.tasks.stack.FAILURES`; empty on success.
+        reason: in words.
+        stacked: cubes in the tower at the end.
+        time: until the person was done, or time was up [s].
+        path_length: of the tool [m].
+        mean_torque: mean of the absolute torque of each joint [N m].
+        rms_torque: root mean square of each joint's torque [N m].
+        effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
+        peak_torque_ratio: largest torque over the rated one.
+        velocity_ratio: largest measured joint velocity over the one allowed.
+        clamped: control steps in which the robot's own limits changed the command.
+    """
+
+    success: bool
+    failure: str
+    reason: str
+    stacked: int
+    time: float
+    path_length: float
+    mean_torque: tuple[float, ...]
+    rms_torque: tuple[float, ...]
+    effort: float
+    peak_torque_ratio: float
+    velocity_ratio: float
+    clamped: int
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run all trials side by side and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m imitarm.benchmark.stacking", description=__doc__)
-    parser.add_argument("--people", type=int, default=10, help="made-up people (default 10)")
-    parser.add_argument("--repeats", type=int, default=5, help="trials of each (default 5)")
-    parser.add_argument(
-        "--sigma", type=float, default=1e3 * SIGMA, help=f"of the camera's noise [mm] (default {1e3 * SIGMA:g})"
+def run_trial(trial: StackingTrial, arm: ArmModel | None = None) -> TrialOutcome:
+    """Let a person stack the cubes by a method, and measure.
+
+    Args:
+        trial: which.
+        arm: the Sawyer with the gripper, when it is loaded already.
+    """
+    done = stack_once(trial.person, trial.repeat, method(trial.method), arm=arm, camera=trial.camera)
+    arm = ArmModel.load("sawyer", tool="gripper") if arm is None else arm
+    return TrialOutcome(
+        success=done.success,
+        failure=done.failure,
+        reason=done.reason,
+        stacked=done.stacked,
+        time=done.time,
+        path_length=done.path_length,
+        mean_torque=tuple(np.abs(done.torques).mean(axis=0).tolist()),
+        rms_torque=tuple(np.sqrt(np.mean(done.torques**2, axis=0)).tolist()),
+        effort=float(np.sum(done.torques**2) * DT),
+        peak_torque_ratio=float((np.abs(done.torques) / arm.max_torque).max()),
+        velocity_ratio=violations(arm, done.joints, DT).velocity_ratio,
+        clamped=done.clamped,
     )
-    parser.add_argument("--methods", nargs="+", choices=RETARGETERS, default=list(RETARGETERS))
-    arguments = parser.parse_args(argv)
-    if arguments.people < 1 or arguments.repeats < 1:
-        parser.error("--people and --repeats must be at least 1")
-    trials: list[Trial] = [
-        (method, person, repeat, 1e-3 * arguments.sigma)
-        for method in arguments.methods
-        for person in range(arguments.people)
-        for repeat in range(arguments.repeats)
-    ]
-    console = Console(width=None if sys.stdout.isatty() else 160)
-    with multiprocessing.get_context("spawn").Pool(min(os.cpu_count() or 1, len(trials))) as pool:
-        results = list(track(pool.imap(run_trial, trials), "stacking", len(trials), console=console, transient=True))
-    table = Table(title=f"{arguments.people} people x {arguments.repeats} trials, camera sigma {arguments.sigma:g} mm")
-    for heading in ("method", "stacked", "95 % [%]", "time [s]", "path [m]", "failures"):
-        table.add_column(heading)
-    for method in arguments.methods:
-        table.add_row(*summary(method, [r for r, t in zip(results, trials, strict=True) if t[0] == method]))
-    console.print(table)
-    console.print("time and path are medians over the trials that succeeded")
-    return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def failures(outcomes: Sequence[str]) -> str:
+    """Return how often each failure happened, in words, the most frequent first; ``outcomes`` are "" on success."""
+    counted = Counter(outcome for outcome in outcomes if outcome)
+    return ", ".join(f"{n} {what}" for what, n in counted.most_common()) or "none"

@@ -56,8 +56,20 @@ class TrueArm:
             start: the person's time at the run's time 0, which is that of its first skeleton [s].
         """
         t = np.asarray(times, dtype=float)
-        points = np.array([truth(start + time).arm(correspondence.side).points for time in t])
-        points = correspondence.sensor_to_base.apply(points)
+        return cls.from_points(
+            t, np.array([truth(start + time).arm(correspondence.side).points for time in t]), correspondence
+        )
+
+    @classmethod
+    def from_points(cls, times: ArrayLike, points: ArrayLike, correspondence: Correspondence) -> TrueArm:
+        """Take an arm's points over time.
+
+        Args:
+            times: shape (n,) [s].
+            points: shoulder, elbow, wrist, hand, hand tip, thumb, in the sensor's frame, shape (n, 6, 3) [m].
+            correspondence: how the sensor stands.
+        """
+        t, points = np.asarray(times, dtype=float), correspondence.sensor_to_base.apply(points)
         hands, hand = np.empty((len(t), 3, 3)), np.eye(3)
         for i, arm in enumerate(points):
             found = hand_rotation(arm[2], arm[4], arm[5])

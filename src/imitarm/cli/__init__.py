@@ -19,10 +19,13 @@ COMMANDS = {
     "capture": "take a person's motion from a camera or a file, record it and check it",
     "calibrate": "measure a person's arm, find where the sensor is, choose how the robot follows",
     "retarget": "turn a person's motion into a robot's, ready to learn from",
+    "teleoperate": "let a person lead a robot, live",
+    "serve": "be a simulated robot that others lead over UDP",
     "lint": "check demonstrations and say what is wrong with them",
     "learn": "learn a skill from demonstrations",
     "reproduce": "let a simulated arm do what a skill has learnt, around obstacles",
     "demo": "learn a sweep, do it around obstacles, write a report",
+    "benchmark": "measure how good the methods are, beside what the thesis says",
     "robots": "list the known arms and tools, or inspect one",
 }
 

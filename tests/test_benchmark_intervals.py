@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imitarm.benchmark.intervals import bootstrap, compare, holm, interval, person_means, sign_flip_p
+
+
+def test_an_interval_covers_the_truth_about_as_often_as_it_says():
+    """Ten persons of four recordings; persons differ more than recordings do, as they do here."""
+    rng = np.random.default_rng(0)
+    covered = 0
+    for trial in range(400):
+        people = rng.normal(3.0, 1.0, 10)
+        values = {(p, r): float(people[p] + rng.normal(0.0, 0.3)) for p in range(10) for r in range(4)}
+        found = interval(values, seed=trial)
+        covered += found.low <= 3.0 <= found.high
+    assert 0.89 < covered / 400 < 0.98
+
+
+def test_recordings_of_one_person_are_not_counted_as_if_they_were_of_many():
+    rng = np.random.default_rng(1)
+    people = rng.normal(0.0, 1.0, 8)
+    few = {(p, 0): float(people[p]) for p in range(8)}
+    many = {(p, r): float(people[p]) for p in range(8) for r in range(50)}
+    assert interval(few).low == pytest.approx(interval(many).low)
+    assert interval(many).used == 400
+
+
+def test_what_has_no_number_is_left_out_and_counted():
+    values = {(0, "a"): 1.0, (0, "b"): math.nan, (1, "a"): 3.0, (2, "a"): math.nan}
+    np.testing.assert_array_equal(person_means(values), [1.0, 3.0])
+    found = interval(values)
+    assert (found.mean, found.persons, found.used, found.of) == (2.0, 2, 2, 4)
+    nobody = interval({(0, "a"): math.nan})
+    assert math.isnan(nobody.mean)
+    assert (nobody.used, nobody.of) == (0, 1)
+    alone = interval({(0, "a"): 1.0})
+    assert alone.mean == 1.0
+    assert math.isnan(alone.low)
+    assert not alone.excludes_zero
+
+
+def test_the_same_seed_gives_the_same_interval():
+    x = np.random.default_rng(2).normal(size=9)
+    assert bootstrap(x, seed=5) == bootstrap(x, seed=5)
+    assert bootstrap(x, seed=5) != bootstrap(x, seed=6)
+    low, high = bootstrap(x)
+    assert low < x.mean() < high
+
+
+@given(st.lists(st.floats(0.1, 10.0), min_size=1, max_size=12))
+def test_differences_of_one_sign_have_the_least_probability(differences):
+    assert sign_flip_p(differences) == pytest.approx(2.0 / 2 ** len(differences))
+    assert sign_flip_p([-d for d in differences]) == sign_flip_p(differences)
+
+
+def test_the_test_is_wrong_as_seldom_as_it_says():
+    rng = np.random.default_rng(3)
+    p = [sign_flip_p(rng.normal(size=8)) for _ in range(400)]
+    assert 0.02 < np.mean(np.array(p) < 0.05) < 0.09
+    assert sign_flip_p([]) == 1.0
+    assert sign_flip_p(np.zeros(5)) == 1.0
+    assert sign_flip_p(rng.normal(2.0, 1.0, 40)) < 0.01  # drawn, not all tried
+
+
+def test_holm():
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert holm([0.5]) == [0.5]
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_a_comparison_is_paired():
+    """A small but steady difference is seen between persons who differ much."""
+    rng = np.random.default_rng(4)
+    people = rng.normal(10.0, 5.0, 10)
+    theirs = {(p, r): float(people[p] + rng.normal(0.0, 0.05)) for p in range(10) for r in range(3)}
+    ours = {key: value - 0.5 + float(rng.normal(0.0, 0.05)) for key, value in theirs.items()}
+    found = compare(ours, theirs)
+    assert found.difference.excludes_zero
+    assert found.difference.mean == pytest.approx(-0.5, abs=0.05)
+    assert found.relative == pytest.approx(-0.5 / people.mean(), abs=0.01)
+    assert found.p == pytest.approx(2.0 / 2**10)
+    ours[0, 0] = math.nan
+    assert compare(ours, theirs).difference.used == 29

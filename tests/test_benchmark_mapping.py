@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+
+from imitarm.benchmark import thesis_table
+from imitarm.benchmark.experiment import LIVE, Experiment, Result
+from imitarm.benchmark.intervals import Comparison, Interval
+from imitarm.benchmark.mapping import BEGIN, END, MappingBenchmark, fill_document, tables, write_tables
+from imitarm.benchmark.mapping_methods import MAIN, METHODS
+from imitarm.benchmark.mapping_report import mapping_report_html
+from imitarm.benchmark.mapping_tables import Figure, Results, success_table, written
+from imitarm.benchmark.running import run_all
+from imitarm.benchmark.stacking import failures
+from imitarm.benchmark.tables import Table
+from imitarm.benchmark.thesis_table import PATH, TIME, TORQUES, claims_table, verdict
+from imitarm.errors import InputError, UnknownNameError
+
+ME = ("thesis", "modern")
+
+
+def live(method, person, repeat, success=True, time=40.0):
+    """A made-up result of a closed-loop trial."""
+    values = {
+        **{"success": success, "failure": "" if success else "dropped", "time": time, "path_length": 5.0},
+        **{"mean_torque": [1.0] * 7},
+    }
+    return Result(Experiment(LIVE, method, seed=person, repeat=repeat), "0", values, "", 1.0)
+
+
+def replay(method, person, torque, path=3.0, singular=0.05, kind="stacking"):
+    values = {
+        **{"mean_torque": [torque] * 7, "path_length": path, "least_singular": singular, "led_share": 1.0},
+        **{f"{kind_}_violations": 0 for kind_ in ("position", "velocity", "acceleration")},
+    }
+    return Result(Experiment(kind, method, seed=person), "0", values, "", 1.0)
+
+
+def held(results, claim, me):
+    table = claims_table(Results(results), ["stacking"])
+    (row,) = (row for row in table.rows if row[0].startswith(claim))
+    return row[2 + 2 * ME.index(me)]
+
+
+def world(mine, theirs, persons=8):
+    """Results in which Me has one torque and all rivals another, persons differing more than methods."""
+    rng = np.random.default_rng(0)
+    found = []
+    for person in range(persons):
+        own = rng.uniform(5.0, 15.0)
+        found += [replay(me, person, own + mine) for me in ME]
+        found += [replay(rival, person, own + theirs) for rival in ("m1", "m2", "m3")]
+    return found
+
+
+def test_a_claim_holds_only_when_the_data_say_so():
+    assert held(world(-1.0, 0.0), "less torque", "modern") == "yes"
+    assert held(world(1.0, 0.0), "less torque", "modern") == "no"
+    assert held(world(0.0, 0.0), "less torque", "modern") == "not shown"
+    assert held(world(-1.0, 0.0, persons=2), "less torque", "modern") == "not shown"  # two persons show nothing
+
+
+def test_a_claim_against_all_rivals_falls_with_one_of_them():
+    results = [r for r in world(-1.0, 0.0) if r.experiment.method != "m2"]
+    assert held(results, "less torque", "thesis") == "yes"
+    better = [replay("m2", person, 0.1) for person in range(8)]
+    assert held([*results, *better], "less torque", "thesis") == "no"
+
+
+def test_times_are_compared_only_where_both_succeeded():
+    results = world(0.0, 0.0)
+    for person in range(8):
+        for repeat in range(3):
+            results += [live(me, person, repeat, time=30.0 + person) for me in ME]
+            for rival in ("m1", "m2", "m3"):
+                results.append(live(rival, person, repeat, success=repeat > 0, time=35.0 + person + repeat))
+    assert held(results, "done in less time", "modern") == "yes"
+    assert held(world(0.0, 0.0), "done in less time", "modern") == "not run"
+    nobody = [*world(0.0, 0.0), *(live(m, p, 0, success=m in ME) for m in MAIN for p in range(8))]
+    assert held(nobody, "done in less time", "modern") == "not shown"  # no rival to compare with
+
+
+def comparison(low, mean, high, p):
+    return Comparison(Interval(mean, low, high, 10, 10, 10), 0.0, p)
+
+
+def test_a_verdict_needs_the_interval_and_the_probability():
+    sure, unsure = comparison(-3.0, -2.0, -1.0, 0.002), comparison(-3.0, -2.0, -1.0, 0.2)
+    assert verdict([sure, sure], -1.0) == "yes"
+    assert verdict([sure, unsure], -1.0) == "not shown"
+    assert verdict([sure, sure], 1.0) == "no"
+    assert verdict([], 1.0) == "not shown"
+    assert verdict([comparison(math.nan, math.nan, math.nan, 1.0)], 1.0) == "not shown"
+
+
+def test_the_printed_table_is_the_thesiss():
+    """Means that METHODS A.10 gives; every row has seven torques."""
+    assert TORQUES.shape == (10, 7)
+    assert PATH.mean() == pytest.approx(8.53, abs=0.01)
+    assert TIME.mean() == pytest.approx(15.1, abs=0.05)
+    assert (TORQUES[:, 4].min(), TORQUES[:, 4].max()) == (10.23, 19.34)
+    assert (TORQUES[:, 6].min(), TORQUES[:, 6].max()) == (20.35, 41.8)
+    assert np.corrcoef(np.arange(10), TIME)[0, 1] < -0.8  # it falls from experiment to experiment
+
+
+def test_no_average_over_failures_without_the_successes_beside_it():
+    results = [live("modern", p, r, success=p > 0, time=40.0 if p else 999.0) for p in range(4) for r in range(2)]
+    (row,) = success_table(Results(results)).rows
+    assert row[1] == "6 of 8"
+    assert row[3].startswith("40")  # the failures' 999 s are not in it
+    assert row[-1] == "2 dropped"
+    assert failures(["", "dropped", "tower fell", "dropped", ""]) == "2 dropped, 1 tower fell"
+    assert failures(["", ""]) == "none"
+    assert written(Interval(0.0412, 0.04, 0.05, 3, 5, 8), Figure("x", "", 1e3)) == "41.2 (40.0 to 50.0), 5 of 8"
+    assert written(Interval(math.nan, math.nan, math.nan, 0, 0, 8), Figure("x", "")) == "– (0 of 8)"
+
+
+def test_every_experiment_of_a_recording_has_the_same_recording():
+    benchmark = MappingBenchmark(people=3, repeats=2, data="somewhere")
+    found = benchmark.experiments()
+    assert len(set(found)) == len(found)
+    plans = {e.plan for e in found if e.task != LIVE}
+    for name in METHODS:
+        assert {e.plan for e in found if e.task != LIVE and e.method == name} == plans
+    assert {e.method for e in found if e.task == LIVE} == set(MAIN)
+    assert sum(e.task == LIVE for e in found) == 3 * 2 * len(MAIN)
+    full = {e.plan for e in MappingBenchmark().experiments() if e.task != LIVE}
+    assert len(full) >= 30
+    assert len({plan.person for plan in full}) == 10
+
+
+@pytest.mark.parametrize("bad", [{"people": 0}, {"repeats": 0}, {"methods": ()}, {"kinds": (), "live": False}])
+def test_what_is_no_benchmark_is_refused(bad):
+    with pytest.raises(InputError):
+        MappingBenchmark(**bad)
+
+
+def test_an_unknown_method_is_refused_by_name():
+    with pytest.raises(UnknownNameError, match="modern"):
+        MappingBenchmark(methods=("magic",)).experiments()
+
+
+def test_tables_go_between_the_marks_and_nothing_else_changes(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"# Title\n\nbefore\n\n{BEGIN}\nold\n{END}\n\nafter\n")
+    table = Table("T", ("a", "b>"), (("x|y", "1"),), "note")
+    for _ in range(2):
+        fill_document(page, [table], "imitarm benchmark mapping", "0+abc")
+        text = page.read_text()
+        assert text.startswith(f"# Title\n\nbefore\n\n{BEGIN}\n")
+        assert text.endswith(f"{END}\n\nafter\n")
+        assert "old" not in text
+        assert "| x\\|y | 1 |" in text
+        assert text.count("**T**") == 1
+    for wrong in ("no marks\n", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{BEGIN}\n{END}\n"):
+        page.write_text(wrong)
+        with pytest.raises(InputError, match="between"):
+            fill_document(page, [table], "", "")
+        assert page.read_text() == wrong
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A small but real benchmark: two people, two methods, the edge of reach."""
+    folder = tmp_path_factory.mktemp("mapping")
+    benchmark = MappingBenchmark(
+        people=2, repeats=1, methods=("modern", "m3"), kinds=("inside", "edge"), seconds=4.0, live=False
+    )
+    return folder, Results(run_all(benchmark.experiments(), folder, jobs=1))
+
+
+@pytest.mark.slow
+def test_a_small_benchmark_fills_its_tables(small, tmp_path):
+    _, results = small
+    assert not any(r.failure for r in results.all)
+    found = tables(results)
+    titles = [table.title for table in found]
+    assert any(title.startswith("Accuracy, edge") for title in titles)
+    assert any(title.startswith("Limits broken") for title in titles)
+    for table in found:
+        assert table.rows
+        assert all(len(row) == len(table.columns) for row in table.rows)
+        assert "nan" not in table.markdown()
+    (limits,) = (t for t in found if t.title.startswith("Limits broken: inside, edge"))
+    modern = next(row for row in limits.rows if row[0] == "modern")
+    assert modern[1:5] == ("4 of 4", "0", "0", "0")
+    document, data = write_tables(results, found, tmp_path)
+    assert document.read_text().count("**") >= 2 * len(found)
+    content = json.loads(data.read_text())
+    assert len(content["results"]) == 8
+    assert content["results"][0]["values"]["tool_rms"] > 0.0
+
+
+@pytest.mark.slow
+def test_the_report_is_complete_and_asks_nothing_of_the_network(small):
+    folder, results = small
+    page = mapping_report_html(results, tables(results), provenance={"command": "x"}, folder=folder / "recordings")
+    assert page.count("<svg") >= 3
+    assert "default-src 'none'" in page
+    assert "Show in 3-D" in page
+    assert 'id="method-modern"' in page
+    assert 'id="method-m3"' in page
+    assert "0 of 4 recordings" in page
+    assert not re.search(r"""(?:src|href)\s*=\s*["'](?:https?:)?//""", page)
+
+
+def test_every_claim_is_judged_by_the_data():
+    """With nothing run there is nothing that held."""
+    table = claims_table(Results([]), [])
+    assert len(table.rows) == len(thesis_table.CLAIMS)
+    assert {row[2] for row in table.rows} == {"not run"}

@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+
+from imitarm.benchmark import experiment as experiments
+from imitarm.benchmark.experiment import LIVE, Experiment, Result
+from imitarm.benchmark.mapping_methods import METHODS
+from imitarm.benchmark.running import run_all
+from imitarm.errors import FileFormatError, InputError, UnknownNameError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.retarget import RETARGETERS
+
+SHORT = 4.0
+ONE = Experiment("inside", "m3", seconds=SHORT)
+
+
+def stamps(folder):
+    return {path.name: path.stat().st_mtime_ns for path in (Path(folder) / "runs").iterdir()}
+
+
+def without_clock(result):
+    return {**asdict(result), "seconds": 0.0}
+
+
+def test_a_run_is_the_same_every_time_and_whoever_made_the_recording(tmp_path):
+    alone, first, second = ONE.run(), ONE.run(tmp_path), ONE.run(tmp_path)
+    assert alone.failure == ""
+    assert without_clock(alone) == without_clock(first) == without_clock(second)
+    assert alone.value("led_share") > 0.5
+
+
+def test_a_result_is_read_as_it_was_written(tmp_path):
+    done = ONE.run()
+    never = Result(done.experiment, done.version, {**done.values, "settling_time": float("nan")}, "", 1.0)
+    for result in (done, never):
+        read = Result.load(result.save(tmp_path))
+        assert json.dumps(read.values) == json.dumps(
+            {k: list(v) if isinstance(v, tuple) else v for k, v in result.values.items()}
+        )
+        assert read.experiment == ONE
+    assert [p.suffix for p in tmp_path.iterdir()] == [".json"]
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[1]", '{"format": "imitarm-result", "version": 99}', "\x00"])
+def test_a_foreign_file_is_no_result(tmp_path, content):
+    path = tmp_path / "r.json"
+    path.write_text(content)
+    with pytest.raises(FileFormatError, match="delete it and run again"):
+        Result.load(path)
+
+
+def test_what_was_run_is_not_run_again(tmp_path):
+    wanted = [ONE, replace(ONE, method="modern")]
+    told = []
+    first = run_all(wanted, tmp_path, jobs=1, on_done=lambda done, of: told.append((done, of)))
+    assert told == [(0, 2), (1, 2), (2, 2)]
+    before = stamps(tmp_path)
+    assert len(list((tmp_path / "recordings").iterdir())) == 1  # one for both
+    told.clear()
+    again = run_all(wanted, tmp_path, jobs=1, on_done=lambda done, of: told.append((done, of)))
+    assert told == [(2, 2)]
+    assert stamps(tmp_path) == before
+    assert [without_clock(r) for r in first] == [without_clock(r) for r in again]
+    run_all(wanted[:1], tmp_path, jobs=1, fresh=True)
+    assert stamps(tmp_path) != before
+
+
+def test_another_setting_or_another_code_is_another_run(tmp_path, monkeypatch):
+    places = {Result.path(tmp_path, e) for e in (ONE, replace(ONE, seconds=5.0), replace(ONE, sigma=0.01))}
+    monkeypatch.setattr(experiments, "code_version", lambda: "0+other")
+    places.add(Result.path(tmp_path, ONE))
+    assert len(places) == 4
+
+
+def test_a_damaged_result_is_run_again(tmp_path):
+    run_all([ONE], tmp_path, jobs=1)
+    path = Result.path(tmp_path / "runs", ONE)
+    whole = json.loads(path.read_text())
+    path.write_text(path.read_text()[:200])
+    (done,) = run_all([ONE], tmp_path, jobs=1)
+    assert json.loads(path.read_text())["values"] == whole["values"]
+    assert done.failure == ""
+
+
+def test_a_task_that_cant_be_done_is_a_result_that_says_why(tmp_path):
+    (done,) = run_all([Experiment("captured", "m3", data=str(tmp_path))], tmp_path, jobs=1)
+    assert "--data" in done.failure
+    assert not done.values
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupted_benchmark_goes_on_where_it_was(tmp_path, how):
+    script = (
+        "import sys\n"
+        "from imitarm.benchmark.experiment import Experiment\n"
+        "from imitarm.benchmark.running import run_all\n"
+        "if __name__ == '__main__':\n"
+        "    run_all([Experiment('inside', 'm3', seed=s, seconds=4.0) for s in range(12)], sys.argv[1], jobs=1)\n"
+    )
+    program = tmp_path / "program.py"
+    program.write_text(script)
+    out = tmp_path / "out"
+    child = subprocess.Popen([sys.executable, program, out], stderr=subprocess.PIPE, start_new_session=True)
+    for _ in range(2400):
+        if (out / "runs").is_dir() and len(list((out / "runs").glob("*.json"))) >= 2:
+            break
+        time.sleep(0.05)
+    if how == signal.SIGKILL:
+        os.killpg(child.pid, how)
+    else:
+        child.send_signal(how)
+    child.communicate(timeout=60)
+    assert child.returncode != 0
+    kept = sorted((out / "runs").glob("*.json"))
+    assert 2 <= len(kept) < 12
+    before = stamps(out)
+    wanted = [Experiment("inside", "m3", seed=s, seconds=4.0) for s in range(4)]
+    results = run_all(wanted, out, jobs=1)
+    assert all(r.failure == "" for r in results)
+    after = stamps(out)
+    assert all(after[path.name] == before[path.name] for path in kept)
+
+
+def test_workers_of_joblib_give_the_same(tmp_path):
+    pytest.importorskip("joblib")
+    wanted = [ONE]
+    local = run_all(wanted, tmp_path / "a", jobs=1)
+    joblib = run_all(wanted, tmp_path / "b", jobs=1, backend="threading")
+    assert [without_clock(r) for r in local] == [without_clock(r) for r in joblib]
+    with pytest.raises(InputError, match="nowhere"):
+        run_all(wanted, tmp_path / "c", backend="nowhere")
+
+
+def test_a_folder_that_cant_be_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="another folder"):
+        run_all([ONE], tmp_path / "file" / "x")
+
+
+@pytest.mark.parametrize(
+    "bad", [{"task": "dance"}, {"method": "magic"}, {"robot": "r2d2"}, {"task": LIVE, "robot": "panda"}, {"seed": -1}]
+)
+def test_what_is_no_experiment_is_refused(bad):
+    with pytest.raises((InputError, UnknownNameError)):
+        Experiment(**{"task": "inside", "method": "modern", **bad})
+
+
+def test_every_method_is_a_row_and_every_row_can_be_built():
+    assert set(RETARGETERS) <= set(METHODS)
+    for row in METHODS.values():
+        assert row(ArmModel.load("sawyer", tool="gripper"), None).name == row.retargeter

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from imitarm import cli
+from imitarm.benchmark.mapping import BEGIN, END
+
+SMALL = ("benchmark", "mapping", "--people", "1", "--seconds", "4", "--kinds", "inside", "--no-live", "--jobs", "1")
+
+
+@pytest.mark.slow
+def test_one_command_prints_tables_and_leaves_files(tmp_path, capsys):
+    out, page, document = tmp_path / "out", tmp_path / "page.html", tmp_path / "doc.md"
+    document.write_text(f"before\n{BEGIN}\n{END}\nafter\n")
+    words = [*SMALL, "--methods", "modern", "m3", "--out", str(out), "--report", str(page), "--fill", str(document)]
+    assert cli.main(words) == 0
+    printed = capsys.readouterr()
+    for said in ("What the thesis claims", "Table 3.1", "Accuracy, inside", "Limits broken", "held?"):
+        assert said in printed.out
+    assert "--data" in printed.err  # what was left out is said
+    assert (out / "mapping.md").read_text().startswith("**What the thesis claims")
+    assert len(json.loads((out / "mapping.json").read_text())["results"]) == 2
+    assert "<svg" in page.read_text()
+    assert "Accuracy, inside" in document.read_text()
+    assert str(tmp_path) not in document.read_text()
+    kept = {path: path.stat().st_mtime_ns for path in (out / "runs").iterdir()}
+    assert cli.main(words) == 0
+    assert {path: path.stat().st_mtime_ns for path in (out / "runs").iterdir()} == kept
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--people", "0"], "people"),
+        (["--jobs", "0"], "--jobs"),
+        (["--sigma", "500"], "sigma"),
+        (["--seconds", "1"], "seconds"),
+        (["--data", "nowhere"], "no such folder"),
+        (["--report", "nowhere/page.html"], "--report"),
+        (["--fill", "nowhere.md"], "can't be read"),
+        (["--methods", "magic"], "modern"),
+        (["--kinds", "dance"], "edge"),
+    ],
+)
+def test_what_is_wrong_is_said_before_the_work(more, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*SMALL, *more]) == 2
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_avoidance_benchmark_stands_beside_it(capsys):
+    assert cli.main(["benchmark", "avoidance", "--seeds", "1", "--methods", "certified"]) == 0
+    printed = capsys.readouterr().out
+    assert "1 scenes a row" in printed
+    assert "gap too narrow" in printed
+    assert cli.main(["benchmark", "avoidance", "--seeds", "0"]) == 2
+    assert cli.main(["benchmark"]) == 2
