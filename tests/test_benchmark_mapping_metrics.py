@@ -95,3 +95,19 @@ def test_a_robot_that_never_moved_has_followed_nobody(followed):
     assert found.mean_torque == pytest.approx(np.abs(ARM.gravity_torque(ARM.home)))
     assert found.mean_motion_torque == pytest.approx(np.zeros(7), abs=1e-9)
     assert (found.teaching_time, found.failures) == (12.5, 2)
+
+
+def test_a_slowed_motion_is_compared_with_the_moment_it_reproduces(followed):
+    """Every sample twice, as if it were done at half the speed: as accurate as before, when its clock is told."""
+    run, correspondence, true = followed
+    n = len(run.times)
+    twice = np.repeat(np.arange(n), 2)
+    slowed = Retargeting(
+        *("slow", ARM, 0.01 * np.arange(2 * n), run.joints[twice], 0.5 * run.velocities[twice]),
+        *((run.targets[0][twice], run.targets[1][twice]), run.elbows[twice], run.closed[twice], run.states[twice], {}),
+    )
+    told = TrueArm(run.times[twice], *(a[twice] for a in (true.shoulder, true.elbow, true.wrist, true.hand)))
+    found, before = measure(slowed, correspondence, told), measure(run, correspondence, true)
+    assert found.tool_rms == pytest.approx(before.tool_rms, rel=0.02)
+    assert found.lag == pytest.approx(before.lag, abs=0.01)
+    assert found.duration > 1.9 * before.duration

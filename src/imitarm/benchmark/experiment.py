@@ -13,6 +13,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import imitarm
 from imitarm.benchmark.mapping_methods import method
 from imitarm.benchmark.mapping_metrics import measure
@@ -118,11 +120,12 @@ class Experiment:
 
     def _replayed(self, folder: Path | None) -> dict[str, Any]:
         recording = self.recording(folder)
-        run = method(self.method)(_arm(self.robot), recording.correspondence).run(recording.skeletons, recording.start)
-        return {
-            **asdict(measure(run, recording.correspondence, recording.true_arm(run.times))),
-            "notes": dict(run.notes),
-        }
+        retargeter = method(self.method)(_arm(self.robot), recording.correspondence)
+        run = retargeter.run(recording.skeletons, recording.start)
+        # a method that slows the motion afterwards is measured against the moment that it reproduces
+        clock = np.asarray(getattr(retargeter, "clock", run.times), dtype=float)
+        metrics = measure(run, recording.correspondence, recording.true_arm(clock))
+        return {**asdict(metrics), "notes": dict(run.notes)}
 
     def _live(self) -> dict[str, Any]:
         return asdict(run_trial(StackingTrial(self.method, self.seed, self.repeat, self.sigma), _arm(self.robot)))

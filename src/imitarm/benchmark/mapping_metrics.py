@@ -124,8 +124,8 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
     Args:
         run: of the method.
         correspondence: that the method was given.
-        true: where the person's arm was at the times of the run; None when it is not known, as with a real camera:
-            what needs it is nan.
+        true: where the person's arm was at the times of the run, or, for a method that slows the motion afterwards, at
+            the moments that it reproduces; None when it is not known, as with a real camera: what needs it is nan.
 
     Raises:
         InputError: when the run is shorter than 4 control periods or a joint position is not finite.
@@ -212,7 +212,7 @@ def _settling(
         if not hold.led[-1]:
             return math.nan
         targets = reference_positions(true, motion.tool, hold, correspondence.scale)[late]
-    end = motion_end(true.times, true.wrist)
+    end = motion_end(run.times, true.wrist)
     return settling_time(run.times, motion.tool, targets.mean(axis=0), end)
 
 

@@ -46,6 +46,8 @@ ACCURACY = (
     Figure("elbow_angle_rms", "elbow's swing [°]", _DEGREES),
 )
 EFFORT = (
+    Figure("duration", "motion [s]"),
+    Figure("teaching_time", "teaching [s]"),
     Figure("path_length", "path [m]", digits=2),
     Figure("settling_time", "settled after [s]", digits=2),
     Figure("effort", "∫τ² [N²m²s]", digits=0),
@@ -61,8 +63,8 @@ COMPARED = (
     ACCURACY[0],
     ACCURACY[1],
     ACCURACY[5],
-    EFFORT[0],
-    EFFORT[1],
+    Figure("path_length", "path [m]", digits=2),
+    Figure("settling_time", "settled after [s]", digits=2),
     Figure("mean_torque", "mean torque [N m]", digits=2),
     Figure("broken_limits", "frames beyond a limit", digits=0),
     SMOOTHNESS[0],
@@ -134,7 +136,7 @@ def accuracy_table(results: Results, task: str) -> Table:
 
 def effort_table(results: Results, tasks: Sequence[str]) -> Table:
     """Return path, settling and torque."""
-    return _figures(results, tasks, EFFORT, "Path, settling, torques")
+    return _figures(results, tasks, EFFORT, "Times, path, torques")
 
 
 def smoothness_table(results: Results, tasks: Sequence[str]) -> Table:

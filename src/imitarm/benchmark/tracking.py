@@ -32,7 +32,7 @@ class TrueArm:
     """Where a person's arm truly was, in the axes of the robot's base.
 
     Attributes:
-        times: on the clock of the run it is compared with, shape (n,) [s].
+        times: of each sample of the run it is compared with, shape (n,) [s]; they never go back.
         shoulder: shape (n, 3) [m].
         elbow: shape (n, 3) [m].
         wrist: shape (n, 3) [m].
