@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.retarget.advice_operators import (
-    PULLED_TO,
     SPEED_LEFT,
     TURNS,
     elbow_turned,
+    pull,
     pulled_in,
     repaired,
     slowed,
@@ -104,7 +104,7 @@ class Advice:
         factor = float(self._infeasible.speeds(window).max(initial=0.0)) / SPEED_LEFT
         if SPEED_LEFT * factor > 1.0 and factor <= _SLOWEST:
             yield "slowed", *slowed(motion, first, past, weight, factor)
-        kappa = np.minimum(1.0, PULLED_TO / np.maximum(self._infeasible.stretch(window), 1e-9))
+        kappa = pull(motion.points[first:past], window)
         if kappa.min() < 1.0:
             points = pulled_in(motion.points[first:past], 1.0 + weight * (kappa - 1.0))
             yield from self._mapped("pulled_in", with_points(motion, first, past, points), first, past)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from imitarm.retarget.infeasible import Infeasible
+from imitarm.retarget.infeasible import ELBOW, Infeasible
 from imitarm.retarget.shown_motion import ShownMotion
 
 Array = NDArray[np.float64]
@@ -44,6 +44,25 @@ def slowed(motion: ShownMotion, first: int, past: int, weight: Array, factor: fl
     where = np.interp(np.arange(np.ceil(passed[-1]) + 1), passed, np.arange(len(motion)))
     last = past + round(passed[-1] - (len(motion) - 1))
     return motion.at(where), min(last, len(where))
+
+
+def pull(points: Array, joints: Array) -> Array:
+    r"""Return how far to pull the wrist in so that the robot is stretched to 78/80 at most, :math:`\kappa`, (n,).
+
+    Where the robot's elbow is the person's, that is :math:`\kappa = 0.78/(\rho |W - S|)` as METHODS has it; where it is
+    not (a relative mapping), the person's elbow has to bend by what the robot's lacks.
+
+    Args:
+        points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
+        joints: of the robot, shape (n, n_joints) [rad].
+    """
+    s, e, w = np.moveaxis(points, 1, 0)
+    upper, fore, reach = _length(e - s), _length(w - e), _length(w - s)
+    lacking = np.maximum(2.0 * np.arccos(PULLED_TO) - np.abs(joints[:, ELBOW]), 0.0)
+    cosine = (reach**2 - upper**2 - fore**2) / (2.0 * upper * fore)
+    bend = np.arccos(np.clip(cosine, -1.0, 1.0)) + lacking
+    near = np.sqrt(upper**2 + fore**2 + 2.0 * upper * fore * np.cos(np.minimum(bend, np.pi)))
+    return np.where(lacking > 0.0, np.minimum(near / np.maximum(reach, 1e-9), 1.0), 1.0)
 
 
 def pulled_in(points: Array, kappa: Array) -> Array:

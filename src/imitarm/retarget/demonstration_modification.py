@@ -65,6 +65,11 @@ class DemonstrationModification(RivalRetargeter):
         advice_time: that a teacher takes for each segment besides watching it [s].
         seed: of the samples that repair key frames.
 
+    Attributes:
+        infeasible: what the arm can't do.
+        clock: for each sample of the last run when the person did it, from the first skeleton on, shape (n,) [s]:
+            a slowed motion is later than its clock. Empty before.
+
     Raises:
         InputError: when the arm has not the axes of a person's arm, or a number can't be used.
     """
@@ -87,8 +92,9 @@ class DemonstrationModification(RivalRetargeter):
         if not 0.0 <= advice_time < np.inf:
             raise InputError(f"DemonstrationModification: advice_time must not be negative [s], got {advice_time!r}")
         self._mapping = JointMapping(arm, relative=relative)
-        self.infeasible = Infeasible(arm, dt, self._mapping.reach, constraints)
+        self.infeasible = Infeasible(arm, dt, constraints)
         self._advice_time, self._seed = advice_time, seed
+        self.clock = np.empty(0)
         super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
 
     def _restart(self, q: Array) -> None:
@@ -128,6 +134,7 @@ class DemonstrationModification(RivalRetargeter):
         self.start(self.arm.home if q is None else q)
         rng = np.random.default_rng(self._seed)
         commands, now = [self.command], frames[0].time
+        self.clock = np.empty(0)
         lessons: list[Advice] = []
         performed = 0
         for estimates in holds(frames, self.correspondence, HOLD):
@@ -140,8 +147,10 @@ class DemonstrationModification(RivalRetargeter):
             performed -= len(commands)
             self._perform(commands, motion, clutch)
             performed += len(commands)
+            self._told(commands, motion.clock - frames[0].time)
             now = last.time
         self._rest(commands, frames[-1].time - now)
+        self._told(commands, np.empty(0))
         return Retargeting.of(self, commands, {**self.notes, **self._notes_of(lessons, performed)})
 
     def _notes_of(self, lessons: Sequence[Advice], performed: int) -> dict[str, float]:
@@ -154,6 +163,14 @@ class DemonstrationModification(RivalRetargeter):
             "execution_time": self.dt * performed,
             "teaching_time": watched + self._advice_time * counts["segments"],
         }
+
+    def _told(self, commands: list[Command], clock: Array) -> None:
+        """Complete ``clock`` up to the last command; the last ones are at ``clock``, what is before them at rest."""
+        rest = len(commands) - len(self.clock) - len(clock)
+        begin = float(self.clock[-1]) if len(self.clock) else -self.dt
+        waited = begin + self.dt * np.arange(1, rest + 1)
+        ahead = float(clock[0]) if len(clock) else np.inf
+        self.clock = np.concatenate([self.clock, np.minimum(waited, ahead), clock])
 
     def _rest(self, commands: list[Command], duration: float) -> None:
         """Stand still for a while, at the end or between two holds."""
@@ -172,9 +189,10 @@ class DemonstrationModification(RivalRetargeter):
             at = approach.towards(at, start)
             path.append((0, at))
         for i, q in (*path, *enumerate(motion.joints)):
-            estimate = motion.estimate(i)
-            target = clutch.target(motion.shown[i], motion.hands[i])
-            done = Command(0.0, q, q, motion.closed[i], "following", target, estimate.upper_arm)
+            shoulder, elbow, wrist = motion.shown[i]
+            upper = (elbow - shoulder) / max(float(np.linalg.norm(elbow - shoulder)), 1e-9)
+            target = clutch.target(wrist, motion.hands[i])
+            done = Command(0.0, q, q, motion.closed[i], "following", target, upper)
             self._order(commands, done, q)
 
     def _order(self, commands: list[Command], command: Command, wanted: Array) -> None:

@@ -17,6 +17,7 @@ Mask = NDArray[np.bool_]
 
 SINGULAR = 0.03  # least singular value of the tool's Jacobian, in m and rad, below which a posture is singular
 STRETCHED = 0.79 / 0.80  # share of the reach beyond which the wrist is too far from the shoulder
+ELBOW = 3  # index of the joint that bends the elbow; at zero the arm is straight
 DILATION = 0.2  # [s] by which what is infeasible is widened on both sides
 _WITHIN = 1e-6  # [rad] a joint may be so far beyond its limit
 
@@ -51,22 +52,19 @@ class Infeasible:
     r"""The predicate F of M1 (METHODS B).
 
     It is true where a joint is beyond a limit of position or velocity, where the arm is singular
-    (:math:`s_{min} < 0.03`) or stretched (:math:`|W - S|` above 79/80 of the reach), or a constraint does not hold.
+    (:math:`s_{min} < 0.03`) or stretched (:func:`stretch` above 79/80), or a constraint does not hold.
 
     Args:
         arm: the robot's arm with its tool.
         dt: sampling period [s].
-        reach: largest distance from shoulder to wrist [m]; inf: not looked at.
         constraints: more of them, by name.
 
     Raises:
         InputError: when a constraint has the name of one of the predicates above.
     """
 
-    def __init__(
-        self, arm: ArmModel, dt: float, reach: float, constraints: Mapping[str, Constraint] | None = None
-    ) -> None:
-        self.arm, self.dt, self.reach = arm, dt, reach
+    def __init__(self, arm: ArmModel, dt: float, constraints: Mapping[str, Constraint] | None = None) -> None:
+        self.arm, self.dt = arm, dt
         self.constraints = {} if constraints is None else dict(constraints)
         taken = sorted({"limits", "speed", "singular", "stretched"} & set(self.constraints))
         if taken:
@@ -98,7 +96,7 @@ class Infeasible:
         found: dict[str, Mask] = {
             "limits": self.outside(joints),
             "singular": np.linalg.svd(jacobians, compute_uv=False)[:, -1] < SINGULAR,
-            "stretched": self.stretch(joints) > STRETCHED,
+            "stretched": stretch(joints) > STRETCHED,
         }
         if self.constraints:
             positions, quaternions = self.arm.tool_path(joints)
@@ -122,12 +120,15 @@ class Infeasible:
         beyond = (joints < self.arm.lower - _WITHIN) | (joints > self.arm.upper + _WITHIN)
         return np.asarray(beyond.any(axis=1))
 
-    def stretch(self, joints: Array) -> Array:
-        """Return the distance from shoulder to wrist over the reach, shape (n,)."""
-        if not np.isfinite(self.reach):
-            return np.zeros(len(joints))
-        ends = np.array([self.arm.sew_points(q)[[0, 2]] for q in joints]).reshape(-1, 2, 3)
-        return np.asarray(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / self.reach)
+
+def stretch(joints: Array) -> Array:
+    r"""Return how far the arm is stretched, shoulder to wrist over the reach, shape (n,), for joints (n, n_joints).
+
+    It is that of the person's chain, on which the joints were mapped: upper arm and forearm in line with the joints'
+    axes and equally long (Sawyer's are 0.412 and 0.411 m), so :math:`|\cos(q_3/2)|`. The offsets between a robot's
+    links would let its own distance from shoulder to wrist be largest where the elbow is bent.
+    """
+    return np.asarray(np.abs(np.cos(0.5 * joints[:, ELBOW])))
 
 
 def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
@@ -138,9 +139,7 @@ def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
         dt: sampling period [s].
     """
     wide = round(DILATION / dt)
-    dilated = np.convolve(found, np.ones(2 * wide + 1), mode="same")[: len(found)] > 0.5 if len(found) else found
-    if 2 * wide + 1 > len(found):  # then numpy returns as many as the window is long
-        dilated = np.full(len(found), bool(found.any()))
+    dilated = np.convolve(found, np.ones(2 * wide + 1))[wide : wide + len(found)] > 0.5
     edges = np.flatnonzero(np.diff(np.concatenate([[False], dilated, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 

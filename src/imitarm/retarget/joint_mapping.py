@@ -46,7 +46,6 @@ class JointMapping:
     Attributes:
         zero: the posture in which the arm is stretched forward, shape (7,) [rad].
         sense: of each joint against the person's, 1 or -1, shape (7,).
-        reach: from the robot's shoulder to its wrist in that posture [m]; inf when its file marks neither.
 
     Raises:
         InputError: when the arm has not the axes of a person's arm.
@@ -57,8 +56,6 @@ class JointMapping:
         self.zero, self.sense = _chain_of(arm)
         stretched = arm.tool_pose(self.zero).rotation
         self._tool_to_hand = stretched.T  # chain(theta) = R_tool(q) R_tool(q*)^T
-        ends = None if arm.landmarks is None else arm.sew_points(self.zero)
-        self.reach = float("inf") if ends is None else float(np.linalg.norm(ends[2] - ends[0]))
         self.start(arm.home)
 
     def start(self, q: Array) -> None:
@@ -116,11 +113,14 @@ class JointMapping:
             theta: the person's angles, shape (7,) [rad].
             hand: wanted rotation of the robot's hand: the tool's times that of the stretched arm back, shape (3, 3).
         """
+        begins = self._origin is None
         if self._origin is None:
             self._origin = self._q, theta
         q0, theta0 = self._from
         q = q0 + self.sense * (theta - theta0)
-        q[:4] = continued(q[:4], self._q[:4], self.arm.lower[:4], self.arm.upper[:4])
+        q[:4] = continued(q[:4], self._q[:4])
+        if begins:  # a whole turn may bring a joint into its limits; later that would be a jump
+            q[:4] = _turned_back(q[:4], self.arm.lower[:4], self.arm.upper[:4])
         chain = self.sense * (q - self.zero)
         _, _, forearm = human_arm_pose(np.concatenate([chain[:4], np.zeros(3)]), _ANY)
         held = np.concatenate([np.zeros(4), self.sense[4:] * (self._q[4:] - self.zero[4:])])
@@ -153,17 +153,16 @@ class Approach:
         return goal
 
 
-def continued(angles: Array, before: Array, lower: Array | None = None, upper: Array | None = None) -> Array:
-    """Return angles less whole turns, so that each is the nearest to the one before, shape (n,) [rad].
+def continued(angles: Array, before: Array) -> Array:
+    """Return angles less whole turns, so that each is the nearest to the one before, shape (n,) [rad]."""
+    return np.asarray(before + (angles - before + np.pi) % (2.0 * np.pi) - np.pi)
 
-    With limits, an angle beyond them is turned back into them by a whole turn where that helps.
-    """
-    near = before + (angles - before + np.pi) % (2.0 * np.pi) - np.pi
-    if lower is None or upper is None:
-        return np.asarray(near)
-    turned = near - 2.0 * np.pi * np.sign(near)
-    outside = (near < lower) | (near > upper)
-    return np.where(outside & (turned >= lower) & (turned <= upper), turned, near)
+
+def _turned_back(angles: Array, lower: Array, upper: Array) -> Array:
+    """Turn angles that are beyond their limits by a whole turn where that brings them inside, shape (n,) [rad]."""
+    turned = angles - 2.0 * np.pi * np.sign(angles)
+    helps = ((angles < lower) | (angles > upper)) & (turned >= lower) & (turned <= upper)
+    return np.where(helps, turned, angles)
 
 
 def _chain_of(arm: ArmModel) -> tuple[Array, Array]:

@@ -26,9 +26,9 @@ class ShownMotion:
         clock: when the person did it [s], on the recording's clock, shape (n,); evenly spaced until it is slowed.
         points: shoulder, elbow, wrist in the base frame, shape (n, 3, 3) [m]; operators change them.
         hands: rotations of the hand, wxyz, shape (n, 4).
-        shown: wrists as the person had them, shape (n, 3) [m]; no operator changes them.
+        shown: points as the person had them, shape (n, 3, 3) [m]; no operator changes them.
         closed: whether the hand was closed; None where not known.
-        joints: of the robot, shape (n, n_joints) [rad]; empty until they are mapped.
+        joints: of the robot, shape (n, n_joints) [rad]; without columns until they are mapped.
     """
 
     clock: Array
@@ -48,7 +48,7 @@ class ShownMotion:
         hands = slerp(clock, times, np.array([e.hand for e in estimates]))
         last = np.searchsorted(times, clock + 1e-9, side="right") - 1
         closed = tuple(estimates[int(i)].closed for i in last)
-        return cls(clock, points, hands, points[:, 2], closed, np.empty((0, 0)))
+        return cls(clock, points, hands, points, closed, np.empty((len(clock), 0)))
 
     def __len__(self) -> int:
         return len(self.clock)
@@ -67,14 +67,15 @@ class ShownMotion:
         """Return the motion read at fractional sample numbers, shape (m,): slower where they lie closer together."""
         n = np.arange(len(self))
         near = tuple(self.closed[int(i)] for i in np.clip(where.astype(int), 0, len(self) - 1))
-        flat = np.concatenate(
-            [self.points.reshape(len(self), -1), self.shown, self.joints, self.clock[:, None]], axis=1
-        )
-        read = np.column_stack([np.interp(where, n, column) for column in flat.T])
-        points, shown, joints, clock = np.split(read, [9, 12, read.shape[1] - 1], axis=1)
-        return ShownMotion(
-            clock[:, 0], points.reshape(-1, 3, 3), slerp(where, n.astype(float), self.hands), shown, near, joints
-        )
+
+        def read(columns: Array) -> Array:
+            flat = columns.reshape(len(self), -1)
+            values = [np.interp(where, n, column) for column in flat.T]
+            return np.stack(values, axis=1).reshape(len(where), *columns.shape[1:])
+
+        hands = slerp(where, n.astype(float), self.hands)
+        clock = np.interp(where, n, self.clock)
+        return ShownMotion(clock, read(self.points), hands, read(self.shown), near, read(self.joints))
 
     def with_joints(self, joints: Array) -> ShownMotion:
         """Return the motion with other joints, shape (n, n_joints) [rad]."""
