@@ -34,14 +34,14 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
         InputError: when the source or an option is wrong.
         TaskFailedError: when fewer than two skeletons came.
     """
+    going_on = live(arguments.source)
+    if going_on and (arguments.trim is not None or arguments.pace != 1.0):
+        raise InputError("--trim, --pace: what is live can't be cut or slowed; record it by 'imitarm capture' first")
     source = open_source(arguments.source)
     truth = source.truth if isinstance(source, SyntheticSource) else None
     notes: list[str] = []
     if isinstance(source, SkeletonRecording):
         source, notes = _mended(source, arguments.person)
-    going_on = live(arguments.source)
-    if going_on and (arguments.trim is not None or arguments.pace != 1.0):
-        raise InputError("--trim, --pace: what is live can't be cut or slowed; record it by 'imitarm capture' first")
     if going_on and arguments.seconds is None:
         remark("capturing; press Ctrl-C to end")
     with followed(source, person=arguments.person) as one:

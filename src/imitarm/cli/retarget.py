@@ -16,6 +16,7 @@ from imitarm.benchmark.seen_arm import seen_arm
 from imitarm.capture.motions import Truth
 from imitarm.capture.skeleton import SIDES, Skeleton
 from imitarm.capture.slowing import slowed
+from imitarm.cli.driven import driven
 from imitarm.cli.gathering import source_help
 from imitarm.cli.merit import judged
 from imitarm.cli.person import person_of
@@ -38,6 +39,7 @@ examples:
   imitarm retarget wave.csv --fit --out wave_sawyer.csv --report wave.html
   imitarm retarget wave.csv --robot panda --tool gripper --calibration calibration.json --scene cups.yaml
   imitarm retarget dance.csv --side left --trim 2 8 --pace 0.5 --orientation fixed
+  imitarm retarget wave.csv --fit --pace 0.5 --drive
   imitarm retarget synthetic:7 --method all --report compare.html
   imitarm learn wave_*.csv --task wave --out wave.json
 
@@ -57,6 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--tool", metavar="NAME", help=f"{', '.join(TOOLS)} or an MJCF file")
     parser.add_argument("--method", choices=(*RETARGETERS, "all"), default="modern", help="default: modern")
+    parser.add_argument(
+        "--drive", action="store_true", help="let the simulated robot do it, drives and all, and measure"
+    )
     parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles that 'modern' keeps clear of (YAML)")
     person = parser.add_argument_group("the person")
     person.add_argument("--side", choices=SIDES, help="the arm; default: as the calibration says, else right")
@@ -111,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
     scene.check()
     skeletons, findings, truth = person_of(arguments, correspondence.side)
     setting = _setting(arguments, arm, correspondence, scene, skeletons)
-    done = [_retargeted(name, setting, skeletons, truth) for name in names]
+    done = [_retargeted(name, setting, skeletons, truth, drive=arguments.drive) for name in names]
     _show([result for result, _ in done])
     for result, _ in done:
         for note in result.notes:
@@ -187,14 +192,19 @@ def _setting(
 
 
 def _retargeted(
-    name: str, setting: _Setting, skeletons: Sequence[Skeleton], truth: Truth | None
+    name: str, setting: _Setting, skeletons: Sequence[Skeleton], truth: Truth | None, *, drive: bool
 ) -> tuple[MethodResult, MappingMetrics]:
     """Let one method retarget the recording, and measure what it made of it."""
     retargeter: Retargeter = RETARGETERS[name](setting.arm, setting.correspondence, dt=PERIOD, scene=setting.scene)
     duration = max(skeletons[-1].time - skeletons[0].time, PERIOD)
     with watched(f"retargeting by {name}", lambda: retargeter.command.time / duration):
         made = retargeter.run(skeletons, setting.q)
-    return judged(made, skeletons, setting.correspondence, truth)
+    result, metrics = judged(made, skeletons, setting.correspondence, truth)
+    if drive:
+        shares = [0.0]
+        with watched(f"driving {setting.arm.name}", lambda: shares[-1]):
+            result = driven(result, setting.scene, shares.append)
+    return result, metrics
 
 
 def _demonstration(made: Retargeting, task: str, source: str, whole: bool) -> Demonstration:

@@ -1,0 +1,258 @@
+from __future__ import annotations
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from imitarm import ArmModel, Demonstration, Pose, Scene, Skill, Sphere, save_scene
+from imitarm.capture.camera_model import SkeletonCamera
+from imitarm.capture.motions import reaching
+from imitarm.capture.person import Person
+from imitarm.capture.recording import SkeletonRecording
+from imitarm.capture.skeleton import JOINT, Skeleton
+from imitarm.capture.synthetic import SyntheticSource
+from imitarm.cli import main
+from imitarm.cli.screen import watched
+from imitarm.retarget import RETARGETERS, LimbLengths
+from imitarm.retarget.calibration import Calibration
+from recording_samples import changed, exchanged, skeletons
+
+ARM = ArmModel.load("sawyer", tool="gripper")
+
+
+def reach(camera: int, duration: float = 5.0) -> list[Skeleton]:
+    """The same reach of the same person, seen by different cameras."""
+    truth = reaching(Person.from_seed(3), 3, duration=duration)
+    return list(SyntheticSource(truth, SkeletonCamera(camera, sigma=0.004, dropout=0.0), duration))
+
+
+def saved(path, frames):
+    SkeletonRecording(frames).save(path)
+    return str(path)
+
+
+@pytest.fixture
+def shown(tmp_path):
+    return saved(tmp_path / "reach.csv", reach(0))
+
+
+def run(*words) -> int:
+    return main(["retarget", *map(str, words), "--tool", "gripper"])
+
+
+def test_a_recording_becomes_a_demonstration_within_the_limits(shown, tmp_path, capsys):
+    out = tmp_path / "demo.csv"
+    assert run(shown, "--out", out, "--task", "reach") == 0
+    printed = capsys.readouterr().out
+    for words in ("following", "tool to its own target, RMS [mm]", "beyond a limit of acceleration", f"wrote {out}"):
+        assert words in printed
+    demo = Demonstration.load(out)
+    assert demo.task == "reach" and demo.joint_names == ARM.joint_names
+    times, joints = demo.trajectory.times, demo.joints
+    np.testing.assert_allclose(times, 0.01 * np.arange(len(times)), atol=1e-9)
+    assert 3.0 < times[-1] < 4.6  # the half second before it took hold is cut off
+    assert np.abs(np.diff(joints[:60], axis=0)).max() > 1e-4  # and it moves soon
+    velocity = np.diff(joints, axis=0) / 0.01
+    assert (np.abs(velocity) <= ARM.max_velocity * (1.0 + 1e-9)).all()
+    np.testing.assert_allclose(ARM.tool_pose(joints[-1]).position, demo.trajectory.positions[-1], atol=1e-9)
+
+
+def test_the_waiting_can_be_kept(shown, tmp_path):
+    files = [tmp_path / f"{name}.csv" for name in ("cut", "whole")]
+    assert run(shown, "--out", files[0]) == 0
+    assert run(shown, "--out", files[1], "--keep-waiting") == 0
+    cut, whole = map(Demonstration.load, files)
+    assert whole.trajectory.duration > cut.trajectory.duration + 0.4
+    assert np.ptp(whole.joints[:40], axis=0).max() == 0.0
+    np.testing.assert_array_equal(whole.joints[-len(cut) :], cut.joints)
+
+
+@pytest.mark.slow
+def test_several_of_them_are_learnt(tmp_path, capsys):
+    for camera in range(3):
+        saved(tmp_path / f"seen_{camera}.csv", reach(camera))
+        assert run(tmp_path / f"seen_{camera}.csv", "--out", tmp_path / f"demo_{camera}.csv", "--task", "reach") == 0
+    files = [str(tmp_path / f"demo_{camera}.csv") for camera in range(3)]
+    skill = tmp_path / "reach.json"
+    assert (
+        main(["learn", *files, "--robot", "sawyer", "--tool", "gripper", "--task", "reach", "--out", str(skill)]) == 0
+    )
+    assert "0 errors" in capsys.readouterr().out
+    learnt = Skill.load(skill)
+    first = Demonstration.load(files[0]).trajectory
+    assert np.linalg.norm(learnt.start_.position - first.positions[0]) < 0.03
+    assert np.linalg.norm(learnt.goal_.position - first.positions[-1]) < 0.05
+
+
+@pytest.mark.slow
+def test_all_methods_side_by_side(shown, tmp_path, capsys):
+    out, page = tmp_path / "demo.csv", tmp_path / "page.html"
+    assert run(shown, "--method", "all", "--out", out, "--report", page, "--drive") == 0
+    shown_table = capsys.readouterr().out
+    for name in RETARGETERS:
+        assert len(Demonstration.load(tmp_path / f"demo_{name}.csv")) > 100
+    row = next(line for line in shown_table.splitlines() if "driven: worst joint behind, RMS" in line)
+    assert len(row.split("│")) == 2 + 1 + len(RETARGETERS)
+    text = page.read_text(encoding="utf-8")
+    assert text.count('id="tab-method-') == len(RETARGETERS) and "imitarm retarget" in text
+    assert 'class="verdict good"' in text  # modern breaks nothing
+
+
+def test_a_made_up_person_is_a_source_and_is_measured_against_the_truth(tmp_path, capsys):
+    assert run("synthetic:1", "--seconds", 4, "--robot", "panda") == 0
+    printed = capsys.readouterr()
+    assert "tool to the true hand, RMS" in printed.out and "on panda" in printed.out
+    row = next(line for line in printed.out.splitlines() if "tool to the true hand, RMS" in line)
+    assert float(row.split("│")[2]) < 120.0
+
+
+def test_a_calibration_says_side_scale_and_turning_and_options_say_it_better(shown, tmp_path, capsys):
+    file, demos = tmp_path / "calibration.json", [tmp_path / f"{i}.csv" for i in range(3)]
+    person = Person.from_seed(3)
+    lengths = LimbLengths(person.upper_arm, person.forearm)
+    Calibration(side="right", lengths=lengths, scale=0.5, orientation="fixed").save(file)
+    assert run(shown, "--calibration", file, "--out", demos[0]) == 0
+    assert run(shown, "--calibration", file, "--scale", 0.25, "--out", demos[1]) == 0
+    assert run(shown, "--calibration", file, "--side", "left", "--out", demos[2]) == 0
+    assert "the calibration is about the right arm" in capsys.readouterr().err
+    half, quarter, left = (Demonstration.load(path).trajectory for path in demos)
+    assert np.ptp(quarter.positions, axis=0).max() == pytest.approx(
+        0.5 * np.ptp(half.positions, axis=0).max(), rel=0.15
+    )
+    assert np.abs(half.quaternions - half.quaternions[0]).max() < 0.05
+    assert np.ptp(left.positions, axis=0).max() < 0.1  # that arm hangs
+
+
+def test_with_fit_a_motion_that_is_too_large_is_made_smaller(shown, tmp_path, capsys):
+    assert run(shown, "--scale", 3, "--fit", "--pace", 0.5, "--orientation", "fixed", "--out", tmp_path / "a.csv") == 0
+    printed = capsys.readouterr()
+    assert "instead of 3.00, so that all of the motion is in reach" in printed.err
+    assert "slowed to 50 % of its pace" in printed.err
+    assert Demonstration.load(tmp_path / "a.csv").trajectory.duration > 7.0
+    row = next(line for line in printed.out.splitlines() if "tool to its own target" in line)
+    assert float(row.split("│")[2]) < 40.0
+
+
+def test_what_is_in_the_way_is_kept_clear_of(shown, tmp_path):
+    free, round_it, scene = tmp_path / "free.csv", tmp_path / "round.csv", tmp_path / "ball.yaml"
+    assert run(shown, "--out", free) == 0
+    path = Demonstration.load(free)
+    ball = Sphere(path.trajectory.positions[len(path) // 2] - np.array([0.0, 0.0, 0.05]), 0.04)
+    save_scene(Scene(None, [ball]), scene)
+    assert run(shown, "--scene", scene, "--out", round_it) == 0
+
+    def nearest(file):
+        joints = Demonstration.load(file).joints
+        spheres = [ARM.collision_spheres(q) for q in joints[::5]]
+        return min(float((ball.signed_distance(centres) - radii).min()) for centres, radii in spheres)
+
+    assert nearest(free) < 0.0 < nearest(round_it)
+
+
+def test_one_of_two_persons_and_repairs(tmp_path, capsys):
+    frames = [exchanged(s) if i == 60 else s for i, s in enumerate(skeletons(90, person=1))]
+    frames[50] = changed(frames[50], time=frames[49].time)
+    both = sorted(frames + skeletons(60, person=2, away=0.8), key=lambda s: s.time)
+    source = saved(tmp_path / "two.csv", both)
+    assert run(source) == 0
+    told = capsys.readouterr().err
+    for words in ("repaired: kept person 1", "repaired: dropped 1 frames", "exchanged left and right back in 1 frames"):
+        assert words in told
+    assert run(source, "--person", 2) == 0
+    assert "kept person" not in capsys.readouterr().err
+    assert run(source, "--person", 5) == 2
+    assert "person 5 is not in it; there is: 1, 2" in capsys.readouterr().err
+
+
+def test_a_stop_on_the_way_is_told(tmp_path, capsys):
+    frames = [s for s in reach(0) if not 2.0 < s.time < 2.8]
+    assert run(saved(tmp_path / "gap.csv", frames)) == 0
+    told = capsys.readouterr().err
+    assert "stopped or waited for" in told and "warning gap" in told
+
+
+def lost(skeleton):
+    tracking = np.array(skeleton.tracking)
+    tracking[[JOINT["elbow_right"], JOINT["wrist_right"]]] = 0
+    return Skeleton(skeleton.time, skeleton.positions, tracking)
+
+
+@pytest.mark.parametrize("n", [0, 10])
+def test_an_arm_that_is_never_seen_for_long_is_a_failure_and_nothing_is_written(tmp_path, capsys, n):
+    """Never at all, or for a third of a second."""
+    source = saved(tmp_path / "lost.csv", [s if i < n else lost(s) for i, s in enumerate(reach(0))])
+    out, page = tmp_path / "demo.csv", tmp_path / "page.html"
+    assert run(source, "--out", out, "--report", page) == 1
+    told = capsys.readouterr().err
+    assert "right arm" in told and "--side" in told
+    assert not out.exists() and not page.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--scale", "-1"], "scale must be between"),
+        (["--pace", "2"], "pace must be between"),
+        (["--seconds", "0"], "--seconds must be above 0"),
+        (["--trim", "50", "60"], "no frame between"),
+        (["--out", "nowhere/demo.csv"], "there is no folder nowhere"),
+        (["--report", "nowhere/page.html"], "there is no folder nowhere"),
+        (["--robot", "sawyr"], "sawyr"),
+        (["--scene", "nothing.yaml"], "nothing.yaml"),
+        (["--calibration", "nothing.json"], "nothing.json"),
+        (["--method", "m9"], "invalid choice"),
+        (["--orientation", "sideways"], "invalid choice"),
+    ],
+)
+def test_wrong_options_are_told_and_nothing_is_written(shown, tmp_path, monkeypatch, capsys, words, told):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(path.name for path in tmp_path.iterdir())
+    assert run(shown, *words) == 2
+    message = capsys.readouterr().err
+    assert told in message and "Traceback" not in message
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_wrong_sources_are_told(tmp_path, capsys):
+    foreign = tmp_path / "foreign.csv"
+    foreign.write_text("a,b\n1,2\n")
+    assert run(foreign) == 2
+    assert "foreign.csv" in capsys.readouterr().err
+    assert run("nothing.csv") == 2
+    assert run("udp:5005", "--pace", 0.5) == 2
+    assert run("synthetic:x") == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_file_that_is_there_is_not_replaced_unasked(shown, tmp_path, capsys):
+    out = tmp_path / "demo.csv"
+    out.write_text("mine")
+    assert run(shown, "--out", out) == 2
+    assert "is there already" in capsys.readouterr().err and out.read_text() == "mine"
+    assert run(shown, "--out", out, "--force") == 0
+    assert len(Demonstration.load(out)) > 100
+
+
+def test_a_sensor_that_was_calibrated_turns_the_motion(shown, tmp_path):
+    """Turned by a quarter about the vertical, the same reach goes to another side."""
+    file, demos = tmp_path / "calibration.json", [tmp_path / f"{i}.csv" for i in range(2)]
+    facing = Calibration(scale=0.5, orientation="fixed").correspondence().sensor_to_base
+    for path, angle in zip(demos, (0.0, 0.5 * np.pi), strict=True):
+        turn = Pose(np.zeros(3), np.array([np.cos(0.5 * angle), 0.0, 0.0, np.sin(0.5 * angle)]))
+        Calibration(scale=0.5, orientation="fixed", sensor_to_base=turn @ facing).save(file)
+        assert json.loads(file.read_text())["scale"] == 0.5
+        assert run(shown, "--calibration", file, "--out", path) == 0
+    ahead, turned = (Demonstration.load(path).trajectory.positions for path in demos)
+    x, y = (ahead[150] - ahead[0])[:2]
+    np.testing.assert_allclose((turned[150] - turned[0])[:2], [-y, x], atol=0.03)
+
+
+def test_work_that_is_quick_shows_no_bar_and_errors_pass_through():
+    asked = []
+    with watched("x", lambda: asked.append(0) or 0.5):
+        time.sleep(0.01)
+    assert not asked
+    with pytest.raises(ValueError, match="inside"), watched("x", lambda: 0.5):
+        raise ValueError("inside")

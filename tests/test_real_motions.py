@@ -1,0 +1,113 @@
+"""Real people lead simulated arms: what a camera and a motion capture system recorded, retargeted by ``modern``.
+
+Limits are measured here, from the joint positions alone, in every control period.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from imitarm import ArmModel, SimulatedRobot
+from imitarm.benchmark.seen_arm import seen_arm
+from imitarm.capture.checks import repaired
+from imitarm.capture.recording import read_recording
+from imitarm.capture.slowing import slowed
+from imitarm.retarget import Correspondence, ModernRetargeter
+from imitarm.retarget.engagement import SEEN_FOR
+from imitarm.retarget.fitting import fit_motion
+
+DT = 0.01
+ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
+RECORDINGS = {
+    "wave hand": ("kinect_gestures/Ges01_wavehand.csv", "right"),
+    "balance hands": ("kinect_gestures/Ges02_balancinghands.csv", "right"),
+    "balance hands, left": ("kinect_gestures/Ges02_balancinghands.csv", "left"),
+    "draw lines": ("kinect_gestures/Ges03_drawlines.csv", "right"),
+    "come here": ("kinect_gestures/Ges04_comehere.csv", "right"),
+    "come here, left": ("kinect_gestures/Ges04_comehere.csv", "left"),
+    "arm in motion capture": ("mocap_arm/recording.tsv", "right"),
+}
+
+each_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
+
+
+def person(real_data, name):
+    path, side = RECORDINGS[name]
+    recording, _ = repaired(read_recording(real_data / path))
+    return list(recording.skeletons), side
+
+
+def fitted(arm, skeletons, correspondence):
+    """The run from where all of the motion is in reach."""
+    times = np.arange(SEEN_FOR, skeletons[-1].time - skeletons[0].time, DT)
+    wrist = seen_arm(skeletons, times, correspondence).wrist
+    fit = fit_motion(arm, wrist, wrist[0], scale=correspondence.scale)
+    follow = Correspondence(correspondence.side, scale=fit.scale, orientation=correspondence.orientation)
+    return ModernRetargeter(arm, follow, dt=DT).run(skeletons, fit.q)
+
+
+def assert_within_limits(arm, joints):
+    velocity = np.diff(joints, axis=0) / DT
+    acceleration = np.diff(velocity, axis=0, prepend=np.zeros((1, arm.n_joints))) / DT  # it begins at rest
+    assert np.isfinite(joints).all()
+    assert (joints <= arm.upper + 1e-9).all()
+    assert (joints >= arm.lower - 1e-9).all()
+    assert (np.abs(velocity) <= arm.max_velocity * (1.0 + 1e-9)).all()
+    assert (np.abs(acceleration) <= arm.max_acceleration * (1.0 + 1e-6)).all()
+
+
+@pytest.mark.slow
+@each_arm
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_no_joint_breaks_a_limit_in_any_frame(real_data, arm, name):
+    """From the robot's home, where much of a gesture is out of reach, and from where it is in reach."""
+    skeletons, side = person(real_data, name)
+    for orientation in ("hand", "upright", "fixed"):
+        correspondence = Correspondence(side, orientation=orientation)
+        run = ModernRetargeter(arm, correspondence, dt=DT).run(skeletons)
+        assert_within_limits(arm, run.joints)
+        assert (run.states == "following").mean() > 0.8
+        assert np.ptp(run.joints, axis=0).max() > 0.1  # it moves
+    run = fitted(arm, skeletons, Correspondence(side, orientation="fixed"))
+    assert_within_limits(arm, run.joints)
+    assert (run.states == "following").mean() > 0.8
+
+
+@pytest.mark.slow
+@each_arm
+@pytest.mark.parametrize("name", [name for name in RECORDINGS if name != "arm in motion capture"])
+def test_gestures_at_half_their_pace_are_followed(real_data, arm, name):
+    """People are quicker than these arms; slowed, the tool gets where the hand was seen."""
+    skeletons, side = person(real_data, name)
+    run = fitted(arm, slowed(skeletons, 0.5), Correspondence(side, orientation="fixed"))
+    assert_within_limits(arm, run.joints)
+    tool, _ = arm.tool_path(run.joints)
+    aimed = np.isfinite(run.targets[0]).all(axis=1)
+    target = run.targets[0][aimed]
+    apart = np.sqrt(np.mean(np.sum((tool[aimed] - target) ** 2, axis=1)))
+    goes = np.sqrt(np.mean(np.sum((target - target.mean(axis=0)) ** 2, axis=1)))
+    assert apart < 0.5 * goes
+
+
+@pytest.mark.slow
+@each_arm
+@pytest.mark.parametrize(("name", "pace"), [("arm in motion capture", 1.0), ("wave hand", 0.5)])
+def test_a_simulated_arm_with_its_drives_follows(real_data, arm, name, pace):
+    """Inertias, gravity, friction and drives that give at most their rated torques: not kinematics alone."""
+    skeletons, side = person(real_data, name)
+    some = [skeleton for skeleton in slowed(skeletons, pace) if skeleton.time - skeletons[0].time < 12.0]
+    run = fitted(arm, some, Correspondence(side, orientation="fixed"))
+    robot = SimulatedRobot(arm, q=run.joints[0])
+    behind, torques = [], []
+    for before, wanted, velocity in zip(run.joints[:-1], run.joints[1:], run.velocities[1:], strict=True):
+        state = robot.move(velocity + 5.0 * (before - robot.set_point), DT)
+        behind.append(np.abs(state.q - wanted))
+        torques.append(state.torque)
+    assert not robot.fault
+    assert np.max(behind) < 0.01  # [rad]
+    assert np.sqrt(np.mean(np.square(behind))) < 0.002
+    tool = arm.tool_pose(robot.state().q).position
+    assert np.linalg.norm(tool - arm.tool_pose(run.joints[-1]).position) < 0.005
+    assert (np.abs(torques) <= arm.max_torque + 1e-9).all()
+    assert (np.mean(np.abs(torques), axis=0) < 0.6 * arm.max_torque).all()  # not at the rated torque all the time

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from imitarm import ArmModel, InputError, Pose, UnreachableError, find_posture
+from imitarm.retarget.fitting import fit_motion
+
+ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
+
+each_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
+
+
+def circle(radius: float) -> np.ndarray:
+    """A circle in a plane that leans, about a point that is nowhere near the robot."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 60)
+    return [7.0, -3.0, 2.0] + radius * np.stack([0.5 * np.cos(angles), np.cos(angles), np.sin(angles)], axis=1)
+
+
+@each_arm
+@pytest.mark.parametrize("radius", [0.05, 0.15, 0.6])
+def test_every_point_of_the_motion_is_in_reach(arm, radius):
+    path = circle(radius)
+    fit = fit_motion(arm, path, path[0])
+    arm.check_limits(fit.q)
+    start = arm.tool_pose(fit.q)
+    np.testing.assert_allclose(start.rotation, arm.tool_pose(arm.home).rotation, atol=1e-4)
+    q = fit.q
+    for point in path[::6]:
+        q = find_posture(arm, Pose(start.position + fit.scale * (point - path[0]), start.quaternion), q0=q)
+    assert (fit.scale == 1.0) == (radius < 0.5)
+
+
+@each_arm
+def test_a_larger_motion_never_gets_a_larger_scale(arm):
+    scales = [fit_motion(arm, circle(radius), circle(radius)[0]).scale for radius in (0.1, 0.3, 0.6, 1.0)]
+    assert scales == sorted(scales, reverse=True)
+    assert fit_motion(arm, circle(0.1), circle(0.1)[0], scale=0.4).scale == 0.4  # never more than was asked for
+
+
+def test_what_was_not_seen_is_left_out_and_nothing_seen_is_told():
+    arm, path = ARMS["sawyer"], circle(0.1)
+    with_gap = path.copy()
+    with_gap[5:9] = np.nan
+    assert fit_motion(arm, with_gap, path[0]).scale == 1.0
+    with pytest.raises(InputError, match="never seen"):
+        fit_motion(arm, np.full((4, 3), np.nan), path[0])
+    with pytest.raises(InputError, match="never seen"):
+        fit_motion(arm, path, np.full(3, np.nan))
+
+
+def test_a_motion_that_fits_at_no_scale_is_told_with_its_size():
+    with pytest.raises(UnreachableError, match=r"19\.99 x 39\.97 x"):
+        fit_motion(ARMS["panda"], circle(20.0), circle(20.0)[0])
