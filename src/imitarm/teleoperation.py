@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time as clock
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -143,7 +142,7 @@ class Teleoperation:
         try:
             while not tally.reason:
                 skeleton = self._newest()
-                self._pace.tick()
+                self._pace.wait()
                 time = (self._pace.ticks - 1) * dt
                 self.step(time, skeleton)
                 tally.duration, tally.steps, tally.overruns = time + dt, tally.steps + 1, self._pace.overruns
@@ -201,10 +200,8 @@ class Teleoperation:
                 newest, now = skeleton, self._clock_ns()
                 came = None if self._stream is None else self._stream.arrival
                 self._arrival = Arrival(np.nan, np.nan, now) if came is None else came
-            elif left == 0.0:
+            elif left == 0.0 or self.source.over:
                 break
-            elif self.source.over:
-                clock.sleep(self._pace.left)
         return newest
 
     def _trouble(self) -> str:

@@ -1,0 +1,235 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from imitarm.capture.sources import followed
+from imitarm.capture.stream import SkeletonSender, UdpSource
+from imitarm.demonstrations.recorder import DemonstrationRecorder
+from imitarm.kinematics.arm import ArmModel
+from imitarm.messages import Status
+from imitarm.pace import Pace
+from imitarm.retarget import Correspondence, ModernRetargeter
+from imitarm.robots import SimulatedRobot
+from imitarm.teleoperation import INTERRUPTED, Teleoperation
+from imitarm.trajectory import Demonstration
+from recording_samples import Listed, skeletons
+from wire_samples import ARM, Clock, Paper, Served, assert_within_limits
+
+DT = 0.01
+
+
+def retargeter(arm=ARM):
+    return ModernRetargeter(arm, Correspondence(orientation="fixed"), dt=DT)
+
+
+def loop(robot, source=None, clock=None, sleep=None, **options):
+    """A loop whose time is set by hand."""
+    clock = Clock() if clock is None else clock
+
+    def pass_time(seconds):
+        clock.ns += round(1e9 * seconds)
+
+    pace = Pace(DT, clock_ns=clock, sleep=pass_time if sleep is None else sleep)
+    return Teleoperation(
+        Listed([]) if source is None else source, retargeter(robot.arm), robot, clock_ns=clock, pace=pace, **options
+    )
+
+
+def lead(one, seconds, start=0.0, each=None, frames=None):
+    """Show the loop 30 skeletons a second."""
+    shown = skeletons(round(30 * (start + seconds)) + 30) if frames is None else frames
+    for k in range(round(start / DT), round((start + seconds) / DT)):
+        new = int((k + 1) * DT * 30) > int(k * DT * 30)
+        one.step(k * DT, shown[int(k * DT * 30)] if new else None)
+        if each is not None:
+            each(k)
+
+
+def test_a_robot_here_is_led_within_its_limits():
+    robot = Paper()
+    one = loop(robot)
+    lead(one, 5.0)
+    assert one.tally.doing["following"] > 300 and one.tally.frames == 150
+    assert np.abs(robot.q - ARM.home).max() > 0.05
+    assert one.tally.speed <= 1.0 and one.tally.acceleration <= 1.0 + 1e-9
+    assert_within_limits(robot.steps)
+    np.testing.assert_allclose(robot.set_point, one.retargeter.command.q, atol=2e-3)
+
+
+def test_the_hand_leads_the_gripper():
+    robot = Paper()
+    one = loop(robot)
+    open_and_closed = [
+        s if i < 60 else type(s)(s.time, s.positions, s.tracking, (3, 3)) for i, s in enumerate(skeletons(150))
+    ]
+    lead(
+        one,
+        4.0,
+        frames=[
+            type(s)(s.time, s.positions, s.tracking, (2, 2)) if i < 60 else s for i, s in enumerate(open_and_closed)
+        ],
+    )
+    assert robot.grasped == [0.0]
+    without = Paper(widest=float("nan"))
+    lead(loop(without), 1.0)
+    assert without.grasped == []
+
+
+def test_it_ends_with_the_source_or_the_time_and_the_arm_at_rest():
+    robot = Paper()
+    source = Listed(skeletons(40))
+    tally = loop(robot, source).run()
+    assert tally.reason == "the source is over" and not robot.velocity.any()
+    tally = loop(Paper(), Listed([None] * 5000)).run(0.5)
+    assert tally.reason == "the time is up" and tally.steps + tally.overruns == 50
+
+
+def test_ctrl_c_ends_it_with_the_arm_at_rest():
+    robot = Paper()
+
+    class Pressed(Listed):
+        def read(self, timeout=1.0):
+            if len(self.items) < 3:
+                raise KeyboardInterrupt
+            return super().read(timeout)
+
+    tally = loop(robot, Pressed(skeletons(60))).run()
+    assert tally.reason == "stopped by the user" and not robot.velocity.any()
+
+
+def test_a_protective_stop_ends_it():
+    robot = Paper()
+    one = loop(robot)
+    robot.fault = "protective stop: a joint was held"
+    one.step(0.0, None)
+    assert one.tally.reason == robot.fault and one.tally.doing == {INTERRUPTED: 1}
+
+
+def test_what_the_robot_did_is_recorded_from_when_it_was_led(tmp_path):
+    robot = SimulatedRobot(ArmModel.load("sawyer", tool="gripper"))
+    path = tmp_path / "shown.csv"
+    with DemonstrationRecorder(path, robot.arm) as recorder:
+        one = loop(robot, recorder=recorder)
+        lead(one, 2.0)
+    shown = Demonstration.load(path)
+    assert len(shown) == recorder.n_samples >= one.tally.doing["following"] > 100
+    np.testing.assert_array_equal(shown.joints[-1], robot.state().q)
+    assert shown.trajectory.times[0] > 0.3
+
+
+# --- over the wire
+
+
+class Wired:
+    """Person, stream, loop, client and server, one after the other in the same time."""
+
+    def __init__(self, operator=None):
+        self.served = Served()
+        self.clock = self.served.clock
+        self.stream = UdpSource(0, clock_ns=self.clock)
+        self.sender = SkeletonSender(self.stream.address, clock_ns=self.clock)
+        self.robot = self.served.client()
+        self.loop = loop(
+            self.robot, followed(self.stream), self.clock, stream=self.stream, operator=operator, sleep=lambda s: None
+        )
+        self.frames = skeletons(600)
+        self.k = 0
+        self.capturing = True
+
+    def run(self, seconds):
+        for _ in range(round(seconds / DT)):
+            if self.capturing and int((self.k + 1) * DT * 30) > int(self.k * DT * 30):
+                self.sender.send(self.frames[int(self.k * DT * 30)])
+            skeleton = self.loop.source.read(0.0)
+            if skeleton is not None:
+                self.loop._arrival = self.stream.arrival
+            self.loop.step(self.k * DT, skeleton)
+            self.served.sleep(DT)
+            self.k += 1
+
+    def close(self):
+        for one in (self.robot, self.sender, self.stream):
+            one.close()
+        self.served.kill()
+
+
+@pytest.fixture
+def wired():
+    wired = Wired(operator=lambda trouble, stopped: stopped)
+    yield wired
+    wired.close()
+
+
+def test_a_served_robot_is_led_once_the_operator_lets_it(wired):
+    told = []
+    wired.loop._operator = lambda trouble, stopped: bool(told.append((trouble, stopped)))
+    wired.run(2.0)
+    assert set(told) == {("just started", True)} and np.array_equal(wired.served.robot.q, ARM.home)
+    assert wired.loop.tally.doing == {INTERRUPTED: 200}
+    wired.loop._operator = lambda trouble, stopped: stopped
+    wired.run(4.0)
+    assert wired.loop.tally.doing["following"] > 200 and wired.served.status is Status.FOLLOWING
+    assert np.abs(wired.served.robot.q - ARM.home).max() > 0.05
+    assert_within_limits(wired.served.robot.steps)
+
+
+def test_the_latency_of_each_stage_is_noted(wired):
+    wired.run(3.0)
+    rows = {stage: n for stage, n, *_ in wired.loop.tally.latency.rows()}
+    assert set(rows) == {"expose", "arrive", "wait", "retarget", "send", "robot", "apply", "total"}
+    assert rows["total"] >= 0.9 * rows["wait"] > 50
+    values = dict(zip(wired.loop.tally.latency.stages, np.nanmax(wired.loop.tally.latency.values, axis=0), strict=True))
+    assert values["robot"] <= 0.004 + 1e-9 and values["total"] <= 0.02
+
+
+def test_a_capture_process_that_dies_stops_the_arm_and_begins_anew(wired):
+    wired.run(2.0)
+    assert wired.loop.retargeter.command.state == "following"
+    wired.capturing = False
+    wired.run(1.5)
+    assert wired.loop.retargeter.command.state in ("stopped", "waiting")
+    assert np.abs(wired.served.robot.velocity).max() < 1e-4 and wired.served.status is Status.FOLLOWING
+    wired.sender.close()
+    wired.sender = SkeletonSender(wired.stream.address, clock_ns=wired.clock)
+    wired.capturing = True
+    wired.frames = [
+        type(s)(s.time - wired.frames[0].time, s.positions, s.tracking, s.hand_states) for s in wired.frames
+    ]
+    wired.run(2.0)
+    assert wired.loop.retargeter.command.state == "following"
+    assert_within_limits(wired.served.robot.steps)
+
+
+def test_a_loop_that_was_held_up_takes_hold_anew_from_where_the_arm_is(wired):
+    wired.run(2.5)
+    for pause in (0.2, 0.8):  # the server slows, then latches
+        wired.served.sleep(pause)
+        wired.run(3.0)
+        assert wired.loop.tally.interruptions >= 1
+        assert wired.loop.retargeter.command.state == "following"
+        np.testing.assert_allclose(wired.robot.set_point, wired.loop.retargeter.command.q, atol=5e-3)
+    assert_within_limits(wired.served.robot.steps)
+
+
+def test_a_robot_process_that_dies_and_comes_back_elsewhere_is_not_pulled_to_where_it_was(wired):
+    wired.run(2.5)
+    port = wired.served.server.address[1]
+    wired.served.kill()
+    wired.run(0.5)
+    assert not wired.robot.ready
+    wired.served = Served(Paper(ARM.home + 0.2), port=port, clock=wired.clock)
+    wired.loop._operator = lambda trouble, stopped: False
+    wired.run(1.0)
+    assert np.array_equal(wired.served.robot.q, ARM.home + 0.2)
+    wired.loop._operator = lambda trouble, stopped: stopped
+    wired.run(3.0)
+    assert wired.loop.retargeter.command.state == "following"
+    assert_within_limits(wired.served.robot.steps)
+
+
+def test_a_faulty_robot_ends_it(wired):
+    wired.run(1.5)
+    wired.served.robot.fault = "protective stop: a joint was held"
+    wired.run(0.1)
+    assert wired.loop.tally.reason == "protective stop: a joint was held"
