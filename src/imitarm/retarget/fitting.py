@@ -81,7 +81,7 @@ def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: floa
     span = np.ptp(path, axis=0)
     raise UnreachableError(
         f"fit: a motion of {span[0]:.2f} x {span[1]:.2f} x {span[2]:.2f} m is not in reach of {arm.name} even at a "
-        f"scale of {_SMALLEST:g}; cut it by --trim, or choose another arm"
+        f"scale of {_SMALLEST:g}; cut it, or choose another arm"
     )
 
 

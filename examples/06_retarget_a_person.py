@@ -1,0 +1,107 @@
+"""Let a person show a robot what to do: five takes before a camera become demonstrations, a skill, and a motion.
+
+The person is made up, and so is the camera with its noise, so that this runs anywhere; `open_source("take.csv")` reads
+a recorded one instead. What is true is known here, so the errors can be told.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imitarm import (
+    ArmModel,
+    Correspondence,
+    Demonstration,
+    Pose,
+    Scene,
+    SimulatedRobot,
+    Skill,
+    Sphere,
+    Trajectory,
+    align,
+    find_posture,
+    reproduce,
+    retarget,
+)
+from imitarm.capture.camera_model import SkeletonCamera
+from imitarm.capture.motions import minimum_jerk
+from imitarm.capture.person import Person
+from imitarm.capture.skeleton import Skeleton, SkeletonSource
+from imitarm.capture.synthetic import SyntheticSource
+from imitarm.policies import ACFRA
+from imitarm.retarget import FACING, Retargeting
+from imitarm.retarget.modern import ModernRetargeter
+
+REST, DURATION = 1.0, 6.0  # [s] with a still hand, so that the robot can take hold; of a take
+
+
+def take(number: int) -> SkeletonSource:
+    """One take: the person puts something from the right to the left over an edge, never twice quite alike."""
+    person = Person.from_seed(4)
+    varied = np.random.default_rng(number).normal(0.0, 0.01, (3, 3))
+    shoulder = person.shoulder("right", 0.0)
+    # in the camera's axes: x is the person's right, y up, z away from the camera
+    places = shoulder + np.array([[0.3, -0.2, -0.3], [0.05, -0.03, -0.45], [-0.22, -0.2, -0.38]]) + varied
+    hand = minimum_jerk(places[[0, 0, 1, 2, 2]], [0.0, REST, 0.5 * (REST + DURATION - 1.0), DURATION - 1.0, DURATION])
+
+    def truth(time: float) -> Skeleton:
+        return person.skeleton(time, hand(np.clip(time, 0.0, DURATION)))
+
+    return SyntheticSource(truth, SkeletonCamera(number, sigma=0.006, dropout=0.0), DURATION, name=f"take {number}")
+
+
+def following(run: Retargeting) -> slice:
+    """The part of a run in which the robot followed the person."""
+    led = np.flatnonzero(run.states == "following")
+    return slice(int(led[0]), int(led[-1]) + 1)
+
+
+def main() -> None:
+    arm = ArmModel.load("sawyer", tool="gripper")
+    # The tool goes as far as the hand does and stays upright; nothing is calibrated, limbs are learnt on the way.
+    correspondence = Correspondence(side="right", scale=1.0, orientation="fixed")
+    begin = arm.tool_pose(arm.home)
+    start = find_posture(arm, Pose(begin.position + np.array([0.02, -0.25, 0.0]), begin.quaternion))
+
+    demonstrations = []
+    for number in range(5):
+        source, runs = take(number), []
+        whole = retarget(source, ModernRetargeter(arm, correspondence), q=start, task="put", on_done=runs.append)
+        run, part = runs[0], following(runs[0])
+        times = whole.trajectory.times[part]
+        positions = whole.trajectory.positions[part]
+        demonstrations.append(
+            Demonstration(
+                Trajectory(times - times[0], positions, whole.trajectory.quaternions[part]),
+                run.joints[part],
+                task="put",
+                source=source.name,
+            )
+        )
+        hand = FACING.apply(np.array([source.truth(time).arm("right").wrist for time in times]))
+        apart = np.linalg.norm((positions - positions[0]) - (hand - hand[0]), axis=1)
+        velocity = np.diff(run.joints, axis=0) / 0.01
+        acceleration = np.diff(velocity, axis=0) / 0.01
+        print(
+            f"{source.name}: {times[-1] - times[0]:.1f} s, {1e3 * apart.mean():.0f} mm from the true hand on average, "
+            f"{100 * np.max(np.abs(velocity) / arm.max_velocity):.0f} % of the velocity and "
+            f"{100 * np.max(np.abs(acceleration) / arm.max_acceleration):.0f} % of the acceleration allowed"
+        )
+
+    skill = Skill().fit(align(demonstrations))
+    print(f"learnt {skill.gmr_.n_components_} components from {len(demonstrations)} takes of a person")
+
+    # The robot does it alone, and round a ball that nobody showed it.
+    middle = skill.generate(Pose(skill.start_.position, begin.quaternion)).positions
+    ball = Sphere(middle[len(middle) // 2] + np.array([0.0, 0.0, 0.02]), 0.03, name="ball")
+    for name, scene in {"nothing in the way": Scene(), "a ball on the path": Scene(None, [ball])}.items():
+        robot = SimulatedRobot(arm, scene=scene, q=find_posture(arm, skill.start_, q0=start))
+        policy = ACFRA(skill, tool_spheres=arm.tool_spheres)
+        rollout = reproduce(policy, robot, scene.after, timeout=20.0, link_clearance=0.02)
+        ends = 1e3 * np.linalg.norm(rollout.trajectory.positions[-1] - skill.goal_.position)
+        near = f", {1e3 * rollout.min_clearance:.0f} mm from the ball" if scene.obstacles else ""
+        print(f"{name}: {rollout.reason}, {ends:.1f} mm from where the person ended{near}")
+
+
+if __name__ == "__main__":
+    main()
