@@ -9,6 +9,8 @@ from imitarm.retarget.arm_estimator import ArmEstimator
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import human_arm_pose
 from imitarm.retarget.joint_mapping import Approach, JointMapping, continued
+from imitarm.retarget.limbs import LimbLengths
+from imitarm.tasks.operator import Operator
 from shown_arm import EASY, LENGTHS, skeleton
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
@@ -107,6 +109,22 @@ def test_a_part_mapped_anew_is_the_same():
     once = [mapping.joints(e, clutch) for e in estimates]
     mapping.resume(once[19])
     np.testing.assert_allclose([mapping.joints(e, clutch) for e in estimates[20:]], once[20:], atol=1e-9)
+
+
+def test_absolute_a_person_who_stacks_cubes_would_put_the_sawyers_elbow_into_the_table():
+    """Why the default is relative: a person's elbow hangs, and the table is 0.32 m below the Sawyer's shoulder."""
+    arm = ARMS["sawyer"]
+    for seed in range(10):
+        operator = Operator(seed)
+        lengths = LimbLengths(operator.person.upper_arm, operator.person.forearm)
+        correspondence = Correspondence(lengths=lengths, orientation="fixed")
+        estimate = ArmEstimator(correspondence, smoothing=False).update(operator.act(0.0))
+        clutch = correspondence.engage(estimate.wrist, estimate.hand, arm.tool_pose(arm.home))
+        absolute, relative = (JointMapping(arm, relative=kind).joints(estimate, clutch) for kind in (False, True))
+        for q, free in ((absolute, False), (relative, True)):
+            centers, radii = arm.collision_spheres(q)
+            low = (centers[:, 2] - radii)[centers[:, 0] > 0.3].min()  # where the table is
+            assert bool(low > 0.0) is free
 
 
 def test_an_approach_is_slow_then_gone():
