@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from imitarm.benchmark.mapping_metrics import MappingMetrics, measure
 from imitarm.benchmark.seen_arm import seen_arm, target_lag
-from imitarm.benchmark.tracking import TrueArm
+from imitarm.benchmark.tracking import TrueArm, rms
 from imitarm.capture.motions import Truth
 from imitarm.capture.skeleton import Skeleton
 from imitarm.retarget import Correspondence, Retargeting
@@ -33,11 +33,16 @@ CAPTIONS = {
     "m3": "Our reading of incremental inverse kinematics, without a treatment of singularities.",
 }
 _FAR = 0.05  # [m] a tool farther from its target has not reached it
+_FOLLOWS = 0.5  # share of the hand's own motion (RMS) within which a tool follows it
 _DEGREES = 180.0 / np.pi
 
 
 def judged(
-    run: Retargeting, skeletons: Sequence[Skeleton], correspondence: Correspondence, truth: Truth | None = None
+    run: Retargeting,
+    skeletons: Sequence[Skeleton],
+    correspondence: Correspondence,
+    truth: Truth | None = None,
+    clock: Array | None = None,
 ) -> tuple[MethodResult, MappingMetrics]:
     """Measure what a method made of a recording.
 
@@ -46,29 +51,35 @@ def judged(
         skeletons: of the person.
         correspondence: that the method was given.
         truth: where the person truly was, when that is known; None: what the camera saw stands for it.
+        clock: for each sample of the run when the person did it, since the first skeleton, shape (n,) [s]: a method
+            that slows the motion afterwards is measured against the moments that it reproduces; None: then.
 
     Returns:
         the result for the report, and the metrics in SI units.
     """
+    times = run.times if clock is None else clock
     if truth is None:
-        true = seen_arm(skeletons, run.times, correspondence)
+        true = seen_arm(skeletons, times, correspondence)
     else:
-        true = TrueArm.of(truth, run.times, correspondence, start=skeletons[0].time)
+        true = TrueArm.of(truth, times, correspondence, start=skeletons[0].time)
     metrics = measure(run, correspondence, true)
+    goes = correspondence.scale * rms(true.wrist - true.wrist.mean(axis=0))
+    followed = metrics.tool_rms_without_lag < _FOLLOWS * goes
     result = MethodResult(
         name=run.method,
         title=TITLES.get(run.method, run.method),
         run=run,
-        measures=_measures(run, metrics, "hand as seen" if truth is None else "true hand"),
+        measures=_measures(run, metrics, "hand as seen" if truth is None else "true hand", followed),
         tables=[_torques(run, metrics)],
         notes=warnings_of(run, metrics),
         caption=CAPTIONS.get(run.method, ""),
+        clock=clock,
     )
     return result, metrics
 
 
-def _measures(run: Retargeting, m: MappingMetrics, hand: str) -> list[Measure]:
-    """Return the figures of merit, in the units in which people think."""
+def _measures(run: Retargeting, m: MappingMetrics, hand: str, followed: bool) -> list[Measure]:
+    """Return the figures of merit, in the units in which people think; what does not follow has no lag."""
     tool = run.arm.tool_path(run.joints)[0]
     shares = [Measure(state, 100.0 * float(np.mean(run.states == state)), "% of the time", 1) for state in STATES]
     return [
@@ -79,7 +90,7 @@ def _measures(run: Retargeting, m: MappingMetrics, hand: str) -> list[Measure]:
         Measure("lag behind its own target", 1e3 * target_lag(run.times, tool, run.targets[0]), "ms", 0, "less"),
         Measure(f"tool to the {hand}, RMS", 1e3 * m.tool_rms, "mm", 1, "less"),
         Measure("the same without its lag", 1e3 * m.tool_rms_without_lag, "mm", 1, "less"),
-        Measure(f"lag behind the {hand}", 1e3 * m.lag, "ms", 0),
+        Measure(f"lag behind the {hand}", 1e3 * m.lag if followed else np.nan, "ms", 0),
         Measure("upper arm's direction, RMS error", _DEGREES * m.elbow_direction_rms, "°", 1, "less"),
         Measure("beyond a limit of position", m.position_violations, "frames", 0, "less", fault=True),
         Measure("beyond a limit of velocity", m.velocity_violations, "frames", 0, "less", fault=True),

@@ -199,7 +199,8 @@ def _retargeted(
     duration = max(skeletons[-1].time - skeletons[0].time, PERIOD)
     with watched(f"retargeting by {name}", lambda: retargeter.command.time / duration):
         made = retargeter.run(skeletons, setting.q)
-    result, metrics = judged(made, skeletons, setting.correspondence, truth)
+    clock = getattr(retargeter, "clock", None)  # of a method that slows the motion afterwards
+    result, metrics = judged(made, skeletons, setting.correspondence, truth, clock)
     if drive:
         shares = [0.0]
         with watched(f"driving {setting.arm.name}", lambda: shares[-1]):

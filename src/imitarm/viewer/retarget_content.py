@@ -6,6 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
 from imitarm.retarget import Correspondence, Retargeting
@@ -55,6 +58,7 @@ class MethodResult:
         tables: more, for this method's tab.
         notes: sentences on what the reader should know of this run.
         caption: a sentence on the method.
+        clock: for each sample of the run when the person did it, since the first skeleton, shape (n,) [s]; None: then.
     """
 
     name: str
@@ -64,6 +68,7 @@ class MethodResult:
     tables: Sequence[PlainTable] = ()
     notes: Sequence[str] = ()
     caption: str = ""
+    clock: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -103,9 +103,10 @@ def playback(report: RetargetReport, method: MethodResult, *, dark: bool = False
     """
     run = method.run
     recording = retargeting_frames(run, report.scene)
+    times = recording.times if method.clock is None else np.interp(recording.times, run.times, method.clock)
     person = PersonMark.beside(
         report.skeletons,
-        recording.times,
+        times,
         report.correspondence.sensor_to_base,
         side=report.correspondence.side,
         place=_PLACE,
