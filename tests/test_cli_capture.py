@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from imitarm.capture.recording import SkeletonRecording, read_recording
+from imitarm.capture.stream import UdpSource
 from imitarm.cli import main
 from recording_samples import Listed, changed, exchanged, same, skeletons
 
@@ -130,3 +131,21 @@ def test_a_capture_that_is_ended_keeps_what_came(tmp_path, kind, name):
     assert [p.name for p in tmp_path.iterdir()] == [name]
     times = [s.time for s in read_recording(tmp_path / name).skeletons]
     assert len(times) > 5 and (np.diff(times) > 0).all()
+
+
+def test_skeletons_are_sent_at_the_pace_at_which_they_happened(tmp_path, capsys):
+    frames, path = skeletons(12), tmp_path / "short.csv"
+    SkeletonRecording(frames).save(path)
+    with UdpSource(0) as received:
+        begin = time.monotonic()
+        assert main(["capture", str(path), "--send", f"127.0.0.1:{received.address[1]}"]) == 0
+        assert time.monotonic() - begin >= frames[-1].time - frames[0].time
+        came = []
+        while (skeleton := received.read(0.0)) is not None:
+            came.append(skeleton)
+        assert all(map(same, came, frames[-len(came) :])) and len(came) + received.gate.dropped["stale"] == 12
+    assert "sent 12 skeletons to 127.0.0.1:" in capsys.readouterr().err
+    assert main(["capture", str(path), "--send", f"127.0.0.1:{received.address[1]}"]) == 0
+    assert "nobody listened to" in capsys.readouterr().err
+    assert main(["capture", str(path), "--send", "nowhere"]) == 2
+    assert "'nowhere' is no address" in capsys.readouterr().err

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import os
+import pty
+import queue
+import time
+
+import pytest
+
+from imitarm.cli.operator import Operator, _standard_input
+from imitarm.errors import TaskFailedError
+
+
+class Keyboard:
+    """What is typed, and b"" for the end of input."""
+
+    def __init__(self):
+        self.keys, self.taken = queue.Queue(), 0
+
+    def read(self):
+        typed = self.keys.get()
+        self.taken += 1
+        return typed
+
+    def type(self, typed, operator):
+        """Type, and wait until it has been read."""
+        before = operator._typed.qsize()
+        self.keys.put(typed)
+        until = time.monotonic() + 10
+        while time.monotonic() < until and operator._typed.qsize() == before and not operator._ended:
+            time.sleep(0.001)
+
+
+@pytest.fixture
+def keyboard():
+    keyboard = Keyboard()
+    yield keyboard
+    keyboard.keys.put(b"")  # lets the thread end
+
+
+def test_a_stopped_robot_waits_for_enter(keyboard):
+    told = []
+    operator = Operator(told.append, read=keyboard.read)
+    assert [operator("just started", True) for _ in range(5)] == [False] * 5
+    assert told == ["the robot can't be led: just started. Is the way free? Enter lets it move again"]
+    keyboard.type(b"y", operator)
+    assert not operator("just started", True)
+    keyboard.type(b"\n", operator)
+    assert operator("just started", True)
+    assert not operator("just started", True)  # one Enter, one answer
+    operator.led()
+    operator("no valid command for 500 ms", True)
+    assert len(told) == 2
+
+
+def test_what_was_typed_before_the_question_counts_for_nothing(keyboard):
+    operator = Operator(lambda line: None, read=keyboard.read)
+    keyboard.type(b"\n\n\n", operator)
+    assert [operator("just started", True) for _ in range(3)] == [False] * 3
+    operator("another reason", True)
+    keyboard.type(b"\n", operator)
+    assert operator("another reason", True)
+
+
+def test_a_robot_that_is_not_stopped_is_not_asked_about(keyboard):
+    told = []
+    operator = Operator(told.append, read=keyboard.read)
+    assert not operator("the robot does not answer", False)
+    keyboard.type(b"\n", operator)
+    assert not operator("the robot does not answer", False)
+    assert told == ["the robot can't be led: the robot does not answer"]
+    assert not operator("just started", True)  # that Enter was not an answer to this
+
+
+def test_at_the_start_it_may_be_let_without_asking_and_only_then(keyboard):
+    operator = Operator(lambda line: None, enable_first=True, read=keyboard.read)
+    assert operator("just started", True) and not operator("the robot does not answer", False)
+    operator.led()
+    assert not operator("no valid command for 500 ms", True)
+
+
+def test_where_nobody_can_answer_a_stopped_robot_ends_the_command(keyboard):
+    operator = Operator(lambda line: None, read=keyboard.read)
+    keyboard.type(b"", operator)
+    assert not operator("the robot does not answer", False)
+    assert not operator("just started", True)
+    with pytest.raises(TaskFailedError, match="just started; nobody can let it move again, since there is no terminal"):
+        operator("just started", True)
+
+
+def test_a_terminal_is_read_only_in_the_foreground(monkeypatch):
+    ours, theirs = pty.openpty()
+    before = os.dup(0)
+    try:
+        os.dup2(theirs, 0)
+        monkeypatch.setattr(os, "tcgetpgrp", lambda descriptor: os.getpgrp() + 1)
+        assert _standard_input() == b""
+        monkeypatch.setattr(os, "tcgetpgrp", lambda descriptor: os.getpgrp())
+        os.write(ours, b"\n")
+        assert _standard_input() == b"\n"
+    finally:
+        os.dup2(before, 0)
+        for descriptor in (before, ours, theirs):
+            os.close(descriptor)

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import signal
+import socket
+import threading
+
+import numpy as np
+import pytest
+
+from imitarm.cli import main
+from imitarm.cli.serve import terminated_as_interrupted
+from imitarm.messages import Status
+from imitarm.table import read_table
+
+
+def test_it_serves_for_a_time_and_says_how_it_went(tmp_path, capfd):
+    trace = tmp_path / "trace.csv"
+    assert main(["serve", "sawyer", "--port", "0", "--seconds", "0.3", "--trace", str(trace)]) == 0
+    shown = capfd.readouterr()
+    assert "sawyer" in shown.out and "listens at 127.0.0.1:" in shown.out
+    assert "stopped: just started" in shown.err
+    assert "commands admitted" in shown.out and "stopped just started" in shown.out
+    table = read_table(trace)
+    assert table.names[:3] == ("t", "status", "set_right_j0") and len(table.names) == 2 + 3 * 7
+    assert (table.values[:, 1] == Status.STOPPED).all() and (np.diff(table.values[:, 0]) > 0).all()
+    assert (table.values[:, 2:9] == table.values[0, 2:9]).all()
+
+
+def test_an_address_that_others_reach_is_warned_of(capfd):
+    assert main(["serve", "panda", "--port", "0", "--host", "0.0.0.0", "--seconds", "0.05"]) == 0
+    shown = capfd.readouterr()
+    assert "whoever can reach this address can move the robot" in shown.err and "panda" in shown.out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["nosuch"], "unknown"),
+        (["sawyer", "--tool", "spoon"], "spoon"),
+        (["sawyer", "--port", "70000"], "--port must be from 0 to 65535"),
+        (["sawyer", "--seconds", "-1"], "--seconds must be above 0"),
+        (["sawyer", "--seconds", "1", "--port", "0", "--rate", "30"], "rate must be between 100 and 1000 Hz"),
+        (["sawyer", "--seconds", "1", "--port", "0", "--rate", "200"], "multiple of the timestep"),
+        (["sawyer", "--scene", "{}/no.yaml"], "no.yaml"),
+        (["sawyer", "--port", "0", "--trace", "{}/there.csv"], "is there already; name another file"),
+        (["sawyer", "--port", "0", "--trace", "{}/no/there.csv"], "can't be written"),
+        (["sawyer", "--port", "0", "--host", "no.such.host.invalid"], "there is no such host"),
+    ],
+)
+def test_a_wrong_option_is_one_message(tmp_path, capsys, options, message):
+    (tmp_path / "there.csv").write_text("precious")
+    assert main(["serve", *(option.format(tmp_path) for option in options)]) == 2
+    text = capsys.readouterr().err
+    assert message in text and "imitarm: error: " in text and "bug" not in text
+    assert (tmp_path / "there.csv").read_text() == "precious"
+
+
+def test_a_port_that_is_taken_is_said(capsys):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        assert main(["serve", "sawyer", "--port", str(taken.getsockname()[1])]) == 2
+    assert "can't listen there" in capsys.readouterr().err
+
+
+def test_the_usual_kill_ends_it_as_ctrl_c_does():
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), terminated_as_interrupted():
+        signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is before
+    outside = []
+
+    def elsewhere():
+        with terminated_as_interrupted():
+            outside.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    assert outside == [before]
