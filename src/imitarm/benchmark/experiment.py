@@ -18,7 +18,7 @@ import numpy as np
 import imitarm
 from imitarm.benchmark.mapping_methods import method
 from imitarm.benchmark.mapping_metrics import measure
-from imitarm.benchmark.recordings import CAPTURED, KINDS, MappingRecording, Plan, make_recording
+from imitarm.benchmark.recordings import CAPTURED, KINDS, MappingRecording, Plan, beyond_reach, make_recording
 from imitarm.benchmark.stacking import StackingTrial, run_trial
 from imitarm.errors import FileFormatError, ImitarmError, InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
@@ -125,7 +125,11 @@ class Experiment:
         # a method that slows the motion afterwards is measured against the moment that it reproduces
         clock = np.asarray(getattr(retargeter, "clock", run.times), dtype=float)
         metrics = measure(run, recording.correspondence, recording.true_arm(clock))
-        return {**asdict(metrics), "notes": dict(run.notes)}
+        facts = {
+            "recorded": float(recording.true_times[-1]),
+            "beyond_reach": beyond_reach(recording, _arm(self.robot)) if self.robot == "sawyer" else math.nan,
+        }
+        return {**asdict(metrics), **facts, "notes": dict(run.notes)}
 
     def _live(self) -> dict[str, Any]:
         return asdict(run_trial(StackingTrial(self.method, self.seed, self.repeat, self.sigma), _arm(self.robot)))
@@ -138,7 +142,8 @@ class Result:
     Attributes:
         experiment: which.
         version: of the code that did it, see :func:`code_version`.
-        values: what was measured, by name: those of :class:`~imitarm.benchmark.mapping_metrics.MappingMetrics`, or of
+        values: what was measured, by name: those of :class:`~imitarm.benchmark.mapping_metrics.MappingMetrics` with
+            ``recorded`` [s], ``beyond_reach`` (share of the time) and the method's own ``notes``; or those of
             :class:`~imitarm.benchmark.stacking.TrialOutcome`; empty after a failure.
         failure: why there is nothing to measure; empty when there is.
         seconds: that it took to compute [s].

@@ -10,7 +10,7 @@ from typing import Any, Final
 from imitarm.benchmark import mapping_plots
 from imitarm.benchmark.experiment import LIVE, Experiment, Result, plain
 from imitarm.benchmark.mapping_methods import MAIN, METHODS
-from imitarm.benchmark.mapping_tables import OURS, Results
+from imitarm.benchmark.mapping_tables import OURS, Results, number
 from imitarm.benchmark.tables import Table
 from imitarm.kinematics.arm import ArmModel
 from imitarm.viewer import palette
@@ -83,14 +83,13 @@ def _verdict(results: Results) -> tuple[str, bool]:
     runs = [r for r in results.all if r.experiment.method == OURS and r.experiment.task != LIVE]
     if not runs:
         return f"{OURS} was not run", False
-    broken = sum(r.value("broken_limits") != 0 if "broken_limits" in r.values else _breaks(r) for r in runs)
+    broken = sum(_breaks(r) for r in runs)
     text = f"{OURS} breaks a limit in {broken} of {len(runs)} recordings"
     return text, broken == 0
 
 
 def _breaks(result: Result) -> bool:
-    kinds = ("position", "velocity", "acceleration")
-    return bool(result.failure) or any(result.value(f"{kind}_violations") > 0 for kind in kinds)
+    return bool(result.failure) or number(result, "broken_limits") > 0
 
 
 def _tiles(results: Results) -> list[tuple[str, str]]:

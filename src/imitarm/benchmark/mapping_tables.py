@@ -59,6 +59,7 @@ SMOOTHNESS = (
     Figure("spectral_arc_length", "SPARC", digits=2),
     Figure("least_singular", "least singular value", digits=3),
 )
+_RECORDED = (Figure("recorded", "length [s]"), Figure("beyond_reach", "beyond reach [%]", 100.0))
 COMPARED = (
     ACCURACY[0],
     ACCURACY[1],
@@ -121,6 +122,19 @@ def written(found: Interval, figure: Figure) -> str:
     if math.isfinite(found.low):
         text += f" ({values[1]:.{figure.digits}f} to {values[2]:.{figure.digits}f})"
     return text if found.used == found.of else f"{text}, {found.used} of {found.of}"
+
+
+def recordings_table(results: Results) -> Table:
+    """Return how many recordings there are, how long, and how often they ask for what no arm of this length reaches."""
+    rows = []
+    for task in results.tasks(REPLAYS):
+        some = results.of(results.methods[0], [task])
+        persons = {r.experiment.seed for r in some}
+        cells = [written(interval(results.values(results.methods[0], [task], f.name)), f) for f in _RECORDED]
+        rows.append((task, str(len(some)), str(len(persons)), *cells))
+    columns = ("kind", "recordings>", "persons, or cameras>", *(f"{figure.title}>" for figure in _RECORDED))
+    note = "Beyond reach: share of the time in which the wrist is led farther than the robot's arm is long."
+    return Table("Recordings, the same for every method", columns, tuple(rows), note)
 
 
 def accuracy_table(results: Results, task: str) -> Table:
@@ -242,6 +256,8 @@ def all_tables(results: Results) -> list[Table]:
     tasks, tables = results.tasks(), []
     if results.tasks([LIVE]):
         tables.append(success_table(results))
+    if results.tasks(REPLAYS):
+        tables.append(recordings_table(results))
     tables += [accuracy_table(results, task) for task in results.tasks(REPLAYS)]
     if tasks:
         tables += [comparison_table(results, tasks), limits_table(results, tasks), effort_table(results, tasks)]
