@@ -26,7 +26,7 @@ class LineProcess:
     Args:
         command: with all its arguments.
         keep: so many lines wait to be read.
-        newest: when more would wait, drop the oldest; else the program waits too.
+        newest: when more would wait, drop the oldest, though never the first of all; else the program waits too.
 
     Raises:
         OSError: when it can't be started.
@@ -85,13 +85,13 @@ class _Lines:
         self._waiting: deque[bytes] = deque()
         self._keep, self._newest = keep, newest
         self._changed = threading.Condition()
-        self._over = self._stopped = False
+        self._over = self._stopped = self._begun = False
 
     def fill(self, pipe: IO[bytes]) -> None:
         try:
             while line := pipe.readline(LONGEST):
                 with self._changed:
-                    if self._newest and len(self._waiting) >= self._keep:
+                    if self._newest and self._begun and len(self._waiting) >= self._keep:
                         self._waiting.popleft()
                     self._changed.wait_for(lambda: self._stopped or len(self._waiting) < self._keep)
                     if self._stopped:
@@ -108,7 +108,7 @@ class _Lines:
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._over, max(until - clock.monotonic(), 0.0))
             if self._waiting:
-                line = self._waiting.popleft()
+                line, self._begun = self._waiting.popleft(), True
                 self._changed.notify_all()
                 return line
             if self._over:

@@ -20,6 +20,7 @@ PROTOCOL = 1
 
 _START = 60.0  # [s] in which the first picture must be through: the first start of all reads 400 MB
 _SILENT = 20.0  # [s] after which a process without a word hangs
+_TICK = 0.01  # [s] more, so that the time is over and not just about
 _KEPT = 64  # pictures of a video that are tracked ahead
 _NUMBERS = 6 * N_LANDMARKS
 
@@ -119,7 +120,7 @@ class MediaPipeSource(SkeletonSource):
         """Return the next line's words; None when none came in time."""
         before = clock.monotonic()
         try:
-            line = self._process.line(timeout)
+            line = self._process.line(min(timeout, max(_SILENT - self._silent, 0.0) + _TICK))
         except EOFError:
             raise self._failed(f"MediaPipe's process is gone ({self._process.ended()})") from None
         if line is not None:

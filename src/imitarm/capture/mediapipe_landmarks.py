@@ -26,6 +26,7 @@ _GAP = 0.5  # [s] after which the distance before says nothing
 _NEAREST, _FARTHEST = 0.3, 15.0  # [m] of a person whom a camera shows
 _TIP = 1.8  # a finger tip is so much farther from the wrist than the knuckles are
 _FITTED = np.array([11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28])  # shoulders to wrists, hips to ankles
+_TURNS = 3  # place and line of sight depend on each other: after three rounds to a millimetre
 _LEAST_WEIGHT = 2.0  # sum of the visibilities of the landmarks that place a person
 
 
@@ -125,15 +126,14 @@ class LandmarkConverter:
         the picture is inferred at best. MediaPipe does not tell open hands from closed ones: both are unknown.
         """
         uv = (landmarks.image - 0.5) * self._scale
-        place = self._fit(landmarks.world, uv, landmarks.visibility)
-        if place is None:
-            self._distance = None
-            return None
-        world = landmarks.world @ _turn_towards(place).T
-        place = self._fit(world, uv, landmarks.visibility)
-        if place is None:
-            self._distance = None
-            return None
+        world, place = landmarks.world, None
+        for _ in range(_TURNS):
+            place = self._fit(world, uv, landmarks.visibility)
+            if place is None:
+                self._distance = None
+                return None
+            world = landmarks.world @ _turn_towards(place).T
+        assert place is not None
         depth = self._steadied(landmarks.time, place[2])
         weight = np.square(landmarks.visibility[_FITTED])[:, None]
         seen = uv[_FITTED] * (world[_FITTED, 2:] + depth) - world[_FITTED, :2]
