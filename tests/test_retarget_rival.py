@@ -160,6 +160,21 @@ def test_bad_input_moves_nothing_beyond_its_limits(rival, stretches, seed):
     assert method.command.state in STATES
 
 
+@each
+@settings(max_examples=8)
+@given(st.lists(st.tuples(SPOILT, st.integers(1, 25)), min_size=3, max_size=8), st.integers(0, 1000))
+def test_a_bad_recording_as_a_whole_gives_a_motion_within_limits(rival, stretches, seed):
+    """Offline too; times that go back are refused before that."""
+    rng, angles, frames = np.random.default_rng(seed), swing(0, 0.8, start=0.6, over=2.0), []
+    for what, count in [("none", 25), *stretches]:
+        for _ in range(count if what != "backwards" else 0):
+            frames.append(spoilt(skeleton(len(frames) / 30, angles(len(frames) / 30)), what, rng))
+    run = rival(SAWYER, FIXED).run(frames)
+    assert within_positions(SAWYER, run.joints)
+    assert np.isfinite(run.velocities).all()
+    assert np.isfinite(list(run.notes.values())).all()
+
+
 def spoilt(frame, what, rng):
     positions, time = np.array(frame.positions), frame.time
     arm = [JOINT[f"{part}_right"] for part in ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")]
