@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import coal
 import numpy as np
@@ -16,7 +17,8 @@ from imitarm.benchmark.avoidance import SLACK, judge, learn, run_family, wilson_
 from imitarm.benchmark.families import CLEARANCE, TOOL_RADIUS
 from imitarm.kinematics.pose import Pose, quaternion_exp
 from imitarm.policies import HORIZONTAL_ONLY, NOT_DOWN, adapt
-from imitarm.policies.certificate import Pair, distances, segment_bounds
+from imitarm.policies.certificate import Pair, distances, looked_at_again, segment_bounds
+from imitarm.policies.certified import _Search
 from imitarm.policies.least_detour import UNBOUNDED, least_norm
 from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Scene, Sphere
 
@@ -41,6 +43,46 @@ def test_a_thousand_scenes_keep_the_clearance(learnt):
         near = [(first + i, o.clearance) for i, o in enumerate(outcomes) if o.accepted and not o.kept]
         assert not refused, f"{n_obstacles} obstacles: refused although solvable: seeds {refused}"
         assert not near, f"{n_obstacles} obstacles: accepted but nearer than asked: {near}"
+
+
+@pytest.mark.parametrize(
+    ("planar", "seed"),
+    [
+        pytest.param(False, 906, id="the bound of two tangents is far below the true distance"),
+        pytest.param(True, 2325, id="long steps cut a corner between samples"),
+        pytest.param(True, 803, id="a detour of 40 cm whose corner is cut by several segments"),
+    ],
+)
+def test_the_answer_does_not_hang_on_rounding(planar, seed):
+    """Scenes that were solved or refused as the CPU happened to round."""
+    skill, path = learn(planar=planar)
+    case = families.sparse_clutter(seed, path, n_obstacles=3, planar=planar)
+    rng = np.random.default_rng(seed)
+    lengths = []
+    for size in (0.0, *[1e-12] * 5, *[1e-9] * 15):
+        shaken = [replace(o, velocity=rng.uniform(-size, size, 3)).after(1.0) for o in case.scene.obstacles]
+        adaptation = adapt(skill, Scene(None, shaken), forbidden=case.forbidden, **OPTIONS)
+        assert adaptation.feasible, adaptation.reason
+        assert judge(case, adaptation).kept
+        lengths.append(adaptation.rmse_to_nominal)
+    assert np.ptp(lengths) < 1e-4  # one and the same detour, not another way round
+
+
+def test_no_place_is_tried_twice(monkeypatch):
+    """Where there is no way, none of the choices goes to looking again at where nothing was found."""
+    skill, path = learn(planar=True)
+    case = families.narrow_gap(0, path, solvable=False)
+    places, children = [], _Search._children
+
+    def recorded(self, displacement, *rest):
+        places.append((self.everywhere, displacement))
+        return children(self, displacement, *rest)
+
+    monkeypatch.setattr(_Search, "_children", recorded)
+    assert not adapt(skill, case.scene, forbidden=case.forbidden, **OPTIONS).feasible
+    assert len(places) > 3
+    for i, (everywhere, place) in enumerate(places):
+        assert all(np.abs(place - other).max() >= 1e-5 for wide, other in places[:i] if wide == everywhere)
 
 
 def test_the_scenes_are_not_void(learnt):
@@ -224,6 +266,32 @@ def test_the_certificate_is_a_lower_bound_on_the_whole_polyline(seed):
     for i, obstacle in enumerate(obstacles):
         assert np.all(bounds[i] <= obstacle.signed_distance(dense).min(axis=0) + 1e-9)
         assert np.all(bounds[i] <= distance[i, :-1] + 1e-12) and np.all(bounds[i] <= distance[i, 1:] + 1e-12)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 2**31), st.sampled_from([0.0, 0.003]))
+def test_looking_between_samples_proves_the_clearance_or_finds_where_it_is_missing(seed, bow):
+    """Nothing in between: each segment whose samples are clear is proven, or has a point that is truly nearer."""
+    rng = np.random.default_rng(seed)
+    polyline = np.cumsum(rng.normal(size=(30, 3)) * 0.03, axis=0)
+    offset = None if bow == 0.0 else rng.normal(size=(30, 3)) * 0.01
+    obstacles = [families.random_obstacle(rng, polyline[10] + rng.normal(size=3) * 0.1, planar=False) for _ in range(3)]
+    pairs = [Pair(obstacle, i, 0.01, offset, bow) for i, obstacle in enumerate(obstacles)]
+    distance, normal = distances(pairs, polyline)
+    rough = segment_bounds(pairs, distance, normal, polyline)
+    clearance = float(np.quantile(rough, 0.3))
+    bounds, dips = looked_at_again(pairs, rough, distance, normal, polyline, clearance)
+    assert np.all(bounds >= rough)
+    short = (bounds < clearance) & (distance[:, :-1] >= clearance) & (distance[:, 1:] >= clearance)
+    assert sorted(zip(dips.pair, dips.segment, strict=True)) == [tuple(at) for at in np.argwhere(short)]
+    u = np.linspace(0.0, 1.0, 200)[:, None, None]
+    for i, pair in enumerate(pairs):
+        centres = pair.centres(polyline)
+        dense = obstacles[i].signed_distance(centres[:-1] * (1 - u) + centres[1:] * u) - pair.radius - bow
+        assert np.all(bounds[i] <= dense.min(axis=0) + 1e-9)
+    for i, j, s in zip(dips.pair, dips.segment, dips.fraction, strict=True):
+        centres = pairs[i].centres(polyline)
+        assert obstacles[i].signed_distance(centres[j] * (1 - s) + centres[j + 1] * s) - 0.01 - bow < clearance + 1e-7
 
 
 def test_moving_means_moves_the_path_by_the_affine_identity(learnt):

@@ -2,13 +2,14 @@
 
 The signed distance to a convex obstacle is a convex function, so a tangent plane at any point under-estimates it
 everywhere. Two samples and their tangents therefore bound the distance on the whole segment between them: what is
-certified is the polyline itself, not a set of samples.
+certified is the polyline itself, not a set of samples. Where that bound falls short, points of the segment are looked
+at until either the bound reaches what is asked, or one of them is truly nearer.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from imitarm.scene.obstacle import Obstacle
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+_LOOKS = 12  # points looked at on a segment whose bound falls short; the bracket then is far below a micrometre
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +56,31 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False)
+class Dips:
+    """Points between two samples, at which a path is nearer to an obstacle than asked although both samples are not.
+
+    Attributes:
+        pair: which sphere and obstacle, shape (m,).
+        segment: index of the sample before the point, shape (m,).
+        fraction: where between that sample and the next, in [0, 1], shape (m,).
+    """
+
+    pair: Index
+    segment: Index
+    fraction: Array
+
+    @classmethod
+    def none(cls) -> Dips:
+        """Return no dips."""
+        return cls(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp), np.empty(0))
+
+    def and_also(self, others: Dips) -> Dips:
+        """Return these dips and others."""
+        pair, segment = np.append(self.pair, others.pair), np.append(self.segment, others.segment)
+        return Dips(pair, segment, np.append(self.fraction, others.fraction))
+
+
+@dataclass(frozen=True, eq=False)
 class Detour:
     """A displaced path and what is proven of it.
 
@@ -64,6 +92,7 @@ class Detour:
         feasible: whether every bound reaches the asked clearance and the path does not stray.
         expanded: how many choices of a side were made.
         strays: whether the path leads absurdly far away or jumps, as it does where a point that must not move is near.
+        dips: where it is too near between two samples that are not.
     """
 
     displacement: Array
@@ -73,6 +102,7 @@ class Detour:
     feasible: bool
     expanded: int
     strays: bool = False
+    dips: Dips = field(default_factory=Dips.none)
 
 
 def judged(
@@ -85,8 +115,12 @@ def judged(
     expanded: int = 0,
 ) -> Detour:
     """Judge a path by its distances (n_pairs, n) and normals (n_pairs, n, 3) against the asked clearance [m]."""
-    bounds = segment_bounds(pairs, distance, normal, positions).min(axis=1)
-    return Detour(displacement, positions, bounds, distance.min(axis=1), bool(bounds.min() >= clearance), expanded)
+    bounds = segment_bounds(pairs, distance, normal, positions)
+    dips = Dips.none()
+    if bounds.min() < clearance:
+        bounds, dips = looked_at_again(pairs, bounds, distance, normal, positions, clearance)
+    feasible, bounds = bool(bounds.min() >= clearance), bounds.min(axis=1)
+    return Detour(displacement, positions, bounds, distance.min(axis=1), feasible, expanded, dips=dips)
 
 
 def distances(pairs: Sequence[Pair], positions: Array) -> tuple[Array, Array]:
@@ -117,10 +151,64 @@ def segment_bounds(pairs: Sequence[Pair], distance: Array, normal: Array, positi
     else:
         step = np.stack([np.diff(pair.centres(positions), axis=0) for pair in pairs])
         bow = np.stack([np.broadcast_to(pair.bow, len(positions) - 1) for pair in pairs])
-    f0, f1 = distance[:, :-1], distance[:, 1:]
     a = (normal[:, :-1, None, :] @ step[..., None])[..., 0, 0]  # the parameter s runs over [0, 1] on each segment
     b = (normal[:, 1:, None, :] @ step[..., None])[..., 0, 0]
+    return _lowest(distance[:, :-1], a, distance[:, 1:], b, 1.0)[0] - bow
+
+
+def looked_at_again(
+    pairs: Sequence[Pair], bounds: Array, distance: Array, normal: Array, positions: Array, clearance: float
+) -> tuple[Array, Dips]:
+    """Look between samples where the bound falls short although both of them keep the clearance.
+
+    Two tangents round a corner cross at twice the depth of the chord, or deeper. The true distance where they cross
+    is either too small, then there is a dip; or its tangent takes the place of one of the two, on whose side the
+    distance then only falls towards it. So the lowest point stays between two tangents, which close in on it.
+
+    Args:
+        pairs: which spheres and obstacles.
+        bounds: of :func:`segment_bounds`, shape (n_pairs, n - 1) [m].
+        distance: clearance at the samples, shape (n_pairs, n) [m].
+        normal: gradient at the samples, shape (n_pairs, n, 3).
+        positions: of the tip at the samples, shape (n, 3) [m].
+        clearance: asked [m].
+
+    Returns:
+        Better lower bounds, shape (n_pairs, n - 1) [m], and the dips that remain.
+    """
+    bounds, dips = bounds.copy(), Dips.none()
+    short = (bounds < clearance) & (distance[:, :-1] >= clearance) & (distance[:, 1:] >= clearance)
+    for i in np.flatnonzero(short.any(axis=1)).tolist():
+        j = np.flatnonzero(short[i])
+        start = pairs[i].centres(positions[j], j)
+        step = pairs[i].centres(positions[j + 1], j + 1) - start
+        bow = np.broadcast_to(pairs[i].bow, len(positions) - 1)[j]
+        left, right = np.zeros(len(j)), np.ones(len(j))
+        f0, f1 = distance[i, j], distance[i, j + 1]
+        a, b = np.einsum("sd,sd->s", normal[i, j], step), np.einsum("sd,sd->s", normal[i, j + 1], step)
+        low, at = _lowest(f0, a, f1, b, 1.0)
+        found = np.zeros(len(j), dtype=bool)
+        for _ in range(_LOOKS):
+            if np.all(found | (low - bow >= clearance)):
+                break
+            f, n = pairs[i].distance_and_normal(start + at[:, None] * step)
+            slope = np.einsum("sd,sd->s", n, step)
+            found |= f - bow < clearance
+            falls, rises = ~found & (slope <= 0.0), ~found & (slope > 0.0)
+            left, f0, a = np.where(falls, (at, f, slope), (left, f0, a))
+            right, f1, b = np.where(rises, (at, f, slope), (right, f1, b))
+            low, inside = _lowest(f0, a, f1, b, right - left)
+            at = np.where(found, at, left + inside)
+        bounds[i, j] = np.maximum(bounds[i, j], low - bow)
+        dip = bounds[i, j] < clearance
+        dips = dips.and_also(Dips(np.full(int(dip.sum()), i), j[dip], at[dip]))
+    return bounds, dips
+
+
+def _lowest(f0: Array, a: Array, f1: Array, b: Array, length: Array | float) -> tuple[Array, Array]:
+    """Return the least value of ``max(f0 + a s, f1 - b (length - s))`` over s in [0, length], and where it is."""
     dip = (a < 0.0) & (b > 0.0)
-    crossing = np.clip((f1 - f0 - b) / np.where(dip, a - b, -1.0), 0.0, 1.0)
+    s = np.clip((f1 - f0 - b * length) / np.where(dip, a - b, -1.0), 0.0, length)
     low = np.where(a >= 0.0, f0, f1)  # rising from the start, or falling until the end
-    return np.asarray(np.where(dip, np.maximum(f0 + a * crossing, f1 + b * (crossing - 1.0)), low) - bow)
+    crossing = np.maximum(f0 + a * s, f1 + b * (s - length))
+    return np.where(dip, crossing, low), np.where(dip, s, np.where(a >= 0.0, 0.0, length))

@@ -38,6 +38,8 @@ _REFINED = 2  # directions whose amplitudes are made smallest; the others wait w
 _VIOLATION_COST = 1e3  # [1/m] price of violated clearance against the style cost (METHODS D.2.5)
 _STYLE_COST = 1e-3
 _REPAIRABLE = 0.003  # [m] a violation that the polish can take out itself
+_SAME = 1e-5  # [m] choices that differ by less are one and the same up to rounding
+_ROUNDING = 1e-6  # [m] a sample that lacks less is not too near: quadratic programs keep their rows no better
 _NEWTON_STEPS = 12
 _LIFT_TOLERANCE = 1e-3  # [m] lifts are this much too long at most
 _THINNED = 3  # sides are rated on every third sample
@@ -97,10 +99,14 @@ class _Search:
     def run(self, max_choices: int, distance: Array, normal: Array) -> Detour:
         """Follow the cheapest choice of sides until one is feasible; begin at the nominal path."""
         heap = [_Node(0.0, 0, np.zeros((self.path.n_components, 3)))]
+        tried: list[Array] = []
         best: Detour | None = None
         order = expanded = 0
         while heap:
             node = heapq.heappop(heap)
+            if any(np.abs(node.displacement - other).max() < _SAME for other in tried):
+                continue
+            tried.append(node.displacement)
             positions = self.path.displaced(node.displacement)
             if node.order > 0:
                 distance, normal = distances(self.pairs, positions)
@@ -128,7 +134,7 @@ class _Search:
     ) -> list[tuple[float, Array]]:
         """Return what each direction round the worst obstacle leads to: (cost, displacement), affordable ones only."""
         worst = int(np.argmin(distance.min(axis=1)))
-        rows = np.flatnonzero((distance[worst] < self.wanted) & self.least.movable)
+        rows = np.flatnonzero((distance[worst] < self.wanted - _ROUNDING) & self.least.movable)
         if not len(rows):
             return []
         rows = rows[:: -(-len(rows) // _MAX_ROWS)]

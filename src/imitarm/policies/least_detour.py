@@ -15,7 +15,7 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.policies.certificate import Detour, Pair, distances, judged
+from imitarm.policies.certificate import Detour, Dips, Pair, distances, judged
 from imitarm.policies.component_path import STILL, ComponentPath
 
 Array = NDArray[np.float64]
@@ -28,7 +28,8 @@ UNBOUNDED = 1e30  # daqp's infinity
 _INFLUENCE = 0.04  # [m] at first, obstacles farther from a sample than this get no row
 _STEPS = 2  # rounds of tangents; most of what there is to save, the first one saves
 _HOPELESS = 0.002  # [m] a sample that lacks this much is no dip between two of them
-_TRIES = 5  # a segment that still dips then is given up
+_TRIES = 12  # a segment that still dips then is given up
+_BEYOND = 2e-5  # [m] asked beyond the clearance of a point between two samples
 _SLACK_SCALE = 1e-4  # [m] missing the tangents by this costs as much as one demonstrated sigma
 _GAIN = 0.9  # stop when a step saves less than a tenth
 _SOLVED = 1  # daqp's exit flag of an optimal solution
@@ -75,21 +76,25 @@ class LeastDetour:
     def judged(self, displacement: Array, positions: Array, distance: Array, normal: Array, expanded: int) -> Detour:
         """Judge a path by its certificate, and by whether it is one that a robot could follow."""
         detour = judged(self.pairs, displacement, positions, distance, normal, self.clearance, expanded)
-        away = positions - self.path.nominal.positions
+        away = self._away(positions)
         far = bool(np.sqrt(np.einsum("nd,nd->n", away, away).max()) > FARTHEST)
         if far or _longest_step(positions) > _LONGEST_STEP * self._longest_step:
             return replace(detour, feasible=False, strays=True)
         return detour
 
     def shrink(self, detour: Detour, distance: Array, normal: Array) -> Detour:
-        """Shrink a displacement to the least one that its tangents allow; where a segment dips, ask for more there."""
+        """Shrink a displacement to the least one that its tangents allow; where a segment dips, hold that point too.
+
+        To ask for more at the samples instead would not do: with longer steps round the corner the path can have them
+        farther out and yet cut it as before, and next to a pinned instant a little more takes a huge displacement.
+        """
         best: Detour | None = None
         moved = np.flatnonzero(detour.displacement.any(axis=1))
-        displacement, positions, wanted = detour.displacement, detour.positions, self.wanted
+        displacement, positions, held = detour.displacement, detour.positions, Dips.none()
         for _ in range(_TRIES if len(moved) else 0):
             cost = self._cost(displacement)
             for _ in range(_STEPS):
-                step = self._step(moved, positions, distance, normal, wanted)
+                step = self._step(moved, positions, distance, normal, held)
                 if step is None:
                     break
                 displacement, positions, distance, normal = step
@@ -101,11 +106,11 @@ class LeastDetour:
                 best = trial
             if trial.feasible or trial.strays or distance.min() < self.clearance - _HOPELESS:
                 break
-            wanted += 2.0 * (self.clearance - float(trial.bounds.min())) + 1e-6
+            held = held.and_also(trial.dips)
         return detour if best is None else best
 
     def _step(
-        self, moved: Index, positions: Array, distance: Array, normal: Array, wanted: float
+        self, moved: Index, positions: Array, distance: Array, normal: Array, held: Dips
     ) -> tuple[Array, Array, Array, Array] | None:
         """Return the displacement of least cost under the tangents, its path, distances and normals; None: no solution.
 
@@ -113,20 +118,39 @@ class LeastDetour:
         """
         answer = None
         for influence in (_INFLUENCE, np.inf):
-            displacement = self._least(moved, positions, distance, normal, wanted, influence)
+            displacement = self._least(moved, positions, distance, normal, held, influence)
             if displacement is None:
                 return None
             new = self.path.displaced(displacement)
             answer = (displacement, new, *distances(self.pairs, new))
-            if answer[2].min() >= min(wanted, float(distance.min())) - STILL:
+            if answer[2].min() >= min(self.wanted, float(distance.min())) - STILL:
                 break
         return answer
+
+    def _away(self, positions: Array) -> Array:
+        return positions - self.path.nominal.positions
+
+    def _between(self, dips: Dips, positions: Array) -> tuple[Array, Array, Array, Array]:
+        """Return normals (m, 3), missing clearance (m,), basis (m, n_components) and distance from nominal (m, 3).
+
+        A point between two samples is a fixed mean of them, so it is as affine in the displacements as they are.
+        """
+        j, s = dips.segment, dips.fraction[:, None]
+        normal, missing = np.empty((len(j), 3)), np.empty(len(j))
+        for i in np.unique(dips.pair).tolist():
+            pair, of = self.pairs[i], np.flatnonzero(dips.pair == i)
+            start, end = pair.centres(positions[j[of]], j[of]), pair.centres(positions[j[of] + 1], j[of] + 1)
+            distance, normal[of] = pair.distance_and_normal(start + s[of] * (end - start))
+            bow = np.broadcast_to(pair.bow, len(positions) - 1)[j[of]]
+            missing[of] = self.clearance + _BEYOND - (distance - bow)
+        away, basis = self._away(positions), self.path.basis
+        return normal, missing, (1.0 - s) * basis[j] + s * basis[j + 1], (1.0 - s) * away[j] + s * away[j + 1]
 
     def _cost(self, displacement: Array) -> float:
         return float(np.einsum("kd,kde,ke->", displacement, self.path.precisions, displacement))
 
     def _least(
-        self, moved: Index, positions: Array, distance: Array, normal: Array, wanted: float, influence: float
+        self, moved: Index, positions: Array, distance: Array, normal: Array, held: Dips, influence: float
     ) -> Array | None:
         """Minimise ``sum Delta_k^T Y_k^-1 Delta_k`` under the tangents at ``positions``; None: no solution.
 
@@ -134,12 +158,15 @@ class LeastDetour:
         it has no solution, one more unknown lets all tangents be missed by the same, smallest length; from the path
         that comes of it the renewed tangents may have one.
         """
-        o, j = np.nonzero((distance < wanted + influence) & self.movable)
-        n = normal[o, j]
+        o, j = np.nonzero((distance < self.wanted + influence) & self.movable)
+        at_samples = (normal[o, j], self.wanted - distance[o, j], self.path.basis[j], self._away(positions)[j])
+        n, missing, lever, away = at_samples
+        if len(held.pair):
+            between = self._between(held, positions)
+            n, missing, lever, away = map(np.concatenate, zip(at_samples, between, strict=True))
         factors = self.path.factors[moved]
-        rows = self.path.basis[np.ix_(j, moved)][:, :, None] * np.swapaxes(n @ factors, 0, 1)
-        offset = np.einsum("rd,rd->r", n, positions[j] - self.path.nominal.positions[j])
-        lower = wanted - distance[o, j] + offset
+        rows = lever[:, moved][:, :, None] * np.swapaxes(n @ factors, 0, 1)
+        lower = missing + np.einsum("rd,rd->r", n, away)
         size = 3 * len(moved)
         n_tangents = len(rows)
         if len(self.forbidden):
