@@ -81,7 +81,7 @@ def test_without_the_caps_the_steps_would_be_many_times_too_long():
     pose = arm.tool_pose(straight)
     out = type(pose)(pose.position + [0.01, 0.0, 0.0], pose.quaternion)
     method._target = pose
-    assert (np.abs(method._increment(out)) / (arm.max_velocity / 30)).max() > 50.0
+    assert (np.abs(method._increment(straight, out)) / (arm.max_velocity / 30)).max() > 50.0
 
 
 def test_scaled_as_a_whole_the_tool_keeps_its_direction_and_is_cut_no_joint_by_itself():

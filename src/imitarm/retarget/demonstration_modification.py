@@ -108,7 +108,7 @@ class DemonstrationModification(RivalRetargeter):
     def _advance(self, estimate: ArmEstimate | None, clutch: Clutch) -> Array:
         if estimate is not None:
             self._goal = self._mapping.joints(estimate, clutch)
-            self._left = max(round(self._period / self.dt), 1)
+            self._left = self._steps
         if self._approach.active:
             return self._approach.towards(self._q, self._goal)
         if self._left <= 0:

@@ -77,24 +77,31 @@ class IncrementalIK(RivalRetargeter):
     def _advance(self, estimate: ArmEstimate | None, clutch: Clutch) -> Array:
         if estimate is not None:
             target = clutch.target(estimate.wrist, estimate.hand)
-            steps = max(round(self._period / self.dt), 1)
-            self._share, self._left = self._increment(target) / steps, steps
+            rest = self._left * self._capped(self._share)  # of the last frame, when this one came early
+            self._left = self._steps
+            self._share = (rest + self._increment(self._q + rest, target)) / self._left
             self._target = target
         if self._left <= 0:
             return self._q
         self._left -= 1
-        return self._q + self._capped(self._share)
+        self._count(self._share)
+        return self._q + (self._share if self.velocity_scaling else self._capped(self._share))
 
-    def _increment(self, target: Pose) -> Array:
-        """Return the joints' way of one frame, shape (n_joints,) [rad]."""
+    def _increment(self, q: Array, target: Pose) -> Array:
+        """Return the joints' way of one frame from where they will be, (n_joints,) [rad]; shape (n_joints,) [rad]."""
         before = target if self._target is None else self._target
-        twist = before.error_to(target) + self._gain * self.arm.tool_pose(self._q).error_to(before)
-        return np.asarray(np.linalg.pinv(self.arm.tool_jacobian(self._q), rcond=_RCOND) @ twist)
+        twist = before.error_to(target) + self._gain * self.arm.tool_pose(q).error_to(before)
+        return np.asarray(np.linalg.pinv(self.arm.tool_jacobian(q), rcond=_RCOND) @ twist)
 
     def _capped(self, step: Array) -> Array:
-        """Cut each joint to its velocity limit by itself; with scaling that is left to the scaling of the step."""
+        """Cut each joint to its velocity limit by itself, or scale the step as a whole."""
         most = self.dt * self.arm.max_velocity
-        over = int(np.count_nonzero(np.abs(step) > most * (1.0 + 1e-9)))
+        if self.velocity_scaling:
+            return np.asarray(step / max(float((np.abs(step) / most).max()), 1.0))
+        return np.clip(step, -most, most)
+
+    def _count(self, step: Array) -> None:
+        """Count the joints that a step would take beyond their velocity limits."""
+        over = int(np.count_nonzero(np.abs(step) > self.dt * self.arm.max_velocity * (1.0 + 1e-9)))
         self.counts["caps"] += over
         self.counts["capped_steps"] += over > 0
-        return step if self.velocity_scaling else np.clip(step, -most, most)

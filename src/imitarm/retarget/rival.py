@@ -132,6 +132,11 @@ class RivalRetargeter(Retargeter):
         """
         return {name: float(self.counts[name]) for name in ("velocity_excess", "position_clips", *self.counts)}
 
+    @property
+    def _steps(self) -> int:
+        """In how many control steps the next frame is to be expected, rounded up, so that no step stands still."""
+        return max(math.ceil(self._period / self.dt - 1e-6), 1)
+
     def _look(self, skeleton: Skeleton | None) -> ArmEstimate | None:
         """Take in a skeleton; return what is new, and count the time in which none showed the arm."""
         self._silence += self.dt
