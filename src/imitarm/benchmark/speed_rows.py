@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark import avoidance, families, ik_rows, retarget_rows
+from imitarm.benchmark import avoidance, families, ik_rows, retarget_rows, transmission_rows
 from imitarm.benchmark.timing import Row
 from imitarm.skills import DMP, GMR, GaussianMixture
 from imitarm.trajectory import Trajectory
@@ -302,5 +302,6 @@ ROWS: tuple[Callable[[], Row], ...] = (
     avoidance_of_three,
     *ik_rows.ROWS,
     *retarget_rows.ROWS,
+    *transmission_rows.ROWS,
     importing,
 )

@@ -43,7 +43,7 @@ second. What is recorded is written at once: a program that is killed leaves FIL
 Exit status 1 when nobody took hold, or the robot could not be led any more.
 """
 
-_SHOWN_EVERY = 10  # steps between two looks at the status line
+_SHOWN_EVERY = 25  # steps between two looks at the status line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     robot.add_argument("--scene", type=Path, metavar="FILE", help="obstacles to keep clear of (YAML); default: none")
     robot.add_argument("--method", choices=sorted(RETARGETERS), default="modern", help="default: modern")
-    robot.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="control steps a second; default: 100")
+    robot.add_argument("--rate", type=float, default=250.0, metavar="HZ", help="control steps a second; default: 250")
     parser.add_argument("--seconds", type=float, metavar="S", help="how long; default: to the end, or till Ctrl-C")
     output = parser.add_argument_group("output")
     output.add_argument("--record", type=Path, metavar="FILE", help="the robot's motion, as a demonstration (CSV)")

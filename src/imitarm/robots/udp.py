@@ -248,7 +248,7 @@ class UdpRobot(Robot):
     def close(self) -> None:
         """Stop the robot if this client leads it, and let go of the socket; a second call does nothing."""
         if self._socket.fileno() >= 0:
-            if self._heard is not None and self.ready:
+            if self._heard is not None and self.reported.owner == self._encoder.session:
                 self._say(Mode.STOP)
             self._socket.close()
 
