@@ -15,9 +15,9 @@ import pytest
 from imitarm.capture.mediapipe import MediaPipeSource
 from imitarm.capture.mediapipe_environment import find_python
 from imitarm.capture.recording import SkeletonRecording, read_recording
-from imitarm.capture.sides import SwapGuard
 from imitarm.capture.skeleton import SIDES
 from imitarm.capture.sources import open_source
+from imitarm.capture.video_figures import agreement, arm_raised, bone, elbow_bent, guarded, tracked_share
 from imitarm.cli import main
 from imitarm.errors import InputError
 from mediapipe_samples import VIDEOS
@@ -49,9 +49,9 @@ def seen(view: int) -> SkeletonRecording:
 
 
 @cache
-def guarded(view: int) -> SkeletonRecording:
+def kept_apart(view: int) -> SkeletonRecording:
     """The same with left and right kept apart."""
-    return SkeletonRecording(list(SwapGuard(seen(view))), name=f"view {view}")
+    return guarded(seen(view))
 
 
 def points(recording, *names):
@@ -62,16 +62,6 @@ def times(recording):
     return np.array([skeleton.time for skeleton in recording.skeletons])
 
 
-def angle(a, b):
-    """Angle between vectors (n, 3) [deg]."""
-    cos = np.sum(a * b, axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
-    return np.degrees(np.arccos(np.clip(cos, -1.0, 1.0)))
-
-
-def tracked(recording, side):
-    return np.array([skeleton.arm(side).confidence[:3].min() >= 1.0 for skeleton in recording.skeletons])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_real_person_is_seen_in_nearly_every_picture_at_the_videos_times(view):
@@ -80,8 +70,8 @@ def test_a_real_person_is_seen_in_nearly_every_picture_at_the_videos_times(view)
     steps = np.diff(times(recording)) * 60.0  # 60 pictures a second
     assert steps.min() > 0.99 and np.allclose(steps, np.round(steps), atol=1e-3)
     assert recording.persons == (0,)
-    shares = {side: np.mean(tracked(recording, side)) for side in SIDES}
-    assert shares["left"] > 0.9 and shares["right"] > (0.3 if view == 3 else 0.9)
+    assert tracked_share(recording, "left") > 0.9
+    assert tracked_share(recording, "right") > (0.3 if view == 3 else 0.9)
 
 
 @pytest.mark.slow
@@ -89,24 +79,19 @@ def test_a_real_person_is_seen_in_nearly_every_picture_at_the_videos_times(view)
 def test_a_real_person_has_a_persons_size_and_stands_in_the_room(view):
     recording = seen(view)
     for side in SIDES:
-        use = tracked(recording, side)
-        s, e, w = (part[use] for part in np.moveaxis(points(recording, *(f"{j}_{side}" for j in PARTS)), 1, 0))
-        for bone in (np.linalg.norm(e - s, axis=1), np.linalg.norm(w - e, axis=1)):
-            length = np.median(bone)  # robust: for some pictures of view 2 left and right are mixed
-            assert 0.17 < length < 0.35 and 1.4826 * np.median(np.abs(bone - length)) < 0.2 * length
+        for name in ("upper arm", "forearm"):
+            length, spread = bone(recording, side, name)
+            assert 0.17 < length < 0.35 and spread < 0.2
     head, hips = np.moveaxis(points(recording, "head", "spine_base"), 1, 0)
     assert (head[:, 1] > hips[:, 1]).mean() > 0.95
     distance = np.linalg.norm(hips, axis=1)
     assert 2.5 < np.median(distance) < 4.5 and np.ptp(distance) < 1.6  # from 3.2 to 3.8 m by the cameras' calibration
 
 
-PARTS = ("shoulder", "elbow", "wrist")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("view", VIEWS)
 def test_left_and_right_are_the_persons_own(view):
-    left, right = np.moveaxis(points(guarded(view), "shoulder_left", "shoulder_right"), 1, 0)
+    left, right = np.moveaxis(points(kept_apart(view), "shoulder_left", "shoulder_right"), 1, 0)
     assert np.mean(FACING[view] * (right - left)[:, 0] > 0.0) > 0.9
     left, right = np.moveaxis(points(seen(view), "shoulder_left", "shoulder_right"), 1, 0)
     share = np.mean(FACING[view] * (right - left)[:, 0] > 0.0)
@@ -116,34 +101,19 @@ def test_left_and_right_are_the_persons_own(view):
 @pytest.mark.slow
 @pytest.mark.parametrize(("one", "other"), list(combinations(VIEWS, 2)))
 def test_the_views_agree_how_far_the_left_arm_is_raised(one, other):
-    raised = []
-    for view in (one, other):
-        s, w, low, top = np.moveaxis(
-            points(guarded(view), "shoulder_left", "wrist_left", "spine_base", "spine_shoulder"), 1, 0
-        )
-        raised.append(at_the_same_times(view, angle(w - s, top - low), tracked(guarded(view), "left")))
-    a, b = np.array(raised)[:, np.isfinite(raised).all(axis=0)]
-    assert len(a) > 80 and np.corrcoef(a, b)[0, 1] > 0.85
-    assert np.ptp(a) > 40.0  # [deg]: there is something to agree upon
+    signals = [arm_raised(kept_apart(view), "left") for view in (one, other)]
+    alike, n = agreement(*signals)
+    assert n > 80 and alike > 0.85
+    assert min(np.ptp(list(signal.values())) for signal in signals) > 0.7  # [rad]: there is something to agree upon
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("one", "other"), [(1, 2), (1, 4), (2, 4)])
 def test_the_views_that_see_it_agree_how_the_right_elbow_bends(one, other):
-    bent = []
-    for view in (one, other):
-        s, e, w = np.moveaxis(points(guarded(view), *(f"{j}_right" for j in PARTS)), 1, 0)
-        bent.append(at_the_same_times(view, angle(s - e, w - e), tracked(guarded(view), "right")))
-    a, b = np.array(bent)[:, np.isfinite(bent).all(axis=0)]
-    assert len(a) > 80 and np.corrcoef(a, b)[0, 1] > 0.5
-    assert np.ptp(a) > 40.0
-
-
-def at_the_same_times(view, values, known):
-    """Values by picture number, nan where they are not known, shape (100,)."""
-    result = np.full(100, np.nan)
-    result[np.round(times(guarded(view)) * 60.0).astype(int)] = np.where(known, values, np.nan)
-    return result
+    signals = [elbow_bent(kept_apart(view), "right") for view in (one, other)]
+    alike, n = agreement(*signals)
+    assert n > 80 and alike > 0.5
+    assert min(np.ptp(list(signal.values())) for signal in signals) > 0.7
 
 
 @pytest.mark.slow
