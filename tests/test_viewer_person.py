@@ -11,8 +11,8 @@ from imitarm.capture.skeleton import JOINT, JOINTS, Skeleton, Tracking
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import rotate
 from imitarm.retarget import FACING
-from imitarm.viewer import PersonMark, palette, playback_html
-from imitarm.viewer.person import _BALLS, _BONES, _balls, _bones, _turns_from_z
+from imitarm.viewer import PersonMark, playback_html
+from imitarm.viewer.person import _BONES, _pieces, _turns_from_z
 from test_viewer_scene3d import messages
 from viewer_samples import make_recording
 
@@ -58,55 +58,83 @@ def test_without_feet_or_hips_the_person_is_still_above_the_floor() -> None:
         skeletons.append(Skeleton(skeleton.time, skeleton.positions, tracking))
     person = mark(skeletons, [0.0, 0.1])
     assert person.positions[0, JOINT["spine_base"], 2] == pytest.approx(FLOOR + 0.9, abs=0.05)
-    nobody = mark([Skeleton(0.0, np.full((25, 3), np.nan))], [0.0])
-    assert not (nobody.tracking > Tracking.LOST).any()
-    assert np.isfinite(np.concatenate([v.ravel() for v in (*_bones(nobody).values(), *_balls(nobody).values())])).all()
 
 
 @given(arrays(float, (5, 3), elements=st.floats(-1.0, 1.0)))
-def test_a_bone_lies_between_its_joints(directions: np.ndarray) -> None:
+def test_a_bone_lies_along_the_way_between_its_joints(directions: np.ndarray) -> None:
     lengths = np.linalg.norm(directions, axis=1)
     unit = directions[lengths > 1e-3] / lengths[lengths > 1e-3, None]
     np.testing.assert_allclose(rotate(_turns_from_z(unit), np.tile([0.0, 0.0, 1.0], (len(unit), 1))), unit, atol=1e-6)
     np.testing.assert_allclose(rotate(_turns_from_z(np.array([[0.0, 0.0, -1.0]])), [[0.0, 0.0, 1.0]]), [[0, 0, -1.0]])
 
 
-def test_the_drawn_bones_end_at_the_joints() -> None:
+def test_the_pieces_reach_from_joint_to_joint() -> None:
+    """Of a person whose bones keep their lengths."""
     person = mark(frames([0.0, 0.5]), [0.0, 0.5])
-    drawn = _bones(person)
-    ends = 0.5 * drawn["batched_scales"][..., 2:] * rotate(drawn["batched_wxyzs"], [0.0, 0.0, 1.0])
-    for k, joint in ((-1.0, 0), (1.0, 1)):
-        at = drawn["batched_positions"] + k * ends
-        np.testing.assert_allclose(at, person.positions[:, [JOINT[bone[joint]] for bone in _BONES]], atol=4e-3)
+    pieces = {piece.name: piece for piece in _pieces(person)}
+    assert {"head", "trunk", "elbow_right wrist_right"} <= set(pieces)
+    for start, end, *radii in _BONES:
+        piece, tip = pieces[f"{start} {end}"], max(radii[0], radii[2])
+        np.testing.assert_array_equal(piece.position, person.positions[:, JOINT[start]])
+        if not start.startswith(("elbow", "shoulder", "wrist")):
+            continue  # a trunk is not quite rigid
+        along = rotate(piece.wxyz, np.tile([0.0, 0.0, 1.0], (2, 1)))
+        length = np.linalg.norm(person.positions[0, JOINT[end]] - person.positions[0, JOINT[start]])
+        np.testing.assert_allclose(piece.position + length * along, person.positions[:, JOINT[end]], atol=5e-3)
+        assert length - 1e-6 <= piece.mesh.vertices[:, 2].max() <= length + tip + 5e-3
 
 
-def test_what_is_inferred_is_paler_what_is_lost_is_hidden_and_the_followed_arm_stands_out() -> None:
+def drawn(person: PersonMark, seconds: float = 1.0) -> tuple[dict, list]:
+    """The nodes and the timed messages of a playback with this person."""
+    _, played = messages(playback_html(make_recording(seconds=seconds), persons=[person]))
+    return {m["name"]: m for t, m in played if "props" in m}, played
+
+
+def test_what_is_inferred_is_paler_what_is_lost_is_not_drawn_and_the_followed_arm_stands_out() -> None:
     skeleton = frames([0.0])[0]
     tracking = np.array(skeleton.tracking)
     tracking[JOINT["elbow_right"]], tracking[JOINT["knee_left"]] = Tracking.INFERRED, Tracking.LOST
-    person = mark([Skeleton(0.0, skeleton.positions, tracking)], [0.0], side="right")
-    balls, names = _balls(person), list(_BALLS)
-    colour, size = balls["batched_colors"][0].astype(int), balls["batched_scales"][0].max(axis=1)
-    elbow, wrist, left = (names.index(name) for name in ("elbow_right", "wrist_right", "wrist_left"))
-    assert (colour[elbow] > colour[wrist]).all()
-    assert tuple(colour[wrist]) != tuple(colour[left])
-    assert size[names.index("knee_left")] < 1e-4 and size[names.index("knee_right")] > 0.03
-    other = _balls(mark([skeleton], [0.0], side="left"))["batched_colors"][0].astype(int)
-    assert tuple(other[left]) == tuple(colour[wrist])  # the accent has changed sides
-    assert palette.DEMONSTRATION.startswith("#cc79")
+    nodes, _ = drawn(mark([Skeleton(0.0, skeleton.positions, tracking)], [0.0]), 0.0)
+
+    def colour(piece: str, look: str) -> list[int]:
+        return list(nodes[f"/person/person {piece}/{look}"]["props"]["color"])
+
+    arm, other = colour("wrist_right hand_right", "seen"), colour("wrist_left hand_left", "seen")
+    assert arm != other
+    assert all(a > b for a, b in zip(colour("elbow_right wrist_right", "inferred"), arm, strict=True))
+    assert not any("knee_left" in name for name in nodes)
+    assert any("knee_right" in name for name in nodes)
+    swapped, _ = drawn(mark([skeleton], [0.0], side="left"), 0.0)
+    assert list(swapped["/person/person wrist_left hand_left/seen"]["props"]["color"]) == arm
 
 
 def test_person_and_robot_play_in_one_scene_at_the_same_times() -> None:
     recording = make_recording(seconds=1.0)
-    person = mark(frames(np.arange(0.0, 1.0, 1 / 30)), recording.times)
-    _, played = messages(playback_html(recording, persons=[person]))
-    nodes = {m["name"]: m for t, m in played if "props" in m}
-    assert {"/person/person bones", "/person/person balls"} <= set(nodes)
+    nodes, played = drawn(mark(frames(np.arange(0.0, 1.0, 1 / 30)), recording.times))
+    assert any(name.startswith("/bodies/") for name in nodes) and "/person/person head" in nodes
     moved = {t for t, m in played if t > 0.0 and m.get("name", "").startswith("/person/")}
     assert 10 < len(moved) <= len(recording) - 1
-    assert moved <= {round(float(t), 9) for t in recording.times} | set(recording.times.tolist())
+    assert moved <= set(recording.times.tolist())
     with pytest.raises(InputError, match="has 2 frames, the recording"):
         playback_html(recording, persons=[mark(frames([0.0, 0.1]), [0.0, 0.1])])
+
+
+def test_a_person_who_leaves_is_gone_and_comes_back() -> None:
+    times = make_recording(seconds=1.0).times
+    seen = np.concatenate([np.arange(0.0, 0.2, 0.04), np.arange(0.8, 1.0, 0.04)])
+    _, played = drawn(mark(frames(seen), times))
+    shown = [
+        (round(t, 2), m["visible"])
+        for t, m in played
+        if m["type"] == "SetSceneNodeVisibilityMessage" and m["name"] == "/person/person head/seen" and t > 0.0
+    ]
+    assert [visible for _, visible in shown] == [False, True]
+    assert 0.4 <= shown[0][0] <= 0.48 and shown[1][0] == pytest.approx(0.8, abs=0.041)
+
+
+def test_nobody_draws_nothing() -> None:
+    nodes, _ = drawn(mark([Skeleton(0.0, np.full((25, 3), np.nan))], [0.0]), 0.0)
+    assert not any(name.startswith("/person/") for name in nodes)
 
 
 def test_wrong_shapes_and_nobody_are_told() -> None:

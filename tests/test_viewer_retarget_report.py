@@ -91,7 +91,7 @@ def test_each_method_has_a_player_with_the_person_beside_the_robot(html: str) ->
     assert len(players) == 2
     _, played = messages(shared[0] + players[0] + shared[1])
     nodes = {m["name"] for t, m in played if "props" in m}
-    assert "/person/person bones" in nodes and "/paths/path of the tool" in nodes and "/paths/target 1" in nodes
+    assert "/person/person head" in nodes and "/paths/path of the tool" in nodes and "/paths/target 1" in nodes
     assert any("obstacle" in name for name in nodes)
     camera = next(m for _, m in played if m["type"] == "SetCameraPositionMessage")
     assert camera["position"][0] > 1.0  # from the front

@@ -13,7 +13,12 @@ _EXPOSURE: Final = 0.7
 
 
 class Mover:
-    """Something drawn whose poses follow those of bodies of the recording."""
+    """Something drawn that changes from frame to frame.
+
+    Args:
+        handle: of viser.
+        poses: what changes, by viser's names, frame by frame: ``position``, ``wxyz``, ..., or ``visible`` (n_frames,).
+    """
 
     def __init__(self, handle: Any, poses: Mapping[str, NDArray[Any]]) -> None:
         self._handle, self._poses = handle, poses
@@ -26,7 +31,7 @@ class Mover:
         """Send the poses of a frame, not the first, where they differ from the frame before."""
         for name, values in self._poses.items():
             if self._changed[name][frame - 1]:
-                setattr(self._handle, name, values[frame])
+                setattr(self._handle, name, bool(values[frame]) if values.ndim == 1 else values[frame])
 
 
 def node_name(kind: str, *names: object) -> str:

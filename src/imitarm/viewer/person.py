@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -13,50 +13,37 @@ from imitarm.capture.skeleton import JOINT, JOINTS, Skeleton, Tracking
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose, matrix_to_quaternion
 from imitarm.viewer import palette
-from imitarm.viewer.geometry import Mesh, cylinder, ellipsoid
+from imitarm.viewer.geometry import Mesh, cylinder, ellipsoid, merge
 from imitarm.viewer.nodes import Mover, lit, node_name
 
 Array = NDArray[np.float64]
 
 _GONE: Final = 0.25  # [s] a person not seen for longer is not drawn
 _STEP: Final = 2.0**-10  # [m], [-] as nodes.STEP, coarser: a camera sees no millimetres
-_HIDDEN: Final = 1e-5  # what is not to be seen is drawn as small as this
 _HIPS: Final = 0.9  # [m] above the floor, where no foot is seen
+_SOLE: Final = 0.036  # [m] of a foot about its joint
 _PALE: Final = 0.55  # share of white in what was only inferred
 _BODY: Final = "#6f7a8a"
 _SKIN: Final = "#c9a58c"
-# from, to, radius [m]
-_BONES: Final[tuple[tuple[str, str, float], ...]] = (
-    ("neck", "head", 0.045),
-    ("spine_shoulder", "neck", 0.05),
-    ("spine_shoulder", "shoulder_left", 0.05),
-    ("spine_shoulder", "shoulder_right", 0.05),
-    ("hip_left", "hip_right", 0.085),
-    *((f"shoulder_{side}", f"elbow_{side}", 0.042) for side in ("left", "right")),
-    *((f"elbow_{side}", f"wrist_{side}", 0.034) for side in ("left", "right")),
-    *((f"wrist_{side}", f"hand_{side}", 0.03) for side in ("left", "right")),
-    *((f"hand_{side}", f"hand_tip_{side}", 0.022) for side in ("left", "right")),
-    *((f"wrist_{side}", f"thumb_{side}", 0.012) for side in ("left", "right")),
-    *((f"hip_{side}", f"knee_{side}", 0.065) for side in ("left", "right")),
-    *((f"knee_{side}", f"ankle_{side}", 0.048) for side in ("left", "right")),
-    *((f"ankle_{side}", f"foot_{side}", 0.036) for side in ("left", "right")),
+# from, to, radius of the bone, of the ball where it begins, of the ball where it ends [m]
+_BONES: Final[tuple[tuple[str, str, float, float, float], ...]] = (
+    ("neck", "head", 0.045, 0.05, 0.0),
+    ("spine_shoulder", "neck", 0.05, 0.055, 0.0),
+    ("spine_shoulder", "shoulder_left", 0.05, 0.055, 0.0),
+    ("spine_shoulder", "shoulder_right", 0.05, 0.055, 0.0),
+    ("hip_left", "hip_right", 0.085, 0.085, 0.085),
+    *((f"shoulder_{side}", f"elbow_{side}", 0.042, 0.056, 0.042) for side in ("left", "right")),
+    *((f"elbow_{side}", f"wrist_{side}", 0.034, 0.046, 0.034) for side in ("left", "right")),
+    *((f"wrist_{side}", f"hand_{side}", 0.03, 0.037, 0.0) for side in ("left", "right")),
+    *((f"hand_{side}", f"hand_tip_{side}", 0.022, 0.036, 0.022) for side in ("left", "right")),
+    *((f"wrist_{side}", f"thumb_{side}", 0.012, 0.012, 0.014) for side in ("left", "right")),
+    *((f"hip_{side}", f"knee_{side}", 0.065, 0.085, 0.06) for side in ("left", "right")),
+    *((f"knee_{side}", f"ankle_{side}", 0.048, 0.062, 0.044) for side in ("left", "right")),
+    *((f"ankle_{side}", f"foot_{side}", _SOLE, 0.044, _SOLE) for side in ("left", "right")),
 )
-# a ball about each end of the bones, radius [m]
-_BALLS: Final = {
-    "spine_shoulder": 0.055,
-    **{f"shoulder_{side}": 0.056 for side in ("left", "right")},
-    **{f"elbow_{side}": 0.046 for side in ("left", "right")},
-    **{f"wrist_{side}": 0.037 for side in ("left", "right")},
-    **{f"hand_{side}": 0.036 for side in ("left", "right")},
-    **{f"hand_tip_{side}": 0.022 for side in ("left", "right")},
-    **{f"thumb_{side}": 0.014 for side in ("left", "right")},
-    **{f"hip_{side}": 0.085 for side in ("left", "right")},
-    **{f"knee_{side}": 0.062 for side in ("left", "right")},
-    **{f"ankle_{side}": 0.044 for side in ("left", "right")},
-    **{f"foot_{side}": 0.036 for side in ("left", "right")},
-}
 _HEAD: Final = (0.075, 0.09, 0.115)  # [m] semi-axes: across, forward, up
-_TRUNK: Final = (0.165, 0.1)  # [m] semi-axes across and forward; its length is that of the spine
+_TRUNK: Final = (0.165, 0.1)  # [m] semi-axes across and forward
+_TRUNK_LENGTH: Final = 0.58  # its third semi-axis over the length of the spine
 _ARM: Final = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
 
 
@@ -142,7 +129,7 @@ def _shift(turned: Array, place: tuple[float, float], floor: float) -> Array:
     """Return by how much joints (n, 25, 3) are moved so that the person stands at a place on the floor, (3,) [m]."""
     usual = np.array([_median(turned[:, joint]) for joint in range(len(JOINTS))])
     feet = [usual[JOINT[f"{part}_{side}"], 2] for part in ("ankle", "foot") for side in ("left", "right")]
-    low = np.nanmin(feet) - _BALLS["foot_left"] if np.isfinite(feet).any() else np.nan
+    low = np.nanmin(feet) - _SOLE if np.isfinite(feet).any() else np.nan
     known = np.flatnonzero(np.isfinite(usual).all(axis=1))
     middle = usual[JOINT["spine_base"]]
     if not np.isfinite(middle).all():
@@ -158,72 +145,92 @@ def _median(points: Array) -> Array:
     return np.median(known, axis=0) if len(known) else np.full(3, np.nan)
 
 
-def draw_person(server: Any, person: PersonMark) -> list[Mover]:
-    """Draw a person as in the first frame, and return what moves: the bones and the balls at their ends.
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """A rigid piece of the figure: what it looks like, and where it is in each frame.
 
-    All bones are one batch of cylinders and all balls one of spheres: a frame is two messages.
+    Attributes:
+        name: of it.
+        mesh: in its own frame.
+        colour: of it.
+        position: shape (n_frames, 3) [m]; nan where not known.
+        wxyz: shape (n_frames, 4).
+        tracking: shape (n_frames,).
     """
-    poses = (_bones(person), _balls(person))
-    meshes = (cylinder(1.0, 0.5), ellipsoid([1.0, 1.0, 1.0]))
-    return [
-        Mover(_add_batch(server, node_name("person", person.name, kind), mesh, pose), pose)
-        for kind, mesh, pose in zip(("bones", "balls"), meshes, poses, strict=True)
-    ]
+
+    name: str
+    mesh: Mesh
+    colour: str
+    position: Array
+    wxyz: Array
+    tracking: NDArray[np.int8]
 
 
-def _add_batch(server: Any, name: str, mesh: Mesh, poses: dict[str, NDArray[Any]]) -> Any:
-    first = {key: values[0] for key, values in poses.items()}
-    return server.scene.add_batched_meshes_simple(name, mesh.vertices, mesh.faces, lod="off", **first)
+def draw_person(server: Any, person: PersonMark) -> list[Mover]:
+    """Draw a person as in the first frame, and return what moves or comes and goes.
+
+    Every bone is a rigid piece as long as it mostly is. Batches would be fewer messages, but a browser builds them
+    aside, and may be at another frame than that of the robot when the playback is wound.
+    """
+    movers = []
+    for piece in _pieces(person):
+        known = (piece.tracking > Tracking.LOST) & np.isfinite(piece.position).all(axis=1)
+        if not known.any():
+            continue
+        last = np.maximum.accumulate(np.where(known, np.arange(len(known)), int(np.argmax(known))))
+        poses = {"position": _rounded(piece.position[last]), "wxyz": _rounded(piece.wxyz[last])}
+        name = node_name("person", person.name, piece.name)
+        frame = server.scene.add_frame(name, show_axes=False, position=poses["position"][0], wxyz=poses["wxyz"][0])
+        movers.append(Mover(frame, poses))
+        for look, white, state in (("seen", 0.0, Tracking.TRACKED), ("inferred", _PALE, Tracking.INFERRED)):
+            visible = known & (piece.tracking == state)
+            if visible.any():
+                mesh = server.scene.add_mesh_simple(
+                    f"{name}/{look}",
+                    piece.mesh.vertices,
+                    piece.mesh.faces,
+                    color=lit(_paler(piece.colour, white)),
+                    visible=bool(visible[0]),
+                )
+                movers.append(Mover(mesh, {"visible": visible}))
+    return movers
 
 
-def _bones(person: PersonMark) -> dict[str, NDArray[Any]]:
-    """Return poses, scales and colours of the bones, frame by frame."""
-    begins, ends = [JOINT[bone[0]] for bone in _BONES], [JOINT[bone[1]] for bone in _BONES]
-    start, end = person.positions[:, begins], person.positions[:, ends]
-    tracking = np.minimum(person.tracking[:, begins], person.tracking[:, ends])
-    along = end - start
-    length = np.linalg.norm(along, axis=2)
-    radius = np.broadcast_to([bone[2] for bone in _BONES], length.shape)
-    colours = [_colour(person.side, bone[0] if "spine" not in bone[0] else bone[1], bone[1]) for bone in _BONES]
-    return _batch(
-        0.5 * (start + end),
-        _turns_from_z(along / np.maximum(length, 1e-9)[..., None]),
-        np.stack([radius, radius, length], axis=2),
-        tracking,
-        colours,
-    )
+def _rounded(values: Array) -> Array:
+    return np.round(values / _STEP) * _STEP
 
 
-def _balls(person: PersonMark) -> dict[str, NDArray[Any]]:
-    """Return poses, scales and colours of the balls at the bones' ends, of the head and of the trunk."""
-    n = len(person)
-    index = [JOINT[name] for name in _BALLS]
-    upright = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (n, len(index), 4))
-    radii = np.broadcast_to(np.array(list(_BALLS.values()))[:, None], (n, len(index), 3))
-    body, body_tracking = _body(person)
-    return _batch(
-        np.concatenate([person.positions[:, index], body[0]], axis=1),
-        np.concatenate([upright, body[1]], axis=1),
-        np.concatenate([radii, body[2]], axis=1),
-        np.concatenate([person.tracking[:, index], body_tracking], axis=1),
-        [*(_colour(person.side, name, name) for name in _BALLS), _SKIN, _BODY],
-    )
-
-
-def _body(person: PersonMark) -> tuple[tuple[Array, Array, Array], NDArray[np.int8]]:
-    """Return centres, rotations and semi-axes of head and trunk, (n, 2, ...), and how they are known."""
+def _pieces(person: PersonMark) -> Iterator[_Piece]:
+    """Give the bones, then head and trunk."""
     p = {name: person.positions[:, JOINT[name]] for name in JOINTS}
     t = {name: person.tracking[:, JOINT[name]] for name in JOINTS}
+    for start, end, *radii in _BONES:
+        along = p[end] - p[start]
+        length = np.linalg.norm(along, axis=1)
+        turns = _turns_from_z(along / np.maximum(length, 1e-9)[:, None])
+        known = length[np.isfinite(length)]
+        mesh = _bone(float(np.median(known)) if len(known) else 0.0, *radii)
+        colour = _colour(person.side, start, end)
+        yield _Piece(f"{start} {end}", mesh, colour, p[start], turns, np.minimum(t[start], t[end]))
     across = p["shoulder_left"] - p["shoulder_right"]
-    spine, nod = p["spine_shoulder"] - p["spine_base"], p["head"] - p["neck"]
-    length = np.linalg.norm(spine, axis=1)
-    half = np.stack([np.full(len(person), _TRUNK[0]), np.full(len(person), _TRUNK[1]), 0.58 * length], axis=1)
-    poses = (
-        np.stack([p["head"], 0.5 * (p["spine_shoulder"] + p["spine_base"])], axis=1),
-        np.stack([_upright(nod, across), _upright(spine, across)], axis=1),
-        np.stack([np.broadcast_to(_HEAD, half.shape), half], axis=1),
+    yield _Piece("head", ellipsoid(_HEAD), _SKIN, p["head"], _upright(p["head"] - p["neck"], across), t["head"])
+    spine = p["spine_shoulder"] - p["spine_base"]
+    lengths = np.linalg.norm(spine, axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    trunk = ellipsoid([*_TRUNK, _TRUNK_LENGTH * float(np.median(lengths)) if len(lengths) else 0.1])
+    middle = 0.5 * (p["spine_shoulder"] + p["spine_base"])
+    yield _Piece(
+        "trunk", trunk, _BODY, middle, _upright(spine, across), np.minimum(t["spine_base"], t["spine_shoulder"])
     )
-    return poses, np.stack([t["head"], np.minimum(t["spine_base"], t["spine_shoulder"])], axis=1)
+
+
+def _bone(length: float, radius: float, begins: float, ends: float) -> Mesh:
+    """Return a bone from the origin along z, with a ball where it begins and, if its radius is not 0, where it ends."""
+    half = 0.5 * max(length, 1e-3)
+    parts = [cylinder(radius, half).moved([0.0, 0.0, half], np.eye(3)), ellipsoid([begins] * 3)]
+    if ends > 0.0:
+        parts.append(ellipsoid([ends] * 3).moved([0.0, 0.0, 2.0 * half], np.eye(3)))
+    return merge(parts)
 
 
 def _upright(up: Array, across: Array) -> Array:
@@ -233,8 +240,7 @@ def _upright(up: Array, across: Array) -> Array:
     known = np.linalg.norm(y, axis=1) > 1e-6  # not nan either
     z = up[known] / np.linalg.norm(up[known], axis=1, keepdims=True)
     y = y[known] / np.linalg.norm(y[known], axis=1, keepdims=True)
-    matrices = np.stack([np.cross(y, z), y, z], axis=2)
-    turns[known] = matrix_to_quaternion(matrices)
+    turns[known] = matrix_to_quaternion(np.stack([np.cross(y, z), y, z], axis=2))
     return turns
 
 
@@ -247,37 +253,15 @@ def _turns_from_z(directions: Array) -> Array:
     return np.where(back, [0.0, 1.0, 0.0, 0.0], turns / np.where(back, 1.0, length))
 
 
-def _batch(
-    positions: Array, quaternions: Array, scales: Array, tracking: NDArray[np.int8], colours: Sequence[str]
-) -> dict[str, NDArray[Any]]:
-    """Return what viser needs to draw a batch, frame by frame; what is lost stays where it was, too small to see."""
-    known = (tracking > Tracking.LOST) & np.isfinite(positions).all(axis=2) & np.isfinite(scales).all(axis=2)
-    last = np.maximum.accumulate(np.where(known, np.arange(len(known))[:, None], 0), axis=0)
-    column = np.arange(known.shape[1])
-    shown = {
-        "batched_positions": np.nan_to_num(positions[last, column]),
-        "batched_wxyzs": quaternions[last, column],
-        "batched_scales": np.where(known[..., None], np.nan_to_num(scales), _HIDDEN),
-    }
-    rounded = {name: np.round(values / _STEP) * _STEP for name, values in shown.items()}
-    rounded["batched_scales"] = np.maximum(rounded["batched_scales"], _HIDDEN)
-    sure, pale = (np.array([_rgb(colour, share) for colour in colours]) for share in (0.0, _PALE))
-    held = tracking[last, column]
-    return {
-        **{name: values.astype(np.float32) for name, values in rounded.items()},
-        "batched_colors": np.where((held == Tracking.INFERRED)[..., None], pale, sure).astype(np.uint8),
-    }
-
-
-def _rgb(colour: str, white: float) -> Array:
-    share = (1.0 - white) * np.array(palette.rgb(colour)) / 255.0 + white
-    return np.round(255.0 * np.array(lit(share.tolist(), linear=True)))
+def _paler(colour: str, white: float) -> list[float]:
+    """Return red, green and blue, 0 to 1, of a colour with a share of white."""
+    return [(1.0 - white) * part / 255.0 + white for part in palette.rgb(colour)]
 
 
 def _colour(side: str, start: str, end: str) -> str:
-    """Return the colour of a bone or a ball: the followed arm stands out, hands and head are skin."""
+    """Return the colour of a bone: the followed arm stands out, hands and neck are skin."""
     followed = {f"{part}_{side}" for part in _ARM}
     if start in followed and end in followed:
         return palette.DEMONSTRATION
     bare = ("hand", "thumb", "head", "neck")
-    return _SKIN if start.startswith(bare) or end.startswith(bare) else _BODY
+    return _SKIN if end.startswith(bare) else _BODY
