@@ -1,9 +1,12 @@
-"""Real people lead simulated arms: what a camera and a motion capture system recorded, retargeted by ``modern``.
+"""Real people lead simulated arms: what a Kinect, a motion capture system and a film recorded, led by ``modern``.
 
 Limits are measured here, from the joint positions alone, in every control period.
 """
 
 from __future__ import annotations
+
+import os
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,11 +14,15 @@ import pytest
 from imitarm import ArmModel, SimulatedRobot
 from imitarm.benchmark.seen_arm import seen_arm
 from imitarm.capture.checks import repaired
+from imitarm.capture.mediapipe_environment import find_python
 from imitarm.capture.recording import read_recording
 from imitarm.capture.slowing import slowed
+from imitarm.capture.sources import followed, open_source
+from imitarm.errors import InputError
 from imitarm.retarget import Correspondence, ModernRetargeter
 from imitarm.retarget.engagement import SEEN_FOR
 from imitarm.retarget.fitting import fit_motion
+from mediapipe_samples import VIDEOS
 
 DT = 0.01
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
@@ -111,3 +118,39 @@ def test_a_simulated_arm_with_its_drives_follows(real_data, arm, name, pace):
     assert np.linalg.norm(tool - arm.tool_pose(run.joints[-1]).position) < 0.005
     assert (np.abs(torques) <= arm.max_torque + 1e-9).all()
     assert (np.mean(np.abs(torques), axis=0) < 0.6 * arm.max_torque).all()  # not at the rated torque all the time
+
+
+@cache
+def man_in_the_film(view):
+    """The man of the pose2sim videos, as MediaPipe sees him from one side, left and right kept apart."""
+    with followed(open_source(f"video:{VIDEOS / f'cam0{view}.mp4'}")) as one:
+        return list(one)
+
+
+@pytest.fixture
+def film():
+    """MediaPipe and the videos; where CI=true their absence is a failure, elsewhere the test is skipped."""
+    try:
+        find_python()
+        missing = "" if (VIDEOS / "cam04.mp4").is_file() else f"there are no videos in {VIDEOS}; say 'make mediapipe'"
+    except InputError as error:
+        missing = str(error)
+    if missing and os.environ.get("CI") == "true":
+        pytest.fail(missing)
+    if missing:
+        pytest.skip(missing)
+    return man_in_the_film
+
+
+@pytest.mark.slow
+@each_arm
+@pytest.mark.parametrize("view", [1, 2, 3, 4])
+def test_a_man_in_a_film_breaks_no_limit_either(film, arm, view):
+    """Filmed by one camera at 60 Hz for 1.65 s: he swings his arms, and depth is guessed."""
+    skeletons = film(view)
+    for side in ("left", "right"):
+        for pace in (1.0, 0.5):
+            run = fitted(arm, slowed(skeletons, pace), Correspondence(side, orientation="fixed"))
+            assert_within_limits(arm, run.joints)
+            assert (run.states == "following").mean() > 0.3
+            assert np.ptp(run.joints, axis=0).max() > 0.1
