@@ -38,6 +38,8 @@ def test_a_good_follower_before_a_faultless_camera(followed):
     assert found.tool_rms_without_lag < found.tool_rms
     assert found.tool_rms_from_first == pytest.approx(found.tool_rms)  # it was engaged once
     assert found.engagements == 1
+    assert found.executed_rms == pytest.approx(found.tool_rms, rel=0.01)  # its commands are within the limits
+    assert found.executed_rms_without_lag == pytest.approx(found.tool_rms_without_lag, rel=0.01)
     assert found.broken_limits == 0
     assert found.settling_time < 0.6
     assert found.orientation_rms < 0.02
@@ -69,7 +71,7 @@ def test_what_needs_the_truth_is_nan_without_it_and_the_rest_is_the_same(followe
     blind, seeing = measure(run, correspondence), measure(run, correspondence, true)
     needing = {
         *("tool_rms", "tool_rms_without_lag", "lag", "tool_rms_from_first", "orientation_rms"),
-        *("elbow_direction_rms", "elbow_angle_rms", "settling_time"),
+        *("elbow_direction_rms", "elbow_angle_rms", "settling_time", "executed_rms", "executed_rms_without_lag"),
     }
     for field in dataclasses.fields(blind):
         value = getattr(blind, field.name)

@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark.motion_measures import ArmMotion, jerk_rms, path_length, spectral_arc_length, violations
+from imitarm.benchmark.motion_measures import (
+    ArmMotion,
+    executed,
+    jerk_rms,
+    path_length,
+    spectral_arc_length,
+    violations,
+)
 from imitarm.benchmark.tracking import (
     Hold,
     TrueArm,
@@ -48,6 +55,9 @@ class MappingMetrics:
         lag: that lag [s].
         tool_rms_from_first: distance to the reference of the first engagement over all frames after it, whatever
             the state, lag included [m].
+        executed_rms: distance of the tool to the reference, lag included, when an arm that keeps its limits of
+            position, velocity and acceleration executes the commands [m]: nothing is gained by breaking them.
+        executed_rms_without_lag: the same with the best constant lag taken out [m].
         target_rms: distance of the tool to the method's own target [m].
         orientation_rms: angle between the tool's rotation and the reference [rad].
         elbow_direction_rms: angle between the robot's upper arm and where it should point, see
@@ -86,6 +96,8 @@ class MappingMetrics:
     tool_rms_without_lag: float
     lag: float
     tool_rms_from_first: float
+    executed_rms: float
+    executed_rms_without_lag: float
     target_rms: float
     orientation_rms: float
     elbow_direction_rms: float
@@ -137,6 +149,7 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
     tool_rms, without_lag, lag, from_first, turned, upper_arm, swing = _tracking(
         run, motion, hold, correspondence, true
     )
+    executed_rms, executed_without_lag = _executed(run, motion, hold, correspondence, true)
     targets = run.targets[0]
     aimed = np.isfinite(targets).all(axis=1)
     moving = motion.torques - motion.gravity
@@ -149,6 +162,8 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
         tool_rms_without_lag=without_lag,
         lag=lag,
         tool_rms_from_first=from_first,
+        executed_rms=executed_rms,
+        executed_rms_without_lag=executed_without_lag,
         target_rms=rms((motion.tool - targets)[aimed]),
         orientation_rms=turned,
         elbow_direction_rms=upper_arm,
@@ -197,6 +212,17 @@ def _tracking(
         rms(elbow_direction_errors(true, motion.sew, hold)[led]),
         rms(swing[led & np.isfinite(swing)]),
     )
+
+
+def _executed(
+    run: Retargeting, motion: ArmMotion, hold: Hold, correspondence: Correspondence, true: TrueArm | None
+) -> tuple[float, float]:
+    """Return how far an arm that keeps its limits is from the reference: as it is, and without lag."""
+    if true is None or not hold.led.any():
+        return math.nan, math.nan
+    tool = run.arm.tool_path(executed(run.arm, run.joints, motion.dt))[0]
+    off = tool - reference_positions(true, tool, hold, correspondence.scale)
+    return rms(off[hold.led]), best_lag(true, tool, hold, correspondence.scale)[1]
 
 
 def _settling(
