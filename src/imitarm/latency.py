@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 STAGES = {
     "expose": "exposure to sent by the capture process",
-    "arrive": "sent to received, beyond the quickest",
+    "arrive": "sent to received",
     "wait": "received to taken by a control step",
     "retarget": "taken to command ready",
     "send": "command ready to sent to the robot",
@@ -23,7 +23,7 @@ STAGES = {
     "apply": "received by the robot to applied",
     "total": "exposure to applied",
 }
-"""The stages a frame goes through, in order, and what each is; ``total`` is the sum of what was measured."""
+"""The stages a frame goes through, in order, and what each is. Between two machines the quickest way counts as none."""
 
 _CHUNK = 1024
 

@@ -83,7 +83,7 @@ class Arrival(NamedTuple):
 
     Attributes:
         waited: between exposure and sending [s].
-        queued: on the way, beyond the quickest way there was [s].
+        queued: on the way [s]; from another machine, beyond the quickest there was.
         received_ns: when it was received [ns].
     """
 
@@ -137,24 +137,26 @@ class UdpSource(SkeletonSource):
         """Return the next skeleton; None when none came within ``timeout`` seconds, or it was closed."""
         until = clock.monotonic() + timeout
         while not self._closed:
-            for data, _ in waiting(self._socket):
+            for data, address in waiting(self._socket):
                 now = self._clock_ns()
                 came = self.gate.open(data, now, SkeletonFrame)
                 if came is not None:
-                    return self._skeleton(came[1], now)
+                    here = address[0].startswith("127.")  # one clock for both sides
+                    way = 1e-9 * (now - came[0].time_ns) if here else self.gate.age
+                    return self._skeleton(came[1], now, way)
             left = until - clock.monotonic()
             if left <= 0.0:
                 break
             wait_for(self._socket, left)
         return None
 
-    def _skeleton(self, frame: SkeletonFrame, now: int) -> Skeleton:
+    def _skeleton(self, frame: SkeletonFrame, now: int, way: float) -> Skeleton:
         """Return what was sent, at a time that goes on from one session to the next."""
         if self.gate.sessions != self._sessions:
             self._sessions = self.gate.sessions
             silent = 0.0 if self.arrival is None else 1e-9 * (now - self.arrival.received_ns)
             self._shift = self._time + silent - frame.time
-        self.arrival = Arrival(1e-9 * frame.waited_ns, self.gate.age, now)
+        self.arrival = Arrival(1e-9 * frame.waited_ns, way, now)
         self._time = frame.time + self._shift
         left, right = frame.hands
         return Skeleton(self._time, frame.positions, frame.tracking, (HandState(left), HandState(right)), frame.person)
