@@ -11,12 +11,13 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.benchmark.driving import drive as drive_run
 from imitarm.benchmark.mapping_metrics import MappingMetrics
 from imitarm.benchmark.seen_arm import seen_arm
 from imitarm.capture.motions import Truth
 from imitarm.capture.skeleton import SIDES, Skeleton
 from imitarm.capture.slowing import slowed
-from imitarm.cli.driven import driven
+from imitarm.cli.driven import with_driven
 from imitarm.cli.gathering import source_help
 from imitarm.cli.merit import judged
 from imitarm.cli.person import person_of
@@ -204,7 +205,7 @@ def _retargeted(
     if drive:
         shares = [0.0]
         with watched(f"driving {setting.arm.name}", lambda: shares[-1]):
-            result = driven(result, setting.scene, shares.append)
+            result = with_driven(result, drive_run(made, setting.scene, shares.append))
     return result, metrics
 
 

@@ -1,0 +1,159 @@
+"""Real people lead the simulated arms: the tables of docs/real_data.md, as Markdown.
+
+    python -m imitarm.benchmark.real_motions DATA [VIDEO ...]
+
+DATA is the folder with ``kinect_gestures`` and ``mocap_arm``, VIDEO are films of a person or recordings of one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from imitarm.benchmark.driving import drive
+from imitarm.benchmark.mapping_metrics import measure
+from imitarm.benchmark.seen_arm import seen_arm, target_lag
+from imitarm.capture.checks import repaired
+from imitarm.capture.recording import SkeletonRecording
+from imitarm.capture.skeleton import Skeleton
+from imitarm.capture.slowing import slowed
+from imitarm.capture.sources import followed, open_source
+from imitarm.errors import ImitarmError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.retarget import RETARGETERS, Correspondence
+from imitarm.retarget.engagement import SEEN_FOR
+from imitarm.retarget.fitting import fit_motion
+
+PACES = (1.0, 0.5)
+_PERIOD = 0.01  # [s]
+_STRIDE = 10  # periods over which a hand's speed is taken: a camera's noise would be most of it in one
+_FILMS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
+_GESTURES = {
+    "wave hand": ("Ges01_wavehand.csv", "right"),
+    "balance hands": ("Ges02_balancinghands.csv", "right"),
+    "draw lines": ("Ges03_drawlines.csv", "right"),
+    "come here": ("Ges04_comehere.csv", "left"),
+}
+
+
+class Shown(NamedTuple):
+    """A motion of a real person: its name, the skeletons, the arm that moves."""
+
+    name: str
+    skeletons: list[Skeleton]
+    side: str
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the tables; return 0."""
+    parser = argparse.ArgumentParser(prog="python -m imitarm.benchmark.real_motions", description=__doc__)
+    parser.add_argument("data", type=Path, metavar="DATA")
+    parser.add_argument("videos", nargs="*", metavar="VIDEO")
+    arguments = parser.parse_args(argv)
+    try:
+        motions = list(real_motions(arguments.data, arguments.videos))
+        for line in tables(motions):
+            sys.stdout.write(line + "\n")
+            sys.stdout.flush()
+    except ImitarmError as error:
+        sys.stderr.write(f"{error}\n")
+        return error.exit_status
+    return 0
+
+
+def real_motions(data: Path, videos: Sequence[str] = ()) -> Iterator[Shown]:
+    """Give what there is of real people in motion.
+
+    Args:
+        data: the folder of real recordings.
+        videos: films of a person, or recordings of one.
+
+    Raises:
+        InputError: when a file is missing or can't be read, or MediaPipe is needed and not there.
+    """
+    for name, (file, side) in _GESTURES.items():
+        yield Shown(name, _person(str(data / "kinect_gestures" / file)), side)
+    yield Shown("motion capture", _person(str(data / "mocap_arm" / "recording.tsv")), "right")
+    for video in videos:
+        word = f"video:{video}" if Path(video).suffix.lower() in _FILMS else video
+        yield Shown(f"video {Path(video).stem}", _person(word), "left")
+
+
+def _person(word: str) -> list[Skeleton]:
+    source = open_source(word)
+    mended = repaired(source)[0] if isinstance(source, SkeletonRecording) else source
+    with followed(mended) as one:
+        return list(one)
+
+
+def tables(motions: Sequence[Shown]) -> Iterator[str]:
+    """Give the lines of the tables: ``modern`` on every motion and arm, then all methods on the first and the last."""
+    heads = (
+        "motion",
+        "arm",
+        "pace",
+        "scale",
+        "tool asked for, up to [m/s]",
+        "following [%]",
+        "to its target, RMS [mm]",
+        "lag [ms]",
+        "frames beyond a limit",
+        "highest velocity, acceleration [% of the limit]",
+        "driven: behind, at most [mrad]",
+        "driven: torque [% of rated]",
+    )
+    yield from _head(heads)
+    for motion in motions:
+        for arm in ("sawyer", "panda"):
+            for pace in PACES:
+                yield _line([motion.name, arm, f"{pace:g}", *_row(motion, arm, pace, "modern")])
+    yield ""
+    yield from _head((*heads[:3], "method", *heads[3:]))
+    for motion in motions[:1]:
+        for arm in ("sawyer", "panda"):
+            for method in RETARGETERS:
+                yield _line([motion.name, arm, f"{PACES[-1]:g}", method, *_row(motion, arm, PACES[-1], method)])
+
+
+def _row(motion: Shown, robot: str, pace: float, method: str) -> list[str]:
+    """Return the cells of one motion by one method on one arm, which begins where all of the motion is in its reach."""
+    arm = ArmModel.load(robot, tool="gripper")
+    skeletons = slowed(motion.skeletons, pace)
+    follow = Correspondence(motion.side, orientation="fixed")
+    wrist = seen_arm(skeletons, np.arange(SEEN_FOR, skeletons[-1].time - skeletons[0].time, _PERIOD), follow).wrist
+    fit = fit_motion(arm, wrist, wrist[0])
+    follow = replace(follow, scale=fit.scale)
+    gone = np.linalg.norm(wrist[_STRIDE:] - wrist[:-_STRIDE], axis=1) / (_STRIDE * _PERIOD)
+    run = RETARGETERS[method](arm, follow, dt=_PERIOD).run(skeletons, fit.q)
+    m, driven = measure(run, follow), drive(run)
+    lag = 1e3 * target_lag(run.times, arm.tool_path(run.joints)[0], run.targets[0])
+    return [
+        f"{fit.scale:.2f}",
+        f"{fit.scale * float(gone.max()):.1f}",
+        f"{100 * m.following_share:.0f}",
+        f"{1e3 * m.target_rms:.0f}",
+        f"{lag:.0f}" if np.isfinite(lag) else "–",
+        str(m.broken_limits),
+        f"{100 * m.velocity_ratio:.0f}, {100 * m.acceleration_ratio:.0f}",
+        f"{1e3 * driven.behind_max:.1f}",
+        f"{100 * driven.peak_torque_ratio:.0f}" + (" (stopped itself)" if driven.fault else ""),
+    ]
+
+
+def _head(cells: Sequence[str]) -> Iterator[str]:
+    yield _line(cells)
+    yield _line(["---"] * len(cells))
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
