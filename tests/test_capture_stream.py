@@ -105,6 +105,15 @@ def test_frames_that_waited_too_long_are_dropped(link):
     assert link.source.gate.dropped == {"stale": 5}
 
 
+def test_what_came_before_somebody_listened_can_be_forgotten(link):
+    for skeleton in skeletons(5):
+        link.sender.send(skeleton)
+    link.clock.ns += 10_000 * MS
+    link.source.flush()
+    assert link.source.read(0.0) is None
+    assert same(link.pass_on(skeletons(1)[0]), skeletons(1)[0])
+
+
 def test_how_it_came_is_told(link):
     skeleton = skeletons(1)[0]
     link.pass_on(skeleton)

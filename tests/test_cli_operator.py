@@ -9,6 +9,7 @@ import pytest
 
 from imitarm.cli.operator import Operator, _standard_input
 from imitarm.errors import TaskFailedError
+from imitarm.robots.udp import TAKEN
 
 
 class Keyboard:
@@ -76,6 +77,13 @@ def test_at_the_start_it_may_be_let_without_asking_and_only_then(keyboard):
     operator = Operator(lambda line: None, enable_first=True, read=keyboard.read)
     assert operator("just started", True) and not operator("the robot does not answer", False)
     operator.led()
+    assert not operator("no valid command for 500 ms", True)
+
+
+def test_a_robot_that_somebody_leads_at_the_start_is_not_taken_over_when_it_stops_later(keyboard):
+    operator = Operator(lambda line: None, enable_first=True, read=keyboard.read)
+    assert not operator(TAKEN, False)
+    assert not operator("no valid command for 500 ms", True)
     assert not operator("no valid command for 500 ms", True)
 
 

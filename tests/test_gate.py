@@ -70,6 +70,15 @@ def test_a_time_in_the_future_does_not_make_the_others_look_late():
     assert gate.dropped == {"clock": 1}
 
 
+def test_a_clock_that_was_wrong_at_first_is_believed_after_half_a_second():
+    """The first datagram had waited for ages: the offset that was concluded from it locks nobody out."""
+    gate = Gate()
+    gate.admit(header(0, 0), 20_000 * MS)
+    admitted = [gate.admit(header(k, 20_000 * MS + k * PERIOD), 20_000 * MS + k * PERIOD) for k in range(1, 100)]
+    assert not any(admitted[:50]) and all(admitted[51:])
+    assert gate.age == 0.0
+
+
 def test_two_senders_are_never_mixed():
     gate = Gate()
     admitted = []

@@ -224,6 +224,25 @@ def test_another_arm_is_not_led(served):
         UdpRobot(ArmModel.load("panda"), served.server.address, clock_ns=served.clock, sleep=served.sleep)
 
 
+def test_another_arm_that_takes_the_place_of_the_robot_is_not_led(led):
+    served, robot = led
+    wave(served, robot, 0.3)
+    port = served.server.address[1]
+    served.kill()
+    for _ in range(15):
+        robot.move(np.zeros(N), PERIOD)
+        served.sleep(PERIOD)
+    other = Served(SimulatedRobot(ArmModel.load("panda")), port=port, clock=served.clock)
+    try:
+        for _ in range(20):
+            robot.move(np.ones(N), PERIOD)
+            other.sleep(PERIOD)
+        assert not robot.ready and robot.trouble == "the robot that answers is not sawyer"
+        assert not other.robot.velocity.any()
+    finally:
+        other.kill()
+
+
 def test_a_robot_that_can_not_be_enabled_says_why(led):
     served, robot = led
     with served.client() as second, pytest.raises(TaskFailedError, match="not enabled: somebody else leads"):

@@ -29,6 +29,7 @@ REASONS = {
 _HALF = 2**31
 _MASK = 2**32 - 1
 _WINDOW = 60_000_000_000  # [ns] quicker than two clocks drift apart by what matters, longer than a queue lasts
+_BELIEVED_AFTER = 500_000_000  # [ns] of silence
 _RETIRED = 64  # sessions remembered
 
 
@@ -105,7 +106,7 @@ class Gate:
     def _fault(self, header: Header, now: int) -> str:
         """Return why a datagram is to be dropped; empty when it is not."""
         difference = now - header.time_ns
-        fault = self._unwanted(header, now) or self._untimely(header, difference)
+        fault = self._unwanted(header, now) or self._untimely(header, difference, now)
         if fault:
             return fault
         if self._last is None:
@@ -131,12 +132,13 @@ class Gate:
         self.begin(header.session)
         return ""
 
-    def _untimely(self, header: Header, difference: int) -> str:
+    def _untimely(self, header: Header, difference: int, now: int) -> str:
         """Return why this does not come after the one before."""
         if self._last is None:
             return ""
         step = (header.sequence - self._last) & _MASK
         if step == 0 or step >= _HALF:
             return "order" if step else "duplicate"
-        # or it would make all that come after it look late
-        return "clock" if difference < min(self._least) - 10.0 * self._max_age else ""
+        # or it would make all that come after it look late; but when nothing else comes, it is the clock that was wrong
+        early = difference < min(self._least) - 10.0 * self._max_age
+        return "clock" if early and now - self._heard <= _BELIEVED_AFTER else ""

@@ -139,6 +139,8 @@ class Teleoperation:
         """
         dt, tally = self.retargeter.dt, self.tally
         ending: float | None = None
+        if self._stream is not None:
+            self._stream.flush()
         try:
             while not tally.reason:
                 skeleton = self._newest()

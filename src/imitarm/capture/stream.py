@@ -133,6 +133,11 @@ class UdpSource(SkeletonSource):
         self._closed = True
         self._socket.close()
 
+    def flush(self) -> None:
+        """Forget what has come so far: who has been busy elsewhere since this was opened begins with what comes now."""
+        for _ in waiting(self._socket):
+            pass
+
     def read(self, timeout: float = 1.0) -> Skeleton | None:
         """Return the next skeleton; None when none came within ``timeout`` seconds, or it was closed."""
         until = clock.monotonic() + timeout

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 
 from imitarm.errors import TaskFailedError
+from imitarm.robots.udp import TAKEN
 
 
 class Operator:
@@ -47,6 +48,7 @@ class Operator:
         Raises:
             TaskFailedError: when it is stopped and nobody can answer.
         """
+        self._first = self._first and trouble != TAKEN  # that was at the start, and is not to be taken over later
         if self._first:
             return stopped
         if (trouble, stopped) != self._asked:

@@ -11,6 +11,7 @@ from io import TextIOWrapper
 from pathlib import Path
 
 import numpy as np
+from rich.text import Text
 
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.errors import InputError
@@ -92,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _shown(trace: Trace | None, update: Callable[[str], None]) -> Callable[[RobotServer], None]:
+def _shown(trace: Trace | None, update: Callable[[Text], None]) -> Callable[[RobotServer], None]:
     """Return what to do after every period: write it down, and now and then show it."""
 
     def on_step(server: RobotServer) -> None:
@@ -102,9 +103,8 @@ def _shown(trace: Trace | None, update: Callable[[str], None]) -> Callable[[Robo
         if server.pace.ticks % _SHOWN_EVERY == 0:
             moving = float(np.abs(supervisor.robot.velocity).max())
             words = f"{supervisor.status.name.lower()}, {supervisor.gate.admitted} commands"
-            update(
-                f"{words}, {np.degrees(moving):.0f} deg/s, {server.pace.overruns} periods missed {supervisor.reason}"
-            )
+            missed = f"{server.pace.overruns} periods missed"
+            update(Text(f"{words}, {np.degrees(moving):.0f} deg/s, {missed} {supervisor.reason}"))
 
     return on_step
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+from rich.text import Text
 
 from imitarm.capture.skeleton import SIDES
 from imitarm.capture.sources import followed, open_source
@@ -168,7 +169,7 @@ def _operator(arguments: argparse.Namespace, tell: Callable[[str], None]) -> Ope
     return Operator(tell, enable_first=arguments.enable) if arguments.to else None
 
 
-def _shown(operator: Operator | None, update: Callable[[str], None]) -> Callable[[Moment], None]:
+def _shown(operator: Operator | None, update: Callable[[Text], None]) -> Callable[[Moment], None]:
     """Return what to do after every step: tell the operator, and now and then show how it goes."""
     steps = 0
 
@@ -178,7 +179,7 @@ def _shown(operator: Operator | None, update: Callable[[str], None]) -> Callable
         if operator is not None and moment.doing != INTERRUPTED:
             operator.led()
         if steps % _SHOWN_EVERY == 0:
-            update(f"{moment.time:.1f} s  {moment.doing}  {moment.trouble}")
+            update(Text(f"{moment.time:.1f} s  {moment.doing}  {moment.trouble}"))
 
     return on_step
 

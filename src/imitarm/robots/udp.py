@@ -21,6 +21,7 @@ from imitarm.sockets import Address, connected, resolved, try_to_send, waiting
 Array = NDArray[np.float64]
 
 FRESH = 0.1  # [s] a state that is older says nothing about now
+TAKEN = "somebody else leads the robot"
 _ASK_AGAIN = 0.02  # [s]
 _LED = (Status.FOLLOWING, Status.SLOWING)
 
@@ -90,7 +91,7 @@ class UdpRobot(Robot):
         self.interruptions, self.sequence = 0, None
         self._heard: int | None = None
         self._opening: float | None = None
-        self._led = self._slowed = False
+        self._led = self._slowed = self._other_arm = False
         self._echoes: list[Echo] = []
         self._echoed, self._quickest = 0, float("inf")
         super().__init__(arm, arm.home)
@@ -107,14 +108,13 @@ class UdpRobot(Robot):
         for _ in range(max(round(timeout / _ASK_AGAIN), 1)):
             self._say(Mode.OBSERVE)
             self._sleep(_ASK_AGAIN)
-            if self.listen():
+            if self.listen() or self._other_arm:
                 break
         else:
             raise TaskFailedError(
                 f"{address[0]}:{address[1]}: no robot answers; start one with 'imitarm serve', or check the address"
             )
-        if self.reported.arm != self._arm:
-            self._heard = None
+        if self._other_arm:
             raise InputError(f"{address[0]}:{address[1]}: the robot there is not {self.arm.name}; name the right arm")
         self._begin(self.reported.set_point)
 
@@ -134,9 +134,9 @@ class UdpRobot(Robot):
     def trouble(self) -> str:
         """Why it is not ready, in words; empty when it is."""
         if not self.fresh:
-            return "the robot does not answer"
+            return f"the robot that answers is not {self.arm.name}" if self._other_arm else "the robot does not answer"
         if self.reported.status in _LED and not self.ready:
-            return "somebody else leads the robot"
+            return TAKEN
         return self.reported.reason
 
     def state(self) -> ArmState:
@@ -280,7 +280,8 @@ class UdpRobot(Robot):
             if opened is None:
                 continue
             header, state = opened
-            if state.arm == self._arm and len(state.q) != self.arm.n_joints:
+            self._other_arm = state.arm != self._arm or len(state.q) != self.arm.n_joints
+            if self._other_arm:
                 continue
             self.reported, self._heard, came = state, now, True
             self._note_echo(header, state)
