@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import gc
+import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -24,6 +26,17 @@ def test_lines_come_in_order_and_then_there_are_no_more():
     assert process.ended() == "exit status 3: bye"
     process.close()
     assert not alive(process.pid)
+
+
+def test_what_it_said_last_is_told_without_chatter():
+    process = started(
+        "import sys; sys.stderr.write('x' * 900 + ' I am ill\\nW0000 all is well\\nINFO: up\\n')",
+        chatter="W0000 |INFO: ",
+    )
+    with pytest.raises(EOFError):
+        process.line(10.0)
+    assert process.ended().endswith("x I am ill") and len(process.ended()) < 700
+    process.close()
 
 
 def test_nothing_in_time_is_none():
@@ -76,6 +89,33 @@ def test_it_does_not_outlive_the_last_reference():
     del process
     gc.collect()
     assert not alive(pid)
+
+
+def test_it_does_not_outlive_a_program_that_is_killed():
+    program = (
+        "import sys, time\n"
+        "from imitarm.capture.line_process import LineProcess\n"
+        "child = LineProcess([sys.executable, '-c', 'import sys; print(1, flush=True); sys.stdin.read()'])\n"
+        "child.line(30.0)\n"
+        "print(child.pid, flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as parent:
+        pid = int(parent.stdout.readline())
+        assert alive(pid)
+        parent.kill()
+    until = time.monotonic() + 30.0
+    while running(pid) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not running(pid)
+
+
+def running(pid):
+    """Whether a process that is not ours runs; one that has ended may wait as a zombie for who inherits it."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 def test_what_can_not_be_started_leaves_nothing():

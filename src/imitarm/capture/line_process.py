@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import subprocess
 import tempfile
 import threading
@@ -14,7 +15,7 @@ from typing import IO
 
 LONGEST = 65536  # [bytes] of a line: more is foreign
 _GRACE = 1.0  # [s] in which it may end by itself
-_TAIL = 600  # [bytes] of what it said last
+_READ, _TAIL = 20000, 600  # [characters] of what it said last that are looked at, and given
 
 
 class LineProcess:
@@ -27,12 +28,16 @@ class LineProcess:
         command: with all its arguments.
         keep: so many lines wait to be read.
         newest: when more would wait, drop the oldest, though never the first of all; else the program waits too.
+        chatter: what lines on its standard error look like that are no reason for anything.
 
     Raises:
         OSError: when it can't be started.
     """
 
-    def __init__(self, command: list[str | Path], *, keep: int = 64, newest: bool = False) -> None:
+    def __init__(
+        self, command: list[str | Path], *, keep: int = 64, newest: bool = False, chatter: str | None = None
+    ) -> None:
+        self._chatter = None if chatter is None else re.compile(chatter)
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (is closed at the end)
         try:
             self._process = subprocess.Popen(
@@ -69,8 +74,10 @@ class LineProcess:
         except subprocess.TimeoutExpired:
             status = "still running"
         self._errors.seek(0, 2)
-        self._errors.seek(max(self._errors.tell() - _TAIL, 0))
-        said = " ".join(self._errors.read().decode("utf-8", "replace").split())
+        self._errors.seek(max(self._errors.tell() - _READ, 0))
+        lines = self._errors.read().decode("utf-8", "replace").splitlines()
+        kept = [line for line in lines if self._chatter is None or not self._chatter.match(line)]
+        said = " ".join(" ".join(kept).split())[-_TAIL:]
         return f"{status}{': ' + said if said else ''}"
 
     def close(self) -> None:

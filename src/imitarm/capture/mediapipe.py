@@ -23,6 +23,7 @@ _SILENT = 20.0  # [s] after which a process without a word hangs
 _TICK = 0.01  # [s] more, so that the time is over and not just about
 _KEPT = 64  # pictures of a video that are tracked ahead
 _NUMBERS = 6 * N_LANDMARKS
+_CHATTER = r"[IW]\d{4} |INFO: |WARNING: All log messages"  # what MediaPipe logs when all is well
 
 
 class MediaPipeSource(SkeletonSource):
@@ -72,7 +73,9 @@ class MediaPipeSource(SkeletonSource):
             worker = importlib.resources.files("imitarm.capture").joinpath("mediapipe_worker.py")
             path = stack.enter_context(importlib.resources.as_file(worker))
             try:  # -I: neither this folder nor the user's own packages are searched for modules
-                self._process = LineProcess([chosen, "-I", path, *what], keep=1 if webcam else _KEPT, newest=webcam)
+                self._process = LineProcess(
+                    [chosen, "-I", path, *what], keep=1 if webcam else _KEPT, newest=webcam, chatter=_CHATTER
+                )
             except OSError as error:
                 raise InputError(f"{chosen}: can't be started: {error.strerror or error}") from error
             try:
