@@ -6,7 +6,16 @@ import pytest
 from imitarm.capture.mediapipe_environment import VARIABLE
 from imitarm.capture.recording import SkeletonRecording
 from imitarm.capture.skeleton import JOINT, Tracking
-from imitarm.capture.video_figures import agreement, arm_raised, bone, elbow_bent, guarded, main, tracked_share
+from imitarm.capture.video_figures import (
+    agreement,
+    arm_raised,
+    bone,
+    elbow_bent,
+    guarded,
+    main,
+    tracked_share,
+    wrist_difference,
+)
 from imitarm.kinematics.pose import quaternion_to_matrix
 from mediapipe_samples import SIZE, line, player, seen, standing
 from recording_samples import changed, exchanged, skeletons
@@ -21,6 +30,19 @@ def test_angles_are_the_same_from_everywhere_and_agree():
         assert one.keys() == other.keys() and len(one) == 60
         assert list(one.values()) == pytest.approx(list(other.values()), abs=1e-9)
         assert agreement(one, other) == (pytest.approx(1.0), 60)
+
+
+def test_what_two_views_differ_by_is_the_error_of_both():
+    frames, rng = skeletons(90), np.random.default_rng(2)
+    turn = quaternion_to_matrix(np.array([0.1, 0.7, -0.5, 0.5]))
+    views = []
+    for _ in range(2):
+        noise = rng.normal(scale=0.02, size=(90, 25, 3))
+        views.append([changed(s, positions=s.positions + e) for s, e in zip(frames, noise, strict=True)])
+    views[1] = [changed(s, positions=s.positions @ turn.T + [0.0, 0.2, 3.0]) for s in views[1]]
+    found = wrist_difference(*map(SkeletonRecording, views))
+    assert found == pytest.approx(0.02 * np.sqrt(2 * 2 * 3), rel=0.1)  # two views, wrist and shoulder, three axes
+    assert np.isnan(wrist_difference(*(SkeletonRecording(view[:5]) for view in views)))
 
 
 def test_what_is_not_tracked_does_not_count():

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from imitarm.capture.mediapipe import MediaPipeSource
 from imitarm.capture.noise import measure_noise
@@ -89,6 +90,26 @@ def agreement(one: dict[float, float], other: dict[float, float]) -> tuple[float
     return float(np.corrcoef(a, b)[0, 1]), len(common)
 
 
+def wrist_difference(one: SkeletonRecording, other: SkeletonRecording) -> float:
+    """Return by how much two views differ on the wrists, seen from the shoulders, root mean square [m].
+
+    One rotation for the whole recording, which fits best, is between the views; so neither's place nor its axes count.
+    What is left is the error of both together. It is nan when they share fewer than 20 frames.
+    """
+    found = [{round(s.time, 3): s for s in view.skeletons} for view in (one, other)]
+    pairs: list[tuple[Array, Array]] = []
+    for time in sorted(found[0].keys() & found[1].keys()):
+        for side in SIDES:
+            a, b = (view[time].arm(side) for view in found)
+            if min(a.confidence[:3].min(), b.confidence[:3].min()) >= 1.0:
+                pairs.append((a.wrist - a.shoulder, b.wrist - b.shoulder))
+    if len(pairs) < _LEAST_COMMON:
+        return np.nan
+    first, second = np.moveaxis(np.array(pairs), 1, 0)
+    turn, _ = Rotation.align_vectors(second, first)
+    return float(np.sqrt(np.mean(np.sum(np.square(turn.apply(first) - second), axis=1))))
+
+
 def _describe(recording: SkeletonRecording, pictures: int, seconds: float, swaps: int) -> str:
     lines = [
         f"{recording.name}: {pictures} pictures, {len(recording)} with a person, {pictures / seconds:.0f} a second, "
@@ -130,6 +151,7 @@ def main(arguments: list[str]) -> int:
                 for side in SIDES:
                     alike, n = agreement(signal(one, side), signal(other, side))
                     parts.append(f"{side} {what} {alike:.2f} ({n})")
+            parts.append(f"wrists differ by {100.0 * wrist_difference(one, other):.0f} cm")
             sys.stdout.write(f"{one.name} and {other.name}: {', '.join(parts)}\n")
     except ImitarmError as error:
         sys.stderr.write(f"error: {error}\n")
