@@ -26,6 +26,7 @@ from imitarm.capture.slowing import slowed
 from imitarm.capture.sources import followed, open_source
 from imitarm.errors import ImitarmError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import RETARGETERS, Correspondence
 from imitarm.retarget.engagement import SEEN_FOR
 from imitarm.retarget.fitting import fit_motion
@@ -105,6 +106,7 @@ def tables(motions: Sequence[Shown]) -> Iterator[str]:
         "lag [ms]",
         "frames beyond a limit",
         "highest velocity, acceleration [% of the limit]",
+        "links apart, least [mm]",
         "driven: behind, at most [mrad]",
         "driven: torque [% of rated]",
     )
@@ -131,7 +133,7 @@ def _row(motion: Shown, robot: str, pace: float, method: str) -> list[str]:
     follow = replace(follow, scale=fit.scale)
     gone = np.linalg.norm(wrist[_STRIDE:] - wrist[:-_STRIDE], axis=1) / (_STRIDE * _PERIOD)
     run = RETARGETERS[method](arm, follow, dt=_PERIOD).run(skeletons, fit.q)
-    m, driven = measure(run, follow), drive(run)
+    m, driven, links = measure(run, follow), drive(run), SelfClearance(arm)
     lag = 1e3 * target_lag(run.times, arm.tool_path(run.joints)[0], run.targets[0])
     return [
         f"{fit.scale:.2f}",
@@ -141,6 +143,7 @@ def _row(motion: Shown, robot: str, pace: float, method: str) -> list[str]:
         f"{lag:.0f}" if np.isfinite(lag) else "–",
         str(m.broken_limits),
         f"{100 * m.velocity_ratio:.0f}, {100 * m.acceleration_ratio:.0f}",
+        f"{1e3 * min(links.distance(q) for q in run.joints[::2]):.0f}",
         f"{1e3 * driven.behind_max:.1f}",
         f"{100 * driven.peak_torque_ratio:.0f}" + (" (stopped itself)" if driven.fault else ""),
     ]

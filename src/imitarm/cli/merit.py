@@ -12,6 +12,7 @@ from imitarm.benchmark.seen_arm import seen_arm, target_lag
 from imitarm.benchmark.tracking import TrueArm, rms
 from imitarm.capture.motions import Truth
 from imitarm.capture.skeleton import Skeleton
+from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import Correspondence, Retargeting
 from imitarm.retarget.retargeter import STATES
 from imitarm.viewer.retarget_content import Measure, MethodResult, PlainTable
@@ -99,9 +100,16 @@ def _measures(run: Retargeting, m: MappingMetrics, hand: str, followed: bool) ->
         Measure("highest acceleration", 100.0 * m.acceleration_ratio, "% of the limit", 0, "less"),
         Measure("jerk of the joints, RMS", m.joint_jerk_rms, "rad/s³", 0, "less"),
         Measure("least singular value", m.least_singular, "m/rad", 3, "more"),
+        Measure("links off each other, at least", 1e3 * _links_apart(run), "mm", 0, "more"),
         Measure("path of the tool", m.path_length, "m", 2),
         Measure("highest torque", 100.0 * m.peak_torque_ratio, "% of the rated", 0, "less"),
     ]
+
+
+def _links_apart(run: Retargeting) -> float:
+    """Return the least distance between links that are not neighbours [m], by the spheres that cover them."""
+    links = SelfClearance(run.arm)
+    return min(links.distance(q) for q in run.joints[::2])
 
 
 def _torques(run: Retargeting, m: MappingMetrics) -> PlainTable:
@@ -143,6 +151,8 @@ def warnings_of(run: Retargeting, m: MappingMetrics) -> list[str]:
     beyond = [f"{what} in {count} frames" for what, count in broken.items() if count]
     if beyond:
         lines.append(f"breaks limits of {', '.join(beyond)}: no real arm would do this")
+    if _links_apart(run) < 0.0:
+        lines.append("links come so near each other that they may touch: choose another start (--fit) or scale")
     if run.closed.any():
         lines.append("the hand closed on the way; a demonstration holds no gripper, so that is not kept")
     return lines

@@ -6,7 +6,8 @@ A motion that is still to come can't be fitted; a recording can. The tool will b
 
 with W the person's wrist in the base's axes and :math:`W_0` where it is when the clutch engages. The middle of the
 motion is put near where the robot's tool is at home, and the scale is made smaller until the arm reaches the six
-outermost points of the motion and its start, with its tool turned as at home and well off its singularities.
+outermost points of the motion and its start, with its tool turned as at home, well off its singularities and with its
+links off each other.
 """
 
 from __future__ import annotations
@@ -22,12 +23,14 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import find_posture, solve_ik
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.posture import ANGLE_LENGTH
+from imitarm.kinematics.self_clearance import SelfClearance
 
 Array = NDArray[np.float64]
 
 _SHRINK: Final = 0.85  # from one scale that is tried to the next
 _SMALLEST: Final = 0.15
 _EASY, _POSSIBLE = 0.1, 0.05  # [m/rad] least singular value where an arm begins; where it goes
+_APART: Final = 0.02  # [m] to be kept between links
 _STILL: Final = 1e-3  # [rad/s] faster is not standing
 _MIDDLES: Final = np.array(
     [[0.0, 0.0, 0.0], [0.0, 0.0, 0.15], [0.1, 0.0, 0.1], [-0.1, 0.0, 0.1], [0.0, 0.0, -0.1], [0.0, 0.15, 0.1]]
@@ -64,16 +67,16 @@ def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: floa
         raise InputError("fit: the wrist was never seen, so nothing can be fitted")
     middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
     outermost = path[np.unique(np.concatenate([path.argmin(axis=0), path.argmax(axis=0)]))]
-    home = arm.tool_pose(arm.home)
+    home, search = arm.tool_pose(arm.home), _Search(arm, SelfClearance(arm, _APART))
     tried = scale
     while tried >= _SMALLEST:
         for shift in _MIDDLES:
             centre = home.position + shift
-            first = _posture(arm, Pose(centre + tried * (begin - middle), home.quaternion), arm.home, _EASY)
-            if first is None or not _stands(arm, first):
+            first = search.posture(Pose(centre + tried * (begin - middle), home.quaternion), arm.home, _EASY)
+            if first is None or not search.stands(first):
                 continue
             if all(
-                _posture(arm, Pose(centre + tried * (point - middle), home.quaternion), first, _POSSIBLE) is not None
+                search.posture(Pose(centre + tried * (point - middle), home.quaternion), first, _POSSIBLE) is not None
                 for point in outermost
             ):
                 return Fit(first, tried)
@@ -85,20 +88,28 @@ def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: floa
     )
 
 
-def _posture(arm: ArmModel, tool_to_base: Pose, near: Array, least: float) -> Array | None:
-    """Return a posture near another one, shape (n_joints,); None if there is none so far from a singularity."""
-    try:
-        q = find_posture(arm, tool_to_base, q0=near, restarts=2)
-    except UnreachableError:
-        return None
-    jacobian = arm.tool_jacobian(q)
-    jacobian[3:] *= ANGLE_LENGTH
-    return q if float(np.linalg.svd(jacobian, compute_uv=False)[-1]) >= least else None
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Looks for postures of an arm whose links stay off each other."""
 
+    arm: ArmModel
+    links: SelfClearance
 
-def _stands(arm: ArmModel, q: Array) -> bool:
-    """Whether an arm that keeps off its singularities stands still at a posture, and does not move off by itself."""
-    if arm.landmarks is None:
-        return True
-    velocity = solve_ik(arm, q, np.zeros(6), velocity=np.zeros(arm.n_joints), singularity_bounds=True)
-    return float(np.abs(velocity).max()) <= _STILL
+    def posture(self, tool_to_base: Pose, near: Array, least: float) -> Array | None:
+        """Return a posture near another one, shape (n_joints,); None if none is so far from a singularity."""
+        try:
+            q = find_posture(self.arm, tool_to_base, q0=near, restarts=2)
+        except UnreachableError:
+            return None
+        jacobian = self.arm.tool_jacobian(q)
+        jacobian[3:] *= ANGLE_LENGTH
+        free = float(np.linalg.svd(jacobian, compute_uv=False)[-1]) >= least
+        return q if free and self.links.distance(q) >= self.links.clearance else None
+
+    def stands(self, q: Array) -> bool:
+        """Whether an arm that keeps off its singularities stands still there, and does not move off by itself."""
+        if self.arm.landmarks is None:
+            return True
+        still = np.zeros(self.arm.n_joints)
+        velocity = solve_ik(self.arm, q, np.zeros(6), velocity=still, singularity_bounds=True)
+        return float(np.abs(velocity).max()) <= _STILL
