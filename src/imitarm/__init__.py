@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from imitarm.benchmark.experiment import Experiment, Result
     from imitarm.capture import Skeleton, SkeletonSource
     from imitarm.demonstrations import Finding, align, lint, read
     from imitarm.errors import ImitarmError, InfeasibleError, InputError, TaskFailedError, UnreachableError
@@ -57,6 +58,7 @@ __all__ = [
     "Cylinder",
     "Demonstration",
     "Ellipsoid",
+    "Experiment",
     "Finding",
     "GaussianMixture",
     "ImitarmError",
@@ -66,6 +68,7 @@ __all__ = [
     "Obstacle",
     "Policy",
     "Pose",
+    "Result",
     "Retargeter",
     "Robot",
     "Rollout",
@@ -104,6 +107,7 @@ _HOME = {
     "DMP": "imitarm.skills",
     "Demonstration": "imitarm.trajectory",
     "Ellipsoid": "imitarm.scene",
+    "Experiment": "imitarm.benchmark.experiment",
     "Finding": "imitarm.demonstrations",
     "GMR": "imitarm.skills",
     "GaussianMixture": "imitarm.skills",
@@ -118,6 +122,7 @@ _HOME = {
     "Policy": "imitarm.policies",
     "Pose": "imitarm.kinematics.pose",
     "RETARGETERS": "imitarm.retarget",
+    "Result": "imitarm.benchmark.experiment",
     "Retargeter": "imitarm.retarget",
     "Robot": "imitarm.robots",
     "Rollout": "imitarm.trajectory",
