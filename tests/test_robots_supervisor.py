@@ -118,6 +118,19 @@ def test_the_watchdog_slows_after_100_ms_and_latches_after_500():
     assert bench.events[-2:] == ["no valid command for 100 ms: slowing", "stopped: no valid command for 500 ms"]
 
 
+def test_a_command_is_carried_on_for_30_ms_and_has_faded_by_100():
+    bench, speed, fastest = Bench(), 0.15 * ARM.max_velocity, []
+    for k in range(70):
+        bench.sender.move(bench.now, ARM.home + 3 * k * DT * speed, speed)
+        bench.step(3)
+    for _ in range(21):
+        bench.step()
+        fastest.append(np.max(np.abs(bench.robot.velocity) / speed))
+    assert bench.status is Status.FOLLOWING
+    assert min(fastest[:4]) > 0.95 and fastest[-1] < 0.35
+    assert_within_limits(bench.robot.steps)
+
+
 def test_an_arm_that_is_not_told_to_brakes_at_once_and_stays():
     """From full speed to rest within the limits of acceleration, and not a step afterwards."""
     bench = Bench()
