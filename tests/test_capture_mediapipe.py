@@ -99,6 +99,11 @@ def test_a_worker_that_fails_is_told_from_one_that_is_done(program, error, messa
         list(MediaPipeSource(film))
 
 
+def test_a_python_that_can_not_be_started_is_told(film, tmp_path):
+    with pytest.raises(InputError, match=r"python: can't be started: No such file.*make its environment anew"):
+        MediaPipeSource(film, python=tmp_path / "python")
+
+
 def test_a_worker_that_hangs_is_ended(worker, film, monkeypatch):
     monkeypatch.setattr(mediapipe, "_SILENT", 1.0)
     worker("signal.signal(signal.SIGTERM, signal.SIG_IGN)\n" + said(HELLO, frame(0)) + "\n" + FOREVER)

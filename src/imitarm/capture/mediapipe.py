@@ -23,6 +23,7 @@ _SILENT = 20.0  # [s] after which a process without a word hangs
 _TICK = 0.01  # [s] more, so that the time is over and not just about
 _KEPT = 64  # pictures of a video that are tracked ahead
 _NUMBERS = 6 * N_LANDMARKS
+_ANEW = "make its environment anew: python -m imitarm.capture.mediapipe_environment"
 _CHATTER = r"[IW]\d{4} |INFO: |WARNING: All log messages"  # what MediaPipe logs when all is well
 
 
@@ -77,7 +78,7 @@ class MediaPipeSource(SkeletonSource):
                     [chosen, "-I", path, *what], keep=1 if webcam else _KEPT, newest=webcam, chatter=_CHATTER
                 )
             except OSError as error:
-                raise InputError(f"{chosen}: can't be started: {error.strerror or error}") from error
+                raise InputError(f"{chosen}: can't be started: {error.strerror or error}; {_ANEW}") from error
             try:
                 size = self._greeting(chosen)
                 self._converter = LandmarkConverter(size, field_of_view)
@@ -141,8 +142,7 @@ class MediaPipeSource(SkeletonSource):
             line = self._process.line(_START)
         except EOFError:
             raise InputError(
-                f"{self._said}: MediaPipe does not start with {python} ({self._process.ended()}); make its environment "
-                "anew: python -m imitarm.capture.mediapipe_environment"
+                f"{self._said}: MediaPipe does not start with {python} ({self._process.ended()}); {_ANEW}"
             ) from None
         if line is None or clock.monotonic() > until:
             raise InputError(f"{self._said}: no picture within {_START:g} s; MediaPipe's process was ended")
