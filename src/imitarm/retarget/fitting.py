@@ -32,9 +32,10 @@ _SMALLEST: Final = 0.15
 _EASY, _POSSIBLE = 0.1, 0.05  # [m/rad] least singular value where an arm begins; where it goes
 _APART: Final = 0.02  # [m] to be kept between links
 _STILL: Final = 1e-3  # [rad/s] faster is not standing
-_MIDDLES: Final = np.array(
-    [[0.0, 0.0, 0.0], [0.0, 0.0, 0.15], [0.1, 0.0, 0.1], [-0.1, 0.0, 0.1], [0.0, 0.0, -0.1], [0.0, 0.15, 0.1]]
-)  # [m] from the tool at home
+_GRID: Final = np.stack(
+    np.meshgrid([0.0, 0.1, -0.1], [0.0, 0.15, -0.15], [0.0, 0.1, -0.1, 0.2], indexing="ij"), axis=-1
+).reshape(-1, 3)
+_MIDDLES: Final = _GRID[np.argsort(np.linalg.norm(_GRID, axis=1), kind="stable")]  # [m] from the tool at home
 
 
 @dataclass(frozen=True, eq=False)

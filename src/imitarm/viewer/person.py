@@ -29,10 +29,10 @@ _SKIN: Final = "#c9a58c"
 _BONES: Final[tuple[tuple[str, str, float, float, float], ...]] = (
     ("neck", "head", 0.045, 0.05, 0.0),
     ("spine_shoulder", "neck", 0.05, 0.055, 0.0),
-    ("spine_shoulder", "shoulder_left", 0.05, 0.055, 0.0),
-    ("spine_shoulder", "shoulder_right", 0.05, 0.055, 0.0),
+    ("spine_shoulder", "shoulder_left", 0.04, 0.055, 0.0),
+    ("spine_shoulder", "shoulder_right", 0.04, 0.055, 0.0),
     ("hip_left", "hip_right", 0.085, 0.085, 0.085),
-    *((f"shoulder_{side}", f"elbow_{side}", 0.042, 0.056, 0.042) for side in ("left", "right")),
+    *((f"shoulder_{side}", f"elbow_{side}", 0.042, 0.062, 0.042) for side in ("left", "right")),
     *((f"elbow_{side}", f"wrist_{side}", 0.034, 0.046, 0.034) for side in ("left", "right")),
     *((f"wrist_{side}", f"hand_{side}", 0.03, 0.037, 0.0) for side in ("left", "right")),
     *((f"hand_{side}", f"hand_tip_{side}", 0.022, 0.036, 0.022) for side in ("left", "right")),
