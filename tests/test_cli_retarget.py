@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 
 import numpy as np
@@ -13,7 +14,7 @@ from imitarm.capture.person import Person
 from imitarm.capture.recording import SkeletonRecording
 from imitarm.capture.skeleton import JOINT, Skeleton
 from imitarm.capture.synthetic import SyntheticSource
-from imitarm.cli import main
+from imitarm.cli import main, screen
 from imitarm.cli.screen import watched
 from imitarm.retarget import RETARGETERS, LimbLengths
 from imitarm.retarget.calibration import Calibration
@@ -256,3 +257,17 @@ def test_work_that_is_quick_shows_no_bar_and_errors_pass_through():
     assert not asked
     with pytest.raises(ValueError, match="inside"), watched("x", lambda: 0.5):
         raise ValueError("inside")
+
+
+def test_work_that_takes_long_shows_a_bar_with_its_share(monkeypatch):
+    monkeypatch.setattr(screen, "_LONG", 0.0)
+    asked = threading.Event()
+
+    def share() -> float:
+        asked.set()
+        return 7.0  # more than all of it is no fault
+
+    before = threading.active_count()
+    with watched("x", share):
+        assert asked.wait(10.0)
+    assert threading.active_count() == before  # whoever watched has gone

@@ -15,7 +15,7 @@ from imitarm.capture.skeleton import SkeletonSource
 from imitarm.errors import InputError, UnknownNameError
 
 WORDS = {
-    "FILE": "a recording: imitarm's own or a table of the Kinect SDK",
+    "FILE": "a recording: imitarm's own, a table of the Kinect SDK, or motion capture",
     "synthetic:SEED": "a made-up person before a made-up camera",
     "udp:PORT": "what 'imitarm capture --send' sends; udp:ADDRESS:PORT hears other machines too",
     "video:FILE": "the person in a video, by MediaPipe",
