@@ -267,7 +267,6 @@ def test_work_that_takes_long_shows_a_bar_with_its_share(monkeypatch):
         asked.set()
         return 7.0  # more than all of it is no fault
 
-    before = threading.active_count()
-    with watched("x", share):
+    with watched("a long work", share):
         assert asked.wait(10.0)
-    assert threading.active_count() == before  # whoever watched has gone
+    assert "a long work" not in {thread.name for thread in threading.enumerate()}  # whoever watched has gone

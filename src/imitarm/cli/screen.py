@@ -84,7 +84,7 @@ def watched(what: str, share: Callable[[], float]) -> Iterator[None]:
             while not over.wait(0.2):
                 progress.update(task, completed=min(max(share(), 0.0), 1.0))
 
-    watcher = threading.Thread(target=watch, daemon=True)
+    watcher = threading.Thread(target=watch, daemon=True, name=what)
     watcher.start()
     try:
         yield
