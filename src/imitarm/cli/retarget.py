@@ -127,7 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"{arguments.source}: the {correspondence.side} arm was never seen for {SEEN_FOR:g} s on end, so nothing "
             "was followed and nothing is written; keep it in view, or choose the other by --side"
         )
-    source = f"{arguments.source}, {correspondence.side} arm"
+    source = f"{Path(arguments.source).name}, {correspondence.side} arm"
     for name, (result, metrics) in zip(names, done, strict=True):
         if name in files and metrics.engagements:
             _demonstration(result.run, arguments.task, f"{source}, {name}", arguments.keep_waiting).save(files[name])
@@ -258,7 +258,7 @@ def _written_report(
                     *(m for m in result.measures if m.label in wanted),
                 ],
                 scene=setting.scene,
-                summary=f"The {correspondence.side} arm of a person, {arguments.source}, moves the tool of {arm.name}: "
+                summary=f"The {correspondence.side} arm of a person, {Path(arguments.source).name}, moves the tool of {arm.name}: "
                 f"10 cm of the hand are {10 * correspondence.scale:.1f} cm of the tool, which turns "
                 f"{_TURNS[correspondence.orientation]}.",
                 findings=findings,
