@@ -81,6 +81,9 @@ def test_a_captured_arm_needs_its_data(real_data, tmp_path):
     made = make_recording(Plan(CAPTURED, 0, seconds=SHORT, data=str(real_data)), ARM)
     assert made.true_times[-1] == pytest.approx(SHORT + 1.0 + 2.0, abs=0.2)
     assert np.ptp(made.true_points[:, 2], axis=0).max() > 0.05
+    upper = np.linalg.norm(made.true_points[:, 1] - made.true_points[:, 0], axis=1)
+    assert made.correspondence.lengths.upper_arm == pytest.approx(np.median(upper))  # its own bones, not the person's
+    assert beyond_reach(made, ARM) == 0.0
 
 
 @pytest.mark.parametrize("bad", [{"kind": "dance"}, {"person": -1}, {"seconds": 1.0}, {"sigma": 0.5}])

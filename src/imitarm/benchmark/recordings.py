@@ -21,6 +21,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.posture import find_posture
 from imitarm.retarget.correspondence import FACING, Correspondence, Orientation
+from imitarm.retarget.fitting import fit_motion
 from imitarm.retarget.limbs import LimbLengths
 from imitarm.tasks.ideal import IdealFollower, ideal_camera
 from imitarm.tasks.stack import StackTask
@@ -173,12 +174,18 @@ def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
         if seen is not None:
             skeletons.append(seen)
         time = camera.next_time(time)
-    lengths = calibrate(person, plan.camera(2 * plan.number + 1))
-    correspondence = Correspondence(lengths=lengths, scale=_scale(plan, person), orientation=task)
     first = skeletons[0].time
     true_times = np.arange(0.0, skeletons[-1].time - first + _STEP, _STEP)
-    points = np.array([truth(first + t).arm(correspondence.side).points for t in true_times])
-    start = _start(plan, arm, points[0])
+    points = np.array([truth(first + t).arm("right").points for t in true_times])
+    if plan.kind == CAPTURED:  # bones of its own, and a motion that was not made for this robot
+        lengths = LimbLengths(*np.median(np.linalg.norm(np.diff(points[:, :3], axis=1), axis=2), axis=0).tolist())
+        wrist = FACING.apply(points[:, 2])
+        fit = fit_motion(arm, wrist, wrist[0])
+        start, scale = fit.q, fit.scale
+    else:
+        lengths = calibrate(person, plan.camera(2 * plan.number + 1))
+        start, scale = _start(plan, arm, points[0]), _scale(plan, person)
+    correspondence = Correspondence(lengths=lengths, scale=scale, orientation=task)
     return MappingRecording(plan, tuple(skeletons), correspondence, start, true_times, points)
 
 
