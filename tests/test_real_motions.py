@@ -84,17 +84,21 @@ def test_no_joint_breaks_a_limit_in_any_frame(real_data, arm, name):
 @pytest.mark.slow
 @each_arm
 @pytest.mark.parametrize("name", [name for name in RECORDINGS if name != "arm in motion capture"])
-def test_gestures_at_half_their_pace_are_followed(real_data, arm, name):
-    """People are quicker than these arms; slowed, the tool gets where the hand was seen."""
+def test_gestures_no_quicker_than_the_tool_are_followed(real_data, arm, name):
+    """A hand goes at 2 to 3 m/s, the tool at 1 m/s; slowed to 0.7 m/s, the tool gets where the hand was seen."""
     skeletons, side = person(real_data, name)
-    run = fitted(arm, slowed(skeletons, 0.5), Correspondence(side, orientation="fixed"))
+    correspondence = Correspondence(side, orientation="fixed")
+    times = np.arange(0.0, skeletons[-1].time - skeletons[0].time, DT)
+    wrist = seen_arm(skeletons, times, correspondence).wrist
+    speed = float(np.linalg.norm(wrist[10:] - wrist[:-10], axis=1).max()) / (10 * DT)
+    run = fitted(arm, slowed(skeletons, min(1.0, 0.7 / speed)), correspondence)
     assert_within_limits(arm, run.joints)
     tool, _ = arm.tool_path(run.joints)
     aimed = np.isfinite(run.targets[0]).all(axis=1)
     target = run.targets[0][aimed]
     apart = np.sqrt(np.mean(np.sum((tool[aimed] - target) ** 2, axis=1)))
     goes = np.sqrt(np.mean(np.sum((target - target.mean(axis=0)) ** 2, axis=1)))
-    assert apart < 0.5 * goes
+    assert apart < 0.3 * goes
 
 
 @pytest.mark.slow

@@ -258,7 +258,8 @@ def _written_report(
                     *(m for m in result.measures if m.label in wanted),
                 ],
                 scene=setting.scene,
-                summary=f"The {correspondence.side} arm of a person, {Path(arguments.source).name}, moves the tool of {arm.name}: "
+                summary=f"The {correspondence.side} arm of a person, {Path(arguments.source).name}, moves the tool of "
+                f"{arm.name}: "
                 f"10 cm of the hand are {10 * correspondence.scale:.1f} cm of the tool, which turns "
                 f"{_TURNS[correspondence.orientation]}.",
                 findings=findings,
