@@ -249,6 +249,28 @@ def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
     return Table(f"Paired comparison: {', '.join(tasks)}", columns, tuple(rows), note)
 
 
+def rivals_table(results: Results, tasks: Sequence[str]) -> Table:
+    """Return where another method is better than ``modern``: in each kind of recording, and with the loop closed."""
+    rows = []
+    rivals = [name for name in results.methods if name != OURS and OURS in results.methods]
+    for task in tasks:
+        for figure in COMPARED:
+            ours = results.values(OURS, [task], figure.name)
+            found = [compare(ours, results.values(name, [task], figure.name)) for name in rivals]
+            for name, comparison, p in zip(rivals, found, holm([c.p for c in found]), strict=True):
+                if comparison.difference.low > 0.0:  # less is better in all of them
+                    cells = _difference(comparison, figure)
+                    rows.append((task, figure.title, METHODS[name].title, *cells, f"{p:.3f}"))
+    done = {name: [bool(r.values.get("success")) for r in results.of(name, [LIVE])] for name in [OURS, *rivals]}
+    for name in rivals:
+        if done[OURS] and done[name] and np.mean(done[name]) > np.mean(done[OURS]):
+            text = f"{sum(done[OURS])} of {len(done[OURS])} against {sum(done[name])} of {len(done[name])}"
+            rows.append((LIVE, "stacked", METHODS[name].title, text, "", "", ""))
+    columns = ("recordings", "measure", "better", "difference (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
+    note = f"All measures whose interval says that {OURS} is worse, and every method that stacked more often."
+    return Table(f"Where another method is better than {OURS}", columns, tuple(rows), note)
+
+
 def _difference(comparison: Comparison, figure: Figure) -> tuple[str, str, str]:
     found = comparison.difference
     if not math.isfinite(found.mean):
@@ -268,6 +290,7 @@ def all_tables(results: Results) -> list[Table]:
         tables.append(recordings_table(results))
     tables += [accuracy_table(results, task) for task in results.tasks(REPLAYS)]
     if tasks:
+        tables.append(rivals_table(results, tasks))
         tables += [comparison_table(results, tasks), limits_table(results, tasks), effort_table(results, tasks)]
         tables.append(smoothness_table(results, tasks))
         tables.append(torque_table(results, tasks, "mean_torque", "Mean of the absolute torque"))
