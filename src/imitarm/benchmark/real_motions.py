@@ -1,6 +1,6 @@
 """Real people lead the simulated arms: the tables of docs/real_data.md, as Markdown.
 
-    python -m imitarm.benchmark.real_motions DATA [VIDEO ...]
+    python -m imitarm.benchmark.real_motions DATA [VIDEO ...] [--fill docs/real_data.md]
 
 DATA is the folder with ``kinect_gestures`` and ``mocap_arm``, VIDEO are films of a person or recordings of one.
 """
@@ -17,14 +17,16 @@ from typing import NamedTuple
 import numpy as np
 
 from imitarm.benchmark.driving import drive
+from imitarm.benchmark.experiment import write_text
 from imitarm.benchmark.mapping_metrics import measure
 from imitarm.benchmark.seen_arm import seen_arm, target_lag
+from imitarm.benchmark.tables import Table
 from imitarm.capture.checks import repaired
 from imitarm.capture.recording import SkeletonRecording
 from imitarm.capture.skeleton import Skeleton
 from imitarm.capture.slowing import slowed
 from imitarm.capture.sources import followed, open_source
-from imitarm.errors import ImitarmError
+from imitarm.errors import ImitarmError, InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import RETARGETERS, Correspondence
@@ -32,7 +34,22 @@ from imitarm.retarget.engagement import SEEN_FOR
 from imitarm.retarget.fitting import fit_motion
 
 PACES = (1.0, 0.5)
+BEGIN, END = "<!-- real motions -->", "<!-- end -->"
+"""Between these lines of a document stand the tables."""
 _PERIOD = 0.01  # [s]
+_ARMS = ("sawyer", "panda")
+_COLUMNS = (
+    "scale>",
+    "tool asked for, up to [m/s]>",
+    "following [%]>",
+    "to its target, RMS [mm]>",
+    "lag [ms]>",
+    "frames beyond a limit>",
+    "highest velocity, acceleration [% of the limit]>",
+    "links apart, least [mm]>",
+    "driven: behind, at most [mrad]>",
+    "driven: torque [% of the rated]>",
+)
 _STRIDE = 10  # periods over which a hand's speed is taken: a camera's noise would be most of it in one
 _FILMS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 _GESTURES = {
@@ -52,20 +69,41 @@ class Shown(NamedTuple):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the tables; return 0."""
+    """Print the tables, and put them into a document where that is asked for; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m imitarm.benchmark.real_motions", description=__doc__)
     parser.add_argument("data", type=Path, metavar="DATA")
     parser.add_argument("videos", nargs="*", metavar="VIDEO")
+    parser.add_argument("--fill", type=Path, metavar="FILE", help=f"a document, between {BEGIN!r} and {END!r}")
     arguments = parser.parse_args(argv)
     try:
-        motions = list(real_motions(arguments.data, arguments.videos))
-        for line in tables(motions):
-            sys.stdout.write(line + "\n")
-            sys.stdout.flush()
+        if arguments.fill is not None:
+            _split(arguments.fill)
+        text = "\n".join(table.markdown() for table in tables(list(real_motions(arguments.data, arguments.videos))))
+        sys.stdout.write(text)
+        if arguments.fill is not None:
+            head, tail = _split(arguments.fill)
+            write_text(arguments.fill, f"{head}{BEGIN}\n\n{text}\n{END}{tail}")
     except ImitarmError as error:
         sys.stderr.write(f"{error}\n")
         return error.exit_status
     return 0
+
+
+def _split(document: Path) -> tuple[str, str]:
+    """Return what stands before and after the tables of a document.
+
+    Raises:
+        InputError: when it can't be read, or the tables have no place in it.
+    """
+    try:
+        text = document.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{document}: can't be read as a document ({error})") from error
+    head, begins, rest = text.partition(BEGIN)
+    _, ends, tail = rest.partition(END)
+    if not (begins and ends):
+        raise InputError(f"{document}: needs a line {BEGIN!r} and after it a line {END!r}: the tables go between")
+    return head, tail
 
 
 def real_motions(data: Path, videos: Sequence[str] = ()) -> Iterator[Shown]:
@@ -93,34 +131,24 @@ def _person(word: str) -> list[Skeleton]:
         return list(one)
 
 
-def tables(motions: Sequence[Shown]) -> Iterator[str]:
-    """Give the lines of the tables: ``modern`` on every motion and arm, then all methods on the first and the last."""
-    heads = (
-        "motion",
-        "arm",
-        "pace",
-        "scale",
-        "tool asked for, up to [m/s]",
-        "following [%]",
-        "to its target, RMS [mm]",
-        "lag [ms]",
-        "frames beyond a limit",
-        "highest velocity, acceleration [% of the limit]",
-        "links apart, least [mm]",
-        "driven: behind, at most [mrad]",
-        "driven: torque [% of rated]",
-    )
-    yield from _head(heads)
-    for motion in motions:
-        for arm in ("sawyer", "panda"):
-            for pace in PACES:
-                yield _line([motion.name, arm, f"{pace:g}", *_row(motion, arm, pace, "modern")])
-    yield ""
-    yield from _head((*heads[:3], "method", *heads[3:]))
-    for motion in motions[:1]:
-        for arm in ("sawyer", "panda"):
-            for method in RETARGETERS:
-                yield _line([motion.name, arm, f"{PACES[-1]:g}", method, *_row(motion, arm, PACES[-1], method)])
+def tables(motions: Sequence[Shown]) -> list[Table]:
+    """Return two tables: ``modern`` on every motion and arm at each pace, and all methods on the first motion.
+
+    Args:
+        motions: at least one.
+    """
+    modern = [
+        (motion.name, arm, f"{pace:g}", *_row(motion, arm, pace, "modern"))
+        for motion in motions
+        for arm in _ARMS
+        for pace in PACES
+    ]
+    first, pace = motions[0], PACES[-1]
+    every = [(arm, method, *_row(first, arm, pace, method)) for arm in _ARMS for method in RETARGETERS]
+    return [
+        Table("modern on every motion", ("motion", "arm", "pace>", *_COLUMNS), tuple(modern)),
+        Table(f"All methods on {first.name!r} at pace {pace:g}", ("arm", "method", *_COLUMNS), tuple(every)),
+    ]
 
 
 def _row(motion: Shown, robot: str, pace: float, method: str) -> list[str]:
@@ -147,15 +175,6 @@ def _row(motion: Shown, robot: str, pace: float, method: str) -> list[str]:
         f"{1e3 * driven.behind_max:.1f}",
         f"{100 * driven.peak_torque_ratio:.0f}" + (" (stopped itself)" if driven.fault else ""),
     ]
-
-
-def _head(cells: Sequence[str]) -> Iterator[str]:
-    yield _line(cells)
-    yield _line(["---"] * len(cells))
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":
