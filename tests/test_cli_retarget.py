@@ -127,11 +127,11 @@ def test_a_calibration_says_side_scale_and_turning_and_options_say_it_better(sho
 
 
 def test_with_fit_a_motion_that_is_too_large_is_made_smaller(shown, tmp_path, capsys):
-    assert run(shown, "--scale", 3, "--fit", "--pace", 0.5, "--orientation", "fixed", "--out", tmp_path / "a.csv") == 0
+    assert run(shown, "--scale", 6, "--fit", "--pace", 0.2, "--orientation", "fixed", "--out", tmp_path / "a.csv") == 0
     printed = capsys.readouterr()
-    assert "instead of 3.00, so that all of the motion is in reach" in printed.err
-    assert "slowed to 50 % of its pace" in printed.err
-    assert Demonstration.load(tmp_path / "a.csv").trajectory.duration > 7.0
+    assert "instead of 6.00, so that all of the motion is in reach" in printed.err
+    assert "slowed to 20 % of its pace" in printed.err
+    assert Demonstration.load(tmp_path / "a.csv").trajectory.duration > 20.0
     row = next(line for line in printed.out.splitlines() if "tool to its own target" in line)
     assert float(row.split("│")[2]) < 40.0
 
