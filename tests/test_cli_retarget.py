@@ -88,7 +88,8 @@ def test_several_of_them_are_learnt(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_all_methods_side_by_side(shown, tmp_path, capsys):
+def test_all_methods_side_by_side(shown, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")  # a narrower terminal breaks the words of a table
     out, page = tmp_path / "demo.csv", tmp_path / "page.html"
     assert run(shown, "--method", "all", "--out", out, "--report", page, "--drive") == 0
     shown_table = capsys.readouterr().out

@@ -27,12 +27,12 @@ def _console(stream: TextIO) -> Console:
 def say(*lines: str) -> None:
     """Print lines to stdout."""
     for line in lines:
-        _console(sys.stdout).print(line)
+        _console(sys.stdout).print(line, soft_wrap=True)  # a path must not be broken
 
 
 def remark(line: str) -> None:
     """Print a line to stderr."""
-    _console(sys.stderr).print(line)
+    _console(sys.stderr).print(line, soft_wrap=True)
 
 
 def show_table(

@@ -73,7 +73,7 @@ class ArmMemory:
         """Return the pose of a site in the base frame."""
         quaternion = np.empty(4)
         mujoco.mju_mat2Quat(quaternion, self.data.site_xmat[site])
-        return _pose(self.data.site_xpos[site].copy(), quaternion)
+        return Pose.trusted(self.data.site_xpos[site].copy(), quaternion)
 
     def site_jacobian(self, site: int) -> Array:
         """Return the Jacobian of a site, shape (6, n), as a view that the next one overwrites."""
@@ -99,13 +99,3 @@ def columns(indices: NDArray[np.int32]) -> Columns:
     """Return consecutive indices as a slice, which is several times quicker."""
     first = int(indices[0])
     return slice(first, first + len(indices)) if np.all(np.diff(indices) == 1) else indices
-
-
-def _pose(position: Array, quaternion: Array) -> Pose:
-    """Build a pose from numbers that are known to be right: Pose's own checks would take ten times as long."""
-    pose = object.__new__(Pose)
-    position.setflags(write=False)
-    quaternion.setflags(write=False)
-    object.__setattr__(pose, "position", position)
-    object.__setattr__(pose, "quaternion", quaternion)
-    return pose

@@ -16,12 +16,16 @@ from imitarm.kinematics.bounds import VelocityBox, WristBound
 from imitarm.kinematics.ik_methods import METHODS, Task
 from imitarm.kinematics.posture import ANGLE_LENGTH
 from imitarm.kinematics.sew import one_angle
+from imitarm.kinematics.spare_motion import spare_motion
 
 Array = NDArray[np.float64]
 Rows = tuple[ArrayLike, ArrayLike]
+Bounds = tuple[Array, Array]
 
 _WEIGHTS = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
 _MAX_SPEED = {"dls": 0.6, "qp": 2.0, "svd": 0.6}  # [m/s] clamp of the weighted twist
+_BENT = 0.1  # squared sine of the angle at the elbow below which its swing fades
+_QUICK = 0.5  # share of what the joints can change in a step by which the swing's speed may change
 _REFERENCE = 0.04  # squared length below which the direction that the elbow's angle is measured from fades
 
 
@@ -45,22 +49,28 @@ class IKStep:
 class ElbowTask(NamedTuple):
     r"""Where the elbow should be while the tool does its task (METHODS A.9).
 
-    It adds :math:`\tfrac{w}2 (J_\psi v - k\,\mathrm{wrap}(\psi_h - \psi))^2` to the cost of ``"qp"``, with
-    :math:`w = w_\psi c \sin^2\beta`, where :math:`\beta` is the angle at the robot's elbow: the weight fades as the
-    arm gets straight, and near the one direction in which the stereographic angle is lost.
+    The elbow swings by the spare motion, the unit vector n along :math:`(I - J^+ J) J_\psi^T`, which leaves the tool
+    as it is. What is added to the cost of ``"qp"`` is
+
+    .. math:: \tfrac{w}2\,(n^T v - s)^2, \qquad s = c\,\sin^2\!\beta\;
+              \frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
+
+    with e the tool's twist and :math:`\beta` the angle at the robot's elbow: the swing fades, to none, as the arm gets
+    straight, and near the one direction in which the stereographic angle is lost. While no limit is near this takes
+    nothing from the tool, whatever the weight; where the joints are at their limits the weight decides, and a spare
+    motion that is not held would drift into postures from which the arm does not get on.
 
     Attributes:
         angle: wanted :func:`~imitarm.kinematics.sew.sew_angle` [rad].
-        weight: :math:`w_\psi` [m^2] beside the tool's task, whose weight is 1; much more than the default moves
-            the tool where the accelerations are at their limits; 0: the elbow is free.
-        confidence: c, 0 to 1: how surely the wanted angle is known.
+        weight: w beside the tool's task, whose weight is 1 [m^2]; 0: the spare motion is free.
+        confidence: c, 0 to 1: how surely the wanted angle is known; 0: no swing.
         gain: k [1/s].
         max_rate: the wanted rate of the angle is cut to this [rad/s].
         convention: of the angle.
     """
 
     angle: float
-    weight: float = 0.001
+    weight: float = 0.1
     confidence: float = 1.0
     gain: float = 5.0
     max_rate: float = 1.0
@@ -189,7 +199,7 @@ class IKSolver:
             posture = np.minimum(np.maximum(posture, lower), upper)
         checked = None if rows is None else self._checked_rows(rows)
         if sew is not None:
-            jacobian, wanted = self._with_elbow(memory, jacobian, wanted, sew)
+            jacobian, wanted = self._with_elbow(memory, jacobian, wanted, sew, previous, (lower, upper))
         bound = None if self._wrist is None else self._wrist.at(position)
         return Task(
             jacobian,
@@ -205,8 +215,10 @@ class IKSolver:
             bound,
         )
 
-    def _with_elbow(self, memory: ArmMemory, jacobian: Array, wanted: Array, sew: ElbowTask) -> tuple[Array, Array]:
-        """Add the elbow's row to the task; nothing where its angle is lost."""
+    def _with_elbow(
+        self, memory: ArmMemory, jacobian: Array, wanted: Array, sew: ElbowTask, previous: Array | None, bounds: Bounds
+    ) -> tuple[Array, Array]:
+        """Add the swing's row to the task; nothing where the arm has no joint to spare."""
         angle, weight, confidence, gain, max_rate, convention = sew
         if self.method != "qp":
             raise InputError(f"solve_ik: method {self.method!r} can't lead the elbow; use method='qp'")
@@ -216,15 +228,23 @@ class IKSolver:
         now = one_angle(shoulder, elbow, wrist, convention)
         if now is None:
             return jacobian, wanted
-        share = math.sqrt(weight * confidence * now.bend * min(1.0, now.reference / _REFERENCE))
+        gradient = np.array(now.shoulder + now.elbow + now.wrist).dot(memory.marked_jacobians())
+        swing = spare_motion(jacobian, gradient)
+        if swing is None:
+            return jacobian, wanted
+        direction, turns, share_of_tool = swing
+        share = min(confidence, 1.0) * min(1.0, now.bend / _BENT) * min(1.0, now.reference / _REFERENCE)
         rate = gain * math.remainder(angle - now.angle, math.tau)
-        gradient = np.array(now.shoulder + now.elbow + now.wrist)
-        gradient *= share
-        extended, target = np.empty((7, len(self._max_velocity))), np.empty(7)
-        extended[:6] = jacobian
-        extended[6] = gradient.dot(memory.marked_jacobians())
-        target[:6] = wanted
-        target[6] = share * min(max(rate, -max_rate), max_rate)
+        speed = share * (min(max(rate, -max_rate), max_rate) - float(share_of_tool.dot(wanted))) / turns
+        if previous is not None:
+            before = float(direction.dot(previous))
+            half = 0.5 * (bounds[1] - bounds[0])
+            change = _QUICK * float((half / np.maximum(np.abs(direction), 1e-9)).min())
+            speed = min(max(speed, before - change), before + change)
+        root = math.sqrt(weight)
+        extended, target = np.empty((7, len(direction))), np.empty(7)
+        extended[:6], target[:6] = jacobian, wanted
+        extended[6], target[6] = root * direction, root * speed
         return extended, target
 
     def _joints(self, values: ArrayLike, what: str) -> Array:

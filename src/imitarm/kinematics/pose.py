@@ -238,6 +238,21 @@ class Pose:
         object.__setattr__(self, "quaternion", quaternion)
 
     @classmethod
+    def trusted(cls, position: Array, quaternion: Array) -> Pose:
+        """Build from numbers that are known to be right and belong to nobody else: the checks take ten times as long.
+
+        Args:
+            position: shape (3,) [m]; from now on read-only.
+            quaternion: of length one, shape (4,) wxyz; from now on read-only.
+        """
+        pose = object.__new__(cls)
+        position.setflags(write=False)
+        quaternion.setflags(write=False)
+        object.__setattr__(pose, "position", position)
+        object.__setattr__(pose, "quaternion", quaternion)
+        return pose
+
+    @classmethod
     def identity(cls) -> Pose:
         """Return the pose of a frame in itself."""
         return cls(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))

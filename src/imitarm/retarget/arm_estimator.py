@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Literal
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from imitarm.capture.skeleton import HandState, Skeleton
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import matrix_to_quaternion
+from imitarm.retarget.anchoring import Anchoring
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import carried, hand_rotation
 from imitarm.retarget.limbs import LimbLengths, correct_limbs, fit_limbs, measure_limbs
@@ -21,7 +23,7 @@ Array = NDArray[np.float64]
 
 _LEARNING_FRAMES = 60  # lengths that were not given are learnt from so many, then kept
 _GRIP_FRAMES = 3  # a hand state counts when so many frames in a row have it
-_FILTER = (1.5, 15.0, 3.0)  # [Hz, Hz per m/s, Hz] of the points; a slower speed estimate makes the robot late
+_FILTER = (3.0, 25.0, 10.0)  # [Hz, Hz per m/s, Hz] of the points; a slower speed estimate makes the robot late
 _JUMP = 0.12  # [m] what a hand may go within half the outlier filter's window without being one
 
 
@@ -34,7 +36,7 @@ class ArmEstimate:
         shoulder: position, shape (3,) [m].
         elbow: position, shape (3,) [m].
         wrist: position, shape (3,) [m].
-        velocity: of the wrist, shape (3,) [m/s].
+        velocities: of these three, shape (3, 3) [m/s].
         hand: rotation of the hand, wxyz, shape (4,): its x along the hand, its z away from the palm's back.
         angular_velocity: of the hand, shape (3,) [rad/s].
         confidence: of elbow, wrist and hand rotation, each 0 to 1.
@@ -45,17 +47,22 @@ class ArmEstimate:
     shoulder: Array
     elbow: Array
     wrist: Array
-    velocity: Array
+    velocities: Array
     hand: Array
     angular_velocity: Array
     confidence: tuple[float, float, float]
     closed: bool | None
 
     @property
+    def velocity(self) -> Array:
+        """Velocity of the wrist, shape (3,) [m/s]."""
+        return self.velocities[2]
+
+    @property
     def upper_arm(self) -> Array:
         """Direction from the shoulder to the elbow, a unit vector (3,)."""
         way = self.elbow - self.shoulder
-        return np.asarray(way / max(float(np.sqrt(way @ way)), 1e-9))
+        return way / max(math.sqrt(float(way.dot(way))), 1e-9)
 
 
 class ArmEstimator:
@@ -65,7 +72,8 @@ class ArmEstimator:
 
     Args:
         correspondence: which arm, and where the sensor is.
-        smoothing: One-Euro filters on; off, the corrected points are given as they are.
+        smoothing: One-Euro filters on, and jumps that come with a change of tracking taken out
+            (:class:`~imitarm.retarget.anchoring.Anchoring`); off, the corrected points are given as they are.
         limbs: how the bones get their lengths: ``"fit"`` by the least change of all three points,
             ``"direction"`` as the thesis does, from the shoulder outwards.
     """
@@ -83,29 +91,26 @@ class ArmEstimator:
         self._smoothing = smoothing
         self._rotation = correspondence.sensor_to_base.rotation
         self._origin = correspondence.sensor_to_base.position
-        self._filters = tuple(OneEuro(*_FILTER) for _ in range(3))
-        self._turn = OneEuroRotation()
-        self._guard = Hampel(least=_JUMP)
+        self._filter, self._turn = OneEuro(*_FILTER), OneEuroRotation()
+        self._guard, self._anchoring = Hampel(least=_JUMP), Anchoring()
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past, learnt lengths too."""
-        self._time = -np.inf
-        self._hand: Array | None = None  # rotation matrix in the base frame
+        """Forget the past."""
+        self._time = self._used = -np.inf
+        self._hand: Array | None = None
         self._fore: Array | None = None
-        self._grips: deque[HandState] = deque(maxlen=_GRIP_FRAMES)
         self._closed: bool | None = None
+        self._grips: deque[HandState] = deque(maxlen=_GRIP_FRAMES)
         self._learning: list[Skeleton] = []
         self.lengths: LimbLengths | None = self.correspondence.lengths
-        for one in (*self._filters, self._turn):
+        for one in (self._filter, self._turn, self._guard, self._anchoring):
             one.reset()
-        self._guard.reset()
 
     def update(self, skeleton: Skeleton) -> ArmEstimate | None:
         """Take in the next skeleton; None when its arm is lost, impossible, not newer, or of unknown length yet."""
         if skeleton.time <= self._time:
             return None
-        gap = skeleton.time - self._time
         self._time = skeleton.time
         arm = skeleton.arm(self.correspondence.side)
         if not arm.seen:
@@ -114,28 +119,32 @@ class ArmEstimator:
             self._learn(skeleton)
         if self.lengths is None or not self._guard.accept(arm.time, arm.wrist - arm.shoulder):
             return None
-        points = arm.points @ self._rotation.T + self._origin
-        confidence = arm.confidence
-        if self._limbs == "fit":
-            shoulder, elbow, wrist = fit_limbs(points[:3], confidence[:3], self.lengths)
-        else:
-            shoulder, (elbow, wrist) = points[0], correct_limbs(points[0], points[1], points[2], self.lengths)
-        elbow_known, wrist_known = float(confidence[1]), float(min(confidence[2], confidence[0]))
-        if gap > GAP:
+        period, self._used = arm.time - self._used, arm.time
+        if period > GAP:
             self._hand = None
-        rotation, hand_known = self._hand_rotation(points, confidence, wrist - elbow)
-        s, e, w, hand = self._smooth(arm.time, (shoulder, elbow, wrist), rotation, confidence, hand_known)
-        return ArmEstimate(
-            arm.time,
-            s,
-            e,
-            w,
-            self._filters[2].velocity if self._smoothing else np.zeros(3),
-            hand,
-            self._turn.velocity if self._smoothing else np.zeros(3),
-            (elbow_known, wrist_known, hand_known),
-            self._grip(arm.hand_state),
-        )
+            self._anchoring.reset()
+        points = arm.points.dot(self._rotation.T) + self._origin
+        confidence = arm.confidence.tolist()
+        bones = self._bones(points[:3], arm.confidence[:3], period, self.lengths)
+        rotation, hand_known = self._hand_rotation(points, confidence, bones[2] - bones[1])
+        hand = matrix_to_quaternion(rotation)
+        velocities, turning = np.zeros((3, 3)), np.zeros(3)
+        if self._smoothing:
+            bones = self._filter.filter(arm.time, bones, arm.confidence[:3, None])
+            hand = self._turn.filter(arm.time, hand, 1.0 if hand_known else 0.5)
+            velocities, turning = self._filter.velocity, self._turn.velocity
+        known = (confidence[1], min(confidence[2], confidence[0]), hand_known)
+        closed = self._grip(arm.hand_state)
+        return ArmEstimate(arm.time, bones[0], bones[1], bones[2], velocities, hand, turning, known, closed)
+
+    def _bones(self, points: Array, confidence: Array, period: float, lengths: LimbLengths) -> Array:
+        """Return shoulder, elbow and wrist with the bones' lengths between them, shape (3, 3) [m]."""
+        if self._smoothing:
+            velocity = self._filter.velocity if period <= GAP else np.zeros((3, 3))
+            points = self._anchoring.anchor(points, confidence.tolist(), velocity, period)
+        if self._limbs == "fit":
+            return fit_limbs(points, confidence, lengths)
+        return np.array([points[0], *correct_limbs(points[0], points[1], points[2], lengths)])
 
     def _learn(self, skeleton: Skeleton) -> None:
         """Measure the arm over the first frames in which it is seen."""
@@ -148,29 +157,17 @@ class ArmEstimator:
         if len(self._learning) >= _LEARNING_FRAMES:
             self._learning = []
 
-    def _hand_rotation(self, points: Array, confidence: Array, forearm: Array) -> tuple[Array, float]:
+    def _hand_rotation(self, points: Array, confidence: list[float], forearm: Array) -> tuple[Array, float]:
         """Return the hand's rotation in the base frame, and how far it is believed; carried along where not seen."""
-        length = float(np.sqrt(forearm @ forearm))
+        length = math.sqrt(float(forearm.dot(forearm)))
         fore = forearm / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
-        seen = confidence[[2, 4, 5]].min() >= 1.0
+        seen = min(confidence[2], confidence[4], confidence[5]) >= 1.0
         rotation = hand_rotation(points[2], points[4], points[5]) if seen else None
         known = 1.0 if rotation is not None else 0.0
         if rotation is None:
             rotation = carried(self._hand, self._fore, fore)
         self._hand, self._fore = rotation, fore
         return rotation, known
-
-    def _smooth(
-        self, time: float, points: tuple[Array, Array, Array], rotation: Array, confidence: Array, hand_known: float
-    ) -> tuple[Array, Array, Array, Array]:
-        hand = matrix_to_quaternion(rotation)
-        if not self._smoothing:
-            return *points, hand
-        s, e, w = (
-            one.filter(time, point, float(known))
-            for one, point, known in zip(self._filters, points, confidence[:3], strict=True)
-        )
-        return s, e, w, self._turn.filter(time, hand, 1.0 if hand_known else 0.5)
 
     def _grip(self, state: HandState) -> bool | None:
         """Return whether the hand is closed, once several frames in a row say so."""

@@ -2,6 +2,7 @@ r"""What of a person's arm stands for what of the robot's: which side, which fra
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -89,12 +90,12 @@ class Clutch:
         position = self.home.position + self.correspondence.scale * (wrist - self.wrist)
         kind = self.correspondence.orientation
         if kind == "fixed":
-            return Pose(position, self.home.quaternion)
+            return Pose.trusted(position, self.home.quaternion)
         turn = quaternion_multiply(hand, self.hand * _CONJUGATE)
         if kind == "upright":  # twist of the swing-twist decomposition about the vertical
             turn = _about_vertical(turn)
         quaternion = quaternion_multiply(turn, self.home.quaternion)
-        return Pose(position, quaternion / np.sqrt(quaternion @ quaternion))
+        return Pose.trusted(position, quaternion / math.sqrt(float(quaternion.dot(quaternion))))
 
 
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
@@ -102,7 +103,8 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 def _about_vertical(turn: Array) -> Array:
     """Return the part of a rotation (4,) that turns about the base's z."""
-    length = float(np.hypot(turn[0], turn[3]))
+    w, z = float(turn[0]), float(turn[3])
+    length = math.hypot(w, z)
     if length < 1e-9:  # upside down: no turn about the vertical is nearer than another
         return np.array([1.0, 0.0, 0.0, 0.0])
-    return np.array([turn[0], 0.0, 0.0, turn[3]]) / length
+    return np.array([w / length, 0.0, 0.0, z / length])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,26 +29,40 @@ class JerkLimiter:
     A joint that kept this bound can keep it again by braking with a, so that there is always a way on. Near a limit
     the last cut may exceed the jerk; position, velocity and acceleration are kept always.
 
+    An arm that is held up by something falls behind its commands, and its drives press harder the farther it does. So
+    a command brakes before it leads the measured joints by more than ``max_lead``: one more limit of position.
+
     Args:
         arm: whose limits.
         dt: control period [s].
         frequency: omega [rad/s]; must be well below 1/dt.
         rise_time: how long a joint takes to full acceleration [s]: j = a_max / rise_time.
+        max_lead: of a command over the measured position [rad]; more than a joint at full speed goes within the
+            robot's delay.
+
+    Raises:
+        InputError: when a number can't work.
     """
 
-    def __init__(self, arm: ArmModel, dt: float, *, frequency: float = 30.0, rise_time: float = 0.05) -> None:
+    def __init__(
+        self, arm: ArmModel, dt: float, *, frequency: float = 30.0, rise_time: float = 0.02, max_lead: float = math.inf
+    ) -> None:
         if not 0.0 < frequency * dt < 1.0:
             raise InputError(f"JerkLimiter: frequency must be positive and below 1/dt = {1 / dt:g} rad/s")
         if not rise_time >= dt:
             raise InputError(f"JerkLimiter: rise_time must be at least dt = {dt:g} s, got {rise_time:g}")
+        if not max_lead > 0.0:
+            raise InputError(f"JerkLimiter: max_lead must be positive [rad], got {max_lead:g}")
         self._dt = dt
         self._stiffness, self._damping = frequency * frequency, 2.0 * frequency
         self._v_max, self._a_max = arm.max_velocity, arm.max_acceleration
         self._step = arm.max_acceleration * dt
         self._jerk_step = arm.max_acceleration * (dt / rise_time)
         self.max_jerk = arm.max_acceleration / rise_time
-        self._ends = np.stack([arm.upper, -arm.lower])
-        self._sign = np.array([[1.0], [-1.0]])
+        self._upper, self._lower, self._lead = arm.upper, arm.lower, max_lead
+        # farther than this from an end no bound on the way left is below the other two
+        self._room = arm.max_velocity * (arm.max_velocity / (2.0 * arm.max_acceleration) + 2.0 * dt)
+        self._inner = arm.lower + self._room, arm.upper - self._room
         self._half_squared, self._double = 0.25 * np.square(self._step), 2.0 * arm.max_acceleration
         self.start(arm.home)
 
@@ -56,12 +72,13 @@ class JerkLimiter:
         self.velocity: Array = np.zeros_like(self.q)
         self.acceleration: Array = np.zeros_like(self.q)
 
-    def follow(self, q: Array, velocity: Array) -> Array:
+    def follow(self, q: Array, velocity: Array, measured: Array | None = None) -> Array:
         """Go on by one period towards a reference and return the joint positions reached, (n_joints,) [rad].
 
         Args:
             q: of the reference, shape (n_joints,) [rad].
             velocity: of the reference, shape (n_joints,) [rad/s].
+            measured: where the joints are, shape (n_joints,) [rad]; None: where they were told to be.
         """
         dt, before = self._dt, self.velocity
         # semi-implicit: the error is that at the end of the period, which keeps the follower calm at a large omega dt
@@ -72,19 +89,29 @@ class JerkLimiter:
         most = np.minimum(self.acceleration + self._jerk_step, self._a_max)
         least = np.maximum(self.acceleration - self._jerk_step, -self._a_max)
         after = before + dt * np.minimum(np.maximum(wanted, least), most)
-        lower, upper = self._box()
+        lower, upper = self._box(measured)
         after = np.minimum(np.maximum(after, lower), upper)
         self.q = self.q + 0.5 * dt * (before + after)
         self.velocity, self.acceleration = after, (after - before) / dt
         return self.q
 
-    def _box(self) -> tuple[Array, Array]:
+    def _box(self, measured: Array | None) -> tuple[Array, Array]:
         """Return the least and largest velocity from which each joint can still stop before its limits."""
-        # both directions at once: row 0 upwards, row 1 downwards, where up is what is down in row 0
-        moved = self._sign * self.velocity
-        way = self._ends - self._sign * self.q - (0.5 * self._dt) * moved
+        q, velocity, step = self.q, self.velocity, self._step
+        upper, lower = np.minimum(velocity + step, self._v_max), np.maximum(velocity - step, -self._v_max)
+        leads = measured is not None and np.abs(q - measured).max() > 0.5 * self._lead
+        if not leads and (q > self._inner[0]).all() and (q < self._inner[1]).all():
+            return lower, upper
+        top, bottom = self._upper, self._lower
+        if leads and measured is not None:
+            top, bottom = np.minimum(top, measured + self._lead), np.maximum(bottom, measured - self._lead)
+        ahead = q + (0.5 * self._dt) * velocity
+        return (
+            np.minimum(np.maximum(-self._braking(ahead - bottom), lower), upper),
+            np.maximum(np.minimum(self._braking(top - ahead), upper), lower),
+        )
+
+    def _braking(self, way: Array) -> Array:
+        """Return the largest velocity from which a joint can stop within ``way``; negative where it is beyond."""
         bound = np.sqrt(self._half_squared + self._double * np.maximum(way, 0.0)) - 0.5 * self._step
-        bound = bound + np.minimum(way, 0.0) * (2.0 / self._dt)  # the speed already had leads beyond: it must turn
-        bound = np.minimum(np.maximum(bound, moved - self._step), moved + self._step)
-        bound = np.minimum(bound, self._v_max)
-        return -bound[1], bound[0]
+        return np.asarray(bound + np.minimum(way, 0.0) * (2.0 / self._dt))

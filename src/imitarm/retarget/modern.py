@@ -14,7 +14,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_solver import ElbowTask, IKSolver
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
 from imitarm.kinematics.posture import ANGLE_LENGTH
-from imitarm.kinematics.sew import sew_derivatives
+from imitarm.kinematics.sew import one_angle
 from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.engagement import Engagement
@@ -29,9 +29,12 @@ COAST, HOLD = 0.1, 0.3  # [s] without a sight of the arm: until then the motion 
 _FADE = 0.05  # [s] time constant of the fading motion
 _PUSHED = 0.05  # [rad] an arm found farther than this from its command was moved by somebody
 _BETWEEN = 0.07  # [s] cameras leave out a frame now and then
-_SWING_GAIN, _SWING_RATE = 2.0, 0.4  # [1/s], [rad/s] a quick elbow would take the joints' speed from the tool
+_SWING_GAIN, _SWING_RATE = 5.0, 1.0  # [1/s], [rad/s] of the elbow
+_BEHIND = 0.01  # [m] a tool that is farther than this from its target lets the elbow be, 1 rad counting as 0.3 m
 _BENT = 0.1  # squared sine of the angle at the person's elbow below which its swing tells less and less
 _BRAKING = 1.5  # [m/s^2] the tool can nearly always brake so hard, 1 rad counting as 0.3 m
+_HELD = 0.02  # [rad] a joint that is farther than this behind its command is held up by something
+_METRES = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
 _STILL = 1e-3  # [rad/s] slower is at rest
 
 
@@ -47,7 +50,8 @@ class ModernRetargeter(Retargeter):
     3. a quadratic programme for the joints' velocities: the twist, the elbow's SEW angle, the box of position, velocity
        and acceleration that can always be kept, bounds that keep elbow and wrist off their singularities, rows that
        keep the links off the scene;
-    4. a follower that limits the jerk (:class:`~imitarm.retarget.jerk_limit.JerkLimiter`) and guards the limits again.
+    4. a follower that limits the jerk (:class:`~imitarm.retarget.jerk_limit.JerkLimiter`), guards the limits again,
+       and does not press on against what holds the arm up.
 
     The elbow's angle changes as the person's does, from where both were when the clutch engaged:
     :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. It counts less the less surely the person's elbow is seen, and the
@@ -63,9 +67,13 @@ class ModernRetargeter(Retargeter):
         scene: obstacles to keep clear of.
         gain: K [1/s].
         lead: share of the hand's velocity that is fed forward, 0 to 1.
-        elbow: weight of the elbow's angle beside the tool [m^2]; 0: the elbow is free.
+        elbow: weight of the elbow's swing beside the tool [m^2]; 0: the elbow is free.
         clearance: to keep from the scene [m].
         max_speed: the twist is cut to this [m/s], 1 rad counting as 0.3 m.
+        max_lead: how far a joint's command may lead its measured position [rad].
+
+    Raises:
+        InputError: when a number is out of range.
     """
 
     name: ClassVar[str] = "modern"
@@ -77,11 +85,12 @@ class ModernRetargeter(Retargeter):
         *,
         dt: float = 0.01,
         scene: Scene | None = None,
-        gain: float = 25.0,
-        lead: float = 0.6,
-        elbow: float = 1e-4,
+        gain: float = 15.0,
+        lead: float = 0.9,
+        elbow: float = 0.1,
         clearance: float = 0.01,
-        max_speed: float = 1.0,
+        max_speed: float = 1.5,
+        max_lead: float = 0.06,
     ) -> None:
         if not (0.0 < gain * dt <= 1.0 and 0.0 <= lead <= 1.0 and elbow >= 0.0 and max_speed > 0.0):
             raise InputError(
@@ -92,7 +101,7 @@ class ModernRetargeter(Retargeter):
         known = arm.landmarks is not None  # else neither its elbow's angle nor its singularities are
         self._solver = IKSolver(arm, dt=dt, max_speed=max_speed, singularity_bounds=known)
         self._elbow = elbow if known else 0.0
-        self._limiter = JerkLimiter(arm, dt)
+        self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
         super().__init__(arm, correspondence, dt=dt, scene=scene)
 
     def _begin(self, q: Array) -> None:
@@ -106,17 +115,18 @@ class ModernRetargeter(Retargeter):
 
     def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
         """Return the joint positions to be at after ``dt``; see :class:`~imitarm.retarget.retargeter.Retargeter`."""
+        measured = np.asarray(q, dtype=float)
         self._look(skeleton)
-        state = self._state(np.asarray(q, dtype=float))
+        state = self._state(measured)
         target = closed = None
         if state in _LED and self._estimate is not None:
             target, ahead = self._target(self._estimate)
             closed = self._estimate.closed
-            self._reach(target, ahead, self._elbow_task(self._estimate))
+            self._reach(target, ahead, self._elbow_task(self._estimate), measured)
         else:
             self._offset = None
             self._drive(np.zeros(6), None)
-        reached = self._limiter.follow(self._q, self._velocity)
+        reached = self._limiter.follow(self._q, self._velocity, measured)
         elbow = None if target is None or self._estimate is None else self._estimate.upper_arm
         time, velocity = self.command.time + self.dt, self._limiter.velocity
         self.command = Command(time, reached, velocity, closed, state, target, elbow)
@@ -169,25 +179,40 @@ class ModernRetargeter(Retargeter):
         """Return where the elbow should be; None when it is free, or one of the two angles is lost."""
         if self._elbow == 0.0:
             return None
-        person = sew_derivatives(estimate.shoulder, estimate.elbow, estimate.wrist)
-        if math.isnan(person.angle):
+        person = one_angle(estimate.shoulder.tolist(), estimate.elbow.tolist(), estimate.wrist.tolist())
+        if person is None:
             return None
         if self._offset is None:
-            robot = sew_derivatives(*self.arm.sew_points(self._q))
-            if math.isnan(robot.angle):
+            robot = one_angle(*self.arm.sew_points(self._q).tolist())
+            if robot is None:
                 return None
-            self._offset = float(robot.angle - person.angle)
-        confidence = estimate.confidence[0] * min(1.0, float(person.bend) / _BENT)
-        angle = math.remainder(float(person.angle) + self._offset, math.tau)
+            self._offset = robot.angle - person.angle
+        confidence = estimate.confidence[0] * min(1.0, person.bend / _BENT)
+        angle = math.remainder(person.angle + self._offset, math.tau)
         return ElbowTask(angle, self._elbow, confidence, _SWING_GAIN, _SWING_RATE)
 
-    def _reach(self, target: Pose, ahead: Array, elbow: ElbowTask | None) -> None:
-        """Move the reference towards a target."""
+    def _reach(self, target: Pose, ahead: Array, elbow: ElbowTask | None, measured: Array) -> None:
+        """Move the reference towards a target; not on against what holds the arm up."""
         error = self.arm.tool_pose(self._q).error_to(target)
         weighted = math.sqrt(float(error[:3].dot(error[:3])) + ANGLE_LENGTH**2 * float(error[3:].dot(error[3:])))
         # far away it goes no faster than it can brake again, or it would swing about the target
         gain = min(self._gain, math.sqrt(2.0 * _BRAKING / max(weighted, 1e-9)))
-        self._drive(gain * error + ahead, elbow)
+        if elbow is not None:  # a tool that is behind needs all the joints
+            elbow = elbow._replace(confidence=elbow.confidence / (1.0 + (weighted / _BEHIND) ** 2))
+        twist = gain * error + ahead
+        held = float(np.abs(self._limiter.q - measured).max())
+        if held > _HELD:
+            twist = self._yielding(twist, measured, min((held - _HELD) / _HELD, 1.0))
+        self._drive(twist, elbow)
+
+    def _yielding(self, twist: Array, measured: Array, share: float) -> Array:
+        """Return a twist without a share of what goes on in the direction in which the tool is held back."""
+        back = self.arm.tool_pose(measured).error_to(self.arm.tool_pose(self._limiter.q)) * _METRES
+        square = float(back.dot(back))
+        along = float(back.dot(twist * _METRES))
+        if square < 1e-12 or along <= 0.0:
+            return twist
+        return twist - share * (along / square) * back / _METRES
 
     def _drive(self, twist: Array, elbow: ElbowTask | None) -> None:
         """Move the reference by one step of inverse kinematics."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,15 @@ Array = NDArray[np.float64]
 GAP = 0.3  # [s] after a longer gap a filter begins anew
 
 
-def smoothing_share(cutoff: float, period: float) -> float:
-    r"""Return :math:`\alpha = 1 / (1 + 1/(2\pi f T))`: how much of a new value a low-pass filter takes over."""
-    return 1.0 / (1.0 + 1.0 / (2.0 * math.pi * cutoff * period))
+def smoothing_share(cutoff: Any, period: float) -> Any:
+    r"""Return :math:`\alpha = 1 / (1 + 1/(2\pi f T))`: how much of a new value a low-pass filter takes over.
+
+    Args:
+        cutoff: f [Hz], a number or an array.
+        period: T [s].
+    """
+    turned = (2.0 * math.pi * period) * cutoff
+    return turned / (1.0 + turned)
 
 
 class OneEuro:
@@ -52,35 +59,35 @@ class OneEuro:
         self.value: Array = np.zeros(0)
         self.velocity: Array = np.zeros(0)
 
-    def filter(self, time: float, x: Array, confidence: float = 1.0) -> Array:
-        """Take in a measured vector and return the smoothed one, same shape; ``velocity`` is its derivative.
+    def filter(self, time: float, x: Array, confidence: float | Array = 1.0) -> Array:
+        """Take in measured vectors and return the smoothed ones, same shape; ``velocity`` is their derivative.
 
         Args:
             time: of the measurement [s]; when it is not later than the one before, that one is returned.
-            x: shape (d,).
-            confidence: 0 to 1.
+            x: a vector, shape (d,), or several, each with its own speed, shape (k, d).
+            confidence: 0 to 1; for several vectors one number or shape (k, 1).
         """
         period = time - self._time
         if period > GAP:
-            self._time, self.value, self.velocity = time, np.array(x, dtype=float), np.zeros(len(x))
-            self._raw = self.value
+            self._time, self.value = time, np.array(x, dtype=float)
+            self._raw, self.velocity = self.value, np.zeros_like(self.value)
             return self.value
         if period <= 0.0:
             return self.value
         self._time = time
-        speed = self._difference(x, self._raw) / period
-        self._raw = np.array(x, dtype=float)
         share = confidence * smoothing_share(self.derivative_cutoff, period)
-        self.velocity = self.velocity + share * (speed - self.velocity)
-        cutoff = self.min_cutoff + self.beta * math.sqrt(float(self.velocity.dot(self.velocity)))
-        self.value = self._moved(confidence * smoothing_share(cutoff, period) * self._difference(x, self.value))
+        self.velocity = self.velocity + share * (self._difference(x, self._raw) / period - self.velocity)
+        self._raw = np.array(x, dtype=float)
+        speed = np.sqrt((self.velocity * self.velocity).sum(axis=-1, keepdims=True))
+        share = confidence * smoothing_share(self.min_cutoff + self.beta * speed, period)
+        self.value = self._moved(share * self._difference(x, self.value))
         return self.value
 
     def _difference(self, x: Array, before: Array) -> Array:
-        return np.asarray(x - before)
+        return x - before
 
     def _moved(self, step: Array) -> Array:
-        return np.asarray(self.value + step)
+        return self.value + step
 
 
 class OneEuroRotation(OneEuro):
@@ -95,7 +102,7 @@ class OneEuroRotation(OneEuro):
     def __init__(self, min_cutoff: float = 1.0, beta: float = 1.0, derivative_cutoff: float = 1.0) -> None:
         super().__init__(min_cutoff, beta, derivative_cutoff)
 
-    def filter(self, time: float, x: Array, confidence: float = 1.0) -> Array:
+    def filter(self, time: float, x: Array, confidence: float | Array = 1.0) -> Array:
         """Take in a measured unit quaternion (4,) and return the smoothed one; ``velocity`` is (3,) [rad/s]."""
         result = super().filter(time, x, confidence)
         if len(self.velocity) == 4:  # it has just begun
@@ -123,7 +130,7 @@ class Hampel:
 
     def __init__(self, window: float = 0.3, least: float = 0.02) -> None:
         self.window, self.least = window, least
-        self._seen: deque[tuple[float, Array]] = deque()
+        self._seen: deque[tuple[float, list[float]]] = deque()
 
     def reset(self) -> None:
         """Forget the past."""
@@ -134,12 +141,11 @@ class Hampel:
         seen = self._seen
         while seen and (time - seen[0][0] > self.window or time <= seen[0][0]):
             seen.popleft()
-        seen.append((time, x))
+        seen.append((time, x.tolist()))
         if len(seen) < 4:
             return True
-        values = np.array([value for _, value in seen])
-        half = len(values) // 2
-        middle = np.sort(values, axis=0)[half]  # np.median takes longer on so few values
-        difference = values - middle
-        away = np.sqrt(np.einsum("ij,ij->i", difference, difference)).tolist()
-        return bool(away[-1] <= max(4.0 * 1.4826 * sorted(away)[half], self.least))
+        # a handful of short vectors: plain floats take a third of NumPy's time
+        half = len(seen) // 2
+        middle = [sorted(axis)[half] for axis in zip(*(value for _, value in seen), strict=True)]
+        away = [math.dist(value, middle) for _, value in seen]
+        return away[-1] <= max(4.0 * 1.4826 * sorted(away)[half], self.least)

@@ -201,11 +201,11 @@ class _Trial:
         self.operator.see(self.sight(time))
         self.expose(time)
         robot, before = self.robot, self.retargeter.command.q
-        wanted = self.retargeter.step(self.newest(time), robot.state().q)
+        self.retargeter.step(self.newest(time), robot.state().q)
         if self.retargeter.command.closed is not None and self.retargeter.command.closed != self.closed:
             self.closed = self.retargeter.command.closed
             robot.grasp(CLOSED if self.closed else OPEN)
-        robot.move((wanted - before) / DT + _FOLLOW * (before - robot.set_point), DT)
+        robot.move(self.retargeter.command.velocity + _FOLLOW * (before - robot.set_point), DT)
         self.clamped += bool(robot.clamped)
         state = robot.state()
         self.tool = robot.tool_to_base.position
