@@ -65,10 +65,14 @@ def lag(tool, wanted):
 
 @pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
 def test_the_tool_follows_the_hand(arm):
-    tool, wanted = tool_and_hand(arm, 1)
-    late = lag(tool, wanted)
-    error = np.linalg.norm(tool[late:] - wanted[: len(tool) - late], axis=1)
-    assert np.sqrt(np.mean(error**2)) < 0.012
+    """Seed 1 leads the hand close to the shoulder, where the elbow has to go a long way round."""
+    misses = []
+    for seed in range(5):
+        tool, wanted = tool_and_hand(arm, seed)
+        late = lag(tool, wanted)
+        misses.append(np.sqrt(np.mean(np.sum((tool[late:] - wanted[: len(tool) - late]) ** 2, axis=1))))
+    assert np.median(misses) < 0.004
+    assert max(misses) < 0.02
 
 
 def test_it_is_less_than_80_ms_late():
