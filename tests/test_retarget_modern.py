@@ -1,3 +1,4 @@
+import mujoco
 import numpy as np
 import pytest
 
@@ -7,6 +8,7 @@ from imitarm.capture.motions import MotionCapture, reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import Skeleton
 from imitarm.capture.synthetic import SyntheticSource
+from imitarm.kinematics.reach_of_links import _shapes, meeting_links
 from imitarm.kinematics.sew import sew_angle
 from imitarm.retarget import FACING, Correspondence, LimbLengths, ModernRetargeter, retarget
 
@@ -184,6 +186,37 @@ def test_what_stands_in_the_way_is_not_touched():
         gaps.append(float((scene.clearance(centers) - radii).min()))
     assert min(gaps) > 0.0
     assert_within_limits(arm, run.joints)
+
+
+@pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
+def test_a_hand_that_leads_the_tool_into_the_arm_does_not_get_there(arm):
+    """Measured by the exact distance of the shapes, which the method does not use."""
+    person = Person.from_seed(4)
+    start = person.shoulder("right") + np.array([0.05, -0.2, -0.35])
+    ways = ([0.0, -0.35, 0.45], [0.3, -0.3, 0.4], [-0.1, -0.5, 0.3])  # back, down and aside: to the base
+    model = arm.spec().compile()
+    data, shapes, meet = mujoco.MjData(model), _shapes(arm, model), meeting_links(arm)
+    nearest = {}
+    for own_clearance in (0.02, None):
+        gaps = []
+        for way in ways:
+            times = np.arange(0.0, 5.0, 1 / 30)
+            frames = [person.skeleton(t, start + np.clip((t - 1.5) / 2.0, 0.0, 1.0) * np.array(way)) for t in times]
+            correspondence = Correspondence(lengths=lengths(person), orientation="fixed", scale=1.3)
+            run = ModernRetargeter(arm, correspondence, own_clearance=own_clearance).run(frames)
+            assert_within_limits(arm, run.joints)
+            for q in run.joints[::10]:
+                data.qpos[:] = arm.posture(model, q)
+                mujoco.mj_kinematics(model, data)
+                gaps += [
+                    mujoco.mj_geomDistance(model, data, one, other, 1.0, None)
+                    for outer, inner in zip(*np.nonzero(meet), strict=True)
+                    for one in shapes[outer]
+                    for other in shapes[inner]
+                ]
+        nearest[own_clearance] = min(gaps)
+    assert nearest[0.02] > 0.01
+    assert nearest[None] < nearest[0.02]
 
 
 def test_a_real_arm_drives_both_robots_within_their_limits(real_data):

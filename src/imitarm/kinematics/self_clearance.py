@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.reach_of_links import meeting_links
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int_]
@@ -27,8 +28,9 @@ class SelfClearance:
     and a row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets it shrink no faster than exponentially (METHODS A.9).
     Every two links that are near have one row, for their nearest spheres; of those the ``n_rows`` nearest are taken.
 
-    Not watched are links that are joined by a joint, and spheres that are nearer than the clearance in the arm's home
-    posture. What the arm stands on is no part of it: put it into the scene.
+    Not watched are links that are joined by a joint, links that their joints' limits keep apart
+    (:func:`~imitarm.kinematics.reach_of_links.meeting_links`), and spheres that are nearer than the clearance in the
+    arm's home posture. The base is watched; what it stands on is no part of the arm: put it into the scene.
 
     Args:
         arm: the arm with its tool.
@@ -48,12 +50,14 @@ class SelfClearance:
             )
         self.arm, self.clearance = arm, clearance
         self._n_rows, self._gain = n_rows, gain
-        centers, radii = arm.collision_spheres(arm.home)
-        links = arm.cover.links
+        cover = arm.cover
+        centers, radii = self._centers(arm.home), np.concatenate([cover.radii, cover.base_radii])
+        links = np.concatenate([cover.links, np.zeros(len(cover.base_radii), dtype=int)])
+        meet = meeting_links(arm)
         sums = radii[:, None] + radii
         apart = np.linalg.norm(centers[:, None] - centers, axis=2) - sums
         # the sphere that is farther out comes first, so every pair occurs once
-        outer, inner = np.nonzero((links[:, None] > links + 1) & (apart >= clearance))
+        outer, inner = np.nonzero(meet[links[:, None], links] & (apart >= clearance))
         pair_of_links = links[outer] * (arm.n_joints + 1) + links[inner]
         order = np.argsort(pair_of_links, kind="stable")
         self._outer, self._inner = outer[order], inner[order]
@@ -64,6 +68,10 @@ class SelfClearance:
         ends = [*self._starts.tolist(), len(order)][1:]
         self._groups = [slice(a, b) for a, b in zip(self._starts.tolist(), ends, strict=True)]
         self._near = np.float32(clearance + _INFLUENCE)
+
+    def _centers(self, q: ArrayLike) -> Array:
+        """Return where all spheres are, those of the base last, shape (m, 3) [m]."""
+        return np.concatenate([self.arm.collision_spheres(q)[0], self.arm.cover.base_centers])
 
     @property
     def n_pairs(self) -> int:
@@ -81,7 +89,7 @@ class SelfClearance:
         """
         if not self.n_pairs:
             return math.inf
-        centers, _ = self.arm.collision_spheres(q)
+        centers = self._centers(q)
         return float((np.linalg.norm(centers[self._outer] - centers[self._inner], axis=1) - self._sums).min())
 
     def nearest(self, q: ArrayLike) -> tuple[Indices, Array]:
@@ -111,9 +119,13 @@ class SelfClearance:
         rows = self.arm.cover.parting(self.arm.at(q).data, outer, inner, centers, normals)
         return rows, -self._gain * (distances - self.clearance)
 
+    def watch(self) -> SelfWatch:
+        """Return the same for a control loop, at a fifth of the price."""
+        return SelfWatch(self, self._gain)
+
     def _found(self, q: ArrayLike) -> tuple[Indices, Indices, Array, Array, Array]:
         """Return the nearest pairs: outer and inner spheres, centres of the outer, normals and distances."""
-        centers, _ = self.arm.collision_spheres(q)
+        centers = self._centers(q)
         best: list[int] = []
         if self._groups:
             coarse = self._coarse_distances(centers)
@@ -140,3 +152,42 @@ class SelfClearance:
         np.sqrt(distances, out=distances)
         distances -= self._coarse_sums
         return distances
+
+
+class SelfWatch:
+    r"""Rows of a :class:`SelfClearance` for a control loop: the nearest links are looked for every few steps.
+
+    In between the distances follow from the joints' motion, :math:`d(q) \approx d_0 + \nabla d\,(q - q_0)`; what that
+    leaves out in 70 ms is less than 15 mm with every joint at 1 rad/s, far less in the usual motion.
+
+    Args:
+        own: what is watched.
+        gain: xi [1/s].
+        every: steps after which a new look is taken when there is time for it.
+        at_least_every: steps after which it is taken in any case.
+    """
+
+    def __init__(self, own: SelfClearance, gain: float, *, every: int = 4, at_least_every: int = 8) -> None:
+        self._own, self._gain, self._every, self._latest = own, gain, every, at_least_every
+        self.reset()
+
+    def reset(self) -> None:
+        """Look anew in the next step."""
+        self._age = self._latest
+        self._rows: tuple[Array, Array] | None = None
+        self._at: Array = np.zeros(0)
+
+    def rows(self, q: Array, *, time_to_look: bool = True) -> tuple[Array, Array] | None:
+        """Return inequalities on the joint velocity as ``SelfClearance.rows`` does; None when nothing is near.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            time_to_look: whether this step has time for a new look.
+        """
+        self._age += 1
+        if self._age > self._latest or (time_to_look and self._age > self._every):
+            self._rows, self._at, self._age = self._own.rows(q), q.copy(), 1
+        if self._rows is None:
+            return None
+        rows, lower = self._rows
+        return rows, lower - self._gain * rows.dot(q - self._at)

@@ -26,19 +26,28 @@ class SphereCover:
         radii: shape (m,) [m].
         links: by how many of the arm's joints each sphere is moved, shape (m,).
         follows_last_joint: which spheres move rigidly with the flange, shape (m,).
+        base_centers: of the spheres that cover the base, which never moves, shape (b, 3) [m].
+        base_radii: theirs, shape (b,) [m].
     """
 
     def __init__(self, model: mujoco.MjModel, joints: NDArray[np.int_]) -> None:
         """Cover the shapes of ``model``; columns of the Jacobians belong to ``joints``."""
         owners: list[int] = []
         centers, radii = [np.zeros((0, 3))], [np.zeros(0)]
+        base_centers, base_radii = [np.zeros((0, 3))], [np.zeros(0)]
+        at_rest = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, at_rest)
         for geom in np.flatnonzero(model.geom_group == COLLISION_GROUP):
             body = int(model.geom_bodyid[geom])
-            if model.body_weldid[body] != 0:  # the base never moves
-                points, radius = covering_spheres(model, int(geom))
+            points, radius = covering_spheres(model, int(geom))
+            if model.body_weldid[body] == 0:  # the base never moves
+                base_centers.append(points @ at_rest.xmat[body].reshape(3, 3).T + at_rest.xpos[body])
+                base_radii.append(np.full(len(points), radius))
+            else:
                 centers.append(points)
                 radii.append(np.full(len(points), radius))
                 owners += [body] * len(points)
+        self.base_centers, self.base_radii = np.concatenate(base_centers), np.concatenate(base_radii)
         self.bodies = tuple(model.body(body).name for body in owners)
         self.radii = np.concatenate(radii)
         self.radii.setflags(write=False)
@@ -47,6 +56,7 @@ class SphereCover:
         self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
         moves = [[_carries(model, int(model.jnt_bodyid[joint]), body) for joint in joints] for body in owners]
         self._moves = np.array(moves, dtype=float).reshape(len(owners), 1, len(joints))
+        self._moves_of_all = np.concatenate([self._moves[:, 0], np.zeros((len(self.base_radii), len(joints)))])
         self.links = self._moves[:, 0].sum(axis=1).astype(int)
         self.follows_last_joint = self._moves[:, 0, -1] > 0.0
 
@@ -66,7 +76,7 @@ class SphereCover:
         Args:
             data: the kinematics of a posture.
             outer: spheres (k,) that are moved by all joints that move the inner ones, and more.
-            inner: spheres (k,).
+            inner: spheres (k,); those of the base are counted on after the others.
             centers: of the outer spheres, shape (k, 3) [m].
             normals: unit vectors from inner to outer, shape (k, 3).
         """
@@ -75,7 +85,7 @@ class SphereCover:
         rates -= normals @ _cross(axes, anchors).T
         if self._slides.any():
             rates[:, self._slides] = normals @ axes[self._slides].T
-        rates *= self._moves[outer, 0] - self._moves[inner, 0]
+        rates *= self._moves_of_all[outer] - self._moves_of_all[inner]
         return np.asarray(rates)
 
     def jacobians(self, data: mujoco.MjData) -> Array:

@@ -14,6 +14,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_solver import ElbowTask, IKSolver
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
 from imitarm.kinematics.posture import ANGLE_LENGTH
+from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.sew import one_angle
 from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
 from imitarm.retarget.correspondence import Correspondence
@@ -49,7 +50,7 @@ class ModernRetargeter(Retargeter):
        velocity;
     3. a quadratic programme for the joints' velocities: the twist, the elbow's SEW angle, the box of position, velocity
        and acceleration that can always be kept, bounds that keep elbow and wrist off their singularities, rows that
-       keep the links off the scene;
+       keep the links off each other and off the scene;
     4. a follower that limits the jerk (:class:`~imitarm.retarget.jerk_limit.JerkLimiter`), guards the limits again,
        and does not press on against what holds the arm up.
 
@@ -69,6 +70,7 @@ class ModernRetargeter(Retargeter):
         lead: share of the hand's velocity that is fed forward, 0 to 1.
         elbow: weight of the elbow's swing beside the tool [m^2]; 0: the elbow is free.
         clearance: to keep from the scene [m].
+        own_clearance: of links from each other [m]; None: not watched.
         max_speed: the twist is cut to this [m/s], 1 rad counting as 0.3 m.
         max_lead: how far a joint's command may lead its measured position [rad].
 
@@ -89,6 +91,7 @@ class ModernRetargeter(Retargeter):
         lead: float = 0.9,
         elbow: float = 0.1,
         clearance: float = 0.01,
+        own_clearance: float | None = 0.02,
         max_speed: float = 1.5,
         max_lead: float = 0.06,
     ) -> None:
@@ -101,6 +104,7 @@ class ModernRetargeter(Retargeter):
         known = arm.landmarks is not None  # else neither its elbow's angle nor its singularities are
         self._solver = IKSolver(arm, dt=dt, max_speed=max_speed, singularity_bounds=known)
         self._elbow = elbow if known else 0.0
+        self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).watch()
         self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
         super().__init__(arm, correspondence, dt=dt, scene=scene)
 
@@ -111,6 +115,9 @@ class ModernRetargeter(Retargeter):
         self._estimate: ArmEstimate | None = None
         self._engagement = Engagement(self.correspondence)
         self._estimator = ArmEstimator(self.correspondence)
+        if self._own is not None:
+            self._own.reset()
+        self._seeing = False  # a step with a new frame has less time for the rest
         self._offset: float | None = None  # of the robot's elbow angle from the person's
 
     def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
@@ -135,6 +142,7 @@ class ModernRetargeter(Retargeter):
     def _look(self, skeleton: Skeleton | None) -> None:
         """Take in a skeleton, and count the time in which none showed the arm."""
         self._silence += self.dt
+        self._seeing = skeleton is not None
         estimate = None if skeleton is None else self._estimator.update(skeleton)
         if estimate is not None:
             self._estimate, self._silence = estimate, 0.0
@@ -217,6 +225,9 @@ class ModernRetargeter(Retargeter):
     def _drive(self, twist: Array, elbow: ElbowTask | None) -> None:
         """Move the reference by one step of inverse kinematics."""
         rows = clearance_rows(self.arm, self._q, self.scene, self._clearance)
+        own = None if self._own is None else self._own.rows(self._q, time_to_look=not self._seeing)
+        if own is not None:
+            rows = own if rows is None else (np.concatenate([rows[0], own[0]]), np.concatenate([rows[1], own[1]]))
         velocity = self._solver.solve(self._q, twist, velocity=self._velocity, rows=rows, sew=elbow)
         self._velocity = velocity
         self._q = self._q + self.dt * velocity
