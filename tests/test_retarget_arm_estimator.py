@@ -4,10 +4,11 @@ import pytest
 from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
-from imitarm.capture.skeleton import HandState, Skeleton
+from imitarm.capture.skeleton import HandState, Skeleton, Tracking
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.errors import UnknownNameError
 from imitarm.retarget import FACING, Correspondence, LimbLengths
+from imitarm.retarget.anchoring import Anchoring
 from imitarm.retarget.arm_estimator import ArmEstimator
 
 PERSON = Person.from_seed(2)
@@ -93,3 +94,31 @@ def test_the_hand_is_carried_by_the_forearm_when_it_is_not_seen():
 def test_an_unknown_way_with_limbs_is_named():
     with pytest.raises(UnknownNameError, match="fit"):
         ArmEstimator(Correspondence(), limbs="guess")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_hand_at_rest_that_is_hidden_now_and_then_wanders_less_than_half_as_far(seed, monkeypatch):
+    """The way that its estimate goes, with and without anchoring; the camera loses and guesses the arm often."""
+    still = Person(**{**PERSON.__dict__, "tremor": 0.0 * PERSON.tremor, "sway": 0.0 * PERSON.sway})
+
+    def wandered():
+        camera = SkeletonCamera(seed, sigma=0.015, dropout=2.0)
+        estimator = ArmEstimator(Correspondence(lengths=LENGTHS))
+        source = SyntheticSource(lambda t: still.skeleton(t, HOLD), camera, 20.0)
+        wrist = [estimate.wrist for estimate in map(estimator.update, source) if estimate is not None]
+        assert len(wrist) > 300
+        return np.linalg.norm(np.diff(wrist, axis=0), axis=1).sum()
+
+    anchored = wandered()
+    monkeypatch.setattr(Anchoring, "anchor", lambda self, points, *_: points)
+    assert anchored < 0.5 * wandered()
+
+
+def test_without_smoothing_nothing_is_anchored():
+    """What is given as it is corrected stays so, hidden or not."""
+    estimator = ArmEstimator(Correspondence(lengths=LENGTHS), smoothing=False)
+    for k, frame in enumerate(frames(1.0)):
+        tracking = np.array(frame.tracking)
+        tracking[9:11] = Tracking.INFERRED if k % 6 < 3 else Tracking.TRACKED
+        estimate = estimator.update(Skeleton(frame.time, frame.positions, tracking))
+        np.testing.assert_allclose(estimate.wrist, FACING.apply(frame.arm().wrist), atol=1e-9)

@@ -1,0 +1,133 @@
+"""What comes with a change of tracking is taken for an error; what is measured between two changes is a motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imitarm import InputError
+from imitarm.retarget.anchoring import Anchoring
+
+T = 1 / 30
+SEEN, GUESSED = [1.0, 1.0, 1.0], [1.0, 1.0, 0.5]
+STILL = np.zeros((3, 3))
+JUMP = np.array([0.08, -0.03, 0.05])
+some = settings(deadline=None, max_examples=60)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def arm(rng):
+    return rng.normal(size=(3, 3))
+
+
+def hidden(points, jump=JUMP):
+    """The same arm with the wrist guessed elsewhere."""
+    return points + np.array([[0.0], [0.0], [1.0]]) * jump
+
+
+@some
+@given(seeds, st.lists(st.sampled_from([0.2, 0.5, 1.0]), min_size=3, max_size=3))
+def test_without_a_change_of_confidence_points_are_as_they_were_measured(seed, confidence):
+    anchoring, rng = Anchoring(), np.random.default_rng(seed)
+    for _ in range(20):
+        points = arm(rng)
+        assert np.array_equal(anchoring.anchor(points, confidence, rng.normal(size=(3, 3)), T), points)
+
+
+def test_a_hand_that_is_hidden_and_seen_again_does_not_jump():
+    """The way that it goes on at each change is its velocity times the period, wherever the camera guesses it."""
+    anchoring, rng = Anchoring(), np.random.default_rng(0)
+    points, velocity = arm(rng), 0.1 * arm(rng)
+    before = anchoring.anchor(points, SEEN, velocity, T)
+    for k in range(1, 40):
+        guessed = (k // 5) % 2 == 1
+        points = points + T * velocity
+        measured = hidden(points, rng.normal(size=3)) if guessed else points
+        now = anchoring.anchor(measured, GUESSED if guessed else SEEN, velocity, T)
+        if k % 5 == 0:
+            np.testing.assert_allclose(now[2] - before[2], T * velocity[2], atol=1e-12)
+        np.testing.assert_array_equal(now[:2], measured[:2])  # the others are not touched
+        before = now
+
+
+def test_while_it_is_guessed_its_motion_is_followed_and_its_place_is_not_believed():
+    anchoring, rng = Anchoring(), np.random.default_rng(1)
+    points = arm(rng)
+    anchoring.anchor(points, SEEN, STILL, T)
+    anchoring.anchor(hidden(points), GUESSED, STILL, T)
+    for _ in range(300):  # ten seconds on
+        points = points + 0.02 * rng.normal(size=3)
+        np.testing.assert_allclose(anchoring.anchor(hidden(points), GUESSED, STILL, T), points, atol=1e-12)
+
+
+def seen_again(anchoring, points):
+    """See, guess, and see again an arm at rest that the camera now puts elsewhere; return what it is off."""
+    anchoring.anchor(points, SEEN, STILL, T)
+    anchoring.anchor(points, GUESSED, STILL, T)
+    elsewhere = hidden(points)
+    return elsewhere, elsewhere - anchoring.anchor(elsewhere, SEEN, STILL, T)
+
+
+def test_when_it_is_seen_the_offset_fades_slowly_with_time():
+    points = arm(np.random.default_rng(2))
+    anchoring = Anchoring(time=8.0)
+    elsewhere, off = seen_again(anchoring, points)
+    np.testing.assert_allclose(off[2], JUMP, atol=1e-12)
+    for k in range(1, 241):
+        left = elsewhere - anchoring.anchor(elsewhere, SEEN, STILL, T)
+        np.testing.assert_allclose(left[2], np.exp(-k * T / 8.0) * JUMP, atol=1e-12)
+
+
+def test_when_it_is_seen_the_offset_fades_with_the_way():
+    points = arm(np.random.default_rng(3))
+    anchoring = Anchoring(time=1e9, way=0.2)
+    elsewhere, off = seen_again(anchoring, points)
+    for k in range(1, 31):
+        moved = elsewhere + [0.0, 0.0, 0.01 * k]
+        left = moved - anchoring.anchor(moved, SEEN, STILL, T)
+        np.testing.assert_allclose(left[2], np.exp(-0.01 * k / 0.2) * off[2], atol=1e-9)
+    np.testing.assert_allclose(left[:2], 0.0, atol=1e-12)
+
+
+@some
+@given(seeds)
+def test_between_changes_a_joint_goes_as_it_is_measured(seed):
+    """While it is guessed exactly so; while it is seen what fades of the offset comes on top, and no more."""
+    anchoring, rng = Anchoring(time=5.0, way=0.1), np.random.default_rng(seed)
+    points = arm(rng)
+    before, off = anchoring.anchor(points, SEEN, STILL, T), np.zeros((3, 3))
+    confidence = SEEN
+    for _ in range(60):
+        measured = points + 0.05 * rng.normal(size=(3, 3)) * rng.integers(0, 2, size=(3, 1))
+        changed = rng.random(3) < 0.2
+        new = np.where(changed, rng.choice([0.2, 0.5, 1.0], size=3), confidence).tolist()
+        velocity = rng.normal(size=(3, 3))
+        now = anchoring.anchor(measured, new, velocity, T)
+        for i in range(3):
+            step, way = now[i] - before[i], np.linalg.norm(measured[i] - points[i])
+            if new[i] != confidence[i]:
+                np.testing.assert_allclose(step, T * velocity[i], atol=1e-12)
+            elif new[i] < 1.0:
+                np.testing.assert_allclose(step, measured[i] - points[i], atol=1e-12)
+            else:
+                fades = np.linalg.norm(off[i]) * (T / 5.0 + way / 0.1)
+                assert np.linalg.norm(step) <= way + fades + 1e-12
+                assert np.linalg.norm(now[i] - measured[i]) <= np.linalg.norm(off[i]) + 1e-12
+        points, confidence, before, off = measured, new, now, now - measured
+
+
+def test_the_past_can_be_forgotten():
+    anchoring, points = Anchoring(), arm(np.random.default_rng(4))
+    elsewhere, off = seen_again(anchoring, points)
+    assert np.linalg.norm(off) > 0.05
+    anchoring.reset()
+    for confidence in (GUESSED, GUESSED):  # a first sight is believed, whatever was before
+        assert np.array_equal(anchoring.anchor(elsewhere, confidence, STILL, T), elsewhere)
+
+
+@pytest.mark.parametrize("options", [{"time": 0.0}, {"way": 0.0}, {"time": -1.0}, {"way": np.nan}])
+def test_settings_that_never_let_go_are_refused(options):
+    with pytest.raises(InputError, match="Anchoring"):
+        Anchoring(**options)
