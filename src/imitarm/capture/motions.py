@@ -60,8 +60,9 @@ def reaching(person: Person, seed: int, *, duration: float = 12.0, kind: str = "
     rng = np.random.default_rng([30312, person.seed, seed])
     place = _comfortable(rng, person)
     places, times = [place], [REST]
+    out = False
     while times[-1] < duration:
-        out = kind == "edge" and len(places) % 2 == 1
+        out = kind == "edge" and not out
         place = _stretched(rng, person) if out else _comfortable(rng, person)
         pace = max(float(np.linalg.norm(place - places[-1])) / rng.uniform(*_SPEED), 0.6)
         places.append(place)

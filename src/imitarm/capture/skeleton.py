@@ -151,7 +151,7 @@ class Skeleton:
             )
         if not np.isfinite(self.time):
             raise InputError(f"Skeleton: time must be a finite number of seconds, got {self.time!r}")
-        if not np.isin(tracking, (0, 1, 2)).all():
+        if not ((tracking == 0) | (tracking == 1) | (tracking == 2)).all():
             raise InputError(f"Skeleton: tracking must be 0, 1 or 2 (lost, inferred, tracked), got {tracking}")
         try:
             left, right = (HandState(state) for state in self.hand_states)

@@ -261,6 +261,6 @@ class IKSolver:
         matrix, lower = (np.asarray(part, dtype=float) for part in rows)
         if lower.ndim != 1 or matrix.shape != (len(lower), n):
             raise InputError(f"solve_ik: rows need shapes (m, {n}) and (m,), got {matrix.shape}, {lower.shape}")
-        if not (np.isfinite(matrix).all() and np.isfinite(lower).all()):
+        if not math.isfinite(float(matrix.sum() + lower.sum())):
             raise InputError("solve_ik: rows must be finite numbers")
         return matrix, lower

@@ -54,15 +54,18 @@ class JerkLimiter:
         if not max_lead > 0.0:
             raise InputError(f"JerkLimiter: max_lead must be positive [rad], got {max_lead:g}")
         self._dt = dt
-        self._stiffness, self._damping = frequency * frequency, 2.0 * frequency
+        # semi-implicit: the error is that at the end of the period, which keeps the follower calm at a large omega dt
+        calm = 1.0 + 2.0 * frequency * dt + frequency * frequency * dt * dt
+        self._stiffness, self._damping = frequency * frequency / calm, 2.0 * frequency / calm
         self._v_max, self._a_max = arm.max_velocity, arm.max_acceleration
+        self._v_min, self._a_min = -arm.max_velocity, -arm.max_acceleration
         self._step = arm.max_acceleration * dt
         self._jerk_step = arm.max_acceleration * (dt / rise_time)
         self.max_jerk = arm.max_acceleration / rise_time
         self._upper, self._lower, self._lead = arm.upper, arm.lower, max_lead
         # farther than this from an end no bound on the way left is below the other two
-        self._room = arm.max_velocity * (arm.max_velocity / (2.0 * arm.max_acceleration) + 2.0 * dt)
-        self._inner = arm.lower + self._room, arm.upper - self._room
+        room = arm.max_velocity * (arm.max_velocity / (2.0 * arm.max_acceleration) + 2.0 * dt)
+        self._inner = list(zip((arm.lower + room).tolist(), (arm.upper - room).tolist(), strict=True))
         self._half_squared, self._double = 0.25 * np.square(self._step), 2.0 * arm.max_acceleration
         self.start(arm.home)
 
@@ -81,13 +84,9 @@ class JerkLimiter:
             measured: where the joints are, shape (n_joints,) [rad]; None: where they were told to be.
         """
         dt, before = self._dt, self.velocity
-        # semi-implicit: the error is that at the end of the period, which keeps the follower calm at a large omega dt
-        error = q - self.q - dt * before
-        wanted = (self._stiffness * error + self._damping * (velocity - before)) / (
-            1.0 + dt * self._damping + dt * dt * self._stiffness
-        )
+        wanted = self._stiffness * (q - self.q - dt * before) + self._damping * (velocity - before)
         most = np.minimum(self.acceleration + self._jerk_step, self._a_max)
-        least = np.maximum(self.acceleration - self._jerk_step, -self._a_max)
+        least = np.maximum(self.acceleration - self._jerk_step, self._a_min)
         after = before + dt * np.minimum(np.maximum(wanted, least), most)
         lower, upper = self._box(measured)
         after = np.minimum(np.maximum(after, lower), upper)
@@ -98,18 +97,26 @@ class JerkLimiter:
     def _box(self, measured: Array | None) -> tuple[Array, Array]:
         """Return the least and largest velocity from which each joint can still stop before its limits."""
         q, velocity, step = self.q, self.velocity, self._step
-        upper, lower = np.minimum(velocity + step, self._v_max), np.maximum(velocity - step, -self._v_max)
-        leads = measured is not None and np.abs(q - measured).max() > 0.5 * self._lead
-        if not leads and (q > self._inner[0]).all() and (q < self._inner[1]).all():
+        upper, lower = np.minimum(velocity + step, self._v_max), np.maximum(velocity - step, self._v_min)
+        if self._free(q, measured):
             return lower, upper
         top, bottom = self._upper, self._lower
-        if leads and measured is not None:
+        if measured is not None:
             top, bottom = np.minimum(top, measured + self._lead), np.maximum(bottom, measured - self._lead)
         ahead = q + (0.5 * self._dt) * velocity
         return (
             np.minimum(np.maximum(-self._braking(ahead - bottom), lower), upper),
             np.maximum(np.minimum(self._braking(top - ahead), upper), lower),
         )
+
+    def _free(self, q: Array, measured: Array | None) -> bool:
+        """Return whether no limit of position is near; in plain floats, which for few numbers take less time."""
+        half = 0.5 * self._lead
+        where = q if measured is None else measured
+        for value, at, (low, high) in zip(q.tolist(), where.tolist(), self._inner, strict=True):
+            if not (low < value < high and -half < value - at < half):
+                return False
+        return True
 
     def _braking(self, way: Array) -> Array:
         """Return the largest velocity from which a joint can stop within ``way``; negative where it is beyond."""

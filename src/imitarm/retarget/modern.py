@@ -178,7 +178,9 @@ class ModernRetargeter(Retargeter):
         left = math.exp(-self._silence / _FADE)
         seconds = _FADE * (1.0 - left)
         wrist = estimate.wrist + seconds * estimate.velocity
-        hand = quaternion_multiply(quaternion_exp(seconds * estimate.angular_velocity), estimate.hand)
+        hand = estimate.hand
+        if self.correspondence.orientation != "fixed":
+            hand = quaternion_multiply(quaternion_exp(seconds * estimate.angular_velocity), hand)
         ahead = np.zeros(6)
         ahead[:3] = (self._lead * left * self.correspondence.scale) * estimate.velocity
         return clutch.target(wrist, hand), ahead
