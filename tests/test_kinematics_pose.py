@@ -103,6 +103,21 @@ def test_a_pose_never_changes():
         pose.position = np.zeros(3)
 
 
+@quick
+@given(poses)
+def test_a_trusted_pose_is_the_same_pose_and_never_changes_either(pose):
+    position, quaternion = pose.position.copy(), pose.quaternion.copy()
+    trusted = p.Pose.trusted(position, quaternion)
+    assert isinstance(trusted, p.Pose)
+    assert trusted.position is position  # nothing is copied
+    assert trusted.quaternion is quaternion
+    assert np.array_equal(trusted.matrix, pose.matrix)
+    assert np.array_equal(trusted.error_to(pose), pose.error_to(pose))
+    for array in (trusted.position, trusted.quaternion):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 5.0
+
+
 @pytest.mark.parametrize(
     ("position", "quaternion", "said"),
     [

@@ -78,7 +78,67 @@ def test_a_smooth_reference_is_followed_without_lag(arm):
     assert np.abs(reached - q)[100:].max() < 0.002
 
 
-@pytest.mark.parametrize("options", [{"frequency": 0.0}, {"frequency": 200.0}, {"rise_time": 0.001}])
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.02, 0.06, 0.2]), st.booleans())
+def test_a_command_does_not_run_away_from_joints_that_are_held(seed, max_lead, to_and_fro):
+    """Held from rest on; one that swings through where they are may need its braking way."""
+    arm = ArmModel.load("sawyer")
+    rng = np.random.default_rng(seed)
+    limiter = JerkLimiter(arm, DT, max_lead=max_lead)
+    limiter.start(arm.home)
+    q, joints, fastest = arm.home.copy(), [arm.home], np.zeros(7)
+    ahead = arm.max_velocity * rng.choice([-1.0, 1.0], size=7)
+    for k in range(300):
+        if to_and_fro and k % 60 == 0:
+            ahead = arm.max_velocity * rng.choice([-1.0, 1.0], size=7)
+        q = q + DT * ahead
+        joints.append(limiter.follow(q, ahead, arm.home))
+        fastest = np.maximum(fastest, np.abs(limiter.velocity))
+    lead = np.abs(np.array(joints) - arm.home)
+    braking = fastest * (fastest / (2.0 * arm.max_acceleration) + 2.0 * DT)
+    assert (lead <= max_lead + (braking if to_and_fro else 2.0 * DT * fastest)).all()
+    assert lead[60].max() <= max_lead + 1e-3  # and there it stays
+    assert max(broken(arm, np.array(joints))) <= 1e-6
+
+
+def test_joints_that_are_stopped_in_motion_are_left_by_the_braking_way_and_no_more(arm):
+    limiter = JerkLimiter(arm, DT, max_lead=0.06)
+    middle = 0.5 * (arm.upper + arm.lower)
+    limiter.start(middle)
+    ahead = 0.4 * arm.max_velocity
+    q, joints, stopped = middle.copy(), [middle], None
+    for k in range(200):
+        q = q + DT * ahead
+        measured = joints[-1] if k < 50 else stopped
+        joints.append(limiter.follow(q, ahead, measured))
+        if k == 49:
+            stopped = joints[-1]
+            np.testing.assert_allclose(limiter.velocity, ahead, rtol=0.05)
+    braking = np.max(ahead * (ahead / (2.0 * arm.max_acceleration) + 2.0 * DT))
+    lead = np.abs(np.array(joints[50:]) - stopped)
+    assert lead.max() <= 0.06 + braking
+    assert lead[-1].max() <= 0.06 + 1e-6  # where it was farther it has come back
+    assert max(broken(arm, np.array(joints))) <= 1e-6
+
+
+def test_joints_that_follow_do_not_feel_the_lead(arm):
+    """A robot that is three periods late is led as if nothing were measured."""
+    t = np.arange(0.0, 4.0, DT)[:, None]
+    q, v = arm.home + 0.15 * (1.0 - np.cos(1.5 * t)), 0.225 * np.sin(1.5 * t)
+    reached = {}
+    for max_lead in (0.06, np.inf):
+        limiter = JerkLimiter(arm, DT, max_lead=max_lead)
+        limiter.start(arm.home)
+        joints = [arm.home] * 3
+        for a, b in zip(q, v, strict=True):
+            joints.append(limiter.follow(a, b, joints[-3]))
+        reached[max_lead] = np.array(joints)
+    np.testing.assert_array_equal(reached[0.06], reached[np.inf])
+
+
+@pytest.mark.parametrize(
+    "options", [{"frequency": 0.0}, {"frequency": 200.0}, {"rise_time": 0.001}, {"max_lead": 0.0}, {"max_lead": np.nan}]
+)
 def test_settings_that_can_not_work_are_refused(arm, options):
     with pytest.raises(InputError, match="JerkLimiter"):
         JerkLimiter(arm, DT, **options)

@@ -164,6 +164,89 @@ def test_bad_input_breaks_no_limit(what):
     assert_within_limits(arm, np.array(joints))
 
 
+def calm_person():
+    """A person without tremor, who holds the hand where the tool has room all round."""
+    person = Person.from_seed(4)
+    still = Person(**{**person.__dict__, "tremor": 0.0 * person.tremor, "sway": 0.0 * person.sway})
+    return still, person.shoulder("right") + np.array([0.05, -0.2, -0.3])
+
+
+def led(arm, ways, measured, duration, **options):
+    """Lead an arm whose joints are at ``measured(time, command)``; the hand is ``ways(time)`` [m] from its start.
+
+    Returns:
+        times, commands, measured joints, and how far tool and target are from the tool's start, each a row a step.
+    """
+    person, hold = calm_person()
+    correspondence = Correspondence(lengths=lengths(person), orientation="fixed")
+    retargeter = ModernRetargeter(arm, correspondence, **options)
+    q, home = arm.home.copy(), arm.tool_pose(arm.home).position
+    times, rows = DT * np.arange(round(duration / DT)), []
+    for k, time in enumerate(times):
+        hand = hold + FACING.inverse().rotation @ np.asarray(ways(time))
+        command = retargeter.step(person.skeleton(time, hand) if k % 3 == 0 else None, q)
+        q = measured(time, command)
+        target = retargeter.command.target
+        at = np.full(3, np.nan) if target is None else target.position - home
+        rows.append((command, q, arm.tool_pose(q).position - home, at))
+    return times, *(np.array(part) for part in zip(*rows, strict=True))
+
+
+def ramp(time, start, seconds=1.0):
+    return np.clip((time - start) / seconds, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
+@pytest.mark.parametrize("way", [(0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, -0.15, 0.1)])
+def test_an_arm_that_is_held_is_not_pressed_on(arm, way):
+    """From 1.5 s on nothing moves it, and the hand goes on."""
+
+    def lead_and_way(**options):
+        _, commands, joints, _, targets = led(
+            arm,
+            lambda time: ramp(time, 1.5) * np.array(way),
+            lambda time, command: command if time < 1.5 else arm.home,
+            5.0,
+            **options,
+        )
+        assert_within_limits(arm, commands)
+        gone = arm.tool_pose(commands[-1]).position - arm.tool_pose(arm.home).position
+        assert np.linalg.norm(targets[-1]) == pytest.approx(np.linalg.norm(way), abs=1e-3)
+        return np.abs(commands - joints).max(), np.linalg.norm(gone) / np.linalg.norm(way)
+
+    lead, _ = lead_and_way(max_lead=0.06)
+    assert lead <= 0.06 + 0.01  # a period or two later it has braked
+    lead, _ = lead_and_way(max_lead=0.03)
+    assert lead <= 0.03 + 0.01
+    _, gone = lead_and_way(max_lead=10.0)
+    assert gone < 0.7  # even then it does not go on to the target
+
+
+@pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
+def test_an_arm_that_is_held_in_one_direction_is_led_in_the_others(arm):
+    """A smooth wall stops the tool 2 cm ahead; the hand goes on, then aside, then back."""
+    wall = arm.tool_pose(arm.home).position[0] + 0.02
+
+    def measured(_, command):
+        q = command.copy()
+        for _ in range(4):  # the least change of the joints that keeps the tool before the wall
+            over, row = arm.tool_pose(q).position[0] - wall, arm.tool_jacobian(q)[0]
+            q = q - max(over, 0.0) * row / (row @ row)
+        return q
+
+    def ways(time):
+        return 0.15 * np.array([ramp(time, 1.5) - 2.0 * ramp(time, 6.0), ramp(time, 3.5), 0.0])
+
+    times, commands, joints, tool, target = led(arm, ways, measured, 8.0)
+    assert_within_limits(arm, commands)
+    assert np.abs(commands - joints).max() < 0.08
+    held = (times > 3.0) & (times < 6.0)
+    assert (target[held, 0] - tool[held, 0] > 0.12).all()  # it is held indeed
+    assert np.abs(tool[held, 1] - target[held, 1]).max() < 0.03  # and goes aside as the hand does
+    free = (times > 6.0) & (target[:, 0] < -0.02)
+    assert np.linalg.norm(tool[free] - target[free], axis=1).max() < 0.02  # and comes back with it, at once
+
+
 def test_an_arm_that_was_pushed_while_waiting_starts_where_it_is():
     arm = ARMS["sawyer"]
     retargeter = ModernRetargeter(arm)
@@ -247,7 +330,9 @@ def test_what_is_no_recording_is_named(frames, says):
         ModernRetargeter(ARMS["sawyer"]).run(frames)
 
 
-@pytest.mark.parametrize("options", [{"gain": 0.0}, {"gain": 200.0}, {"lead": 2.0}, {"max_speed": 0.0}, {"dt": 1.0}])
+@pytest.mark.parametrize(
+    "options", [{"gain": 0.0}, {"gain": 200.0}, {"lead": 2.0}, {"max_speed": 0.0}, {"dt": 1.0}, {"max_lead": 0.0}]
+)
 def test_settings_that_can_not_work_are_refused(options):
-    with pytest.raises(InputError, match="ModernRetargeter"):
+    with pytest.raises(InputError, match="JerkLimiter" if "max_lead" in options else "ModernRetargeter"):
         ModernRetargeter(ARMS["sawyer"], **options)

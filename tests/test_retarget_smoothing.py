@@ -57,6 +57,23 @@ def test_it_is_the_same_in_every_direction(seed):
         np.testing.assert_allclose(turned.filter(k * T, turn @ x), turn @ plain.filter(k * T, x), atol=1e-12)
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4))
+def test_several_vectors_at_once_are_smoothed_as_one_by_one(seed, count):
+    """Each with its own speed and confidence, over dropped frames, gaps and frames that are not newer."""
+    rng = np.random.default_rng(seed)
+    together, alone = OneEuro(), [OneEuro() for _ in range(count)]
+    time = 0.0
+    for _ in range(40):
+        time += rng.choice([0.0, T, T, T, 2 * T, 0.5])
+        x = rng.normal(size=(count, 3)) * 10.0 ** rng.uniform(-3, 0, size=(count, 1))
+        confidence = rng.uniform(size=(count, 1))
+        smooth = together.filter(time, x, confidence)
+        for i, one in enumerate(alone):
+            np.testing.assert_allclose(smooth[i], one.filter(time, x[i], float(confidence[i, 0])), atol=1e-13)
+            np.testing.assert_allclose(together.velocity[i], one.velocity, atol=1e-12)
+
+
 def test_a_gap_begins_anew_and_an_old_frame_changes_nothing():
     one = OneEuro()
     one.filter(0.0, np.zeros(3))
