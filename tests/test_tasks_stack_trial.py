@@ -12,7 +12,7 @@ from imitarm.retarget.modern import ModernRetargeter
 from imitarm.tasks.ideal import IdealFollower, ideal_camera
 from imitarm.tasks.operator import Operator
 from imitarm.tasks.stack import StackTask
-from imitarm.tasks.stack_trial import DT, calibrate, stack_correspondence, stack_once, task_camera
+from imitarm.tasks.stack_trial import DT, calibrate, stack_correspondence, stack_once
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +37,14 @@ def test_a_person_stacks_with_an_ideal_follower(arm):
 
 
 @pytest.mark.slow
-def test_a_person_stacks_with_a_method_before_a_noisy_camera(arm):
-    result = stack_once(4, 0, ModernRetargeter, arm=arm)
-    assert result.success, result.reason
-    assert result.failure == ""
-    assert result.method == "modern"
-    assert len(result.truth) > len(result.skeletons)
+def test_ten_people_stack_with_a_method_before_a_noisy_camera(arm):
+    """1 to 2 cm of noise, dropouts, occlusion; the rates of all methods are in docs/mapping_benchmark.md."""
+    results = [stack_once(person, 0, ModernRetargeter, arm=arm) for person in range(10)]
+    assert sum(result.success for result in results) >= 7, [result.reason for result in results]
+    for result in results:
+        assert (result.failure == "") == result.success
+        assert result.method == "modern"
+        assert len(result.truth) > len(result.skeletons)  # frames were lost
 
 
 def test_a_trial_is_repeated_exactly_by_its_seeds(arm, short):
@@ -88,7 +90,7 @@ def test_an_arm_is_measured_before_a_trial():
     exact = calibrate(person, SkeletonCamera.ideal())
     assert exact.upper_arm == pytest.approx(person.upper_arm, abs=1e-6)
     assert exact.forearm == pytest.approx(person.forearm, abs=1e-6)
-    measured = calibrate(person, task_camera(3))
+    measured = calibrate(person, SkeletonCamera.from_seed(3))
     assert measured.upper_arm == pytest.approx(person.upper_arm, abs=0.03)
     assert stack_correspondence(person, measured).lengths is measured
     assert stack_correspondence(person).lengths.upper_arm == person.upper_arm

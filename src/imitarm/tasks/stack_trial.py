@@ -25,7 +25,6 @@ Array = NDArray[np.float64]
 
 DT = 0.01  # [s] control period
 TIMEOUT = 90.0  # [s]
-SIGMA = 0.005  # [m] of the camera's noise: the wander of a hand that is held still, as in recordings of a Kinect v2
 _WATCH_EVERY = 3  # control steps between two looks at the cubes
 _SETTLE = 1.0  # [s] that the robot rests before the verdict
 _FOLLOW = 5.0  # [1/s] how quickly the set-point is brought back to the commands after a limit cut one
@@ -104,23 +103,13 @@ def calibrate(person: Person, camera: SkeletonCamera) -> LimbLengths:
     return measure_limbs(seen)
 
 
-def task_camera(seed: int) -> SkeletonCamera:
-    """Return the camera of this task: all the faults of :class:`~imitarm.capture.camera_model.SkeletonCamera`.
-
-    Its standard deviation is smaller than that model's usual one, which also stands for what bones seem to
-    change their lengths by as the pose changes: before a real sensor a hand that is held still does not wander by
-    centimetres within a second, and a person who can't hold a cube still within a third of its side stacks nothing.
-    """
-    return SkeletonCamera(seed, sigma=SIGMA)
-
-
 def stack_once(
     seed: int,
     repeat: int,
     factory: Factory,
     *,
     arm: ArmModel | None = None,
-    camera: Callable[[int], SkeletonCamera] = task_camera,
+    camera: Callable[[int], SkeletonCamera] = SkeletonCamera.from_seed,
     latency: float = 0.03,
     control: Control = "torque",
     timeout: float = TIMEOUT,
@@ -136,7 +125,7 @@ def stack_once(
         repeat: which trial of this person.
         factory: of the method.
         arm: the Sawyer with the gripper, when it is loaded already.
-        camera: makes the camera from a seed.
+        camera: makes the camera from a seed; by default one with 1 to 2 cm of noise and all the other faults.
         latency: from exposure until the skeleton is there [s].
         control: of the robot's drives; the softer ones by default, because contacts are to be expected.
         timeout: [s].
