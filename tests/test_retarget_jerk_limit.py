@@ -136,6 +136,24 @@ def test_joints_that_follow_do_not_feel_the_lead(arm):
     np.testing.assert_array_equal(reached[0.06], reached[np.inf])
 
 
+def test_a_joint_near_its_end_does_not_slow_the_others(arm):
+    """A robot that does at once what it is told: with one joint near its end the others go at full speed."""
+    start = 0.5 * (arm.upper + arm.lower)
+    start[1] = arm.upper[1] - 0.05
+    ahead = 0.8 * arm.max_velocity
+    ahead[1] = 0.0
+    reached = {}
+    for max_lead in (0.06, np.inf):
+        limiter = JerkLimiter(arm, DT, max_lead=max_lead)
+        limiter.start(start)
+        q, joints = start.copy(), [start]
+        for _ in range(60):
+            q = q + DT * ahead
+            joints.append(limiter.follow(q, ahead, joints[-1]))
+        reached[max_lead] = np.array(joints)
+    np.testing.assert_array_equal(reached[0.06], reached[np.inf])
+
+
 @pytest.mark.parametrize(
     "options", [{"frequency": 0.0}, {"frequency": 200.0}, {"rise_time": 0.001}, {"max_lead": 0.0}, {"max_lead": np.nan}]
 )

@@ -52,11 +52,12 @@ class ElbowTask(NamedTuple):
     The elbow swings by the spare motion, the unit vector n along :math:`(I - J^+ J) J_\psi^T`, which leaves the tool
     as it is. What is added to the cost of ``"qp"`` is
 
-    .. math:: \tfrac{w}2\,(n^T v - s)^2, \qquad s = c\,\sin^2\!\beta\;
+    .. math:: \tfrac{w}2\,(n^T v - s)^2, \qquad s = c\,\min(1, 10\sin^2\!\beta)\;
               \frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
 
     with e the tool's twist and :math:`\beta` the angle at the robot's elbow: the swing fades, to none, as the arm gets
-    straight, and near the one direction in which the stereographic angle is lost. While no limit is near this takes
+    straight, and likewise near the one direction in which the stereographic angle is lost. From one step to the next s
+    changes by no more than half of what the joints can change. While no limit is near this takes
     nothing from the tool, whatever the weight; where the joints are at their limits the weight decides, and a spare
     motion that is not held would drift into postures from which the arm does not get on.
 

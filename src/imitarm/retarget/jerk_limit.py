@@ -30,15 +30,16 @@ class JerkLimiter:
     the last cut may exceed the jerk; position, velocity and acceleration are kept always.
 
     An arm that is held up by something falls behind its commands, and its drives press harder the farther it does. So
-    a command brakes before it leads the measured joints by more than ``max_lead``: one more limit of position.
+    a command that leads the measured joint by more than half of ``max_lead`` brakes: ``max_lead`` is one more limit of
+    position, and what it takes to brake may lead beyond.
 
     Args:
         arm: whose limits.
         dt: control period [s].
         frequency: omega [rad/s]; must be well below 1/dt.
         rise_time: how long a joint takes to full acceleration [s]: j = a_max / rise_time.
-        max_lead: of a command over the measured position [rad]; more than a joint at full speed goes within the
-            robot's delay.
+        max_lead: of a command over the measured position [rad]; half of it must be more than the joints go at full
+            speed within the robot's delay, or it slows them.
 
     Raises:
         InputError: when a number can't work.
@@ -102,7 +103,9 @@ class JerkLimiter:
             return lower, upper
         top, bottom = self._upper, self._lower
         if measured is not None:
-            top, bottom = np.minimum(top, measured + self._lead), np.maximum(bottom, measured - self._lead)
+            held = np.abs(q - measured) > 0.5 * self._lead  # joints that do follow are not slowed
+            top = np.where(held, np.minimum(top, measured + self._lead), top)
+            bottom = np.where(held, np.maximum(bottom, measured - self._lead), bottom)
         ahead = q + (0.5 * self._dt) * velocity
         return (
             np.minimum(np.maximum(-self._braking(ahead - bottom), lower), upper),

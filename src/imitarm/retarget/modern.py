@@ -72,7 +72,7 @@ class ModernRetargeter(Retargeter):
         clearance: to keep from the scene [m].
         own_clearance: of links from each other [m]; None: not watched.
         max_speed: the twist is cut to this [m/s], 1 rad counting as 0.3 m.
-        max_lead: how far a joint's command may lead its measured position [rad].
+        max_lead: how far a joint's command may lead its measured position [rad]; a robot that answers late needs more.
 
     Raises:
         InputError: when a number is out of range.
