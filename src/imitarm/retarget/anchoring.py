@@ -12,22 +12,30 @@ from imitarm.errors import InputError
 Array = NDArray[np.float64]
 
 
+FARTHEST = 0.2  # [m] no camera's guess is farther off: an offset beyond was a motion
+_AGAIN = 0.12  # [s] a joint that is seen, or guessed, again so soon has the offset that it had then
+
+
 class Anchoring:
     r"""Takes a jump that comes with a change of tracking for an error of the camera, not for a motion.
 
     A joint that is hidden is inferred, and its error is then another one and several times larger. The step between
-    the last tracked and the first inferred position is mostly that, and so is the step back. So at each change of a
-    joint's confidence its offset o is set such that the motion goes on as it was,
+    the last tracked and the first inferred position is mostly that, and so is the step back. So when a joint is
+    guessed, its offset o is set such that the motion goes on as it was,
 
     .. math:: o = x_p + v\,\Delta t - \tilde x, \qquad x = \tilde x + o
 
     with :math:`x_p` the position before and v its velocity. While the joint is guessed the offset stands: its
-    motion is followed, its place is not believed. While it is seen the offset fades, with time and with the way that
-    the joint goes,
+    motion is followed, its place is not believed. When it is seen again it is anchored once more, and while it is
+    seen the offset fades, with time and with the way that the joint goes,
 
     .. math:: o \leftarrow o\,\exp(-\Delta t / T - |\Delta x| / L).
 
     A person who looks at the robot never notices that; a robot that jumped and jumped back would be noticed.
+
+    A joint that flickers between seen and guessed is anchored once: for an eighth of a second both keep their own
+    offset. Else the place that is measured would never count, and the estimate would go on at its own velocity. An
+    offset is never longer than 0.2 m.
 
     Args:
         time: T [s].
@@ -45,9 +53,11 @@ class Anchoring:
 
     def reset(self) -> None:
         """Forget the past."""
+        self._clock = 0.0
         self._confidence: list[float] = []
         self._measured: Array = np.zeros((0, 3))
         self._offsets: Array | None = None
+        self._kept: dict[tuple[int, float], tuple[float, Array]] = {}  # of joint and confidence: when, and its offset
 
     def anchor(self, points: Array, confidence: list[float], velocity: Array, period: float) -> Array:
         """Return where the joints are taken to be, shape (k, 3) [m].
@@ -62,19 +72,28 @@ class Anchoring:
         measured, self._measured = self._measured, points
         if not before:
             return points
-        offsets = self._offsets
-        if offsets is None and confidence == before:  # nothing was ever hidden
+        self._clock += period
+        if self._offsets is None and confidence == before:  # nothing was ever hidden
             return points
-        was = np.zeros_like(points) if offsets is None else offsets
+        was = np.zeros_like(points) if self._offsets is None else self._offsets
         steps = points - measured
         ways = np.sqrt((steps * steps).sum(axis=1)).tolist()
         offsets = np.empty_like(points)
         for i, (now, then, way) in enumerate(zip(confidence, before, ways, strict=True)):
             if now != then:
-                offsets[i] = was[i] - steps[i] + period * velocity[i]
+                self._kept[i, then] = self._clock, was[i]
+                offsets[i] = self._anchored(i, now, was[i] - steps[i] + period * velocity[i])
             elif now >= 1.0:
                 offsets[i] = was[i] * math.exp(-period / self._time - way / self._way)
             else:
                 offsets[i] = was[i]
         self._offsets = offsets
         return points + offsets
+
+    def _anchored(self, joint: int, confidence: float, going_on: Array) -> Array:
+        """Return the offset of a joint whose tracking has changed: the one it had a moment ago, or a new one."""
+        when, offset = self._kept.get((joint, confidence), (-math.inf, going_on))
+        if self._clock - when > _AGAIN:
+            offset = going_on
+        length = math.sqrt(float(offset.dot(offset)))
+        return offset if length <= FARTHEST else offset * (FARTHEST / length)
