@@ -134,11 +134,11 @@ def test_links_that_are_said_not_to_meet_do_not(name):
 @settings(deadline=None, max_examples=25)
 @given(st.sampled_from(list(ARMS)), seeds)
 def test_a_watch_tells_the_distances_between_its_looks(name, seed):
-    """Joints at no more than 1 rad/s: what is missing of the distances after 70 ms is a fraction of the clearance."""
+    """Joints at no more than 1 rad/s: what is missing of the distances after 50 ms is a fraction of the clearance."""
     arm, own, rng = ARMS[name], CLEARANCES[name], np.random.default_rng(seed)
     watch, q, velocity = own.watch(), folded(name, seed), rng.uniform(-1.0, 1.0, 7)
     pairs, _ = own.nearest(q)
-    for step in range(8):
+    for step in range(5):
         rows = watch.rows(q, time_to_look=False)
         if len(pairs) == 0:
             assert rows is None
@@ -147,7 +147,7 @@ def test_a_watch_tells_the_distances_between_its_looks(name, seed):
         gaps = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1) - radii[pairs].sum(axis=1)
         told = own.clearance - rows[1] / 5.0
         apart = gaps > 0.0  # deep inside each other distances change quickly
-        assert np.abs(told - gaps)[apart].max(initial=0.0) < (1e-9 if step == 0 else 0.015)
+        assert np.abs(told - gaps)[apart].max(initial=0.0) < (1e-9 if step == 0 else 0.008)
         q = q + 0.01 * velocity
     later = watch.rows(q)
     assert (later is None) == (own.rows(q) is None)

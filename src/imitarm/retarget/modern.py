@@ -104,7 +104,7 @@ class ModernRetargeter(Retargeter):
         known = arm.landmarks is not None  # else neither its elbow's angle nor its singularities are
         self._solver = IKSolver(arm, dt=dt, max_speed=max_speed, singularity_bounds=known)
         self._elbow = elbow if known else 0.0
-        self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).watch()
+        self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).watch(dt)
         self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
         super().__init__(arm, correspondence, dt=dt, scene=scene)
 
