@@ -244,6 +244,10 @@ def test_learn_does_not_overwrite_unasked(shown, tmp_path, capsys):
     assert "there is no folder" in capsys.readouterr().err
     assert main([*words, str(tmp_path)]) == 2
     assert "is a folder" in capsys.readouterr().err
+    one = next(path for path in shown.iterdir())
+    before = one.read_bytes()
+    assert main([*words, str(one), "--force"]) == 2
+    assert "is the file of FILE, too" in capsys.readouterr().err and one.read_bytes() == before
     assert main([*words, str(out), "--force"]) == 0
     assert Skill.load(out).n_demonstrations_ == 5
 

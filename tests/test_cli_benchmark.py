@@ -39,6 +39,8 @@ def test_one_command_prints_tables_and_leaves_files(tmp_path, capsys):
         (["--seconds", "1"], "seconds"),
         (["--data", "nowhere"], "no such folder"),
         (["--report", "nowhere/page.html"], "--report"),
+        (["--report", "."], "is a folder"),
+        (["--data", ".", "--out", "."], "is the folder of --data, too"),
         (["--fill", "nowhere.md"], "can't be read"),
         (["--methods", "magic"], "modern"),
         (["--kinds", "dance"], "edge"),
@@ -49,6 +51,26 @@ def test_what_is_wrong_is_said_before_the_work(more, said, tmp_path, monkeypatch
     assert cli.main([*SMALL, *more]) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_report_replaces_no_document(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    text = f"precious\n{BEGIN}\n{END}\n"
+    (tmp_path / "paper.md").write_text(text)
+    assert cli.main([*SMALL, "--report", "paper.md"]) == 2
+    assert "is there already and is no HTML page; name another file\n" in capsys.readouterr().err
+    assert cli.main([*SMALL, "--fill", "paper.md", "--report", "paper.md"]) == 2
+    assert "--report paper.md: is the file of --fill, too" in capsys.readouterr().err
+    (tmp_path / "results").mkdir()
+    assert cli.main([*SMALL, "--out", "results", "--report", "results/mapping.json"]) == 2
+    assert "--report results/mapping.json: is the file of --out, too" in capsys.readouterr().err
+    assert not list((tmp_path / "results").iterdir())
+    assert cli.main([*SMALL, "--out", "paper.md"]) == 2
+    assert "--out paper.md: is no folder" in capsys.readouterr().err
+    assert (
+        sorted(path.name for path in tmp_path.iterdir()) == ["paper.md", "results"]
+        and (tmp_path / "paper.md").read_text() == text
+    )
 
 
 def test_the_avoidance_benchmark_stands_beside_it(capsys):

@@ -162,6 +162,24 @@ def test_points_that_will_not_do_are_refused_and_nothing_is_lost(inside, capsys,
     assert message in capsys.readouterr().err and (inside / "calibration.json").read_bytes() == before
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["limbs", "a.csv", "--out", "a.csv"], "--out a.csv: is the file of SOURCE, too"),
+        (["sensor", "a.csv", "--out", "a.csv"], "--out a.csv: is the file of PAIRS, too"),
+        (["sensor", "--source", "webcam:0", "--points", "a.csv", "--out", "a.csv"], "is the file of --points, too"),
+        (["clutch", "--out", "folder"], "--out folder: is a folder; name a file in it"),
+        (["clutch", "--out", "no/a.json"], "there is no folder no"),
+    ],
+)
+def test_what_is_measured_from_is_not_written_over(inside, capsys, words, message):
+    (inside / "a.csv").write_text("precious")
+    (inside / "folder").mkdir()
+    assert main(["calibrate", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert (inside / "a.csv").read_text() == "precious" and not list((inside / "folder").iterdir())
+
+
 def test_a_column_that_is_missing_is_named(inside, capsys):
     (inside / "pairs.csv").write_text("sensor_x,sensor_y,sensor_z,base_x,base_y,z\n" + "1,2,3,4,5,6\n" * 4)
     assert main(["calibrate", "sensor", "pairs.csv"]) == 2

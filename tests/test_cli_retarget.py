@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import argparse
 import json
 import threading
 import time
@@ -15,7 +16,9 @@ from imitarm.capture.recording import SkeletonRecording
 from imitarm.capture.skeleton import JOINT, Skeleton
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.cli import main, screen
+from imitarm.cli.retarget import _places
 from imitarm.cli.screen import watched
+from imitarm.errors import InputError
 from imitarm.retarget import RETARGETERS, LimbLengths
 from imitarm.retarget.calibration import Calibration
 from recording_samples import changed, exchanged, skeletons
@@ -215,6 +218,64 @@ def test_wrong_options_are_told_and_nothing_is_written(shown, tmp_path, monkeypa
     message = capsys.readouterr().err
     assert told in message and "Traceback" not in message
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--report", "reach.csv"], "--report reach.csv: is the file of SOURCE, too"),
+        (["--report", "{}/reach.csv", "--force"], "is the file of SOURCE, too"),
+        (["--report", "link.csv", "--force"], "is the file of SOURCE, too"),
+        (["--out", "reach.csv", "--force"], "--out reach.csv: is the file of SOURCE, too"),
+        (["--out", "o.csv", "--report", "o.csv"], "--report o.csv: is the file of --out, too"),
+        (["--out", "o.csv", "--report", "folder/../o.csv", "--force"], "is the file of --out, too"),
+        (["--method", "all", "--out", "o.csv", "--report", "o_m1.csv"], "is the file of --out, too"),
+        (["--calibration", "mine.json", "--report", "mine.json"], "is the file of --calibration, too"),
+        (["--scene", "mine.json", "--out", "mine.json", "--force"], "is the file of --scene, too"),
+        (["--robot", "mine.json", "--out", "mine.json", "--force"], "is the file of --robot, too"),
+        (["--report", "mine.json"], "is there already and is no HTML page; name another file"),
+        (["--report", "folder"], "--report folder: is a folder; name a file in it"),
+        (["--out", "folder"], "--out folder: is a folder; name a file in it"),
+        (["--out", "folder", "--force"], "--out folder: is a folder; name a file in it"),
+        (["--out", "folder", "--method", "all"], "--out folder: is a folder; name a file in it"),
+        (["--out", ".", "--method", "all"], "--out .: is a folder; name a file in it"),
+    ],
+)
+def test_no_file_is_lost_by_writing(shown, tmp_path, monkeypatch, capsys, words, told):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("imitarm.cli.retarget.ArmModel.load", lambda *_, **__: pytest.fail("it has begun to work"))
+    (tmp_path / "mine.json").write_text("mine")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link.csv").symlink_to(shown)
+    before = {path.name: path.is_file() and path.read_bytes() for path in tmp_path.iterdir()}
+    assert run(shown, *(word.format(tmp_path) for word in words)) == 2
+    message = capsys.readouterr().err
+    assert told in message and message.startswith("imitarm: error: ")
+    assert {path.name: path.is_file() and path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("content", "more", "replaced"),
+    [
+        ("<!DOCTYPE html>\n<p>older</p>", [], True),
+        ("  <html><p>older</p></html>", [], True),
+        ("", [], True),
+        ("t,x\n0,1\n", [], False),
+        ("a letter about <html>", [], False),
+        ("a letter about <html>", ["--force"], True),
+    ],
+)
+def test_a_report_replaces_a_page_and_nothing_else_unasked(tmp_path, content, more, replaced):
+    page = tmp_path / "page.html"
+    page.write_text(content)
+    words = argparse.Namespace(source="synthetic:1", out=None, report=page, force=bool(more), pace=1.0, seconds=None)
+    words.robot, words.tool, words.scene, words.calibration = "sawyer", None, None, None
+    if replaced:
+        assert _places(words, ["modern"]) == {}
+    else:
+        with pytest.raises(InputError, match="is there already and is no HTML page"):
+            _places(words, ["modern"])
+    assert page.read_text() == content
 
 
 def test_wrong_sources_are_told(tmp_path, capsys):

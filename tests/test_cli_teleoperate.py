@@ -11,7 +11,7 @@ from imitarm.capture.recording import SkeletonRecording
 from imitarm.cli import main, teleoperate
 from imitarm.cli.teleoperate import _correspondence, add_arguments
 from imitarm.kinematics.arm import ArmModel
-from imitarm.retarget import LimbLengths
+from imitarm.retarget import RETARGETERS, LimbLengths
 from imitarm.retarget.calibration import Calibration
 from imitarm.robots import RobotServer, SimulatedRobot, UdpRobot
 from imitarm.table import read_table
@@ -98,11 +98,19 @@ def test_nobody_in_the_picture_is_a_failure(capfd):
     [
         (["--to", "127.0.0.1:0"], 2, "is no address; say HOST:PORT"),
         (["--seconds", "0"], 2, "--seconds must be above 0"),
-        (["--rate", "5"], 2, "--rate must be from 20 to 1000 Hz"),
+        (["--rate", "5"], 2, "--rate must be from 50 to 1000 Hz"),
+        (["--rate", "49.9"], 2, "--rate must be from 50 to 1000 Hz"),
         (["--enable"], 2, "--enable is about a served robot"),
         (["--record", "{}/no/a.csv"], 2, "there is no folder"),
-        (["--record", "{}/person.csv"], 2, "is there already"),
-        (["--latency", "{}/person.csv"], 2, "is there already"),
+        (["--record", "{}/there.csv"], 2, "is there already; name another file, or replace it with --force"),
+        (["--latency", "{}/there.csv"], 2, "is there already"),
+        (["--record", "{}/person.csv"], 2, "is the file of SOURCE, too"),
+        (["--record", "{}/person.csv", "--force"], 2, "is the file of SOURCE, too"),
+        (["--latency", "{}/person.csv", "--force"], 2, "is the file of SOURCE, too"),
+        (["--record", "{}/z.csv", "--latency", "{}/z.csv"], 2, "is the file of --record, too"),
+        (["--calibration", "{}/there.csv", "--record", "{}/there.csv", "--force"], 2, "of --calibration, too"),
+        (["--record", "{}", "--force"], 2, "is a folder; name a file in it"),
+        (["--latency", "{}"], 2, "is a folder; name a file in it"),
         (["--calibration", "{}/person.csv"], 2, "person.csv"),
         (["--calibration", "{}/no.json"], 2, "no.json"),
         (["--robot", "tractor"], 2, "tractor"),
@@ -111,10 +119,19 @@ def test_nobody_in_the_picture_is_a_failure(capfd):
 )
 def test_a_wrong_option_is_one_message(person, tmp_path, capsys, options, status, message):
     before = person.read_bytes()
+    (tmp_path / "there.csv").write_text("precious")
     assert main(["teleoperate", str(person), *(option.format(tmp_path) for option in options)]) == status
     text = capsys.readouterr().err
     assert message in text and text.startswith("imitarm: error: ") and "bug" not in text
-    assert person.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["person.csv"]
+    assert person.read_bytes() == before and (tmp_path / "there.csv").read_text() == "precious"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["person.csv", "there.csv"]
+
+
+@pytest.mark.parametrize("method", sorted(RETARGETERS))
+def test_the_slowest_rate_is_one_that_every_method_can_do(person, capfd, method):
+    words = ["--rate", "50", "--method", method, "--seconds", "0.1"]
+    assert main(["teleoperate", str(person), *words]) == 1  # nobody takes hold within 0.1 s
+    assert "nobody took hold" in capfd.readouterr().err
 
 
 def test_a_robot_that_does_not_answer_is_said(person, capsys, monkeypatch):

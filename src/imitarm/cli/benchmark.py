@@ -16,6 +16,7 @@ from imitarm.benchmark.mapping_tables import Results
 from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.running import LOCAL, run_all
 from imitarm.benchmark.tables import Table
+from imitarm.cli.outputs import check_outputs, same_place
 from imitarm.cli.screen import progress_bar, remark, say, show_table
 from imitarm.cli.trial import provenance
 from imitarm.errors import InputError
@@ -80,7 +81,7 @@ def _mapping(arguments: argparse.Namespace) -> int:
     """Run the mapping benchmark, print its tables, write its files."""
     benchmark = _asked(arguments)
     folder: Path = arguments.out or Path("benchmark-mapping")
-    _check(arguments)
+    _check(arguments, folder)
     if not benchmark.data and benchmark.kinds:
         remark("the captured arm is left out: it needs real recordings, name their folder with --data")
     with progress_bar() as bar:
@@ -157,19 +158,22 @@ def _given(value: int | None, otherwise: int) -> int:
     return otherwise if value is None else value
 
 
-def _check(arguments: argparse.Namespace) -> None:
+def _check(arguments: argparse.Namespace, folder: Path) -> None:
     """Find out before the work what would only fail after it."""
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {arguments.jobs}")
     if arguments.data is not None and not arguments.data.is_dir():
         raise InputError(f"--data {arguments.data}: there is no such folder")
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {folder}: is no folder; name another one")
+    if arguments.data is not None and same_place(folder, arguments.data):
+        raise InputError(f"--out {folder}: is the folder of --data, too; name another one")
     if arguments.fill is not None:
         check_document(arguments.fill)
-    report: Path | None = arguments.report
-    if report is None:
+    written = [("--out", folder / name) for name in ("mapping.md", "mapping.json")]
+    check_outputs([("--report", arguments.report)], [("--fill", arguments.fill), *written])
+    if arguments.report is None:
         return
-    if report.is_dir() or not report.absolute().parent.is_dir():
-        raise InputError(f"--report {report}: must be a file in a folder that is there")
     missing = [name for name in ("matplotlib", "viser") if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(f"--report needs {' and '.join(missing)}: pip install 'imitarm[report]'")

@@ -11,6 +11,7 @@ from typing import Any, get_args
 from imitarm.capture.sources import followed, live, open_source
 from imitarm.cli.gathering import add_side_and_person, gather, source_help
 from imitarm.cli.guiding import ask, choose, touched_points
+from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import remark, say, show_table
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.arm import ArmModel
@@ -86,8 +87,9 @@ def run(arguments: argparse.Namespace) -> int:
         TaskFailedError: when what was measured is not good enough to be kept.
     """
     out: Path = arguments.out
-    if not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
+    read = (("source", "SOURCE"), ("pairs", "PAIRS"), ("points", "--points"), ("robot", "--robot"))
+    inputs = [(said, getattr(arguments, name, None)) for name, said in read]
+    check_outputs([("--out", out)], inputs, force=True)  # the file is added to
     before = Calibration.load(out) if out.exists() else Calibration()
     after = {"limbs": _limbs, "sensor": _sensor, "clutch": _clutch}[arguments.what](arguments, before)
     after.save(out)

@@ -10,9 +10,10 @@ from typing import Literal
 
 import numpy as np
 
+from imitarm.cli.outputs import check_outputs
 from imitarm.cli.reading import add_reading_arguments, arm_of, read_and_lint, show_findings
 from imitarm.cli.screen import remark, say, show_table, working
-from imitarm.demonstrations import Alignment, compute_alignment
+from imitarm.demonstrations import Alignment, compute_alignment, files_of
 from imitarm.demonstrations.align import METHODS
 from imitarm.errors import InputError
 from imitarm.skills import Skill
@@ -59,7 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         InputError: when an option, a file or the place for the skill is wrong.
     """
-    _check_output(arguments.out, arguments.force)
+    inputs = [*(("FILE", file) for file in files_of(arguments.files)), ("--robot", arguments.robot)]
+    check_outputs([("--out", arguments.out)], [*inputs, ("--tool", arguments.tool)], force=arguments.force)
     arm = arm_of(arguments)
     raw, findings = read_and_lint(arguments, arm, task=arguments.task, repair=arguments.repair)
     show_findings(raw, findings)
@@ -80,16 +82,6 @@ def run(arguments: argparse.Namespace) -> int:
     _show(skill, alignment)
     say(f"wrote {arguments.out}")
     return 0
-
-
-def _check_output(path: Path, force: bool) -> None:
-    """Find out before the work whether its result can be written."""
-    if path.is_dir():
-        raise InputError(f"--out {path}: is a folder; name a file in it, such as {path / 'skill.json'}")
-    if not path.parent.is_dir():
-        raise InputError(f"--out {path}: there is no folder {path.parent}; make it first")
-    if path.exists() and not force:
-        raise InputError(f"--out {path}: is there already; name another file, or replace it with --force")
 
 
 def _show(skill: Skill, alignment: Alignment) -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.cli.trial import provenance, show_results, try_scene
-from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_file import ARMS, TOOLS
 from imitarm.kinematics.ik import find_posture
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--control", choices=("position", "torque"), default="position", help="of the simulated drives")
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=Path, metavar="FILE", help="the measured motion, as a demonstration (CSV)")
-    output.add_argument("--force", action="store_true", help="replace the file of --out")
+    output.add_argument("--force", action="store_true", help="replace files that are there")
     output.add_argument("--report", type=Path, metavar="FILE", help="a page with 3-D playback and figures (HTML)")
 
 
@@ -68,11 +68,11 @@ def run(arguments: argparse.Namespace) -> int:
         InputError: when a file or an option is wrong.
         UnreachableError: when the arm can't reach the start.
     """
-    for path in (arguments.out, arguments.report):
-        if path is not None and not path.absolute().parent.is_dir():
-            raise InputError(f"{path}: there is no folder {path.parent}; make it first")
-    if arguments.out is not None and arguments.out.exists() and not arguments.force:
-        raise InputError(f"--out {arguments.out}: is there already; name another file, or replace it with --force")
+    inputs = [
+        ("SKILL", arguments.skill),
+        *((f"--{name}", getattr(arguments, name)) for name in ("scene", "robot", "tool")),
+    ]
+    check_outputs([("--out", arguments.out), ("--report", arguments.report)], inputs, force=arguments.force)
     skill = Skill.load(arguments.skill)
     arm = ArmModel.load(arguments.robot, tool=arguments.tool)
     scene = Scene() if arguments.scene is None else load_scene(arguments.scene)

@@ -20,6 +20,7 @@ from imitarm.capture.slowing import slowed
 from imitarm.cli.driven import with_driven
 from imitarm.cli.gathering import source_help
 from imitarm.cli.merit import judged
+from imitarm.cli.outputs import check_outputs
 from imitarm.cli.person import person_of
 from imitarm.cli.screen import remark, say, show_table, watched, working
 from imitarm.cli.trial import provenance
@@ -86,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output = parser.add_argument_group("output")
     output.add_argument("--task", default="", metavar="WORDS", help="what is shown, kept in the demonstration")
     output.add_argument("--out", type=Path, metavar="FILE", help="the demonstration (CSV); one a method with 'all'")
-    output.add_argument("--force", action="store_true", help="replace files of --out")
+    output.add_argument("--force", action="store_true", help="replace files that are there")
     output.add_argument("--keep-waiting", action="store_true", help="keep what was before and after the following")
     output.add_argument("--report", type=Path, metavar="FILE", help="a page with person and robot side by side (HTML)")
 
@@ -142,16 +143,17 @@ def _places(arguments: argparse.Namespace, names: Sequence[str]) -> dict[str, Pa
     slowed((), arguments.pace)
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
-    for path in (arguments.out, arguments.report):
-        if path is not None and not path.absolute().parent.is_dir():
-            raise InputError(f"{path}: there is no folder {path.parent}; make it first")
     out: Path | None = arguments.out
-    if out is None:
-        return {}
-    files = {name: out if len(names) == 1 else out.with_name(f"{out.stem}_{name}{out.suffix}") for name in names}
-    for path in files.values():
-        if path.exists() and not arguments.force:
-            raise InputError(f"--out {path}: is there already; name another file, or replace it with --force")
+    files: dict[str, Path] = {}
+    if out is not None:
+        one = len(names) == 1 or out.is_dir()  # which is refused
+        files = {name: out if one else out.with_name(f"{out.stem}_{name}{out.suffix}") for name in names}
+    inputs = [
+        ("SOURCE", arguments.source),
+        *((f"--{name}", getattr(arguments, name)) for name in ("calibration", "scene", "robot", "tool")),
+    ]
+    outputs = [*(("--out", path) for path in files.values()), ("--report", arguments.report)]
+    check_outputs(outputs, inputs, force=arguments.force)
     return files
 
 

@@ -17,6 +17,7 @@ from imitarm.capture.sources import followed, open_source
 from imitarm.capture.stream import UdpSource
 from imitarm.cli.gathering import source_help
 from imitarm.cli.operator import Operator
+from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.cli.serve import terminated_as_interrupted
 from imitarm.demonstrations.recorder import DemonstrationRecorder
@@ -133,16 +134,13 @@ def _check_options(arguments: argparse.Namespace) -> None:
     """Find out before the work what would only fail after it."""
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
-    if not 20.0 <= arguments.rate <= 1000.0:
-        raise InputError(f"--rate must be from 20 to 1000 Hz, got {arguments.rate:g}")
-    for option in ("record", "latency"):
-        path: Path | None = getattr(arguments, option)
-        if path is None:
-            continue
-        if not path.absolute().parent.is_dir():
-            raise InputError(f"--{option} {path}: there is no folder {path.parent}; make it first")
-        if path.exists() and not arguments.force:
-            raise InputError(f"--{option} {path}: is there already; name another file, or replace it with --force")
+    if not 50.0 <= arguments.rate <= 1000.0:  # slower, and the jerk could not be limited
+        raise InputError(f"--rate must be from 50 to 1000 Hz, got {arguments.rate:g}")
+    inputs = [
+        ("SOURCE", arguments.source),
+        *((f"--{name}", getattr(arguments, name)) for name in ("calibration", "scene", "robot", "tool")),
+    ]
+    check_outputs([("--record", arguments.record), ("--latency", arguments.latency)], inputs, force=arguments.force)
     if arguments.enable and not arguments.to:
         raise InputError("--enable is about a served robot; name it with --to, or leave --enable out")
 
