@@ -74,7 +74,10 @@ def test_a_made_up_person_for_some_seconds(tmp_path):
     ("options", "message"),
     [
         (["--out", "{}/no/a.csv"], "there is no folder"),
-        (["--out", "{}/wave.csv"], "is there already; name another file, or replace it with --force"),
+        (["--out", "{}/there.csv"], "is there already; name another file, or replace it with --force"),
+        (["--out", "{}/wave.csv"], "is the file of SOURCE, too"),
+        (["--out", "{}/wave.csv", "--force"], "is the file of SOURCE, too"),
+        (["--out", "{}", "--force"], "is a folder; name a file in it"),
         (["--seconds", "0"], "--seconds must be above 0"),
         (["--trim", "3", "1"], "--trim must be two times"),
         (["--trim", "7", "9"], "no frame between 7 and 9 s"),
@@ -82,10 +85,28 @@ def test_a_made_up_person_for_some_seconds(tmp_path):
 )
 def test_a_wrong_option_is_one_message(wave, tmp_path, capsys, options, message):
     before = wave.read_bytes()
+    (tmp_path / "there.csv").write_text("precious")
     assert main(["capture", str(wave), *(option.format(tmp_path) for option in options)]) == 2
     text = capsys.readouterr().err
     assert message in text and text.startswith("imitarm: error: ") and "bug" not in text
-    assert wave.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["wave.csv"]
+    assert wave.read_bytes() == before and (tmp_path / "there.csv").read_text() == "precious"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["there.csv", "wave.csv"]
+
+
+def test_the_film_of_a_video_source_is_not_written_over(tmp_path, capsys):
+    film = tmp_path / "film.mp4"
+    film.write_bytes(b"film")
+    assert main(["capture", f"video:{film}", "--out", str(film), "--force"]) == 2
+    assert "is the file of SOURCE, too" in capsys.readouterr().err and film.read_bytes() == b"film"
+
+
+@pytest.mark.parametrize(("persons", "said"), [((0,), "1 (number 0)"), ((2, 0), "2 (numbers 2, 0)")])
+def test_persons_are_counted_and_their_numbers_said(tmp_path, capsys, persons, said):
+    path = tmp_path / "seen.csv"
+    frames = [one for i, person in enumerate(persons) for one in skeletons(20, person=person, start=0.01 * i)]
+    SkeletonRecording(sorted(frames, key=lambda s: s.time)).save(path)
+    assert main(["capture", str(path)]) == 0
+    assert said in capsys.readouterr().out
 
 
 def test_a_truncated_file_is_named(wave, capsys):

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from imitarm.cli import main
-from imitarm.cli.serve import terminated_as_interrupted
+from imitarm.cli.serve import _summary, terminated_as_interrupted
+from imitarm.kinematics.arm import ArmModel
 from imitarm.messages import Status
+from imitarm.robots import RobotServer, SimulatedRobot
 from imitarm.table import read_table
 
 
@@ -19,7 +21,7 @@ def test_it_serves_for_a_time_and_says_how_it_went(tmp_path, capfd):
     shown = capfd.readouterr()
     assert "sawyer" in shown.out and "listens at 127.0.0.1:" in shown.out
     assert "stopped: just started" in shown.err
-    assert "commands admitted" in shown.out and "stopped just started" in shown.out
+    assert "commands admitted" in shown.out and "stopped: just started" in shown.out
     table = read_table(trace)
     assert table.names[:3] == ("t", "status", "set_right_j0") and len(table.names) == 2 + 3 * 7
     assert (table.values[:, 1] == Status.STOPPED).all() and (np.diff(table.values[:, 0]) > 0).all()
@@ -43,7 +45,9 @@ def test_an_address_that_others_reach_is_warned_of(capfd):
         (["sawyer", "--seconds", "1", "--port", "0", "--rate", "200"], "multiple of the timestep"),
         (["sawyer", "--scene", "{}/no.yaml"], "no.yaml"),
         (["sawyer", "--port", "0", "--trace", "{}/there.csv"], "is there already; name another file"),
-        (["sawyer", "--port", "0", "--trace", "{}/no/there.csv"], "can't be written"),
+        (["sawyer", "--port", "0", "--trace", "{}/no/there.csv"], "there is no folder"),
+        (["sawyer", "--port", "0", "--trace", "{}", "--force"], "is a folder; name a file in it"),
+        (["sawyer", "--scene", "{}/there.csv", "--trace", "{}/there.csv", "--force"], "is the file of --scene, too"),
         (["sawyer", "--port", "0", "--host", "no.such.host.invalid"], "there is no such host"),
     ],
 )
@@ -55,11 +59,31 @@ def test_a_wrong_option_is_one_message(tmp_path, capsys, options, message):
     assert (tmp_path / "there.csv").read_text() == "precious"
 
 
-def test_a_port_that_is_taken_is_said(capsys):
+def test_a_port_that_is_taken_is_said_and_no_more(tmp_path, capsys):
+    trace = tmp_path / "trace.csv"
+    trace.write_text("an older one")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
-        assert main(["serve", "sawyer", "--port", str(taken.getsockname()[1])]) == 2
-    assert "can't listen there" in capsys.readouterr().err
+        assert main(["serve", "sawyer", "--port", str(taken.getsockname()[1]), "--trace", str(trace), "--force"]) == 2
+    shown = capsys.readouterr()
+    assert "can't listen there" in shown.err and shown.err.startswith("imitarm: error: ") and not shown.out
+    assert trace.read_text() == "an older one"
+
+
+@pytest.mark.parametrize(
+    ("status", "reason", "said"),
+    [
+        (Status.STOPPED, "just started", "stopped: just started"),
+        (Status.STOPPED, "stopped by an operator", "stopped by an operator"),
+        (Status.FOLLOWING, "", "following"),
+    ],
+)
+def test_how_it_ended_is_said_once(capsys, status, reason, said):
+    with RobotServer(SimulatedRobot(ArmModel.load("sawyer")), 0) as server:
+        server.supervisor.status, server.supervisor.reason = status, reason
+        _summary(server)
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "at the end" in line]
+    assert line.split("│")[2].strip() == said
 
 
 def test_the_usual_kill_ends_it_as_ctrl_c_does():

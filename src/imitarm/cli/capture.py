@@ -18,6 +18,7 @@ from imitarm.capture.skeleton import Skeleton, SkeletonSource
 from imitarm.capture.sources import live, open_source
 from imitarm.capture.stream import SkeletonSender
 from imitarm.cli.gathering import add_side_and_person, gather, show_findings, source_help
+from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import remark, say, show_table
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.sockets import parse_address
@@ -111,15 +112,11 @@ def _tell_sent(sender: SkeletonSender, address: str) -> None:
 
 def _check_options(arguments: argparse.Namespace) -> None:
     """Find out before the work what would only fail after it."""
-    out: Path | None = arguments.out
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
     if arguments.trim is not None and not 0.0 <= arguments.trim[0] < arguments.trim[1] < np.inf:
         raise InputError(f"--trim must be two times, the first one earlier, got {arguments.trim}")
-    if out is not None and not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
-    if out is not None and out.exists() and not arguments.force:
-        raise InputError(f"--out {out}: is there already; name another file, or replace it with --force")
+    check_outputs([("--out", arguments.out)], [("SOURCE", arguments.source)], force=arguments.force)
 
 
 def _chosen(source: SkeletonSource, person: int | None) -> SkeletonSource:
@@ -148,6 +145,8 @@ def _finished(recording: SkeletonRecording, arguments: argparse.Namespace) -> Sk
 def _show(recording: SkeletonRecording, side: str) -> None:
     """Print what was captured."""
     arms = [skeleton.arm(side).confidence[:3].min() for skeleton in recording.skeletons]
+    persons = recording.persons
+    numbers = ", ".join(map(str, persons))
     tracked, lost = np.mean(np.array(arms) >= 1.0), np.mean(np.array(arms) == 0.0)
     show_table(
         ["captured", recording.name],
@@ -155,7 +154,7 @@ def _show(recording: SkeletonRecording, side: str) -> None:
             ("frames", str(len(recording))),
             ("duration", f"{recording.duration:.2f} s"),
             ("rate", f"{recording.rate:.1f} frames a second"),
-            ("persons", ", ".join(str(person) for person in recording.persons)),
+            ("persons", f"{len(persons)} ({'number' if len(persons) == 1 else 'numbers'} {numbers})"),
             (f"{side} arm", f"tracked in {100 * tracked:.0f} % of the frames, lost in {100 * lost:.0f} %"),
         ],
     )

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from rich.text import Text
 
+from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.errors import InputError
 from imitarm.gate import REASONS
@@ -64,26 +65,33 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
     if not 0 <= arguments.port < 65536:
         raise InputError(f"--port must be from 0 to 65535, got {arguments.port}")
+    inputs = [("--scene", arguments.scene), ("ROBOT", arguments.robot), ("--tool", arguments.tool)]
+    check_outputs([("--trace", arguments.trace)], inputs, force=arguments.force)
     scene = Scene() if arguments.scene is None else load_scene(arguments.scene)
     arm = ArmModel.load(arguments.robot, tool=arguments.tool)
     robot = SimulatedRobot(arm, scene=scene, control=arguments.control)
     with ExitStack() as stack:
         stack.enter_context(terminated_as_interrupted())
-        trace = None if arguments.trace is None else Trace(arguments.trace, arm, replace=arguments.force)
-        if trace is not None:
-            stack.callback(trace.close)
         status = working("starting")
+        early: list[str] = []  # what happens before it listens, which on a port that is taken it never does
+        tell: Callable[[str], None] = early.append
         server = RobotServer(
             robot,
             arguments.port,
             arguments.host,
             rate=arguments.rate,
-            on_event=lambda event: status.console.print(f"{robot.time:9.2f} s  {event}"),
+            on_event=lambda event: tell(f"{robot.time:9.2f} s  {event}"),
         )
         stack.enter_context(server)
+        trace = None if arguments.trace is None else Trace(arguments.trace, arm, replace=arguments.force)
+        if trace is not None:
+            stack.callback(trace.close)
         if arguments.host != LOOPBACK:
             remark("note: whoever can reach this address can move the robot; keep it on a network of its own")
         say(f"{arm.name} listens at {server.address[0]}:{server.address[1]}")
+        tell = status.console.print
+        for event in early:
+            tell(event)
         stack.enter_context(status)
         try:
             server.run(arguments.seconds, on_step=_shown(trace, status.update))
@@ -112,6 +120,7 @@ def _shown(trace: Trace | None, update: Callable[[Text], None]) -> Callable[[Rob
 def _summary(server: RobotServer) -> None:
     """Print what came and what was dropped."""
     supervisor = server.supervisor
+    status, why = supervisor.status.name.lower(), supervisor.reason
     dropped = supervisor.gate.dropped + supervisor.dropped
     show_table(
         ["served", supervisor.robot.arm.name],
@@ -122,7 +131,7 @@ def _summary(server: RobotServer) -> None:
                 (f"dropped: {reason}", f"{n} {REASONS.get(reason, '')}".strip())
                 for reason, n in sorted(dropped.items())
             ),
-            ("at the end", " ".join(filter(None, [supervisor.status.name.lower(), supervisor.reason]))),
+            ("at the end", why if why.startswith(status) else ": ".join(filter(None, [status, why]))),
         ],
     )
 
