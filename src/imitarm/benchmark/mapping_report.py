@@ -119,15 +119,28 @@ def _figures(results: Results) -> str:
 
 
 def _table(table: Table) -> str:
-    head = "".join(f'<th scope="col">{escape(column.removesuffix(">"))}</th>' for column in table.columns)
+    kinds = [_kind(column) for column in table.columns]
+    head = "".join(
+        f'<th scope="col"{kind}>{escape(column.removesuffix(">"))}</th>'
+        for column, kind in zip(table.columns, kinds, strict=True)
+    )
     rows = "".join(
-        f'<tr><th scope="row">{escape(row[0])}</th>{"".join(f"<td>{escape(cell)}</td>" for cell in row[1:])}</tr>'
+        f'<tr><th scope="row">{escape(row[0])}</th>'
+        + "".join(f"<td{kind}>{escape(cell)}</td>" for cell, kind in zip(row[1:], kinds[1:], strict=True))
+        + "</tr>"
         for row in table.rows
     )
     return (
         f'<h3>{escape(table.title)}</h3><div class="card wide"><table><thead><tr>{head}</tr></thead>'
         f'<tbody>{rows}</tbody></table></div><p class="caption">{escape(table.note)}</p>'
     )
+
+
+def _kind(column: str) -> str:
+    """Return the class of a column: words wrap, a symbol keeps its case, numbers need none."""
+    if not column.endswith(">"):
+        return ' class="words"'
+    return "" if column[:1].isascii() else ' class="symbol"'
 
 
 def _players(results: Results, folder: Path | None) -> tuple[tuple[str, str] | None, list[Panel]]:

@@ -122,7 +122,7 @@ def _against(pairs: Sequence[tuple[str, Values, Values]], wanted: float) -> Judg
     """Judge Me against rivals: name, Me's numbers, theirs."""
     found = [(name, compare(ours, theirs)) for name, ours, theirs in pairs]
     texts = [
-        f"{name.upper()} {100 * c.relative:+.0f} %" if math.isfinite(c.relative) else f"{name.upper()} –"
+        f"{METHODS[name].title} {100 * c.relative:+.0f} %" if math.isfinite(c.relative) else f"{METHODS[name].title} –"
         for name, c in found
     ]
     return ", ".join(texts) or "–", verdict([c for _, c in found], wanted)
