@@ -12,6 +12,9 @@ from hypothesis import settings
 settings.register_profile("imitarm", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("imitarm")
 
+# pytest-xdist sets it for its workers: what commands print would be broken at 80 columns, theirs and their children's
+os.environ.pop("COLUMNS", None)
+
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:

@@ -102,7 +102,8 @@ def test_a_task_that_cant_be_done_is_a_result_that_says_why(tmp_path):
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_an_interrupted_benchmark_goes_on_where_it_was(tmp_path, how):
     script = (
-        "import sys\n"
+        "import signal, sys\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # what runs in the background may ignore it
         "from imitarm.benchmark.experiment import Experiment\n"
         "from imitarm.benchmark.running import run_all\n"
         "if __name__ == '__main__':\n"

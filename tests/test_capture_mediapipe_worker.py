@@ -37,7 +37,7 @@ class Camera:
         self.at += 1
         time.sleep(self.film.get("pause", 0.0))
         if self.at > self.film["pictures"] + 100:
-            raise SystemExit  # ends the thread of a webcam that the test has left
+            threading.Event().wait()  # the thread of a webcam that the test has left sleeps on
         return (True, PICTURE) if self.at < self.film["pictures"] else (False, None)
 
     def release(self):

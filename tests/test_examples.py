@@ -43,7 +43,7 @@ SAYS = {
     ],
     "05_your_own_policy": [r"  acfra: clearance \d+ mm, .*finished", r"repelled: .*(touched|not finished)"],
     "06_retarget_a_person": [
-        r"take 4: 5\.\d s, \d\d mm from the true hand on average, (\d\d|100) % of the velocity and (\d\d|100) % of",
+        r"take 4: 5\.\d s, \d{1,2} mm from the true hand on average, (\d\d|100) % of the velocity and (\d\d|100) % of",
         r"learnt \d+ components from 5 takes of a person",
         r"nothing in the way: finished",
         r"a ball on the path: finished, .*, \d\d mm from the ball",
