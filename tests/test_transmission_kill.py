@@ -44,7 +44,11 @@ class Stage:
         self.records = []
 
     def start(self, name, *words):
-        code = f"import sys; from imitarm.cli import main; sys.exit(main({list(map(str, words))!r}))"
+        code = (
+            "import signal, sys; from imitarm.cli import main; "
+            "signal.signal(signal.SIGINT, signal.default_int_handler); "  # what runs in the background may ignore it
+            f"sys.exit(main({list(map(str, words))!r}))"
+        )
         log = (self.folder / f"{name}.log").open("ab")
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         command = [sys.executable, "-c", code]
