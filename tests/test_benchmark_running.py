@@ -134,7 +134,6 @@ def test_an_interrupted_benchmark_goes_on_where_it_was(tmp_path, how):
 
 
 def test_workers_of_joblib_give_the_same(tmp_path):
-    pytest.importorskip("joblib")
     wanted = [ONE]
     local = run_all(wanted, tmp_path / "a", jobs=1)
     joblib = run_all(wanted, tmp_path / "b", jobs=1, backend="threading")
