@@ -156,6 +156,23 @@ def test_what_is_in_the_way_is_kept_clear_of(shown, tmp_path):
     assert nearest(free) < 0.0 < nearest(round_it)
 
 
+def test_a_tool_that_does_not_follow_its_target_is_told_first_and_is_not_green(shown, tmp_path, capsys):
+    """Six times as large as the person's, the motion leaves the arm's reach; as large as that, it does not."""
+    page, demo = tmp_path / "page.html", tmp_path / "demo.csv"
+    assert run(shown, "--scale", 6, "--report", page, "--out", demo) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith("modern: does not follow") and "no joint breaks a limit" in printed.out
+    assert "warning: the tool did not follow its target: try --orientation fixed" in printed.err
+    text = page.read_text(encoding="utf-8")
+    assert 'class="verdict bad"' in text and 'class="verdict good"' not in text
+    assert "modern: does not follow" in text and "farther than 5 cm for" in text and "try --orientation fixed" in text
+    assert len(Demonstration.load(demo)) > 100
+    assert run(shown, "--report", page) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith("modern: follows") and "warning: the tool" not in printed.err
+    assert 'class="verdict good"' in page.read_text(encoding="utf-8")
+
+
 def test_one_of_two_persons_and_repairs(tmp_path, capsys):
     frames = [exchanged(s) if i == 60 else s for i, s in enumerate(skeletons(90, person=1))]
     frames[50] = changed(frames[50], time=frames[49].time)

@@ -12,6 +12,7 @@ from imitarm.benchmark.seen_arm import seen_arm, target_lag
 from imitarm.benchmark.tracking import TrueArm, rms
 from imitarm.capture.motions import Truth
 from imitarm.capture.skeleton import Skeleton
+from imitarm.cli.following import FAR, Following
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import Correspondence, Retargeting
 from imitarm.retarget.retargeter import STATES
@@ -33,7 +34,9 @@ CAPTIONS = {
     "m2": "Our reading of a discrete-time adaptive controller that follows the person's joint angles.",
     "m3": "Our reading of incremental inverse kinematics, without a treatment of singularities.",
 }
-_FAR = 0.05  # [m] a tool farther from its target has not reached it
+TARGET_RMS = "tool to its own target, RMS"
+TARGET_FAR = f"farther than {1e2 * FAR:.0f} cm from its own target"
+TARGET_LAG = "lag behind its own target"
 _FOLLOWS = 0.5  # share of the hand's own motion (RMS) within which a tool follows it
 _DEGREES = 180.0 / np.pi
 
@@ -44,7 +47,7 @@ def judged(
     correspondence: Correspondence,
     truth: Truth | None = None,
     clock: Array | None = None,
-) -> tuple[MethodResult, MappingMetrics]:
+) -> tuple[MethodResult, Following]:
     """Measure what a method made of a recording.
 
     Args:
@@ -56,7 +59,7 @@ def judged(
             that slows the motion afterwards is measured against the moments that it reproduces; None: then.
 
     Returns:
-        the result for the report, and the metrics in SI units.
+        the result for the report, and how well the tool followed its target.
     """
     times = run.times if clock is None else clock
     if truth is None:
@@ -65,33 +68,36 @@ def judged(
         true = TrueArm.of(truth, times, correspondence, start=skeletons[0].time)
     metrics = measure(run, correspondence, true)
     goes = correspondence.scale * rms(true.wrist - true.wrist.mean(axis=0))
-    followed = metrics.tool_rms_without_lag < _FOLLOWS * goes
+    lags = metrics.tool_rms_without_lag < _FOLLOWS * goes
+    title = TITLES.get(run.method, run.method)
+    following = Following.of(title, run, metrics)
     result = MethodResult(
         name=run.method,
-        title=TITLES.get(run.method, run.method),
+        title=title,
         run=run,
-        measures=_measures(run, metrics, "hand as seen" if truth is None else "true hand", followed),
+        measures=_measures(run, metrics, following, "hand as seen" if truth is None else "true hand", lags),
         tables=[_torques(run, metrics)],
-        notes=warnings_of(run, metrics),
+        notes=warnings_of(run, metrics, following),
         caption=CAPTIONS.get(run.method, ""),
         clock=clock,
     )
-    return result, metrics
+    return result, following
 
 
-def _measures(run: Retargeting, m: MappingMetrics, hand: str, followed: bool) -> list[Measure]:
-    """Return the figures of merit, in the units in which people think; what does not follow has no lag."""
+def _measures(run: Retargeting, m: MappingMetrics, following: Following, hand: str, lags: bool) -> list[Measure]:
+    """Return the figures of merit, in the units in which people think; what does not follow the hand has no lag."""
     tool = run.arm.tool_path(run.joints)[0]
     shares = [Measure(state, 100.0 * float(np.mean(run.states == state)), "% of the time", 1) for state in STATES]
     return [
         Measure("duration", m.duration, "s", 2),
         *shares,
         Measure("hold taken", m.engagements, "times", 0),
-        Measure("tool to its own target, RMS", 1e3 * m.target_rms, "mm", 1, "less"),
-        Measure("lag behind its own target", 1e3 * target_lag(run.times, tool, run.targets[0]), "ms", 0, "less"),
+        Measure(TARGET_RMS, 1e3 * m.target_rms, "mm", 1, "less"),
+        Measure(TARGET_FAR, 1e2 * following.far_share, "% of the time", 1, "less"),
+        Measure(TARGET_LAG, 1e3 * target_lag(run.times, tool, run.targets[0]), "ms", 0, "less"),
         Measure(f"tool to the {hand}, RMS", 1e3 * m.tool_rms, "mm", 1, "less"),
         Measure("the same without its lag", 1e3 * m.tool_rms_without_lag, "mm", 1, "less"),
-        Measure(f"lag behind the {hand}", 1e3 * m.lag if followed else np.nan, "ms", 0),
+        Measure(f"lag behind the {hand}", 1e3 * m.lag if lags else np.nan, "ms", 0),
         Measure("upper arm's direction, RMS error", _DEGREES * m.elbow_direction_rms, "°", 1, "less"),
         Measure("beyond a limit of position", m.position_violations, "frames", 0, "less", fault=True),
         Measure("beyond a limit of velocity", m.velocity_violations, "frames", 0, "less", fault=True),
@@ -127,7 +133,7 @@ def _torques(run: Retargeting, m: MappingMetrics) -> PlainTable:
     )
 
 
-def warnings_of(run: Retargeting, m: MappingMetrics) -> list[str]:
+def warnings_of(run: Retargeting, m: MappingMetrics, following: Following) -> list[str]:
     """Return what the user should know of a run, a sentence each."""
     dt = float(run.times[1] - run.times[0])
     lines = []
@@ -136,12 +142,10 @@ def warnings_of(run: Retargeting, m: MappingMetrics) -> list[str]:
     stopped = int(np.sum(run.states == "stopped")) + _waiting_again(run.states)
     if stopped:
         lines.append(f"stopped or waited for {stopped * dt:.1f} s on the way, because the arm was not seen")
-    away = np.linalg.norm(run.arm.tool_path(run.joints)[0] - run.targets[0], axis=1)
-    far = np.isfinite(away) & (away > _FAR)
-    if far.any():
+    if following.far_time:
         lines.append(
-            f"the tool was more than {1e2 * _FAR:.0f} cm from its target for {far.sum() * dt:.1f} s (at most "
-            f"{1e2 * float(away[far].max()):.0f} cm): out of reach, or quicker than the joints may"
+            f"the tool was more than {1e2 * FAR:.0f} cm from its target for {following.far_time:.1f} s (at most "
+            f"{1e2 * following.farthest:.0f} cm): out of reach, or quicker than the joints may"
         )
     broken = {
         "position": m.position_violations,

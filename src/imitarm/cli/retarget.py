@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.benchmark.driving import drive as drive_run
-from imitarm.benchmark.mapping_metrics import MappingMetrics
 from imitarm.benchmark.seen_arm import seen_arm
 from imitarm.capture.motions import Truth
 from imitarm.capture.skeleton import SIDES, Skeleton
 from imitarm.capture.slowing import slowed
 from imitarm.cli.driven import with_driven
+from imitarm.cli.following import FAR, MOSTLY, Following, remedy
 from imitarm.cli.gathering import source_help
-from imitarm.cli.merit import judged
+from imitarm.cli.merit import TARGET_FAR, TARGET_LAG, TARGET_RMS, judged
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.person import person_of
 from imitarm.cli.screen import remark, say, show_table, watched, working
@@ -36,7 +36,7 @@ from imitarm.scene import Scene, load_scene
 from imitarm.trajectory import Demonstration, Trajectory
 from imitarm.viewer.retarget_content import Measure, MethodResult, RetargetReport
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   imitarm retarget wave.csv --fit --out wave_sawyer.csv --report wave.html
   imitarm retarget wave.csv --robot panda --tool gripper --calibration calibration.json --scene cups.yaml
@@ -47,6 +47,8 @@ examples:
 
 The robot begins at its home, or with --fit where all of a recorded motion is in its reach; the tool stays there until
 the person has been seen for half a second, then it follows the hand. The demonstration is cut to what followed.
+The first line says whether the tool followed its target: not when it was more than {100 * FAR:.0f} cm from it (RMS), or
+that far for over {100 * MOSTLY:.0f} % of the time. What it did is written all the same, with a warning.
 Exit status 1 when the person was never seen for long enough, so that nothing was followed.
 """
 
@@ -119,22 +121,27 @@ def run(arguments: argparse.Namespace) -> int:
     skeletons, findings, truth = person_of(arguments, correspondence.side)
     setting = _setting(arguments, arm, correspondence, scene, skeletons)
     done = [_retargeted(name, setting, skeletons, truth, drive=arguments.drive) for name in names]
+    for _, following in done:
+        say(following.verdict())
     _show([result for result, _ in done])
     for result, _ in done:
         for note in result.notes:
             remark(f"{result.title}: {note}")
-    if not any(metrics.engagements for _, metrics in done):
+    hint = remedy(done[0][1], skeletons, setting.correspondence, fitted=arguments.fit, pace=arguments.pace)
+    if hint and done[0][1].engagements:
+        remark(f"warning: {hint}")
+    if not any(following.engagements for _, following in done):
         raise TaskFailedError(
             f"{arguments.source}: the {correspondence.side} arm was never seen for {SEEN_FOR:g} s on end, so nothing "
             "was followed and nothing is written; keep it in view, or choose the other by --side"
         )
     source = f"{Path(arguments.source).name}, {correspondence.side} arm"
-    for name, (result, metrics) in zip(names, done, strict=True):
-        if name in files and metrics.engagements:
+    for name, (result, following) in zip(names, done, strict=True):
+        if name in files and following.engagements:
             _demonstration(result.run, arguments.task, f"{source}, {name}", arguments.keep_waiting).save(files[name])
             say(f"wrote {files[name]}")
     if arguments.report is not None:
-        say(f"wrote {_written_report(arguments, setting, skeletons, findings, done)}")
+        say(f"wrote {_written_report(arguments, setting, skeletons, findings, done, hint)}")
     return 0
 
 
@@ -196,19 +203,19 @@ def _setting(
 
 def _retargeted(
     name: str, setting: _Setting, skeletons: Sequence[Skeleton], truth: Truth | None, *, drive: bool
-) -> tuple[MethodResult, MappingMetrics]:
+) -> tuple[MethodResult, Following]:
     """Let one method retarget the recording, and measure what it made of it."""
     retargeter: Retargeter = RETARGETERS[name](setting.arm, setting.correspondence, dt=PERIOD, scene=setting.scene)
     duration = max(skeletons[-1].time - skeletons[0].time, PERIOD)
     with watched(f"retargeting by {name}", lambda: retargeter.command.time / duration):
         made = retargeter.run(skeletons, setting.q)
     clock = getattr(retargeter, "clock", None)  # of a method that slows the motion afterwards
-    result, metrics = judged(made, skeletons, setting.correspondence, truth, clock)
+    result, following = judged(made, skeletons, setting.correspondence, truth, clock)
     if drive:
         shares = [0.0]
         with watched(f"driving {setting.arm.name}", lambda: shares[-1]):
             result = with_driven(result, drive_run(made, setting.scene, shares.append))
-    return result, metrics
+    return result, following
 
 
 def _demonstration(made: Retargeting, task: str, source: str, whole: bool) -> Demonstration:
@@ -237,15 +244,13 @@ def _written_report(
     setting: _Setting,
     skeletons: Sequence[Skeleton],
     findings: Sequence[str],
-    done: Sequence[tuple[MethodResult, MappingMetrics]],
+    done: Sequence[tuple[MethodResult, Following]],
+    hint: str,
 ) -> Path:
     """Write the report and return where."""
     from imitarm.viewer.retarget_report import write_retarget_report  # noqa: PLC0415 (only when it is asked for)
 
-    (result, metrics), arm, correspondence = done[0], setting.arm, setting.correspondence
-    broken = metrics.broken_limits
-    limits = "no joint breaks a limit" if not broken else f"limits are broken in {broken} frames"
-    wanted = ("tool to its own target, RMS", "lag behind its own target", "highest torque")
+    (result, following), arm, correspondence = done[0], setting.arm, setting.correspondence
     with working("drawing the report"):
         return write_retarget_report(
             RetargetReport(
@@ -253,17 +258,19 @@ def _written_report(
                 methods=[one for one, _ in done],
                 skeletons=skeletons,
                 correspondence=correspondence,
-                verdict=f"{result.title}: follows {100 * metrics.following_share:.0f} % of the time, {limits}",
-                good=not broken and metrics.engagements > 0,
+                verdict=following.verdict(),
+                good=following.good,
                 tiles=[
-                    Measure("joint positions, velocities or accelerations beyond a limit", broken, "frames", 0),
-                    *(m for m in result.measures if m.label in wanted),
+                    *(m for m in result.measures if m.label in _TILES),
+                    Measure(
+                        "joint positions, velocities or accelerations beyond a limit", following.broken, "frames", 0
+                    ),
                 ],
                 scene=setting.scene,
                 summary=f"The {correspondence.side} arm of a person, {Path(arguments.source).name}, moves the tool of "
                 f"{arm.name}: "
                 f"10 cm of the hand are {10 * correspondence.scale:.1f} cm of the tool, which turns "
-                f"{_TURNS[correspondence.orientation]}.",
+                f"{_TURNS[correspondence.orientation]}." + (f" {hint[0].upper()}{hint[1:]}." if hint else ""),
                 findings=findings,
                 provenance=provenance(
                     robot=arm.name,
@@ -276,4 +283,5 @@ def _written_report(
         )
 
 
+_TILES = (TARGET_RMS, TARGET_FAR, TARGET_LAG)  # the measures that matter most
 _TURNS = {"hand": "as the hand does", "upright": "with the hand about the vertical only", "fixed": "not at all"}
