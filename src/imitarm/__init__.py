@@ -151,19 +151,32 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'imitarm' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOME[name]), name)
+    home = importlib.import_module(_HOME[name])
+    return home if home.__name__ == f"imitarm.{name}" else getattr(home, name)
 
 
 def __dir__() -> list[str]:
     return sorted(__all__)
 
 
+class _Verb(ModuleType):
+    """A module that does, when it is called, what its function of the same name does.
+
+    ``imitarm.retarget`` is a package and ``imitarm.reproduce`` a module; both are public verbs, too. One name can't be
+    two things, whichever was imported first, so it is one thing that can be both.
+    """
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        return getattr(self, self.__name__.rpartition(".")[2])(*arguments, **options)
+
+
 class _Package(ModuleType):
-    """Keeps ``imitarm.reproduce`` the function: importing the module of that name would put itself in its place."""
+    """Makes a verb of each module that has a public name: importing it puts it in here."""
 
     def __setattr__(self, name: str, value: object) -> None:
-        if not (name in __all__ and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
+        if name in _HOME and isinstance(value, ModuleType):
+            value.__class__ = _Verb
+        super().__setattr__(name, value)
 
 
 sys.modules[__name__].__class__ = _Package
