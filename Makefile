@@ -17,7 +17,7 @@ help:  ## list the tasks
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
 demo: $(VENV)/.report  ## learn a sweep from demonstrations, do it around obstacles, write demo/report.html
-	$(BIN)/imitarm demo
+	$(BIN)/imitarm demo --force
 
 install: $(VENV)/.dev  ## the development environment in .venv
 

@@ -55,6 +55,26 @@ def test_a_demo_folder_that_cannot_be_made_is_bad_input(tmp_path, capsys):
     assert "name another folder" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["skill.json", "report.html", "results.json"])
+def test_the_demo_replaces_no_file_unasked(tmp_path, monkeypatch, capsys, name):
+    (tmp_path / name).write_text("mine")
+    with monkeypatch.context() as patch:
+        patch.setattr("imitarm.cli.demo.SweepTask", lambda **_: pytest.fail("it has begun to work"))
+        assert main(["demo", "--out", str(tmp_path)]) == 2
+    message = capsys.readouterr().err
+    assert f"{name}: is there already" in message and "--force" in message
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "mine"
+    monkeypatch.setattr("imitarm.cli.demo.SCENES", ())
+    assert main(["demo", "--out", str(tmp_path), "--force"]) in {0, 1}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "results.json", "skill.json"]
+    assert (tmp_path / name).read_text() != "mine"
+
+
+def test_make_demo_can_be_said_again():
+    makefile = (SCENES.parents[1] / "Makefile").read_text()
+    assert "imitarm demo --force\n" in makefile
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("recording", "scene"), [("pouring", "pouring_scene"), ("bottle2shelf", "shelf_scene")])
 def test_real_recordings_on_the_panda_around_three_obstacles(real_data, tmp_path, capsys, recording, scene):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rich.progress import Progress, TaskID
 
+from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import progress_bar, say
 from imitarm.cli.trial import learning_summary, provenance, show_results, try_scene
 from imitarm.demonstrations import compute_alignment, lint
@@ -27,7 +28,8 @@ examples:
 
 Eight demonstrations of a sweep come with the package: a seeded synthetic teacher guided the compliant simulated
 Sawyer by hand. They are checked, aligned and learnt; the skill is then reproduced without obstacles and in four scenes
-with obstacles. FOLDER gets skill.json, report.html (opens offline in any browser) and results.json.
+with obstacles. FOLDER gets skill.json, report.html (opens offline in any browser) and results.json; with --force they
+may replace older ones.
 Exit status 1 when a scene fails or something is touched.
 """
 
@@ -52,15 +54,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="FOLDER", help="default: demo")
     parser.add_argument("--seed", type=int, default=0, help="of where the crumbs lie; default: 0")
     parser.add_argument("--method", choices=METHODS, default="certified", help="how to adapt; default: certified")
+    parser.add_argument("--force", action="store_true", help="replace files that are there")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Learn, reproduce in every scene, report; return 1 when a scene fails."""
+    """Learn, reproduce in every scene, report; return 1 when a scene fails.
+
+    Raises:
+        InputError: when the folder can't be made, or a file in it would be lost.
+    """
     folder: Path = arguments.out
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--out {folder}: can't be made ({error.strerror}); name another folder") from error
+    skill_file, page_file, results_file = (folder / name for name in ("skill.json", "report.html", "results.json"))
+    check_outputs([("--out", path) for path in (skill_file, page_file, results_file)], [], force=arguments.force)
     task = SweepTask(seed=arguments.seed)
     with progress_bar() as progress:
         whole = progress.add_task("learning", total=len(SCENES) + 2.0)
@@ -69,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         findings = lint(shown, arm=arm)
         alignment = compute_alignment(shown)
         skill = Skill().fit(alignment.demonstrations, notes=[str(f) for f in findings] + alignment.notes())
-        skill.save(folder / "skill.json")
+        skill.save(skill_file)
         progress.advance(whole)
         results = [
             _sweep(task, name, skill, alignment.demonstrations, arguments.method, progress, whole) for name in SCENES
@@ -82,8 +91,8 @@ def run(arguments: argparse.Namespace) -> int:
             learning=learning_summary(skill, alignment.demonstrations, findings, alignment),
             provenance=provenance(seed=arguments.seed, demonstrations="synthetic teacher, seeds 0 to 7"),
         )
-        page = write_report(report, folder / "report.html")
-        _write_json(as_data(report), folder / "results.json")
+        page = write_report(report, page_file)
+        _write_json(as_data(report), results_file)
         progress.advance(whole)
     show_results(report)
     say(f"report: {page}")
