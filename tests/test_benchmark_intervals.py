@@ -7,7 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.benchmark.intervals import bootstrap, compare, holm, interval, person_means, sign_flip_p
+from imitarm.benchmark.intervals import (
+    bootstrap,
+    compare,
+    holm,
+    interval,
+    person_means,
+    rate_interval,
+    sign_flip_p,
+    wilson_interval,
+)
 
 
 def test_an_interval_covers_the_truth_about_as_often_as_it_says():
@@ -88,3 +97,51 @@ def test_a_comparison_is_paired():
     assert found.p == pytest.approx(2.0 / 2**10)
     ours[0, 0] = math.nan
     assert compare(ours, theirs).difference.used == 29
+    below = {key: -value for key, value in theirs.items()}
+    assert compare({key: -value for key, value in ours.items()}, below).relative > 0.0  # the sign is the difference's
+
+
+def trials(rates, repeats=5):
+    """Outcomes of persons who succeed in so many of their trials."""
+    return {(p, r): float(r < k) for p, k in enumerate(rates) for r in range(repeats)}
+
+
+@pytest.mark.parametrize("each", [0, 5, 4])
+def test_persons_who_are_all_alike_still_leave_room_for_others(each):
+    """Drawing them again would give an interval without width."""
+    found = rate_interval(trials([each] * 10))
+    assert found.mean == pytest.approx(each / 5)
+    assert (found.low, found.high) == wilson_interval(2 * each, 10)
+    assert found.high - found.low > 0.25
+
+
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=12))
+def test_a_rates_interval_holds_the_rate_and_is_no_narrower_than_of_independent_trials(rates):
+    found = rate_interval(trials(rates))
+    low, high = wilson_interval(sum(rates), 5 * len(rates))
+    assert 0.0 <= found.low <= low + 1e-12
+    assert high - 1e-12 <= found.high <= 1.0
+    assert found.low <= found.mean + 1e-12 and found.mean <= found.high + 1e-12
+
+
+def test_trials_of_one_person_count_for_one_person():
+    few = rate_interval(trials([1, 0, 1, 1, 0, 1, 0, 1], repeats=1))
+    many = rate_interval(trials([20, 0, 20, 20, 0, 20, 0, 20], repeats=20))
+    assert many.high - many.low > 0.9 * (few.high - few.low)
+    assert math.isnan(rate_interval({}).mean)
+
+
+@pytest.mark.parametrize(("rate", "alike"), [(0.94, 0.1), (0.86, 0.4), (0.5, 0.4), (0.06, 0.1)])
+def test_a_rates_interval_covers_the_truth_where_persons_differ(rate, alike):
+    """Rates of persons are drawn from a beta distribution; ``alike`` is the correlation of one person's trials."""
+    rng = np.random.default_rng(5)
+    spread = (1.0 - alike) / alike
+    covered, by_trials = 0, 0
+    for trial in range(300):
+        done = rng.binomial(5, rng.beta(rate * spread, (1.0 - rate) * spread, 10))
+        found = rate_interval(trials(done), seed=trial)
+        covered += found.low <= rate <= found.high
+        low, high = wilson_interval(int(done.sum()), 50)
+        by_trials += low <= rate <= high
+    assert covered / 300 > 0.86
+    assert covered >= by_trials

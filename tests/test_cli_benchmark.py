@@ -5,7 +5,10 @@ import json
 import pytest
 
 from imitarm import cli
+from imitarm.benchmark import experiment, recordings
 from imitarm.benchmark.mapping import BEGIN, END
+from imitarm.cli import benchmark
+from imitarm.errors import TaskFailedError
 
 SMALL = ("benchmark", "mapping", "--people", "1", "--seconds", "4", "--kinds", "inside", "--no-live", "--jobs", "1")
 
@@ -38,7 +41,7 @@ def test_one_command_prints_tables_and_leaves_files(tmp_path, capsys):
         (["--sigma", "500"], "sigma"),
         (["--seconds", "1"], "seconds"),
         (["--data", "nowhere"], "no such folder"),
-        (["--report", "nowhere/page.html"], "--report"),
+        (["--first", "-1"], "first person"),
         (["--report", "."], "is a folder"),
         (["--data", ".", "--out", "."], "is the folder of --data, too"),
         (["--fill", "nowhere.md"], "can't be read"),
@@ -51,6 +54,47 @@ def test_what_is_wrong_is_said_before_the_work(more, said, tmp_path, monkeypatch
     assert cli.main([*SMALL, *more]) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_reports_folder_is_made_before_the_work_or_the_work_is_not_begun(tmp_path, monkeypatch, capsys):
+    """Also one in a folder of results that is still to be made; nothing is made when something else is wrong."""
+    monkeypatch.chdir(tmp_path)
+    begun = []
+
+    def run_all(experiments, folder, **_):
+        begun.append((len(experiments), (tmp_path / "out" / "pages").is_dir(), folder.name))
+        raise TaskFailedError("far enough")
+
+    monkeypatch.setattr(benchmark, "run_all", run_all)
+    words = [*SMALL, "--methods", "modern", "--out", "out", "--report", "out/pages/page.html"]
+    assert cli.main([*words, "--sigma", "500"]) == 2
+    assert cli.main([*words, "--fill", "nowhere.md"]) == 2
+    assert not list(tmp_path.iterdir())
+    assert not begun
+    assert cli.main(words) == 1
+    assert begun == [(1, True, "out")]
+    (tmp_path / "file").write_text("")
+    assert cli.main([*SMALL, "--report", "file/page.html"]) == 2
+    assert "--report file/page.html: its folder can't be made" in capsys.readouterr().err
+    assert len(begun) == 1
+
+
+def test_what_could_not_be_done_is_told_once(tmp_path, monkeypatch, capsys):
+    """One person's recording fails; the others' figures are there all the same."""
+    make = recordings.make_recording
+
+    def fails(plan, arm):
+        if plan.person == 101:
+            raise TaskFailedError("person 101 stacked no tower")
+        return make(plan, arm)
+
+    monkeypatch.setattr(experiment, "make_recording", fails)
+    words = [*SMALL, "--people", "2", "--methods", "modern", "m3", "--out", str(tmp_path), "--backend", "threading"]
+    assert cli.main(words) == 0
+    printed = capsys.readouterr()
+    assert printed.err.count("person 101 stacked no tower") == 1
+    assert "inside, person 101, repeat 0, modern, m3: TaskFailedError" in printed.err
+    assert "1 of 2" in printed.out
 
 
 def test_a_report_replaces_no_document(tmp_path, monkeypatch, capsys):

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-import imitarm
+from imitarm.benchmark.fingerprint import code_version
 from imitarm.benchmark.mapping_methods import method
 from imitarm.benchmark.mapping_metrics import measure
 from imitarm.benchmark.recordings import CAPTURED, KINDS, MappingRecording, Plan, beyond_reach, make_recording
 from imitarm.benchmark.stacking import StackingTrial, run_trial
-from imitarm.errors import FileFormatError, ImitarmError, InputError, UnknownNameError
+from imitarm.errors import FileFormatError, ImitarmError, InputError, TaskFailedError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
 
 REPLAYS = (*KINDS, CAPTURED)
@@ -30,12 +30,7 @@ LIVE = "live stacking"
 ROBOTS = ("sawyer", "panda")
 FORMAT = "imitarm-result"
 VERSION = 1
-# whatever decides a result: when one of these files changes, runs are done again
-_DECIDING = ("kinematics", "capture", "retarget", "robots", "tasks", "scene", "trajectory.py")
-_MEASURING = (
-    *("experiment.py", "mapping_methods.py", "mapping_metrics.py", "motion_measures.py", "recordings.py"),
-    *("stacking.py", "tracking.py"),
-)
+_NO_RECORDING = "the recording can't be made"
 
 
 @dataclass(frozen=True)
@@ -119,7 +114,10 @@ class Experiment:
         return MappingRecording.load(path, self.plan)
 
     def _replayed(self, folder: Path | None) -> dict[str, Any]:
-        recording = self.recording(folder)
+        try:
+            recording = self.recording(folder)
+        except ImitarmError as error:
+            raise TaskFailedError(f"{_NO_RECORDING}: {error}") from error
         retargeter = method(self.method)(_arm(self.robot), recording.correspondence)
         run = retargeter.run(recording.skeletons, recording.start)
         # a method that slows the motion afterwards is measured against the moment that it reproduces
@@ -141,7 +139,7 @@ class Result:
 
     Attributes:
         experiment: which.
-        version: of the code that did it, see :func:`code_version`.
+        version: of the code that did it, see :func:`imitarm.benchmark.fingerprint.code_version`.
         values: what was measured, by name: those of :class:`~imitarm.benchmark.mapping_metrics.MappingMetrics` with
             ``recorded`` [s], ``beyond_reach`` (share of the time) and the method's own ``notes``; or those of
             :class:`~imitarm.benchmark.stacking.TrialOutcome`; empty after a failure.
@@ -154,6 +152,11 @@ class Result:
     values: Mapping[str, Any]
     failure: str
     seconds: float
+
+    @property
+    def unmade(self) -> bool:
+        """Whether there was no recording to follow: that is no failure of the method."""
+        return f": {_NO_RECORDING}: " in self.failure
 
     def value(self, name: str) -> float:
         """Return a measured number; nan when it is not known."""
@@ -200,20 +203,6 @@ class Result:
             if isinstance(error, FileFormatError):
                 raise
             raise FileFormatError(f"{path}: can't be read as a result ({error}); delete it and run again") from error
-
-
-@lru_cache(maxsize=1)
-def code_version() -> str:
-    """Return a fingerprint of all files that decide a result."""
-    package = Path(imitarm.__file__).parent
-    found = [package / "benchmark" / name for name in _MEASURING]
-    for name in _DECIDING:
-        path = package / name
-        found += [path] if path.is_file() else [p for p in path.rglob("*") if p.suffix in {".py", ".xml"}]
-    digest = hashlib.sha256()
-    for path in sorted(found):
-        digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
-    return f"{imitarm.__version__}+{digest.hexdigest()[:12]}"
 
 
 def plain(value: Any) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -106,7 +106,7 @@ class Comparison:
 
     Attributes:
         difference: ours less theirs, over the recordings for which both have a number.
-        relative: that difference over the mean of theirs; nan where that is zero.
+        relative: that difference over the size of the mean of theirs; nan where that is zero.
         p: probability of so large a difference when there is none, by sign flips of the persons' differences.
         corrected: the same after Holm's correction for the comparisons made together.
     """
@@ -128,19 +128,42 @@ def compare(ours: Values, theirs: Values) -> Comparison:
     paired = {key: theirs[key] for key, value in both.items() if math.isfinite(value)}
     base = float(person_means(paired).mean()) if paired else math.nan
     found = interval(both)
-    relative = found.mean / base if abs(base) > _TINY else math.nan
+    relative = found.mean / abs(base) if abs(base) > _TINY else math.nan
     return Comparison(found, relative, sign_flip_p(person_means(both)))
 
 
-def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+def rate_interval(outcomes: Values, *, seed: int = 0) -> Interval:
+    """Return a success rate, the mean over persons of each one's own rate, and where it is with 95 % confidence.
+
+    Persons are drawn again, as by :func:`interval`. That says too little where few or none failed, so the interval is
+    never narrower than Wilson's of as many trials that have nothing to do with each other; and where all persons have
+    one and the same rate, as 0 or 100 %, the persons drawn again are always alike, though other people need not be:
+    then it is Wilson's with only as many trials as there are persons.
+
+    Args:
+        outcomes: of each trial, 1 when it went well, 0 when it did not.
+        seed: of the resampling.
+    """
+    found, rates = interval(outcomes, seed=seed), person_means(outcomes)
+    if len(rates) == 0:
+        return found
+    if np.ptp(rates) < _TINY:
+        low, high = wilson_interval(found.mean * found.persons, found.persons)
+    else:
+        low, high = wilson_interval(found.mean * found.used, found.used)
+        low, high = min(low, max(found.low, 0.0)), max(high, min(found.high, 1.0))
+    return replace(found, low=low, high=high)
+
+
+def wilson_interval(successes: float, trials: int, z: float = 1.959964) -> tuple[float, float]:
     """Return the Wilson score interval of a rate (95 % by default).
 
     Args:
-        successes: how often it went well, 0 to ``trials``.
+        successes: how often it went well, 0 to ``trials``; a mean rate times the trials need not be whole.
         trials: how often it was tried, at least 1.
         z: normal quantile of the confidence.
     """
-    p = successes / trials
+    p = min(max(successes / trials, 0.0), 1.0)
     centre = p + z * z / (2 * trials)
     spread = z * np.sqrt(p * (1 - p) / trials + z * z / (4 * trials**2))
     scale = 1 + z * z / trials

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from imitarm.benchmark.experiment import LIVE
-from imitarm.benchmark.intervals import Interval, Values, interval, wilson_interval
+from imitarm.benchmark.intervals import Interval, Values, interval, rate_interval
 from imitarm.benchmark.mapping_methods import METHODS
 from imitarm.benchmark.mapping_tables import Results
 from imitarm.viewer import palette
@@ -54,20 +54,16 @@ def times(results: Results, *, name: str = "times") -> str:
     """Draw the time to stack four cubes for each method, of the trials that succeeded (Fig 3.8)."""
 
     def values(method: str) -> Values:
-        done = [r for r in results.of(method, [LIVE]) if r.values.get("success")]
-        return {(r.experiment.seed, r.experiment.repeat): r.value("time") for r in done}
+        return results.values(method, [LIVE], "time")
 
     return _live(results, lambda m: interval(values(m)), "time of the successes [s]", "Time to stack four cubes", name)
 
 
 def successes(results: Results, *, name: str = "successes") -> str:
-    """Draw how often four cubes were stacked, with Wilson intervals."""
+    """Draw how often four cubes were stacked, with intervals over persons."""
 
     def rate(method: str) -> Interval:
-        runs = results.of(method, [LIVE])
-        done = sum(bool(r.values.get("success")) for r in runs)
-        low, high = wilson_interval(done, len(runs))
-        return Interval(100 * done / len(runs), 100 * low, 100 * high, len(runs), len(runs), len(runs))
+        return _scaled(rate_interval(results.values(method, [LIVE], "success")), 100.0)
 
     return _live(results, rate, "stacked [%]", "How often four cubes were stacked", name)
 

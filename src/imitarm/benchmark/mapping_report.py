@@ -10,7 +10,9 @@ from typing import Any, Final
 from imitarm.benchmark import mapping_plots
 from imitarm.benchmark.experiment import LIVE, Experiment, Result, plain
 from imitarm.benchmark.mapping_methods import MAIN, METHODS
-from imitarm.benchmark.mapping_tables import OURS, Results, number
+from imitarm.benchmark.mapping_pairs import OURS
+from imitarm.benchmark.mapping_tables import Results, number
+from imitarm.benchmark.recordings import CAPTURED
 from imitarm.benchmark.tables import Table
 from imitarm.kinematics.arm import ArmModel
 from imitarm.viewer import palette
@@ -80,7 +82,7 @@ def mapping_report_html(
 
 
 def _verdict(results: Results) -> tuple[str, bool]:
-    runs = [r for r in results.all if r.experiment.method == OURS and r.experiment.task != LIVE]
+    runs = [r for r in results.all if r.experiment.method == OURS and r.experiment.task != LIVE and not r.unmade]
     if not runs:
         return f"{OURS} was not run", False
     broken = sum(_breaks(r) for r in runs)
@@ -108,7 +110,7 @@ def _figures(results: Results) -> str:
     main = Results(r for r in results.all if r.experiment.method in MAIN)
     bars = "Bars are means over persons, lines 95 % intervals."
     cards = [
-        figure(mapping_plots.successes(main), "Success", "Four cubes stacked, loop closed; Wilson intervals."),
+        figure(mapping_plots.successes(main), "Success", f"Four cubes stacked, loop closed. {bars}"),
         figure(mapping_plots.torques(main, stacking), "Mean torque of each joint (Fig 3.6)", bars),
         figure(mapping_plots.path_lengths(main, tasks), "Path length (Fig 3.7)", bars),
         figure(mapping_plots.times(main), "Time to complete (Fig 3.8)", f"Of the trials that succeeded. {bars}"),
@@ -169,7 +171,8 @@ def _players(results: Results, folder: Path | None) -> tuple[tuple[str, str] | N
 
 def _data(result: Result) -> dict[str, Any]:
     experiment: Experiment = result.experiment
-    facts = {"task": experiment.task, "method": experiment.method, "person": experiment.seed}
+    person = None if experiment.task == CAPTURED else experiment.seed  # that one is no made-up person
+    facts = {"task": experiment.task, "method": experiment.method, "person": person}
     return {
         **facts,
         "repeat": experiment.repeat,

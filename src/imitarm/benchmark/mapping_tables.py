@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from imitarm.benchmark.experiment import LIVE, REPLAYS, Result
-from imitarm.benchmark.intervals import Comparison, Interval, Values, compare, holm, interval, wilson_interval
+from imitarm.benchmark.intervals import Interval, Values, interval, rate_interval
 from imitarm.benchmark.mapping_methods import METHODS
 from imitarm.benchmark.recordings import CAPTURED, KINDS
 from imitarm.benchmark.stacking import failures
 from imitarm.benchmark.tables import Table
 
-OURS = "modern"
+JUDGED = 100
+"""First of the persons that nobody looks at while a method is worked on."""
 _DEGREES = 180.0 / math.pi
 
 
@@ -28,12 +29,14 @@ class Figure:
         title: with its unit.
         factor: from SI.
         digits: after the point.
+        more: whether more of it is better, not less.
     """
 
     name: str
     title: str
     factor: float = 1.0
     digits: int = 1
+    more: bool = False
 
 
 ACCURACY = (
@@ -58,27 +61,25 @@ EFFORT = (
 )
 SMOOTHNESS = (
     Figure("jerk_rms", "jerk [m/s³]", digits=0),
-    Figure("spectral_arc_length", "SPARC", digits=2),
-    Figure("least_singular", "least singular value", digits=3),
+    Figure("spectral_arc_length", "SPARC", digits=2, more=True),
+    Figure("least_singular", "least singular value", digits=3, more=True),
 )
-_RECORDED = (Figure("recorded", "length [s]"), Figure("beyond_reach", "beyond reach [%]", 100.0))
-_ACCURACY_NOTE = (
-    "Mean over persons (95 % interval), root mean squares. Executed: by an arm that keeps its limits, which a real one "
-    "does. Led: share of the time."
-)
-COMPARED = (
-    Figure("tool_rms", "tool [mm]", 1e3),
-    Figure("tool_rms_without_lag", "without lag [mm]", 1e3),
-    Figure("executed_rms", "executed [mm]", 1e3),
-    Figure("executed_rms_without_lag", "executed, without lag [mm]", 1e3),
-    Figure("elbow_direction_rms", "upper arm [°]", _DEGREES),
-    Figure("path_length", "path [m]", digits=2),
-    Figure("settling_time", "settled after [s]", digits=2),
+LED = Figure("led_share", "led [%]", 100.0, 0, more=True)
+TORQUES = (
     Figure("mean_torque", "mean torque [N m]", digits=2),
-    Figure("broken_limits", "frames beyond a limit", digits=0),
-    SMOOTHNESS[0],
+    Figure("rms_torque", "RMS torque [N m]", digits=2),
+    Figure("mean_motion_torque", "mean torque without weight [N m]", digits=2),
 )
-"""What ``modern`` is compared with the others in."""
+"""Means over the joints of what the tables of torques have for each."""
+LOOP = (Figure("time", "time [s]", digits=0), Figure("path_length", "path [m]", digits=2), TORQUES[0])
+
+_RECORDED = (Figure("recorded", "length [s]"), Figure("beyond_reach", "beyond reach [%]", 100.0))
+_MEANS_NOTE = "Mean over persons (95 % interval)"
+_ACCURACY_NOTE = (
+    "root mean squares. Executed: by an arm that keeps its limits, which a real one does. Led: share of the time."
+)
+_CAPTURED_NOTE = "One person's motion before two cameras: mean (each camera's). It has no interval: it is one person"
+_ONE = -1  # person of the captured arm, whichever made-up body carries it: it is one and the same
 
 
 class Results:
@@ -102,17 +103,26 @@ class Results:
         Args:
             method: whose.
             tasks: at which.
-            name: what was measured; ``"broken_limits"`` is the sum of the three counts.
+            name: what was measured; ``"broken_limits"`` is the sum of the three counts. With the loop closed
+                ``"success"`` is 1 or 0, and the rest is known only of the trials that succeeded.
             joint: of what is measured for each joint, which; None: the mean over the joints.
         """
         return {
-            (r.experiment.seed, (r.experiment.task, r.experiment.repeat)): number(r, name, joint)
+            (_person(r), (r.experiment.task, r.experiment.repeat)): number(r, name, joint)
             for r in self.of(method, tasks)
         }
 
 
+def _person(result: Result) -> int:
+    return _ONE if result.experiment.task == CAPTURED else result.experiment.seed
+
+
 def number(result: Result, name: str, joint: int | None = None) -> float:
     """Return one number of a result, see :meth:`Results.values`."""
+    if result.experiment.task == LIVE:
+        done = bool(result.values.get("success"))
+        if name == "success" or not done:
+            return float(done) if name == "success" else math.nan
     if name == "broken_limits":
         return sum(result.value(f"{kind}_violations") for kind in ("position", "velocity", "acceleration"))
     found = result.values.get(name)
@@ -132,28 +142,67 @@ def written(found: Interval, figure: Figure) -> str:
     return text if found.used == found.of else f"{text}, {found.used} of {found.of}"
 
 
+def written_each(values: Values, figure: Figure) -> str:
+    """Return a mean and, in brackets, what it is the mean of: for a few numbers that have no interval."""
+    known = [figure.factor * value for _, value in sorted(values.items()) if math.isfinite(value)]
+    if not known:
+        return f"– (0 of {len(values)})" if values else "–"
+    text = f"{np.mean(known):.{figure.digits}f}"
+    if len(known) > 1:
+        text += f" ({' and '.join(f'{value:.{figure.digits}f}' for value in known)})"
+    return text if len(known) == len(values) else f"{text}, {len(known)} of {len(values)}"
+
+
+def _cells(results: Results, name: str, task: str, figures: Sequence[Figure]) -> list[str]:
+    """Return figures of one kind of recording: with intervals over persons, or both of the captured arm's."""
+    found = [results.values(name, [task], figure.name) for figure in figures]
+    if task == CAPTURED:
+        return [written_each(values, figure) for values, figure in zip(found, figures, strict=True)]
+    return [written(interval(values), figure) for values, figure in zip(found, figures, strict=True)]
+
+
 def recordings_table(results: Results) -> Table:
     """Return how many recordings there are, how long, and how often they ask for what no arm of this length reaches."""
     rows = []
     for task in results.tasks(REPLAYS):
-        some = results.of(results.methods[0], [task])
-        persons = {r.experiment.seed for r in some}
-        cells = [written(interval(results.values(results.methods[0], [task], f.name)), f) for f in _RECORDED]
-        rows.append((task, str(len(some)), str(len(persons)), *cells))
-    columns = ("kind", "recordings>", "persons, or cameras>", *(f"{figure.title}>" for figure in _RECORDED))
-    note = "Beyond reach: share of the time in which the wrist is led farther than the robot's arm is long."
+        runs = [r for r in results.all if r.experiment.task == task]
+        asked, made = {r.experiment.plan for r in runs}, {r.experiment.plan for r in runs if not r.unmade}
+        fact = {r.experiment.plan: r for r in runs if "recorded" in r.values}
+        of = str(len(asked)) if made == asked else f"{len(made)} of {len(asked)}"
+        persons = len({plan.person for plan in asked})
+        who = f"1 person, {len(asked)} cameras" if task == CAPTURED else f"{persons} made up"
+        cells = []
+        for figure in _RECORDED:
+            values = {(_person(r), (task, plan.repeat)): number(r, figure.name) for plan, r in fact.items()}
+            cells.append(written_each(values, figure) if task == CAPTURED else written(interval(values), figure))
+        rows.append((task, of, who, *cells))
+    columns = ("kind", "recordings>", "persons", *(f"{figure.title}>" for figure in _RECORDED))
+    note = (
+        "Beyond reach: share of the time in which the wrist is led farther than the robot's arm is long. A recording "
+        f"that could not be made is missing, for every method. {persons_note(results)}"
+    )
     return Table("Recordings, the same for every method", columns, tuple(rows), note)
+
+
+def persons_note(results: Results) -> str:
+    """Return which made-up persons the figures are of, and whether they may judge a method."""
+    seen = sorted({r.experiment.seed for r in results.all if r.experiment.task != CAPTURED})
+    if not seen:
+        return ""
+    text = f"Persons {seen[0]} to {seen[-1]}." if len(seen) > 1 else f"Person {seen[0]}."
+    return text if seen[0] >= JUDGED else f"{text} Those below {JUDGED} were in sight while methods were worked on."
 
 
 def accuracy_table(results: Results, task: str) -> Table:
     """Return how well the methods follow the true arm in one kind of recording."""
     rows = []
     for name in results.methods:
-        cells = [written(interval(results.values(name, [task], f.name)), f) for f in ACCURACY]
         led = interval(results.values(name, [task], "led_share")).mean
+        cells = _cells(results, name, task, ACCURACY)
         rows.append((METHODS[name].title, *cells, f"{100 * led:.0f}" if math.isfinite(led) else "–"))
     columns = ("method", *(f"{figure.title}>" for figure in ACCURACY), "led [%]>")
-    return Table(f"Accuracy, {task}", columns, tuple(rows), _ACCURACY_NOTE)
+    note = f"{_CAPTURED_NOTE if task == CAPTURED else _MEANS_NOTE}; {_ACCURACY_NOTE}"
+    return Table(f"Accuracy, {task}", columns, tuple(rows), note)
 
 
 def effort_table(results: Results, tasks: Sequence[str]) -> Table:
@@ -172,7 +221,7 @@ def _figures(results: Results, tasks: Sequence[str], figures: Sequence[Figure], 
         for name in results.methods
     )
     columns = ("method", *(f"{figure.title}>" for figure in figures))
-    return Table(f"{title}: {', '.join(tasks)}", columns, rows, "Mean over persons (95 % interval).")
+    return Table(f"{title}: {', '.join(tasks)}", columns, rows, f"{_MEANS_NOTE}.")
 
 
 def torque_table(results: Results, tasks: Sequence[str], name: str, title: str) -> Table:
@@ -183,14 +232,15 @@ def torque_table(results: Results, tasks: Sequence[str], name: str, title: str) 
         figure = Figure(name, "", digits=2)
         rows.append((METHODS[method].title, *(written(f, figure) for f in found)))
     columns = ("method", *(f"τ{joint + 1}>" for joint in range(7)))
-    return Table(f"{title} [N m]: {', '.join(tasks)}", columns, tuple(rows), "Mean over persons (95 % interval).")
+    return Table(f"{title} [N m]: {', '.join(tasks)}", columns, tuple(rows), f"{_MEANS_NOTE}.")
 
 
 def limits_table(results: Results, tasks: Sequence[str]) -> Table:
     """Return what breaks limits, by finite differences of the joint positions alone."""
     rows = []
     for name in results.methods:
-        runs = [r for r in results.of(name, tasks) if not r.failure]
+        made = [r for r in results.of(name, tasks) if not r.unmade]
+        runs = [r for r in made if not r.failure]
         clean = sum(number(r, "broken_limits") == 0 for r in runs)
         counts = [
             sum(int(r.value(f"{kind}_violations")) for r in runs) for kind in ("position", "velocity", "acceleration")
@@ -199,7 +249,7 @@ def limits_table(results: Results, tasks: Sequence[str]) -> Table:
             max((r.value(f"{kind}_ratio") for r in runs), default=math.nan) for kind in ("velocity", "acceleration")
         ]
         own = sum(int(r.value("failures")) for r in runs)
-        row = (METHODS[name].title, f"{clean} of {len(results.of(name, tasks))}", *(str(n) for n in counts))
+        row = (METHODS[name].title, f"{clean} of {len(made)}", *(str(n) for n in counts))
         rows.append((*row, *(f"{ratio:.2f}" for ratio in ratios), str(own)))
     heads = ("method", "recordings without>", "position>", "velocity>", "acceleration>")
     columns = (*heads, "worst velocity>", "worst acceleration>", "known to the method>")
@@ -215,87 +265,18 @@ def success_table(results: Results) -> Table:
         if not runs:
             continue
         done = [r for r in runs if r.values.get("success")]
-        low, high = wilson_interval(len(done), len(runs))
-        figures = [
-            Figure("time", "", digits=0),
-            Figure("path_length", "", digits=2),
-            Figure("mean_torque", "", digits=2),
-        ]
+        found = rate_interval(results.values(name, [LIVE], "success"))
         cells = []
-        for figure in figures:
+        for figure in LOOP:
             values = {(r.experiment.seed, r.experiment.repeat): number(r, figure.name) for r in done}
             cells.append(written(interval(values), figure))
         why = failures([str(r.values.get("failure", r.failure) or "") for r in runs if r not in done])
-        rate = (f"{len(done)} of {len(runs)}", f"{100 * low:.0f} to {100 * high:.0f}")
+        rate = (f"{len(done)} of {len(runs)}", f"{100 * found.low:.0f} to {100 * found.high:.0f}")
         rows.append((METHODS[name].title, *rate, *cells, why))
-    columns = ("method", "stacked>", "95 % [%]>", "time [s]>", "path [m]>", "mean torque [N m]>", "failures")
-    note = "Time, path and torque are means over persons (95 % interval) of the trials that succeeded."
+    columns = ("method", "stacked>", "95 % [%]>", *(f"{figure.title}>" for figure in LOOP), "failures")
+    note = (
+        "The rate's interval is over persons, each by the own rate, and no narrower than Wilson's over trials; where "
+        "all persons have the same rate, it is Wilson's with as many trials as persons. Time, path and torque are "
+        f"means over persons (95 % interval) of the trials that succeeded. {persons_note(results)}"
+    )
     return Table("Four cubes stacked, loop closed", columns, tuple(rows), note)
-
-
-def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return ``modern`` against each other method, paired over the same recordings."""
-    rows = []
-    rivals = [name for name in results.methods if name != OURS]
-    for figure in COMPARED:
-        if OURS not in results.methods:
-            break
-        ours = results.values(OURS, tasks, figure.name)
-        found = [compare(ours, results.values(name, tasks, figure.name)) for name in rivals]
-        for name, comparison, p in zip(rivals, found, holm([c.p for c in found]), strict=True):
-            rows.append((figure.title, METHODS[name].title, *_difference(comparison, figure), f"{p:.3f}"))
-    columns = ("measure", f"{OURS} less", "difference (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
-    note = "Persons are resampled; p by sign flips of the persons' differences, corrected within each measure."
-    return Table(f"Paired comparison: {', '.join(tasks)}", columns, tuple(rows), note)
-
-
-def rivals_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return where another method is better than ``modern``: in each kind of recording, and with the loop closed."""
-    rows = []
-    rivals = [name for name in results.methods if name != OURS and OURS in results.methods]
-    for task in tasks:
-        for figure in COMPARED:
-            ours = results.values(OURS, [task], figure.name)
-            found = [compare(ours, results.values(name, [task], figure.name)) for name in rivals]
-            for name, comparison, p in zip(rivals, found, holm([c.p for c in found]), strict=True):
-                if comparison.difference.low > 0.0:  # less is better in all of them
-                    cells = _difference(comparison, figure)
-                    rows.append((task, figure.title, METHODS[name].title, *cells, f"{p:.3f}"))
-    done = {name: [bool(r.values.get("success")) for r in results.of(name, [LIVE])] for name in [OURS, *rivals]}
-    for name in rivals:
-        if done[OURS] and done[name] and np.mean(done[name]) > np.mean(done[OURS]):
-            text = f"{sum(done[OURS])} of {len(done[OURS])} against {sum(done[name])} of {len(done[name])}"
-            rows.append((LIVE, "stacked", METHODS[name].title, text, "", "", ""))
-    columns = ("recordings", "measure", "better", "difference (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
-    note = f"All measures whose interval says that {OURS} is worse, and every method that stacked more often."
-    return Table(f"Where another method is better than {OURS}", columns, tuple(rows), note)
-
-
-def _difference(comparison: Comparison, figure: Figure) -> tuple[str, str, str]:
-    found = comparison.difference
-    if not math.isfinite(found.mean):
-        return "–", "–", f"0 of {found.of}"
-    low, mean, high = (figure.factor * v for v in (found.low, found.mean, found.high))
-    text = f"{mean:+.{figure.digits}f} ({low:+.{figure.digits}f} to {high:+.{figure.digits}f})"
-    share = f"{100 * comparison.relative:+.0f}" if math.isfinite(comparison.relative) else "–"
-    return text, share, f"{found.used} of {found.of}"
-
-
-def all_tables(results: Results) -> list[Table]:
-    """Return every table that the results fill."""
-    tasks, tables = results.tasks(), []
-    if results.tasks([LIVE]):
-        tables.append(success_table(results))
-    if results.tasks(REPLAYS):
-        tables.append(recordings_table(results))
-    tables += [accuracy_table(results, task) for task in results.tasks(REPLAYS)]
-    if tasks:
-        tables.append(rivals_table(results, tasks))
-        tables += [comparison_table(results, tasks), limits_table(results, tasks), effort_table(results, tasks)]
-        tables.append(smoothness_table(results, tasks))
-        tables.append(torque_table(results, tasks, "mean_torque", "Mean of the absolute torque"))
-        tables.append(torque_table(results, tasks, "rms_torque", "Root mean square torque"))
-        tables.append(torque_table(results, tasks, "mean_motion_torque", "Mean of the absolute torque without weight"))
-    if results.tasks([CAPTURED]):
-        tables.append(limits_table(results, [CAPTURED]))
-    return tables

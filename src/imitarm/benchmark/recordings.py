@@ -43,6 +43,7 @@ _STRETCH = 4.0  # [s] from one full stretch to the next
 _OUT = 1.02  # of the reach: as far as the arm is long, and a little more wished for
 _MOCAP = Path("mocap_arm", "recording.tsv")
 _LONGEST = 120.0  # [s] of a recording
+_REPEATS = 100  # of a person at most: more would have the seeds of the next person
 _TRIES = 5  # repeats of a person's stacking, until one succeeds with the ideal follower
 
 
@@ -53,7 +54,7 @@ class Plan:
     Attributes:
         kind: one of :data:`KINDS`, or :data:`CAPTURED`.
         person: seed of the person, whose limbs and habits differ.
-        repeat: which of this person: seeds motion and camera.
+        repeat: which of this person, 0 to 99: seeds motion and camera; of the captured arm: before which camera.
         seconds: of motion; reaches and drawings take about so long, a capture is cut to it, stacking as it takes.
         sigma: of the camera's error [m]; None: 1 to 2 cm, by the seed.
         data: folder of real recordings, for :data:`CAPTURED`.
@@ -73,15 +74,17 @@ class Plan:
     def __post_init__(self) -> None:
         if self.kind not in {*KINDS, CAPTURED}:
             raise UnknownNameError.among("kind of recording", self.kind, (*KINDS, CAPTURED))
-        if self.person < 0 or self.repeat < 0 or not 4.0 <= self.seconds <= _LONGEST:
-            raise InputError(f"Plan: person and repeat must be at least 0, seconds 4 to {_LONGEST:g}; got {self}")
+        if self.person < 0 or not 0 <= self.repeat < _REPEATS or not 4.0 <= self.seconds <= _LONGEST:
+            raise InputError(
+                f"Plan: person must be at least 0, repeat 0 to {_REPEATS - 1}, seconds 4 to {_LONGEST:g}; got {self}"
+            )
         if self.sigma is not None and not 0.0 <= self.sigma <= 0.1:
             raise InputError(f"Plan: sigma must be between 0 and 0.1 m, got {self.sigma!r}")
 
     @property
     def number(self) -> int:
-        """A number of its own, to seed what is random in it."""
-        return 10 * (100 * self.person + self.repeat) + (*KINDS, CAPTURED).index(self.kind)
+        """A number of its own, whoever the person is, to seed what is random in it."""
+        return 10 * (_REPEATS * self.person + self.repeat) + (*KINDS, CAPTURED).index(self.kind)
 
     def camera(self, number: int) -> SkeletonCamera:
         """Return a camera with all the faults of a real one."""
@@ -239,7 +242,7 @@ def _drawing(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
 def _stacking(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
     """A person who stacks with a gripper that is where the hand is: no method has shaped it."""
     for k in range(_TRIES):
-        done = stack_once(plan.person, plan.repeat + 100 * k, IdealFollower, camera=ideal_camera)
+        done = stack_once(plan.person, plan.repeat + _REPEATS * k, IdealFollower, camera=ideal_camera)
         if done.success:
             return _between(done.truth), done.truth[-1].time, "fixed"
     raise TaskFailedError(f"person {plan.person} stacked no tower in {_TRIES} tries with the ideal gripper")

@@ -13,8 +13,9 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
-from imitarm.benchmark.experiment import REPLAYS, Experiment, Result, code_version
-from imitarm.errors import FileFormatError, InputError, TaskFailedError
+from imitarm.benchmark.experiment import REPLAYS, Experiment, Result
+from imitarm.benchmark.fingerprint import code_version
+from imitarm.errors import FileFormatError, ImitarmError, InputError, TaskFailedError
 
 LOCAL = "local"
 """Backend: processes of this machine."""
@@ -96,7 +97,7 @@ Job = tuple[Experiment, str, str]
 def _make(job: Job) -> Experiment:
     """Make the recording of an experiment; one that can't be made is the experiment's own failure, later."""
     experiment, folder, _ = job
-    with contextlib.suppress(InputError, TaskFailedError):
+    with contextlib.suppress(ImitarmError):
         experiment.recording(Path(folder) / _RECORDINGS)
     return experiment
 

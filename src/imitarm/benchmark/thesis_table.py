@@ -72,10 +72,7 @@ def _spread(column: Array) -> str:
 
 def _times(results: Results, method: str) -> Values:
     """Return the time of each closed-loop trial; nan where it failed."""
-    return {
-        (r.experiment.seed, r.experiment.repeat): r.value("time") if r.values.get("success") else math.nan
-        for r in results.of(method, [LIVE])
-    }
+    return results.values(method, [LIVE], "time")
 
 
 def claims_table(results: Results, tasks: Sequence[str]) -> Table:

@@ -6,13 +6,15 @@ import argparse
 import importlib.util
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from imitarm.benchmark import avoidance
-from imitarm.benchmark.experiment import code_version
+from imitarm.benchmark.experiment import Result
+from imitarm.benchmark.fingerprint import code_version, tables_version
 from imitarm.benchmark.mapping import MappingBenchmark, check_document, fill_document, tables, write_tables
 from imitarm.benchmark.mapping_methods import METHODS
-from imitarm.benchmark.mapping_tables import Results
+from imitarm.benchmark.mapping_tables import JUDGED, Results
 from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.running import LOCAL, run_all
 from imitarm.benchmark.tables import Table
@@ -41,6 +43,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "mapping", help="from a person's arm to a robot's: every method on the same recordings (thesis Table 3.1)"
     )
     mapping.add_argument("--people", type=int, metavar="N", help="made-up people; default: 10, with --quick 2")
+    mapping.add_argument(
+        "--first",
+        type=int,
+        default=JUDGED,
+        metavar="N",
+        help=f"first of them; default: {JUDGED}. Those below {JUDGED} are for working on methods, the others judge",
+    )
     mapping.add_argument("--repeats", type=int, metavar="N", help="closed-loop trials of each; default: 5, quick 1")
     mapping.add_argument("--quick", action="store_true", help="a few short recordings: shows that it runs, no more")
     mapping.add_argument("--methods", nargs="+", choices=METHODS, metavar="NAME", help=f"of {', '.join(METHODS)}")
@@ -80,6 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _mapping(arguments: argparse.Namespace) -> int:
     """Run the mapping benchmark, print its tables, write its files."""
     benchmark = _asked(arguments)
+    experiments = benchmark.experiments()
     folder: Path = arguments.out or Path("benchmark-mapping")
     _check(arguments, folder)
     if not benchmark.data and benchmark.kinds:
@@ -87,7 +97,7 @@ def _mapping(arguments: argparse.Namespace) -> int:
     with progress_bar() as bar:
         task = bar.add_task("measuring", total=None)
         done = run_all(
-            benchmark.experiments(),
+            experiments,
             folder,
             jobs=arguments.jobs,
             fresh=arguments.fresh,
@@ -98,18 +108,17 @@ def _mapping(arguments: argparse.Namespace) -> int:
     found = tables(results)
     for table in found:
         _show(table)
-    for result in done:
-        if result.failure:
-            remark(f"{result.experiment.name}: {result.failure}")
+    for text in _not_done(done):
+        remark(text)
     for path in write_tables(results, found, folder):
         say(f"wrote {path}")
     if arguments.fill is not None:
-        fill_document(arguments.fill, found, _command(), code_version())
+        fill_document(arguments.fill, found, _command(), code_version(), tables_version())
         say(f"filled {arguments.fill}")
     if arguments.report is not None:
         from imitarm.benchmark.mapping_report import write_mapping_report  # noqa: PLC0415 (draws: needs an extra)
 
-        facts = provenance(code=code_version(), experiments=len(done))
+        facts = provenance(code=code_version(), tables=tables_version(), experiments=len(done))
         kept = folder / "recordings"
         say(f"wrote {write_mapping_report(results, found, arguments.report, provenance=facts, folder=kept)}")
     return 0
@@ -136,6 +145,7 @@ def _asked(arguments: argparse.Namespace) -> MappingBenchmark:
     data: Path | None = arguments.data
     return MappingBenchmark(
         people=_given(arguments.people, 2 if quick else 10),
+        first=arguments.first,
         repeats=_given(arguments.repeats, 1 if quick else 5),
         methods=arguments.methods or tuple(METHODS),
         kinds=() if arguments.no_replay else arguments.kinds or KINDS,
@@ -152,6 +162,19 @@ def _command() -> str:
     kept = [w for i, w in enumerate(words) if w not in places | {"--fresh"} and (i == 0 or words[i - 1] not in places)]
     named = ["recordings" if i > 0 and kept[i - 1] == "--data" else w for i, w in enumerate(kept)]
     return shlex.join(["imitarm", *named])
+
+
+def _not_done(results: Sequence[Result]) -> list[str]:
+    """Return what could not be done and why: a recording that can't be made is told once, not for every method."""
+    found: dict[tuple[str, int, int, str], list[str]] = {}
+    for result in results:
+        if result.failure:
+            e = result.experiment
+            found.setdefault((e.task, e.seed, e.repeat, result.failure), []).append(e.method)
+    return [
+        f"{task}, person {person}, repeat {repeat}, {', '.join(methods)}: {why}"
+        for (task, person, repeat, why), methods in found.items()
+    ]
 
 
 def _given(value: int | None, otherwise: int) -> int:
@@ -171,12 +194,20 @@ def _check(arguments: argparse.Namespace, folder: Path) -> None:
     if arguments.fill is not None:
         check_document(arguments.fill)
     written = [("--out", folder / name) for name in ("mapping.md", "mapping.json")]
-    check_outputs([("--report", arguments.report)], [("--fill", arguments.fill), *written])
+    check_outputs([("--report", arguments.report)], [("--fill", arguments.fill), *written], new_folders=True)
     if arguments.report is None:
         return
     missing = [name for name in ("matplotlib", "viser") if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(f"--report needs {' and '.join(missing)}: pip install 'imitarm[report]'")
+    page: Path = arguments.report
+    try:
+        page.absolute().parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--report {page}: its folder can't be made ({error.strerror}); name another one") from error
+    from imitarm.viewer.page import check_writable  # noqa: PLC0415 (draws: needs an extra)
+
+    check_writable(page)
 
 
 def _show(table: Table) -> None:

@@ -19,6 +19,7 @@ def check_outputs(
     inputs: Sequence[tuple[str, str | Path | None]],
     *,
     force: bool | None = None,
+    new_folders: bool = False,
 ) -> None:
     """Refuse to write where an input, another output or a file that was there would be lost.
 
@@ -26,6 +27,7 @@ def check_outputs(
         outputs: the option and the file of each that is written; None: it is not.
         inputs: the option or the argument of each that is read, and the file, or a source that may be none.
         force: files that are there may be replaced; None: the command has no such option.
+        new_folders: the command makes folders that are missing.
 
     Raises:
         InputError: when an output is a folder or in no folder, is the file of an input or of another output, or is
@@ -38,7 +40,7 @@ def check_outputs(
         said = f"{option} {path}"
         if path.is_dir():
             raise InputError(f"{said}: is a folder; name a file in it")
-        if not path.absolute().parent.is_dir():
+        if not new_folders and not path.absolute().parent.is_dir():
             raise InputError(f"{said}: there is no folder {path.parent}; make it first")
         for name, other in taken:
             if same_place(path, other):
