@@ -380,7 +380,7 @@ def test_the_documents_tables_are_of_this_code_or_it_says_that_they_are_not():
     printed = text.split(f"{BEGIN}\n")[1].split("\n")[0]
     code = f"code {code_version()}, tables {tables_version()}"
     present = printed.endswith(f", {code}.")
-    told = re.search(r"printed [^.]*at commit [0-9a-f]{7,40}\b.*has to be run again", " ".join(text.split()))
+    told = re.search(r"Printed [^.]*at commit [0-9a-f]{7,40}\b.*has to be run again", " ".join(text.split()))
     assert present or told, (
         f"docs/mapping_benchmark.md: {printed!r} is not {code}. Print it anew with --fill, or say in it that it was "
         "printed at commit ... and that the command has to be run again"
