@@ -70,13 +70,74 @@ def test_a_time_in_the_future_does_not_make_the_others_look_late():
     assert gate.dropped == {"clock": 1}
 
 
-def test_a_clock_that_was_wrong_at_first_is_believed_after_half_a_second():
-    """The first datagram had waited for ages: the offset that was concluded from it locks nobody out."""
+EARLY = st.one_of(st.integers(1, 60), st.integers(1, 1500), st.integers(1, 10**9))  # [ms]
+
+
+@given(
+    period=st.integers(4, 33),
+    at=st.integers(0, 40),
+    early=EARLY,
+    way=st.integers(0, 50),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_one_stamp_that_is_early_locks_nobody_out_for_longer_than_about_the_age_that_is_allowed(
+    period, at, early, way, seed
+):
+    """Be it the first of all or any later one, early by little or by centuries."""
+    rng, gate, begin = np.random.default_rng(seed), Gate(), 10**12
+    refused = []
+    for k in range(120):
+        sent = begin + k * period * MS
+        queued = int(rng.integers(0, 30)) * MS
+        stamp = sent + early * MS if k == at else sent
+        if not gate.admit(header(k, stamp), sent + way * MS + queued) and k != at:
+            refused.append(k)
+    assert all(at < k and (k - at) * period <= 100 + 3 * period + 30 for k in refused)
+
+
+@given(at=st.integers(3, 20), early=EARLY, period=st.integers(100, 1000))
+def test_nor_where_frames_are_few(at, early, period):
     gate = Gate()
-    gate.admit(header(0, 0), 20_000 * MS)
-    admitted = [gate.admit(header(k, 20_000 * MS + k * PERIOD), 20_000 * MS + k * PERIOD) for k in range(1, 100)]
-    assert not any(admitted[:50]) and all(admitted[51:])
-    assert gate.age == 0.0
+    sent = [10**12 + k * period * MS for k in range(40)]
+    admitted = [gate.admit(header(k, s + early * MS if k == at else s), s + 5 * MS) for k, s in enumerate(sent)]
+    assert all(admitted[:at]) and all(admitted[at + 3 :])
+
+
+@given(
+    at=st.integers(0, 60),
+    stamp=st.one_of(st.integers(-2000, 2000), st.integers(-900_000, 10**12)),
+    queues=st.lists(st.tuples(st.integers(1, 30), st.integers(0, 600)), min_size=1, max_size=6),
+)
+def test_no_stamp_lets_in_what_is_too_old(at, stamp, queues):
+    """Whatever one datagram says of its time, early or late: of the others only those come in that are fresh."""
+    gate = Gate()
+    waits = [0] + [wait for length, wait in queues for _ in range(length)]
+    for k, wait in enumerate(waits):
+        sent = 10**12 + 2 * k * PERIOD
+        if k == at:
+            gate.admit(header(2 * k, sent + stamp * MS), sent + 2 * MS + wait * MS)
+        if gate.admit(header(2 * k + 1, sent), sent + 2 * MS + wait * MS):
+            assert wait <= 100
+            assert gate.age >= 1e-3 * wait - 1e-9  # never younger than it is
+
+
+def test_a_way_that_was_quick_twice_is_not_forgotten():
+    """All are late after it, without an end: that is a queue, not a clock that was wrong."""
+    gate = Gate()
+    waits = [80, 80, 80, 2, 2] + [250] * 1000
+    admitted = [gate.admit(header(k, k * PERIOD), k * PERIOD + wait * MS) for k, wait in enumerate(waits)]
+    assert all(admitted[:5]) and not any(admitted[5:])
+
+
+@given(period=st.integers(4, 3000))
+def test_a_clock_that_was_wrong_at_first_is_corrected_by_two_that_agree(period):
+    """The first datagram had waited for ages: the offset that was concluded from it locks nobody out."""
+    gate, begin = Gate(), 20_000
+    gate.admit(header(0, 0), begin * MS)
+    times = [(begin + k * period) * MS for k in range(1, 100)]
+    admitted = [gate.admit(header(k, time), time) for k, time in enumerate(times, 1)]
+    assert not admitted[0] and all(admitted[1:])
+    assert gate.age == 0.0 and gate.dropped == {"clock": 1}
 
 
 def test_two_senders_are_never_mixed():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from typing import TypeVar
 
@@ -29,8 +30,97 @@ REASONS = {
 _HALF = 2**31
 _MASK = 2**32 - 1
 _WINDOW = 60_000_000_000  # [ns] quicker than two clocks drift apart by what matters, longer than a queue lasts
-_BELIEVED_AFTER = 500_000_000  # [ns] of silence
+_AGREED = 3  # datagrams that agree on the quickest way
+_EARLIER = 2  # datagrams that show that a stamp was false
 _RETIRED = 64  # sessions remembered
+
+
+class Quickest:
+    """Least difference of receiving and sending: two clocks' offset plus the shortest way.
+
+    A difference is *alone* when it is lower by more than half of ``max_age`` than all before it, and none has come as
+    near since. It counts at once, so that nothing old is taken for fresh, and is forgotten as a false stamp
+
+    * when two later datagrams say that they were sent before it: a sender's clock never goes back; or
+    * when for ``max_age`` three have come that are fresh by what at least three had agreed on before.
+
+    So it takes more than one false stamp to make old datagrams look fresh, or fresh ones look old for long.
+
+    Args:
+        max_age: [ns].
+    """
+
+    def __init__(self, max_age: float) -> None:
+        self._max_age, self._near = max_age, 0.5 * max_age
+        self._least = [math.inf, math.inf]  # in this window of time and the one before [ns]
+        self._window = 0
+        self._support = 0  # how many have come near to the least
+        self._before, self._before_support = self._least, 0  # what was known before the one that is alone
+        self._stamp = self._since = self._earlier = self._agreeing = 0  # of that one, and what spoke against it since
+        self._others = math.inf  # least of those since
+        self._refused: tuple[int, int] | None = None  # the last one, when it was too early: difference and sending
+
+    @property
+    def least(self) -> float:
+        """The least difference [ns]; infinite when nothing has come."""
+        return min(self._least)
+
+    def too_early(self, difference: int, sent: int, now: int) -> bool:
+        """Whether a stamp is early by more than ten times ``max_age``: believed only if the next one bears it out.
+
+        Args:
+            difference: of receiving and sending [ns].
+            sent: by the sender's clock [ns].
+            now: by the receiver's [ns].
+        """
+        refused, self._refused = self._refused, None
+        if refused is not None and sent >= refused[1]:  # else that one was false: a clock never goes back
+            self.age(*refused, now)
+        early = difference < self.least - 10.0 * self._max_age
+        if early:
+            self._refused = difference, sent
+        return early
+
+    def age(self, difference: int, sent: int, now: int) -> float:
+        """Note a datagram and return how long it was queued [ns].
+
+        Args:
+            difference: of receiving and sending [ns].
+            sent: by the sender's clock [ns].
+            now: by the receiver's [ns].
+        """
+        self._turn_window(now)
+        if difference < self.least - self._near:
+            self._before, self._before_support = list(self._least), self._support
+            self._support, self._stamp = 1, sent
+            self._since = self._earlier = self._agreeing = 0
+            self._others = math.inf
+        elif difference <= self.least + self._near:
+            self._support += 1
+        elif self._support == 1:
+            self._doubt(difference, sent, now)
+        self._least[0] = min(self._least[0], difference)
+        return difference - self.least
+
+    def _turn_window(self, now: int) -> None:
+        """Forget what is older than two windows of time."""
+        if self.least == math.inf:
+            self._window = now
+        elif now - self._window > _WINDOW:
+            self._window = now
+            self._least, self._before = [math.inf, self._least[0]], [math.inf, self._before[0]]
+
+    def _doubt(self, difference: int, sent: int, now: int) -> None:
+        """Count what speaks against the one that is alone, and forget that one when it is enough."""
+        self._earlier += sent < self._stamp
+        self._others = min(self._others, difference)
+        if difference <= min(self._before) + self._max_age and self._before_support >= _AGREED:
+            self._since = self._since or now
+            self._agreeing += 1
+        agreed = self._agreeing >= _AGREED and now - self._since >= self._max_age
+        if self._earlier >= _EARLIER or agreed:
+            self._least = [min(self._before[0], self._others), self._before[1]]
+            self._support = max(self._before_support, _AGREED)
 
 
 class Gate:
@@ -41,6 +131,8 @@ class Gate:
     *Age.* The clocks of two machines have nothing to do with each other. But the difference between receiving and
     sending is their offset plus the time on the way, and the least of it, over the last one to two minutes, is the
     offset plus the shortest way. What a datagram's difference exceeds that by is how long it was queued: its age.
+    One stamp that is early, by a fault or by malice, would make all others look late for as long; so a difference that
+    nothing else comes near is forgotten after about ``max_age`` (:class:`Quickest`).
 
     *Sessions.* A sender that is restarted begins a new session, which is admitted once the one before has been silent
     for ``patience``; until then it is foreign. So two senders never mix, and a session that was replaced never comes
@@ -66,8 +158,8 @@ class Gate:
         self.dropped: Counter[str] = Counter()
         self._retired: deque[int] = deque(maxlen=_RETIRED)
         self._last: int | None = None
-        self._heard = self._window = 0
-        self._least = [0, 0]  # of receiving less sending, in this window of time and the one before [ns]
+        self._heard = 0
+        self._quickest = Quickest(self._max_age)
 
     def open(self, data: bytes, now_ns: int, kind: type[Kind]) -> tuple[Header, Kind] | None:
         """Return what a datagram says, or None when it is dropped.
@@ -110,12 +202,9 @@ class Gate:
         if fault:
             return fault
         if self._last is None:
-            self._least, self._window = [difference, difference], now
-        elif now - self._window > _WINDOW:
-            self._least, self._window = [difference, self._least[0]], now
+            self._quickest = Quickest(self._max_age)
         self._last, self._heard = header.sequence, now
-        self._least[0] = min(self._least[0], difference)
-        age = difference - min(self._least)
+        age = self._quickest.age(difference, header.time_ns, now)
         if age > self._max_age:
             return "stale"
         self.age = 1e-9 * age
@@ -139,6 +228,4 @@ class Gate:
         step = (header.sequence - self._last) & _MASK
         if step == 0 or step >= _HALF:
             return "order" if step else "duplicate"
-        # or it would make all that come after it look late; but when nothing else comes, it is the clock that was wrong
-        early = difference < min(self._least) - 10.0 * self._max_age
-        return "clock" if early and now - self._heard <= _BELIEVED_AFTER else ""
+        return "clock" if self._quickest.too_early(difference, header.time_ns, now) else ""
