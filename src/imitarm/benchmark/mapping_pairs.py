@@ -76,7 +76,8 @@ def _difference(comparison: Comparison, figure: Figure) -> tuple[str, str, str]:
     found = comparison.difference
     if not math.isfinite(found.mean):
         return "–", "–", f"0 of {found.of}"
-    low, mean, high = (figure.factor * v for v in (found.low, found.mean, found.high))
+    most = 1.0 if figure is STACKED else math.inf  # two rates are no farther apart
+    low, mean, high = (figure.factor * min(max(v, -most), most) for v in (found.low, found.mean, found.high))
     text = f"{mean:+.{figure.digits}f}"
     if high > low:  # when all persons differ by the same, as rates of 0 and 100 % do, it says nothing of others
         text += f" ({low:+.{figure.digits}f} to {high:+.{figure.digits}f})"

@@ -56,7 +56,7 @@ EFFORT = (
     Figure("path_length", "path [m]", digits=2),
     Figure("settling_time", "settled after [s]", digits=2),
     Figure("effort", "∫τ² [N²m²s]", digits=0),
-    Figure("gravity_effort", "of it weight", digits=0),
+    Figure("gravity_effort", "∫τ² of weight alone", digits=0),
     Figure("peak_torque_ratio", "peak over rated", digits=2),
 )
 SMOOTHNESS = (
@@ -78,7 +78,7 @@ _MEANS_NOTE = "Mean over persons (95 % interval)"
 _ACCURACY_NOTE = (
     "root mean squares. Executed: by an arm that keeps its limits, which a real one does. Led: share of the time."
 )
-_CAPTURED_NOTE = "One person's motion before two cameras: mean (each camera's). It has no interval: it is one person"
+_CAPTURED_NOTE = "One person's motion, so without an interval: mean (each of two cameras)"
 _ONE = -1  # person of the captured arm, whichever made-up body carries it: it is one and the same
 
 
