@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Self
 
 from imitarm.capture.native import UNFINISHED, header, line_of
 from imitarm.capture.skeleton import Skeleton
-from imitarm.errors import InputError
-
-PART = ".part"
-"""What is added to a file's name while it is being written."""
+from imitarm.part_file import PartFile
 
 
 class SkeletonRecorder:
@@ -38,23 +33,8 @@ class SkeletonRecorder:
 
     def __init__(self, path: str | Path, *, source: str = "", replace: bool = False) -> None:
         self.path, self.n_frames = Path(path), 0
-        self._part = self.path.with_name(self.path.name + PART)
-        if self.path.is_dir():
-            raise InputError(f"{path}: is a folder; name a file in it")
-        if self.path.exists() and not replace:
-            raise InputError(f"{path}: is there already; name another file, or say that it may be replaced")
-        try:
-            self._file: TextIOWrapper | None = self._part.open("x", encoding="utf-8", newline="\n")
-            self._file.write(header(source, UNFINISHED))
-            self._file.flush()
-        except FileExistsError as error:
-            raise InputError(
-                f"{self._part}: was left by a recording that was not closed, or is being written; read it and save it "
-                "under another name, or remove it"
-            ) from error
-        except OSError as error:
-            raise InputError(f"{self._part}: can't be written: {error.strerror or error}") from error
         self._source = source
+        self._file = PartFile(path, header(source, UNFINISHED), replace=replace)
 
     def write(self, skeleton: Skeleton) -> None:
         """Add a skeleton.
@@ -62,13 +42,7 @@ class SkeletonRecorder:
         Raises:
             InputError: when the recorder is closed, or the disk is full.
         """
-        if self._file is None:
-            raise InputError(f"{self.path}: this recorder is closed; make another one")
-        try:
-            self._file.write(line_of(skeleton))
-            self._file.flush()
-        except OSError as error:
-            raise InputError(f"{self._part}: can't be written: {error.strerror or error}") from error
+        self._file.write(line_of(skeleton))
         self.n_frames += 1
 
     def close(self) -> None:
@@ -79,21 +53,11 @@ class SkeletonRecorder:
         Raises:
             InputError: when that is not possible; what was written stays in ``PATH.part``.
         """
-        if self._file is None:
-            return
-        file, self._file = self._file, None
-        try:
-            with file:
-                file.seek(0)
-                file.write(header(self._source, str(self.n_frames)))
-                file.flush()
-                os.fsync(file.fileno())
-            if self.n_frames:
-                self._part.replace(self.path)
-            else:
-                self._part.unlink()
-        except OSError as error:
-            raise InputError(f"{self.path}: can't be written: {error.strerror or error}") from error
+        self._file.finish(self._take, begin=header(self._source, str(self.n_frames)))
+
+    def _take(self, part: Path) -> None:
+        if self.n_frames:
+            part.replace(self.path)
 
     def __enter__(self) -> Self:
         return self

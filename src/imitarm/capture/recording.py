@@ -10,9 +10,10 @@ import numpy as np
 
 from imitarm.capture import kinect_csv, mocap_tsv, native
 from imitarm.capture.finding import Finding
-from imitarm.capture.recorder import PART, SkeletonRecorder
+from imitarm.capture.recorder import SkeletonRecorder
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
 from imitarm.errors import InputError
+from imitarm.part_file import PART
 from imitarm.table import read_bytes
 
 

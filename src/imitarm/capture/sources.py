@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import cast
 
 from imitarm.capture.people import PersonFilter
-from imitarm.capture.recorder import PART
 from imitarm.capture.recording import read_recording
 from imitarm.capture.sides import SwapGuard
 from imitarm.capture.skeleton import SkeletonSource
 from imitarm.errors import InputError, UnknownNameError
+from imitarm.part_file import PART
 
 WORDS = {
     "FILE": "a recording: imitarm's own, a table of the Kinect SDK, or motion capture",

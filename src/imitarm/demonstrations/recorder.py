@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.part_file import PartFile
 from imitarm.trajectory import FORMAT, VERSION, Demonstration
 
 Array = NDArray[np.float64]
-
-PART = ".part"
-"""What is added to a file's name while it is being written."""
 
 
 class DemonstrationRecorder:
@@ -49,21 +44,8 @@ class DemonstrationRecorder:
     ) -> None:
         self.path, self.n_samples = Path(path), 0
         self._arm, self._task, self._source = arm, task, source
-        self._part = self.path.with_name(self.path.name + PART)
         self._time = -np.inf
-        if self.path.exists() and not replace:
-            raise InputError(f"{path}: is there already; name another file, or say that it may be replaced")
-        try:
-            self._file: TextIOWrapper | None = self._part.open("x", encoding="utf-8", newline="\n")
-            self._file.write(self._header())
-            self._file.flush()
-        except FileExistsError as error:
-            raise InputError(
-                f"{self._part}: was left by a recording that was not closed, or is being written; give it another "
-                "name to keep it, or remove it"
-            ) from error
-        except OSError as error:
-            raise InputError(f"{self._part}: can't be written: {error.strerror or error}") from error
+        self._file = PartFile(path, self._header(), replace=replace)
 
     def _header(self) -> str:
         remarks = {
@@ -87,17 +69,11 @@ class DemonstrationRecorder:
         Raises:
             InputError: when the recorder is closed, or the disk is full.
         """
-        if self._file is None:
-            raise InputError(f"{self.path}: this recorder is closed; make another one")
         if time <= self._time:
             return
         pose = self._arm.tool_pose(q)
         values = [time, *pose.position.tolist(), *pose.quaternion.tolist(), *q.tolist()]
-        try:
-            self._file.write(",".join(map(repr, values)) + "\n")
-            self._file.flush()
-        except OSError as error:
-            raise InputError(f"{self._part}: can't be written: {error.strerror or error}") from error
+        self._file.write(",".join(map(repr, values)) + "\n")
         self._time = time
         self.n_samples += 1
 
@@ -109,18 +85,11 @@ class DemonstrationRecorder:
         Raises:
             InputError: when that is not possible; what was written stays in ``PATH.part``.
         """
-        if self._file is None:
-            return
-        file, self._file = self._file, None
-        try:
-            with file:
-                file.flush()
-                os.fsync(file.fileno())
-            if self.n_samples >= 2:
-                replace(Demonstration.load(self._part), source=self._source).save(self.path)
-            self._part.unlink()
-        except OSError as error:
-            raise InputError(f"{self.path}: can't be written: {error.strerror or error}") from error
+        self._file.finish(self._take)
+
+    def _take(self, part: Path) -> None:
+        if self.n_samples >= 2:
+            replace(Demonstration.load(part), source=self._source).save(self.path)
 
     def __enter__(self) -> Self:
         return self
