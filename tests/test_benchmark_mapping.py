@@ -154,6 +154,8 @@ def test_a_method_that_stacks_more_often_is_named_also_when_chance_could_do_it()
     ((measure, better, difference),) = [row[1:4] for row in rivals_table(Results(results), []).rows]
     assert (measure, better) == ("stacked [%] ↑", "M3")
     assert difference.startswith("-2 (")
+    results = [live(method, p, 0, success=p > 0 or method == "m3") for method in ("modern", "m3") for p in range(2)]
+    assert rivals_table(Results(results), []).rows[0][3].startswith("-50 (-100 to ")  # rates are no farther apart
 
 
 def one_measure(name, mine, theirs):
