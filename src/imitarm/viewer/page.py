@@ -11,7 +11,7 @@ import base64
 import errno
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -121,6 +121,28 @@ def check_writable(path: str | Path) -> Path:
         raise InputError(f"report {target}: there is no folder {target.parent}; make it first")
     if not os.access(target.parent, os.W_OK):
         raise InputError(f"report {target}: the folder may not be written to; choose another one")
+    return target
+
+
+def draw_page(draw: Callable[[], str], path: str | Path) -> Path:
+    """Write a report as one HTML file that needs nothing else.
+
+    The place is looked at before anything is drawn. The page is written aside and renamed at the end, so an older
+    report stays whole when something goes wrong.
+
+    Args:
+        draw: returns the page.
+        path: the file to write; its folder must exist.
+
+    Returns:
+        Where it was written, absolute.
+
+    Raises:
+        InputError: when the folder is missing or can't be written, or the libraries that draw are not installed.
+        TaskFailedError: when the disk is full.
+    """
+    target = check_writable(path)
+    write_page(draw(), target)
     return target
 
 

@@ -13,31 +13,24 @@ from imitarm.viewer import palette
 from imitarm.viewer.background import WORDS, learning_section, provenance_section
 from imitarm.viewer.content import Report, SceneResult
 from imitarm.viewer.data import as_data
-from imitarm.viewer.page import check_writable, data_link, page_html, shared_players, write_page
+from imitarm.viewer.page import data_link, draw_page, page_html, shared_players
 from imitarm.viewer.scene3d import ComponentMark, PathMark, playback_html
 from imitarm.viewer.scene_sections import scenes_section
 from imitarm.viewer.sections import header, table_section
 
 
 def write_report(report: Report, path: str | Path) -> Path:
-    """Write a report as one HTML file that needs nothing else.
-
-    The page is written aside and renamed at the end, so an older report stays whole when something goes wrong.
+    """Write a report as one HTML file, by :func:`~imitarm.viewer.page.draw_page`, and return where it is.
 
     Args:
         report: what to tell.
         path: the file to write; its folder must exist.
 
-    Returns:
-        Where it was written, absolute.
-
     Raises:
-        InputError: when the folder is missing or can't be written, or the libraries that draw are not installed.
+        InputError: when it can't be written there, or the libraries that draw are not installed.
         TaskFailedError: when the disk is full.
     """
-    target = check_writable(path)
-    write_page(report_html(report), target)
-    return target
+    return draw_page(lambda: report_html(report), path)
 
 
 def report_html(report: Report) -> str:

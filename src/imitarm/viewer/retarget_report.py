@@ -14,7 +14,7 @@ from imitarm.viewer import palette, retarget_charts
 from imitarm.viewer.background import provenance_section
 from imitarm.viewer.data import plain
 from imitarm.viewer.markup import figure, number
-from imitarm.viewer.page import check_writable, data_link, page_html, shared_players, write_page
+from imitarm.viewer.page import data_link, draw_page, page_html, shared_players
 from imitarm.viewer.panels import Key, Panel, heading, player_card, tabbed
 from imitarm.viewer.person import PersonMark
 from imitarm.viewer.retarget_content import Measure, MethodResult, PlainTable, RetargetReport
@@ -45,24 +45,17 @@ _WORDS: Final = {
 
 
 def write_retarget_report(report: RetargetReport, path: str | Path) -> Path:
-    """Write a report of retargetings as one HTML file that needs nothing else.
-
-    The page is written aside and renamed at the end, so an older report stays whole when something goes wrong.
+    """Write a report of retargetings as one HTML file, by :func:`~imitarm.viewer.page.draw_page`, and return where it is.
 
     Args:
         report: what to tell.
         path: the file to write; its folder must exist.
 
-    Returns:
-        Where it was written, absolute.
-
     Raises:
-        InputError: when the folder is missing or can't be written, or the libraries that draw are not installed.
+        InputError: when it can't be written there, or the libraries that draw are not installed.
         TaskFailedError: when the disk is full.
     """
-    target = check_writable(path)
-    write_page(retarget_report_html(report), target)
-    return target
+    return draw_page(lambda: retarget_report_html(report), path)
 
 
 def retarget_report_html(report: RetargetReport) -> str:
