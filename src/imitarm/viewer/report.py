@@ -20,7 +20,7 @@ from imitarm.viewer.sections import header, table_section
 
 
 def write_report(report: Report, path: str | Path) -> Path:
-    """Write a report as one HTML file, by :func:`~imitarm.viewer.page.draw_page`, and return where it is.
+    """Write a report by :func:`~imitarm.viewer.page.draw_page` and return where it is.
 
     Args:
         report: what to tell.

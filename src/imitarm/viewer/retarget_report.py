@@ -45,7 +45,7 @@ _WORDS: Final = {
 
 
 def write_retarget_report(report: RetargetReport, path: str | Path) -> Path:
-    """Write a report of retargetings as one HTML file, by :func:`~imitarm.viewer.page.draw_page`, and return where it is.
+    """Write a report of retargetings by :func:`~imitarm.viewer.page.draw_page` and return where it is.
 
     Args:
         report: what to tell.
