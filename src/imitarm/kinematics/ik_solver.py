@@ -22,7 +22,6 @@ Array = NDArray[np.float64]
 Rows = tuple[ArrayLike, ArrayLike]
 Bounds = tuple[Array, Array]
 
-_WEIGHTS = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
 _MAX_SPEED = {"dls": 0.6, "qp": 2.0, "svd": 0.6}  # [m/s] clamp of the weighted twist
 _BENT = 0.1  # squared sine of the angle at the elbow below which its swing fades
 _QUICK = 0.5  # share of what the joints can change in a step by which the swing's speed may change
@@ -95,6 +94,8 @@ class IKSolver:
         small_angle: ``"thesis"`` subtracts half the least singular value from d in ``"dls"`` (METHODS A.8).
         singularity_bounds: keep the elbow 0.15 rad off its stretched position, always, and (``"qp"`` only) the
             wrist 0.1 rad off its singular ones, where the task can spare it (METHODS A.8).
+        turn_length: what one radian counts as, beside a metre, where the joints can't do all of the twist [m]; less
+            lets the tool's turn go sooner, more its way.
 
     Raises:
         UnknownNameError: when method, frame or small_angle is not known.
@@ -112,6 +113,7 @@ class IKSolver:
         max_speed: float | None = None,
         small_angle: str | None = None,
         singularity_bounds: bool = False,
+        turn_length: float = ANGLE_LENGTH,
     ) -> None:
         if method not in METHODS:
             raise UnknownNameError.among("IK method", method, METHODS)
@@ -123,14 +125,17 @@ class IKSolver:
             raise InputError(
                 f"solve_ik: posture_gain must be finite and max_speed not negative, got {posture_gain} and {max_speed}"
             )
+        if not 0.0 < turn_length < math.inf:
+            raise InputError(f"solve_ik: turn_length must be a positive length [m], got {turn_length}")
         self.arm, self.method = arm, method
+        self._weights = np.array([1.0, 1.0, 1.0, turn_length, turn_length, turn_length])
         self._solve = METHODS[method]
         self._site = arm.site(frame)
         self._max_speed = _MAX_SPEED[method] if max_speed is None else max_speed
         self._most = self._max_speed * self._max_speed
         # rows weighted; for "dls" the columns too, whose joints are counted in shares of their velocity limit
         joints = arm.max_velocity if method == "dls" else np.ones(arm.n_joints)
-        self._scale = np.outer(_WEIGHTS, joints)
+        self._scale = np.outer(self._weights, joints)
         self._posture_gain, self._small_angle, self._max_velocity = posture_gain, small_angle, arm.max_velocity
         self._box = VelocityBox(arm, dt, singularity_bounds=singularity_bounds)
         self._wrist = WristBound(arm, dt) if singularity_bounds and method == "qp" else None
@@ -162,7 +167,7 @@ class IKSolver:
         task = self.task(q, twist, velocity=velocity, q_ref=q_ref, rows=rows, sew=sew)
         result = self._solve(task)
         moved = self.arm.at(q).site_jacobian(self._site) @ result
-        error = task.twist[:6] / _WEIGHTS - moved
+        error = task.twist[:6] / self._weights - moved
         near = 1e-9 * task.max_velocity
         limited = (result >= task.upper - near) | (result <= task.lower + near)
         slack = np.zeros(0) if task.rows is None else np.maximum(0.0, task.rows[1] - task.rows[0] @ result)
@@ -182,7 +187,7 @@ class IKSolver:
         wanted = np.asarray(twist, dtype=float)
         if wanted.shape != (6,):
             raise InputError(f"solve_ik: twist must be 6 finite numbers (linear, angular), got {twist!r}")
-        wanted = wanted * _WEIGHTS
+        wanted = wanted * self._weights
         square = float(wanted.dot(wanted))
         if not math.isfinite(square):
             raise InputError(f"solve_ik: twist must be 6 finite numbers (linear, angular), got {twist!r}")

@@ -30,10 +30,11 @@ COAST, HOLD = 0.1, 0.3  # [s] without a sight of the arm: until then the motion 
 _FADE = 0.05  # [s] time constant of the fading motion
 _PUSHED = 0.05  # [rad] an arm found farther than this from its command was moved by somebody
 _BETWEEN = 0.07  # [s] cameras leave out a frame now and then
-_SWING_GAIN, _SWING_RATE = 5.0, 1.0  # [1/s], [rad/s] of the elbow
+_SWING_GAIN, _SWING_RATE = 2.5, 1.0  # [1/s], [rad/s] of the elbow
 _BEHIND = 0.01  # [m] a tool that is farther than this from its target lets the elbow be, 1 rad counting as 0.3 m
 _BENT = 0.1  # squared sine of the angle at the person's elbow below which its swing tells less and less
 _BRAKING = 1.5  # [m/s^2] the tool can nearly always brake so hard, 1 rad counting as 0.3 m
+_TURN_SEEN = 0.1  # [m] what a radian of a turn that a camera saw counts as, beside a metre
 _HELD = 0.02  # [rad] a joint that is farther than this behind its command is held up by something
 _METRES = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
 _STILL = 1e-3  # [rad/s] slower is at rest
@@ -68,10 +69,13 @@ class ModernRetargeter(Retargeter):
         scene: obstacles to keep clear of.
         gain: K [1/s].
         lead: share of the hand's velocity that is fed forward, 0 to 1.
+        turn_length: what one radian of the tool's turn counts as, beside a metre of its way, where the joints can't do
+            both [m]; None: 0.3 where the tool is to stay as it is turned, and 0.1 where it turns with the hand, since
+            a camera sees where a hand is much better than how it is turned.
         elbow: weight of the elbow's swing beside the tool [m^2]; 0: the elbow is free.
         clearance: to keep from the scene [m].
         own_clearance: of links from each other [m]; None: not watched.
-        max_speed: the twist is cut to this [m/s], 1 rad counting as 0.3 m.
+        max_speed: the twist is cut to this [m/s], 1 rad counting as ``turn_length``.
         max_lead: how far a joint's command may lead its measured position [rad]; a robot that answers late needs more.
 
     Raises:
@@ -89,6 +93,7 @@ class ModernRetargeter(Retargeter):
         scene: Scene | None = None,
         gain: float = 15.0,
         lead: float = 0.9,
+        turn_length: float | None = None,
         elbow: float = 0.1,
         clearance: float = 0.01,
         own_clearance: float | None = 0.02,
@@ -102,7 +107,10 @@ class ModernRetargeter(Retargeter):
         self._gain, self._lead = gain, lead
         self._clearance = clearance
         known = arm.landmarks is not None  # else neither its elbow's angle nor its singularities are
-        self._solver = IKSolver(arm, dt=dt, max_speed=max_speed, singularity_bounds=known)
+        if turn_length is None:
+            fixed = correspondence is not None and correspondence.orientation == "fixed"
+            turn_length = ANGLE_LENGTH if fixed else _TURN_SEEN
+        self._solver = IKSolver(arm, dt=dt, max_speed=max_speed, singularity_bounds=known, turn_length=turn_length)
         self._elbow = elbow if known else 0.0
         self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).watch(dt)
         self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
