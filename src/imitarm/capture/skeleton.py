@@ -110,7 +110,7 @@ class Arm:
     @property
     def seen(self) -> bool:
         """Whether shoulder, elbow and wrist all have a position."""
-        return bool(self.confidence[:3].min() > 0.0)
+        return min(self.confidence.tolist()[:3]) > 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +189,10 @@ class Skeleton:
             raise UnknownNameError.among("side", side, SIDES)
         index = _ARM_INDEX[side]
         return Arm(
-            self.time, self.positions[index], CONFIDENCE[self.tracking[index]], self.hand_states[SIDES.index(side)]
+            self.time,
+            self.positions.take(index, axis=0),  # a third of the time that [index] takes
+            CONFIDENCE.take(self.tracking.take(index)),
+            self.hand_states[SIDES.index(side)],
         )
 
 

@@ -23,6 +23,7 @@ _SLACK = 1e-6  # reciprocal weight of a violated extra row
 _SOFT = 8  # daqp's mark of a constraint that may be violated at a price
 _CLEAR = 1e-3  # squared singular values above this can be factored without losing half of the digits
 _EYE = np.eye(6)
+_NOTHING = np.zeros(0)
 
 
 class Task(NamedTuple):
@@ -70,14 +71,10 @@ def _least_cost(task: Task, hessian: Array, linear: Array) -> Array:
     if free is not None:
         return free
     n = len(linear)
-    matrix, lower, upper = _no_rows(n), task.lower.copy(), task.upper.copy()  # it takes none that is read-only
-    sense = np.zeros(n, dtype=np.intc)
-    if task.rows is not None:
-        matrix, least = task.rows
-        upper = np.concatenate((upper, np.full(len(least), 1e30)))
-        lower = np.concatenate((lower, least))
-        sense = np.zeros(n + len(least), dtype=np.intc)
-        sense[n:] = _SOFT
+    matrix, least = (_no_rows(n), _NOTHING) if task.rows is None else task.rows
+    lower, upper = np.empty(n + len(least)), np.empty(n + len(least))  # it takes none that is read-only
+    lower[:n], lower[n:], upper[:n], upper[n:] = task.lower, least, task.upper, 1e30
+    sense = _senses(n, len(least)).copy()
     velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, sense, rho_soft=_SLACK)
     if status <= 0:
         # the box is never empty and rows are soft: only lost digits can bring us here, and standing is safe
@@ -108,6 +105,11 @@ def _scaled_eye(n: int, factor: float) -> Array:
 @cache
 def _no_rows(n: int) -> Array:
     return np.empty((0, n))
+
+
+@cache
+def _senses(n: int, n_rows: int) -> NDArray[np.intc]:
+    return np.array([0] * n + [_SOFT] * n_rows, dtype=np.intc)
 
 
 def damped_least_squares(task: Task) -> Array:

@@ -131,6 +131,7 @@ class IKSolver:
         self._weights = np.array([1.0, 1.0, 1.0, turn_length, turn_length, turn_length])
         self._solve = METHODS[method]
         self._site = arm.site(frame)
+        self._arm_sites = np.array([] if arm.landmarks is None else arm.marked().sites, dtype=np.intp)
         self._max_speed = _MAX_SPEED[method] if max_speed is None else max_speed
         self._most = self._max_speed * self._max_speed
         # rows weighted; for "dls" the columns too, whose joints are counted in shares of their velocity limit
@@ -230,7 +231,7 @@ class IKSolver:
             raise InputError(f"solve_ik: method {self.method!r} can't lead the elbow; use method='qp'")
         if not (math.isfinite(angle) and weight >= 0.0 and confidence >= 0.0 and gain >= 0.0 and max_rate >= 0.0):
             raise InputError(f"solve_ik: sew needs a finite angle and numbers that are not negative, got {sew!r}")
-        shoulder, elbow, wrist = (memory.sites[site].tolist() for site in self.arm.marked().sites)
+        shoulder, elbow, wrist = memory.sites.take(self._arm_sites, axis=0).tolist()
         now = one_angle(shoulder, elbow, wrist, convention)
         if now is None:
             return jacobian, wanted
@@ -244,13 +245,14 @@ class IKSolver:
         speed = share * (min(max(rate, -max_rate), max_rate) - float(share_of_tool.dot(wanted))) / turns
         if previous is not None:
             before = float(direction.dot(previous))
-            half = 0.5 * (bounds[1] - bounds[0])
-            change = _QUICK * float((half / np.maximum(np.abs(direction), 1e-9)).min())
+            along = zip((bounds[1] - bounds[0]).tolist(), direction.tolist(), strict=True)
+            change = 0.5 * _QUICK * min([width / max(abs(share), 1e-9) for width, share in along])
             speed = min(max(speed, before - change), before + change)
         root = math.sqrt(weight)
         extended, target = np.empty((7, len(direction))), np.empty(7)
-        extended[:6], target[:6] = jacobian, wanted
-        extended[6], target[6] = root * direction, root * speed
+        extended[:6], extended[6] = jacobian, direction
+        extended[6] *= root
+        target[:6], target[6] = wanted, root * speed
         return extended, target
 
     def _joints(self, values: ArrayLike, what: str) -> Array:
@@ -267,6 +269,6 @@ class IKSolver:
         matrix, lower = (np.asarray(part, dtype=float) for part in rows)
         if lower.ndim != 1 or matrix.shape != (len(lower), n):
             raise InputError(f"solve_ik: rows need shapes (m, {n}) and (m,), got {matrix.shape}, {lower.shape}")
-        if not math.isfinite(float(matrix.sum() + lower.sum())):
+        if not math.isfinite(float(np.vdot(matrix, matrix)) + sum(lower.tolist())):
             raise InputError("solve_ik: rows must be finite numbers")
         return matrix, lower

@@ -294,5 +294,11 @@ class Pose:
 
         Linear part ``p_target - p`` [m], angular part ``log(R_target R^T)`` [rad] (METHODS A.3).
         """
-        turn = quaternion_multiply(target.quaternion, quaternion_conjugate(self.quaternion))
-        return np.concatenate([target.position - self.position, quaternion_log(turn)])
+        (a, b, c, d), (w, x, y, z) = target.quaternion.tolist(), self.quaternion.tolist()
+        real = a * w + b * x + c * y + d * z
+        u, v, r = b * w - a * x + d * y - c * z, c * w - a * y + b * z - d * x, d * w - a * z + c * x - b * y
+        sine = math.sqrt(u * u + v * v + r * r)
+        share = 2.0 * math.atan2(sine, abs(real)) / sine if sine > _SMALL_ANGLE else 2.0
+        share = share if real >= 0.0 else -share
+        (px, py, pz), (qx, qy, qz) = target.position.tolist(), self.position.tolist()
+        return np.array([px - qx, py - qy, pz - qz, share * u, share * v, share * r])

@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 
 
 FARTHEST = 0.2  # [m] no camera's guess is farther off: an offset beyond was a motion
+_NONE = [0.0, 0.0, 0.0]  # the offset of a joint that was never hidden
 _AGAIN = 0.12  # [s] a joint that is seen, or guessed, again so soon has the offset that it had then
 
 
@@ -55,9 +56,10 @@ class Anchoring:
         """Forget the past."""
         self._clock = 0.0
         self._confidence: list[float] = []
-        self._measured: Array = np.zeros((0, 3))
-        self._offsets: Array | None = None
-        self._kept: dict[tuple[int, float], tuple[float, Array]] = {}  # of joint and confidence: when, and its offset
+        self._measured: list[list[float]] = []
+        self._offsets: list[list[float]] | None = None
+        # of joint and confidence: when, and its offset
+        self._kept: dict[tuple[int, float], tuple[float, list[float]]] = {}
 
     def anchor(self, points: Array, confidence: list[float], velocity: Array, period: float) -> Array:
         """Return where the joints are taken to be, shape (k, 3) [m].
@@ -69,31 +71,31 @@ class Anchoring:
             period: since the call before [s].
         """
         before, self._confidence = self._confidence, confidence
-        measured, self._measured = self._measured, points
+        last, self._measured = self._measured, points.tolist()
         if not before:
             return points
         self._clock += period
         if self._offsets is None and confidence == before:  # nothing was ever hidden
             return points
-        was = np.zeros_like(points) if self._offsets is None else self._offsets
-        steps = points - measured
-        ways = np.sqrt((steps * steps).sum(axis=1)).tolist()
-        offsets = np.empty_like(points)
-        for i, (now, then, way) in enumerate(zip(confidence, before, ways, strict=True)):
+        was = [_NONE] * len(before) if self._offsets is None else self._offsets
+        offsets = list(was)
+        for i, (now, then) in enumerate(zip(confidence, before, strict=True)):
+            x, o = self._measured[i], was[i]
             if now != then:
-                self._kept[i, then] = self._clock, was[i]
-                offsets[i] = self._anchored(i, now, was[i] - steps[i] + period * velocity[i])
-            elif now >= 1.0:
-                offsets[i] = was[i] * math.exp(-period / self._time - way / self._way)
-            else:
-                offsets[i] = was[i]
+                self._kept[i, then] = self._clock, o
+                by_axis = zip(o, last[i], x, velocity[i].tolist(), strict=True)
+                going_on = [a + b + period * v - c for a, b, c, v in by_axis]
+                offsets[i] = self._anchored(i, now, going_on)
+            elif now >= 1.0 and o is not _NONE:
+                left = math.exp(-period / self._time - math.dist(x, last[i]) / self._way)
+                offsets[i] = [left * a for a in o]
         self._offsets = offsets
-        return points + offsets
+        return points + np.array(offsets)
 
-    def _anchored(self, joint: int, confidence: float, going_on: Array) -> Array:
+    def _anchored(self, joint: int, confidence: float, going_on: list[float]) -> list[float]:
         """Return the offset of a joint whose tracking has changed: the one it had a moment ago, or a new one."""
         when, offset = self._kept.get((joint, confidence), (-math.inf, going_on))
         if self._clock - when > _AGAIN:
             offset = going_on
-        length = math.sqrt(float(offset.dot(offset)))
-        return offset if length <= FARTHEST else offset * (FARTHEST / length)
+        length = math.hypot(*offset)
+        return offset if length <= FARTHEST else [a * (FARTHEST / length) for a in offset]

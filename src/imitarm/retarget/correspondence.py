@@ -91,9 +91,9 @@ class Clutch:
         kind = self.correspondence.orientation
         if kind == "fixed":
             return Pose.trusted(position, self.home.quaternion)
+        if kind == "upright":
+            return Pose.trusted(position, _about_vertical(hand, self.hand, self.home.quaternion))
         turn = quaternion_multiply(hand, self.hand * _CONJUGATE)
-        if kind == "upright":  # twist of the swing-twist decomposition about the vertical
-            turn = _about_vertical(turn)
         quaternion = quaternion_multiply(turn, self.home.quaternion)
         return Pose.trusted(position, quaternion / math.sqrt(float(quaternion.dot(quaternion))))
 
@@ -101,10 +101,15 @@ class Clutch:
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
-def _about_vertical(turn: Array) -> Array:
-    """Return the part of a rotation (4,) that turns about the base's z."""
-    w, z = float(turn[0]), float(turn[3])
-    length = math.hypot(w, z)
+def _about_vertical(hand: Array, before: Array, home: Array) -> Array:
+    """Return ``home`` turned as the hand has turned about the base's z since ``before``; all are quaternions (4,).
+
+    That is the twist of the swing-twist decomposition; in plain floats, since only two of the turn's numbers count.
+    """
+    (a, b, c, d), (e, f, g, h), (w, x, y, z) = hand.tolist(), before.tolist(), home.tolist()
+    real, up = a * e + b * f + c * g + d * h, d * e - a * h + c * f - b * g
+    length = math.sqrt(real * real + up * up)
     if length < 1e-9:  # upside down: no turn about the vertical is nearer than another
-        return np.array([1.0, 0.0, 0.0, 0.0])
-    return np.array([w / length, 0.0, 0.0, z / length])
+        return home
+    real, up = real / length, up / length
+    return np.array([real * w - up * z, real * x - up * y, real * y + up * x, real * z + up * w])

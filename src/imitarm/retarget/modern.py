@@ -183,12 +183,13 @@ class ModernRetargeter(Retargeter):
         """Return where the tool should be now, and the twist (6,) with which that moves."""
         clutch = self._engagement.clutch
         assert clutch is not None
-        left = math.exp(-self._silence / _FADE)
-        seconds = _FADE * (1.0 - left)
-        wrist = estimate.wrist + seconds * estimate.velocity
-        hand = estimate.hand
-        if self.correspondence.orientation != "fixed":
-            hand = quaternion_multiply(quaternion_exp(seconds * estimate.angular_velocity), hand)
+        wrist, hand, left = estimate.wrist, estimate.hand, 1.0
+        if self._silence > 0.0:
+            left = math.exp(-self._silence / _FADE)
+            seconds = _FADE * (1.0 - left)
+            wrist = wrist + seconds * estimate.velocity
+            if self.correspondence.orientation != "fixed":
+                hand = quaternion_multiply(quaternion_exp(seconds * estimate.angular_velocity), hand)
         ahead = np.zeros(6)
         ahead[:3] = (self._lead * left * self.correspondence.scale) * estimate.velocity
         return clutch.target(wrist, hand), ahead
@@ -212,13 +213,14 @@ class ModernRetargeter(Retargeter):
     def _reach(self, target: Pose, ahead: Array, elbow: ElbowTask | None, measured: Array) -> None:
         """Move the reference towards a target; not on against what holds the arm up."""
         error = self.arm.tool_pose(self._q).error_to(target)
-        weighted = math.sqrt(float(error[:3].dot(error[:3])) + ANGLE_LENGTH**2 * float(error[3:].dot(error[3:])))
+        x, y, z, u, v, w = error.tolist()
+        weighted = math.hypot(x, y, z, ANGLE_LENGTH * u, ANGLE_LENGTH * v, ANGLE_LENGTH * w)
         # far away it goes no faster than it can brake again, or it would swing about the target
         gain = min(self._gain, math.sqrt(2.0 * _BRAKING / max(weighted, 1e-9)))
         if elbow is not None:  # a tool that is behind needs all the joints
             elbow = elbow._replace(confidence=elbow.confidence / (1.0 + (weighted / _BEHIND) ** 2))
         twist = gain * error + ahead
-        held = float(np.abs(self._limiter.q - measured).max())
+        held = max(map(abs, (self._limiter.q - measured).tolist()))
         if held > _HELD:
             twist = self._yielding(twist, measured, min((held - _HELD) / _HELD, 1.0))
         self._drive(twist, elbow)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from operator import sub
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,9 @@ class OneEuro:
     def reset(self) -> None:
         """Forget the past."""
         self._time = -math.inf
-        self._raw: Array = np.zeros(0)
+        self._last: list[list[float]] = []  # the vectors as they were measured, smoothed, and their velocities
+        self._smooth: list[list[float]] = []
+        self._speed: list[list[float]] = []
         self.value: Array = np.zeros(0)
         self.velocity: Array = np.zeros(0)
 
@@ -68,30 +71,49 @@ class OneEuro:
             confidence: 0 to 1; for several vectors one number or shape (k, 1).
         """
         period = time - self._time
-        if period > GAP:
-            self._time, self.value = time, np.array(x, dtype=float)
-            self._raw, self.velocity = self.value, np.zeros_like(self.value)
-            return self.value
         if period <= 0.0:
             return self.value
+        several = x.ndim == 2
+        measured: list[list[float]] = x.tolist() if several else [x.tolist()]
         self._time = time
-        share = confidence * smoothing_share(self.derivative_cutoff, period)
-        self.velocity = self.velocity + share * (self._difference(x, self._raw) / period - self.velocity)
-        self._raw = np.array(x, dtype=float)
-        speed = np.sqrt(np.einsum("...i,...i->...", self.velocity, self.velocity))[..., None]
-        share = confidence * smoothing_share(self.min_cutoff + self.beta * speed, period)
-        self.value = self._moved(share * self._difference(x, self.value))
+        if period > GAP:
+            self._begin(measured)
+        else:
+            trust = confidence.ravel().tolist() if isinstance(confidence, np.ndarray) else [confidence] * len(measured)
+            self._go_on(measured, trust, period)
+        self._last = measured
+        self.value = np.array(self._smooth if several else self._smooth[0])
+        self.velocity = np.array(self._speed if several else self._speed[0])
         return self.value
 
-    def _difference(self, x: Array, before: Array) -> Array:
-        return x - before
+    def _begin(self, measured: list[list[float]]) -> None:
+        self._smooth, self._speed = measured, [[0.0] * len(x) for x in measured]
 
-    def _moved(self, step: Array) -> Array:
-        return self.value + step
+    def _go_on(self, measured: list[list[float]], trust: list[float], period: float) -> None:
+        """Filter by one period; in plain floats, which for a few short vectors take half of NumPy's time."""
+        steady = smoothing_share(self.derivative_cutoff, period)
+        smooth, speeds = [], []
+        for x, last, value, velocity, c in zip(measured, self._last, self._smooth, self._speed, trust, strict=True):
+            share = c * steady
+            per_second = share / period
+            kept = 1.0 - share
+            speed = [kept * v + per_second * d for v, d in zip(velocity, self._difference(x, last))]  # noqa: B905
+            cutoff = self.min_cutoff + self.beta * math.hypot(*speed)
+            smooth.append(self._moved(value, self._difference(x, value), c * smoothing_share(cutoff, period)))
+            speeds.append(speed)
+        self._smooth, self._speed = smooth, speeds
+
+    def _difference(self, x: list[float], before: list[float]) -> list[float]:
+        return list(map(sub, x, before))
+
+    def _moved(self, value: list[float], way: list[float], share: float) -> list[float]:
+        return [a + share * d for a, d in zip(value, way)]  # noqa: B905
 
 
 class OneEuroRotation(OneEuro):
     """The One-Euro filter of a rotation (quaternion w x y z): steps and speed are rotation vectors in the base frame.
+
+    Its ``filter`` takes a unit quaternion, shape (4,), and returns the smoothed one; ``velocity`` is (3,) [rad/s].
 
     Args:
         min_cutoff: cut-off at rest [Hz].
@@ -102,29 +124,24 @@ class OneEuroRotation(OneEuro):
     def __init__(self, min_cutoff: float = 1.0, beta: float = 1.0, derivative_cutoff: float = 1.0) -> None:
         super().__init__(min_cutoff, beta, derivative_cutoff)
 
-    def filter(self, time: float, x: Array, confidence: float | Array = 1.0) -> Array:
-        """Take in a measured unit quaternion (4,) and return the smoothed one; ``velocity`` is (3,) [rad/s]."""
-        if time - self._time > GAP:
-            super().filter(time, x)
-            self.velocity = np.zeros(3)
-            return self.value
-        return super().filter(time, x, confidence)
+    def _begin(self, measured: list[list[float]]) -> None:
+        self._smooth, self._speed = measured, [[0.0, 0.0, 0.0]]
 
-    def _difference(self, x: Array, before: Array) -> Array:
-        """Return log(x before^-1); in plain floats, which for four numbers takes a quarter of NumPy's time."""
-        (a, b, c, d), (w, i, j, k) = x.tolist(), before.tolist()
+    def _difference(self, x: list[float], before: list[float]) -> list[float]:
+        """Return log(x before^-1)."""
+        (a, b, c, d), (w, i, j, k) = x, before
         real = a * w + b * i + c * j + d * k
         u, v, z = b * w - a * i - c * k + d * j, c * w - a * j - d * i + b * k, d * w - a * k - b * j + c * i
         sine = math.sqrt(u * u + v * v + z * z)
         share = 2.0 * math.atan2(sine, abs(real)) / sine if sine > _SMALL else 2.0
         share = share if real >= 0.0 else -share
-        return np.array([share * u, share * v, share * z])
+        return [share * u, share * v, share * z]
 
-    def _moved(self, step: Array) -> Array:
-        """Return exp(step) value, of length one."""
-        (x, y, z), (w, i, j, k) = step.tolist(), self.value.tolist()
-        half = 0.5 * math.sqrt(x * x + y * y + z * z)
-        share = 0.5 * math.sin(half) / half if half > _SMALL else 0.5
+    def _moved(self, value: list[float], way: list[float], share: float) -> list[float]:
+        """Return exp(share way) value, of length one."""
+        (x, y, z), (w, i, j, k) = way, value
+        half = 0.5 * share * math.sqrt(x * x + y * y + z * z)
+        share *= 0.5 * math.sin(half) / half if half > _SMALL else 0.5
         a, b, c, d = math.cos(half), share * x, share * y, share * z
         w, i, j, k = (
             a * w - b * i - c * j - d * k,
@@ -133,7 +150,7 @@ class OneEuroRotation(OneEuro):
             a * k + b * j - c * i + d * w,
         )
         length = math.sqrt(w * w + i * i + j * j + k * k)
-        return np.array([w / length, i / length, j / length, k / length])
+        return [w / length, i / length, j / length, k / length]
 
 
 class Hampel:
