@@ -127,7 +127,12 @@ class Retargeter(ABC):
         for skeleton in ticks(frames, self.dt):
             self.step(skeleton, commands[-1].q)
             commands.append(self.command)
-        return Retargeting.of(self, commands)
+        return Retargeting.of(self, commands, self.notes)
+
+    @property
+    def notes(self) -> dict[str, float]:
+        """What there is to count so far, by name; a method without anything to count has none."""
+        return {}
 
 
 @dataclass(frozen=True, eq=False)

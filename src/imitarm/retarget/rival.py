@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +14,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
 from imitarm.retarget.correspondence import Clutch, Correspondence
 from imitarm.retarget.engagement import Engagement
-from imitarm.retarget.retargeter import Command, Retargeter, Retargeting, in_order, ticks
+from imitarm.retarget.retargeter import Command, Retargeter
 from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -104,24 +103,6 @@ class RivalRetargeter(Retargeter):
         velocity = (self._q - before) / self.dt
         self.command = Command(self.command.time + self.dt, self._q, velocity, closed, state, target, elbow)
         return self._q
-
-    def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
-        """Retarget a whole recording step by step, with ``notes``.
-
-        Args:
-            skeletons: in the order of their times.
-            q: where the arm is at first, shape (n_joints,) [rad]; None: ``arm.home``.
-
-        Raises:
-            InputError: when there are fewer than two skeletons, or times do not increase.
-        """
-        frames = in_order(skeletons)
-        self.start(self.arm.home if q is None else q)
-        commands = [self.command]
-        for skeleton in ticks(frames, self.dt):
-            self.step(skeleton, commands[-1].q)
-            commands.append(self.command)
-        return Retargeting.of(self, commands, self.notes)
 
     @property
     def notes(self) -> dict[str, float]:

@@ -1,0 +1,46 @@
+"""What an IKSolver is told once: how much a turn counts beside a way."""
+
+import numpy as np
+import pytest
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik_solver import IKSolver
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return ArmModel.load("sawyer", tool="gripper")
+
+
+def test_where_the_joints_cannot_do_both_the_turn_goes_the_sooner_the_less_it_counts(arm):
+    """From rest, no joint can be quick at once: what of the way and of the turn is done then depends on the weight."""
+    rng = np.random.default_rng(0)
+    missed: dict[float, list[tuple[float, float]]] = {0.1: [], 0.3: [], 1.0: []}
+    for _ in range(40):
+        q = arm.home + 0.3 * rng.normal(size=arm.n_joints)
+        twist = np.concatenate([rng.normal(size=3), 3.0 * rng.normal(size=3)])
+        for length, errors in missed.items():
+            solver = IKSolver(arm, turn_length=length, max_speed=100.0)
+            error = solver.step(q, twist, velocity=np.zeros(arm.n_joints)).error
+            errors.append((float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))))
+    ways, turns = zip(*(np.mean(errors, axis=0) for errors in missed.values()), strict=True)
+    assert ways[0] < ways[1] < ways[2]
+    assert turns[0] > turns[1] > turns[2]
+
+
+def test_where_no_limit_is_near_it_changes_nothing(arm):
+    """But for the effort that joints are spared, a hundredth."""
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        q = arm.home + 0.2 * rng.normal(size=arm.n_joints)
+        twist = 0.05 * rng.normal(size=6)
+        for length in (0.1, 0.3, 1.0):
+            error = IKSolver(arm, turn_length=length).step(q, twist).error
+            np.testing.assert_allclose(error, 0.0, atol=1e-2 * np.linalg.norm(twist))
+
+
+@pytest.mark.parametrize("length", [0.0, -0.1, np.nan, np.inf])
+def test_a_length_that_can_not_weigh_is_refused(arm, length):
+    with pytest.raises(InputError, match="turn_length"):
+        IKSolver(arm, turn_length=length)
