@@ -66,3 +66,10 @@ def test_the_tool_is_where_it_was_when_the_clutch_engages_and_stays_engaged_unti
     assert engagement.update(replace(STILL, time=50.0), TOOL) is clutch
     engagement.release()
     assert engagement.update(replace(STILL, time=50.1), TOOL) is None
+
+
+def test_while_the_robot_can_not_be_taken_hold_of_the_time_is_counted_all_the_same():
+    engagement = Engagement(Correspondence())
+    for t in np.arange(0.0, 1.0, 1 / 30):
+        assert engagement.update(replace(STILL, time=float(t)), None) is None
+    assert engagement.update(replace(STILL, time=1.0), TOOL) is not None

@@ -28,18 +28,19 @@ class Engagement:
         self.clutch: Clutch | None = None
         self._since = self._last = math.inf
 
-    def update(self, estimate: ArmEstimate | None, tool_to_base: Pose) -> Clutch | None:
+    def update(self, estimate: ArmEstimate | None, tool_to_base: Pose | None) -> Clutch | None:
         """Take in what became of a frame, and return the clutch, engaged or None.
 
         Args:
             estimate: of the person's arm; None when the frame did not show it.
-            tool_to_base: where the robot's tool is now.
+            tool_to_base: where the robot's tool is now; None while the robot can't be taken hold of, then only how long
+                the arm has been seen is counted.
         """
         if estimate is None or self.clutch is not None:
             return self.clutch
         if not 0.0 <= estimate.time - self._last <= LOST_AFTER:
             self._since = estimate.time
         self._last = estimate.time
-        if estimate.time - self._since >= SEEN_FOR:
+        if tool_to_base is not None and estimate.time - self._since >= SEEN_FOR:
             self.clutch = self._correspondence.engage(estimate.wrist, estimate.hand, tool_to_base)
         return self.clutch

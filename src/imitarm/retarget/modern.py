@@ -140,7 +140,7 @@ class ModernRetargeter(Retargeter):
             self._reach(target, ahead, self._elbow_task(self._estimate), measured)
         else:
             self._offset = None
-            self._drive(np.zeros(6), None)
+            self._drive(np.zeros(6), None, led=False)
         reached = self._limiter.follow(self._q, self._velocity, measured)
         elbow = None if target is None or self._estimate is None else self._estimate.upper_arm
         time, velocity = self.command.time + self.dt, self._limiter.velocity
@@ -161,12 +161,14 @@ class ModernRetargeter(Retargeter):
             if self._silence <= HOLD:
                 return "following" if self._silence <= _BETWEEN else "coasting" if self._silence <= COAST else "holding"
             self._engagement.release()
+        new = self._estimate if self._silence == 0.0 else None
         if not self._at_rest():
+            self._engagement.update(new, None)
             return "stopped"
         if np.abs(q - self._q).max() > _PUSHED:  # somebody has moved the arm: go on from there
             self._q = np.clip(q, self.arm.lower, self.arm.upper)
             self._limiter.start(self._q)
-        if self._silence == 0.0 and self._engagement.update(self._estimate, self.arm.tool_pose(self._q)) is not None:
+        if new is not None and self._engagement.update(new, self.arm.tool_pose(self._q)) is not None:
             return "following"
         return "waiting"
 
@@ -234,12 +236,14 @@ class ModernRetargeter(Retargeter):
             return twist
         return twist - share * (along / square) * back / _METRES
 
-    def _drive(self, twist: Array, elbow: ElbowTask | None) -> None:
-        """Move the reference by one step of inverse kinematics."""
+    def _drive(self, twist: Array, elbow: ElbowTask | None, *, led: bool = True) -> None:
+        """Move the reference by one step of inverse kinematics; an arm that nobody leads goes nowhere by itself."""
         rows = clearance_rows(self.arm, self._q, self.scene, self._clearance)
         own = None if self._own is None else self._own.rows(self._q, time_to_look=not self._seeing)
         if own is not None:
             rows = own if rows is None else (np.concatenate([rows[0], own[0]]), np.concatenate([rows[1], own[1]]))
+        if rows is not None and not led:  # what is too near already is left when the person leads on
+            rows = rows[0], np.minimum(rows[1], 0.0)
         velocity = self._solver.solve(self._q, twist, velocity=self._velocity, rows=rows, sew=elbow)
         self._velocity = velocity
         self._q = self._q + self.dt * velocity
