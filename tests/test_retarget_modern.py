@@ -149,6 +149,20 @@ def test_an_arm_nearer_to_itself_than_it_should_be_does_not_move_by_itself(robot
         np.testing.assert_allclose(retargeter.command.q, q, atol=1e-9)
 
 
+@pytest.mark.parametrize("robot", ["sawyer", "panda"])
+def test_an_arm_at_a_singularity_does_not_move_by_itself(robot):
+    """It did: the bounds that keep a wrist bent bent it, by up to 16 degrees, with nobody in view."""
+    arm, rng = ARMS[robot], np.random.default_rng(4)
+    retargeter = ModernRetargeter(arm)
+    for _ in range(10):
+        q = rng.uniform(arm.lower, arm.upper)
+        q[5], q[3] = np.clip([0.05, -0.05], arm.lower[[5, 3]] + 0.01, arm.upper[[5, 3]] - 0.01)
+        retargeter.start(q)
+        for _ in range(50):
+            retargeter.step(None, retargeter.command.q)
+        np.testing.assert_allclose(retargeter.command.q, q, atol=1e-9)
+
+
 def test_nobody_means_no_motion():
     lost = [Skeleton(k / 30, np.full((25, 3), np.nan)) for k in range(60)]
     run = ModernRetargeter(ARMS["sawyer"]).run(lost)

@@ -111,6 +111,7 @@ class ModernRetargeter(Retargeter):
             fixed = correspondence is not None and correspondence.orientation == "fixed"
             turn_length = ANGLE_LENGTH if fixed else _TURN_SEEN
         self._solver = IKSolver(arm, dt=dt, max_speed=max_speed, singularity_bounds=known, turn_length=turn_length)
+        self._brake = IKSolver(arm, dt=dt)  # its task is to stand: it leaves no singularity by itself
         self._elbow = elbow if known else 0.0
         self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).watch(dt)
         self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
@@ -244,7 +245,8 @@ class ModernRetargeter(Retargeter):
             rows = own if rows is None else (np.concatenate([rows[0], own[0]]), np.concatenate([rows[1], own[1]]))
         if rows is not None and not led:  # what is too near already is left when the person leads on
             rows = rows[0], np.minimum(rows[1], 0.0)
-        velocity = self._solver.solve(self._q, twist, velocity=self._velocity, rows=rows, sew=elbow)
+        solver = self._solver if led else self._brake
+        velocity = solver.solve(self._q, twist, velocity=self._velocity, rows=rows, sew=elbow)
         self._velocity = velocity
         self._q = self._q + self.dt * velocity
 
