@@ -3,9 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imitarm.benchmark.recordings import CAPTURED, KINDS, MappingRecording, Plan, beyond_reach, make_recording
+from imitarm.benchmark.mapping_tables import JUDGED
+from imitarm.benchmark.recording_plan import CAPTURED, KINDS, Plan
+from imitarm.benchmark.recordings import MappingRecording, beyond_reach, make_recording
 from imitarm.capture.person import Person
-from imitarm.errors import InputError, UnknownNameError
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 
 ARM = ArmModel.load("sawyer", tool="gripper")
@@ -86,25 +88,8 @@ def test_a_captured_arm_needs_its_data(real_data, tmp_path):
     assert beyond_reach(made, ARM) == 0.0
 
 
-@pytest.mark.parametrize("bad", [{"kind": "dance"}, {"person": -1}, {"repeat": 100}, {"seconds": 1.0}, {"sigma": 0.5}])
-def test_what_is_no_plan_is_refused(bad):
-    with pytest.raises((InputError, UnknownNameError)):
-        Plan(**{"kind": "inside", "person": 0, **bad})
-
-
-def test_no_two_recordings_have_the_same_seeds_whoever_the_persons_are():
-    plans = [
-        Plan(kind, person, repeat)
-        for kind in (*KINDS, CAPTURED)
-        for person in (0, 1, 30, 99, 100, 101, 109, 1000)
-        for repeat in (0, 1, 99)
-    ]
-    cameras = [2 * plan.number + k for plan in plans for k in (0, 1)]
-    assert len(set(cameras)) == len(cameras) == 2 * len(plans)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("person", range(100, 110))
+@pytest.mark.parametrize("person", range(JUDGED, JUDGED + 10))
 def test_every_person_who_judges_makes_every_recording(person):
     for kind in KINDS:
         made = make_recording(Plan(kind, person), ARM)

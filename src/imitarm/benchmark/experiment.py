@@ -18,7 +18,8 @@ import numpy as np
 from imitarm.benchmark.fingerprint import code_version
 from imitarm.benchmark.mapping_methods import method
 from imitarm.benchmark.mapping_metrics import measure
-from imitarm.benchmark.recordings import CAPTURED, KINDS, MappingRecording, Plan, beyond_reach, make_recording
+from imitarm.benchmark.recording_plan import CAPTURED, KINDS, Plan
+from imitarm.benchmark.recordings import MappingRecording, beyond_reach, make_recording
 from imitarm.benchmark.stacking import StackingTrial, run_trial
 from imitarm.errors import FileFormatError, ImitarmError, InputError, TaskFailedError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel

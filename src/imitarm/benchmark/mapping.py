@@ -21,7 +21,7 @@ from imitarm.benchmark.mapping_tables import (
     success_table,
     torque_table,
 )
-from imitarm.benchmark.recordings import CAPTURED, KINDS
+from imitarm.benchmark.recording_plan import CAPTURED, KINDS
 from imitarm.benchmark.tables import Table
 from imitarm.benchmark.thesis_table import claims_table, printed_table
 from imitarm.errors import InputError
@@ -35,11 +35,11 @@ class MappingBenchmark:
 
     Attributes:
         people: made-up persons.
-        first: of them; they are ``first`` to ``first + people - 1``. Persons below 100 are for working on methods,
-            those from 100 on for judging: what was tuned with a person in sight is not judged by that person.
+        first: of them; they are ``first`` to ``first + people - 1``. Persons below 200 are for working on methods,
+            those from 200 on for judging: what was tuned with a person in sight is not judged by that person.
         repeats: closed-loop trials of each; recordings to replay are one of each kind a person.
         methods: rows, of :data:`imitarm.benchmark.mapping_methods.METHODS`.
-        kinds: of recordings, of :data:`imitarm.benchmark.recordings.KINDS`.
+        kinds: of recordings, of :data:`imitarm.benchmark.recording_plan.KINDS`.
         seconds: about how long a recording is [s].
         sigma: of the camera's error [m]; None: 1 to 2 cm, by the seed.
         live: whether cubes are stacked with the loop closed, by the main methods among the rows.

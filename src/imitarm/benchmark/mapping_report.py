@@ -12,13 +12,13 @@ from imitarm.benchmark.experiment import LIVE, Experiment, Result, plain
 from imitarm.benchmark.mapping_methods import MAIN, METHODS
 from imitarm.benchmark.mapping_pairs import OURS
 from imitarm.benchmark.mapping_tables import Results, number
-from imitarm.benchmark.recordings import CAPTURED
+from imitarm.benchmark.recording_plan import CAPTURED
 from imitarm.benchmark.tables import Table
 from imitarm.kinematics.arm import ArmModel
 from imitarm.viewer import palette
 from imitarm.viewer.background import provenance_section
 from imitarm.viewer.markup import figure
-from imitarm.viewer.page import check_writable, data_link, page_html, shared_players, write_page
+from imitarm.viewer.page import data_link, draw_page, page_html, shared_players
 from imitarm.viewer.panels import Key, Panel, heading, player_card, tabbed
 from imitarm.viewer.retarget_content import MethodResult, RetargetReport
 from imitarm.viewer.retarget_report import playback
@@ -42,7 +42,7 @@ _WORDS: Final = {
 def write_mapping_report(
     results: Results, tables: Sequence[Table], path: str | Path, *, provenance: Mapping[str, Any], folder: Path | None
 ) -> Path:
-    """Write the page aside, then rename it.
+    """Write the page by :func:`~imitarm.viewer.page.draw_page` and return where it is.
 
     Args:
         results: of the benchmark.
@@ -56,10 +56,9 @@ def write_mapping_report(
 
     Raises:
         InputError: when the place can't be written, or the libraries that draw are not installed.
+        TaskFailedError: when the disk is full.
     """
-    target = check_writable(path)
-    write_page(mapping_report_html(results, tables, provenance=provenance, folder=folder), target)
-    return target
+    return draw_page(lambda: mapping_report_html(results, tables, provenance=provenance, folder=folder), path)
 
 
 def mapping_report_html(

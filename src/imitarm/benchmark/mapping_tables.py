@@ -11,11 +11,11 @@ import numpy as np
 from imitarm.benchmark.experiment import LIVE, REPLAYS, Result
 from imitarm.benchmark.intervals import Interval, Values, interval, rate_interval
 from imitarm.benchmark.mapping_methods import METHODS
-from imitarm.benchmark.recordings import CAPTURED, KINDS
+from imitarm.benchmark.recording_plan import CAPTURED, KINDS
 from imitarm.benchmark.stacking import failures
 from imitarm.benchmark.tables import Table
 
-JUDGED = 100
+JUDGED = 200
 """First of the persons that nobody looks at while a method is worked on."""
 _DEGREES = 180.0 / math.pi
 
@@ -190,7 +190,7 @@ def persons_note(results: Results) -> str:
     if not seen:
         return ""
     text = f"Persons {seen[0]} to {seen[-1]}." if len(seen) > 1 else f"Person {seen[0]}."
-    return text if seen[0] >= JUDGED else f"{text} Those below {JUDGED} were in sight while methods were worked on."
+    return text if seen[0] >= JUDGED else f"{text} Those below {JUDGED} are for working on methods."
 
 
 def accuracy_table(results: Results, task: str) -> Table:

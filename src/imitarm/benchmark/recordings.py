@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.benchmark.recording_plan import CAPTURED, REPEATS, Plan
 from imitarm.benchmark.tracking import TrueArm, motion_end
-from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.drawing import DRAWINGS, drawing
 from imitarm.capture.motions import REST, MotionCapture, Truth, reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import HandState, Skeleton
-from imitarm.errors import InputError, TaskFailedError, UnknownNameError, UnreachableError
+from imitarm.errors import InputError, TaskFailedError, UnreachableError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.posture import find_posture
@@ -29,12 +29,6 @@ from imitarm.tasks.stack_trial import calibrate, stack_once
 
 Array = NDArray[np.float64]
 
-KINDS = ("inside", "edge", "drawing", "stacking")
-"""Kinds of recordings of made-up people: reaches where an arm works with ease; the same with the arm stretched out
-every few seconds, beyond what the robot reaches; circles, eights and waves; a whole stacking of four cubes."""
-CAPTURED = "captured"
-"""The kind that needs real data: an arm recorded by motion capture, before a made-up camera."""
-
 REACH = 0.80  # [m] from the Sawyer's shoulder to its wrist when it is stretched (METHODS A.5)
 BEYOND = 1.25  # "edge" is mapped so much larger that the stretched arm of a person is beyond the robot's reach
 _TAIL = 2.0  # [s] of rest at the end, so that settling can be seen
@@ -42,53 +36,7 @@ _STEP = 0.01  # [s] at which the truth is kept
 _STRETCH = 4.0  # [s] from one full stretch to the next
 _OUT = 1.02  # of the reach: as far as the arm is long, and a little more wished for
 _MOCAP = Path("mocap_arm", "recording.tsv")
-_LONGEST = 120.0  # [s] of a recording
-_REPEATS = 100  # of a person at most: more would have the seeds of the next person
 _TRIES = 5  # repeats of a person's stacking, until one succeeds with the ideal follower
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Which recording; plain values that say all of it.
-
-    Attributes:
-        kind: one of :data:`KINDS`, or :data:`CAPTURED`.
-        person: seed of the person, whose limbs and habits differ.
-        repeat: which of this person, 0 to 99: seeds motion and camera; of the captured arm: before which camera.
-        seconds: of motion; reaches and drawings take about so long, a capture is cut to it, stacking as it takes.
-        sigma: of the camera's error [m]; None: 1 to 2 cm, by the seed.
-        data: folder of real recordings, for :data:`CAPTURED`.
-
-    Raises:
-        UnknownNameError: when there is no such kind.
-        InputError: when a number is out of range.
-    """
-
-    kind: str
-    person: int
-    repeat: int = 0
-    seconds: float = 10.0
-    sigma: float | None = None
-    data: str = ""
-
-    def __post_init__(self) -> None:
-        if self.kind not in {*KINDS, CAPTURED}:
-            raise UnknownNameError.among("kind of recording", self.kind, (*KINDS, CAPTURED))
-        if self.person < 0 or not 0 <= self.repeat < _REPEATS or not 4.0 <= self.seconds <= _LONGEST:
-            raise InputError(
-                f"Plan: person must be at least 0, repeat 0 to {_REPEATS - 1}, seconds 4 to {_LONGEST:g}; got {self}"
-            )
-        if self.sigma is not None and not 0.0 <= self.sigma <= 0.1:
-            raise InputError(f"Plan: sigma must be between 0 and 0.1 m, got {self.sigma!r}")
-
-    @property
-    def number(self) -> int:
-        """A number of its own, whoever the person is, to seed what is random in it."""
-        return 10 * (_REPEATS * self.person + self.repeat) + (*KINDS, CAPTURED).index(self.kind)
-
-    def camera(self, number: int) -> SkeletonCamera:
-        """Return a camera with all the faults of a real one."""
-        return SkeletonCamera.from_seed(number) if self.sigma is None else SkeletonCamera(number, sigma=self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +190,7 @@ def _drawing(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
 def _stacking(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
     """A person who stacks with a gripper that is where the hand is: no method has shaped it."""
     for k in range(_TRIES):
-        done = stack_once(plan.person, plan.repeat + _REPEATS * k, IdealFollower, camera=ideal_camera)
+        done = stack_once(plan.person, plan.repeat + REPEATS * k, IdealFollower, camera=ideal_camera)
         if done.success:
             return _between(done.truth), done.truth[-1].time, "fixed"
     raise TaskFailedError(f"person {plan.person} stacked no tower in {_TRIES} tries with the ideal gripper")

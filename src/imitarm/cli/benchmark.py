@@ -15,7 +15,7 @@ from imitarm.benchmark.fingerprint import code_version, tables_version
 from imitarm.benchmark.mapping import MappingBenchmark, check_document, fill_document, tables, write_tables
 from imitarm.benchmark.mapping_methods import METHODS
 from imitarm.benchmark.mapping_tables import JUDGED, Results
-from imitarm.benchmark.recordings import KINDS
+from imitarm.benchmark.recording_plan import KINDS
 from imitarm.benchmark.running import LOCAL, run_all
 from imitarm.benchmark.tables import Table
 from imitarm.cli.outputs import check_outputs, same_place
