@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 _DRAWS = 10_000
 _EXACT = 14  # persons up to which all sign flips are tried; beyond, so many draws as above
 _TINY = 1e-12
+_ALIKE, _COUNTS = 0.3, 2  # correlation of one person's trials before any is seen, and how many persons it counts as
+_FINEST = 1000  # steps of a rate at most, where persons have tried unequally often
 
 
 @dataclass(frozen=True)
@@ -132,34 +134,76 @@ def compare(ours: Values, theirs: Values) -> Comparison:
     return Comparison(found, relative, sign_flip_p(person_means(both)))
 
 
-def rate_interval(outcomes: Values, *, seed: int = 0) -> Interval:
-    """Return a success rate, the mean over persons of each one's own rate, and where it is with 95 % confidence.
+def rate_interval(outcomes: Values) -> Interval:
+    r"""Return a success rate, the mean over persons of each one's own rate, and where it is with 95 % confidence.
 
-    Persons are drawn again, as by :func:`interval`. That says too little where few or none failed, so the interval is
-    never narrower than Wilson's of as many trials that have nothing to do with each other; and where all persons have
-    one and the same rate, as 0 or 100 %, the persons drawn again are always alike, though other people need not be:
-    then it is Wilson's with only as many trials as there are persons.
+    Wilson's interval with :math:`N / D` trials instead of the N that there are (Rao and Scott, Biometrics 1992): trials
+    of one person are alike, and :math:`D = 1 + (m - 1) \rho` says how much less m of them tell than m of strangers.
+    :math:`\rho` is their correlation, from how much more persons' rates differ than those of alike persons would. A few
+    persons tell little of it, so it is mixed with a correlation of 0.3 that counts as much as two persons; where all
+    trials went alike, or there is one person, nothing is known of it and it is 0.3. N / D is never above N, nor below
+    the number of persons.
+
+    Failures of one person say that persons differ, and one more of another that they don't; so by this alone a failure
+    more could make a claim firmer. The lower end is therefore the least of all results that are as good or better in
+    every trial, and the upper end the greatest of all that are as bad or worse.
 
     Args:
         outcomes: of each trial, 1 when it went well, 0 when it did not.
-        seed: of the resampling.
     """
-    found, rates = interval(outcomes, seed=seed), person_means(outcomes)
-    if len(rates) == 0:
-        return found
-    if np.ptp(rates) < _TINY:
-        low, high = wilson_interval(found.mean * found.persons, found.persons)
-    else:
-        low, high = wilson_interval(found.mean * found.used, found.used)
-        low, high = min(low, max(found.low, 0.0)), max(high, min(found.high, 1.0))
-    return replace(found, low=low, high=high)
+    rates = person_means(outcomes)
+    n, used = len(rates), sum(math.isfinite(value) for value in outcomes.values())
+    if n == 0:
+        return Interval(math.nan, math.nan, math.nan, 0, 0, len(outcomes))
+    tried: dict[int, int] = {}
+    for (person, _), value in outcomes.items():
+        tried[person] = tried.get(person, 0) + math.isfinite(value)
+    step = min(math.lcm(*(count for count in tried.values() if count)), _FINEST)
+    low, high = _lower_end(rates, used / n, step), 1.0 - _lower_end(1.0 - rates, used / n, step)
+    return Interval(float(rates.mean()), low, high, n, used, len(outcomes))
 
 
-def wilson_interval(successes: float, trials: int, z: float = 1.959964) -> tuple[float, float]:
+def _lower_end(rates: Array, each: float, step: int) -> float:
+    """Return the least lower end of all results in which every person has this rate or a better one.
+
+    Of those with one and the same mean, the end is least where persons differ most: where whoever is best has become
+    perfect before another gets better (that one majorizes all others). So these are the only ones to look at.
+
+    Args:
+        rates: of the persons, shape (n,).
+        each: trials of a person, on average.
+        step: rates are looked at in steps of one over it.
+    """
+    own = np.sort(rates)[::-1]
+    room = 1.0 - own
+    raised = np.linspace(0.0, room.sum(), round(step * room.sum()) + 1)[:, None]
+    better = own + np.clip(raised - (np.cumsum(room) - room), 0.0, room)
+    trials = len(own) * each / _design_effect(better, each)
+    return min(wilson_interval(p * n, n)[0] for p, n in zip(better.mean(axis=1).tolist(), trials.tolist(), strict=True))
+
+
+def _design_effect(rates: Array, each: float) -> Array:
+    """Return how many trials of like persons tell as much as one of a stranger, shape (k,).
+
+    Args:
+        rates: of n persons, in k results, shape (k, n).
+        each: trials of a person, on average.
+    """
+    n, mean = rates.shape[1], rates.mean(axis=1)
+    within, alike = mean * (1.0 - mean), np.full(len(rates), _ALIKE)
+    known = (within > _TINY) & (n > 1) & (each > 1.0)
+    if known.any():
+        effect = each * rates[known].var(axis=1, ddof=1) / within[known]
+        found = np.clip((effect - 1.0) / (each - 1.0), 0.0, 1.0)
+        alike[known] = ((n - 1) * found + _COUNTS * _ALIKE) / (n - 1 + _COUNTS)
+    return 1.0 + (each - 1.0) * alike
+
+
+def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tuple[float, float]:
     """Return the Wilson score interval of a rate (95 % by default).
 
     Args:
-        successes: how often it went well, 0 to ``trials``; a mean rate times the trials need not be whole.
+        successes: how often it went well, 0 to ``trials``; neither need be whole.
         trials: how often it was tried, at least 1.
         z: normal quantile of the confidence.
     """

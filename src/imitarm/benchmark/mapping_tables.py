@@ -275,8 +275,8 @@ def success_table(results: Results) -> Table:
         rows.append((METHODS[name].title, *rate, *cells, why))
     columns = ("method", "stacked>", "95 % [%]>", *(f"{figure.title}>" for figure in LOOP), "failures")
     note = (
-        "The rate's interval is over persons, each by the own rate, and no narrower than Wilson's over trials; where "
-        "all persons have the same rate, it is Wilson's with as many trials as persons. Time, path and torque are "
-        f"means over persons (95 % interval) of the trials that succeeded. {persons_note(results)}"
+        "The rate's interval is Wilson's with fewer trials than there are, the fewer the more persons differ; a "
+        "failure more never raises its lower end. Time, path and torque are means over persons (95 % interval) of the "
+        f"trials that succeeded. {persons_note(results)}"
     )
     return Table("Four cubes stacked, loop closed", columns, tuple(rows), note)
