@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -73,26 +74,109 @@ def test_a_time_in_the_future_does_not_make_the_others_look_late():
 EARLY = st.one_of(st.integers(1, 60), st.integers(1, 1500), st.integers(1, 10**9))  # [ms]
 
 
+COPY = st.one_of(st.none(), st.integers(0, 40))  # [ms] after the datagram
+
+
 @given(
     period=st.integers(4, 33),
     at=st.integers(0, 40),
     early=EARLY,
+    copy=COPY,
     way=st.integers(0, 50),
     seed=st.integers(0, 2**32 - 1),
 )
 def test_one_stamp_that_is_early_locks_nobody_out_for_longer_than_about_the_age_that_is_allowed(
-    period, at, early, way, seed
+    period, at, early, copy, way, seed
 ):
-    """Be it the first of all or any later one, early by little or by centuries."""
-    rng, gate, begin = np.random.default_rng(seed), Gate(), 10**12
-    refused = []
+    """Be it the first of all or any later one, early by little or by centuries, delivered once or twice."""
+    rng, begin = np.random.default_rng(seed), 10**12
+    arrivals = []  # when, number, stamp
     for k in range(120):
         sent = begin + k * period * MS
-        queued = int(rng.integers(0, 30)) * MS
-        stamp = sent + early * MS if k == at else sent
-        if not gate.admit(header(k, stamp), sent + way * MS + queued) and k != at:
-            refused.append(k)
-    assert all(at < k and (k - at) * period <= 100 + 3 * period + 30 for k in refused)
+        arrival = sent + (way + int(rng.integers(0, 30))) * MS
+        arrivals.append((arrival, k, sent + early * MS if k == at else sent))
+        if k == at and copy is not None:
+            arrivals.append((arrival + copy * MS, k, sent + early * MS))
+    refused = refused_numbers(arrivals)
+    assert all(at < k and (k - at) * period <= 100 + 3 * period + 30 for k in refused - {at})
+
+
+def refused_numbers(arrivals):
+    """Which of the datagrams are refused though they are newer than all that came."""
+    gate, refused, newest = Gate(), set(), -1
+    for arrival, k, stamp in sorted(arrivals, key=lambda one: one[0]):
+        if not gate.admit(header(k, stamp), arrival) and k > newest:
+            refused.add(k)
+        newest = max(newest, k)
+    return refused
+
+
+@pytest.mark.parametrize("early", [1200, 5000, 20_000])
+def test_a_copy_does_not_bear_out_a_stamp_that_is_much_too_early(early):
+    times = [(k, 10**12 + 33 * k * MS) for k in range(3600)]
+    arrivals = [(time, k, time + early * MS if k == 50 else time) for k, time in times]
+    arrivals.insert(51, arrivals[50])
+    assert refused_numbers(arrivals) == {50}
+
+
+@pytest.mark.parametrize("early", [(200, 400), (400, 200), (300, 200, 400), (1200, 1300, 2500), (1200, 2500, 3800)])
+@pytest.mark.parametrize("period", [10, 33])
+def test_stamps_that_are_early_each_in_its_own_way_are_forgotten_one_by_one(early, period):
+    times = [(k, 10**12 + period * k * MS) for k in range(3600)]
+    arrivals = [(time, k, time + (early[k - 50] if 50 <= k < 50 + len(early) else 0) * MS) for k, time in times]
+    copies = [one for k in range(50, 50 + len(early)) for one in [arrivals[k]] * 2]
+    behind = arrivals[50 : 50 + len(early)] * 2  # each copy after the last of them
+    for false in (arrivals[50 : 50 + len(early)], copies, behind):
+        gate, now = Gate(), 0
+        for arrival, k, stamp in [*arrivals[:50], *false, *arrivals[50 + len(early) :]]:
+            now = max(now, arrival)
+            gate.admit(header(k, stamp), now)
+        assert gate.admitted >= 3600 - len(early) - 4
+
+
+@st.composite
+def early_stamps(draw, *, first, least):
+    """Up to four that don't bear each other out: the differences are more than 50 ms apart, queues included."""
+    count = draw(st.integers(1, 4))
+    steps = draw(st.lists(st.one_of(st.integers(81, 150), st.integers(81, 3000)), min_size=count, max_size=count))
+    places = draw(st.lists(st.integers(first, 40), min_size=count, max_size=count, unique=True))
+    early = draw(st.permutations((np.cumsum(steps) - 81 + least).tolist()))
+    return dict(zip(places, early, strict=True))
+
+
+def several_lock_nobody_out(stamps, period, copy, seed):
+    rng, begin = np.random.default_rng(seed), 10**12
+    arrivals = []
+    for k in range(100):
+        sent = begin + k * period * MS
+        arrival, stamp = sent + (2 + int(rng.integers(0, 30))) * MS, sent + stamps.get(k, 0) * MS
+        arrivals.append((arrival, k, stamp))
+        if k in stamps and copy is not None:
+            arrivals.append((arrival + copy * MS, k, stamp))
+    for k in refused_numbers(arrivals) - set(stamps):
+        at = max((at for at in stamps if at < k), default=k)
+        assert at < k and (k - at) * period <= 100 + 3 * period + 30
+
+
+@given(
+    stamps=early_stamps(first=3, least=81),
+    period=st.one_of(st.integers(4, 33), st.integers(34, 1000)),
+    copy=COPY,
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_nor_do_several_that_do_not_bear_each_other_out(stamps, period, copy, seed):
+    """Wherever they are after the first three datagrams, close to each other or not, each delivered once or twice."""
+    several_lock_nobody_out(stamps, period, copy, seed)
+
+
+@given(
+    stamps=early_stamps(first=0, least=250),
+    period=st.integers(4, 33),
+    copy=COPY,
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_nor_do_the_first_when_the_next_were_sent_before_them(stamps, period, copy, seed):
+    several_lock_nobody_out(stamps, period, copy, seed)
 
 
 @given(at=st.integers(3, 20), early=EARLY, period=st.integers(100, 1000))
@@ -103,22 +187,48 @@ def test_nor_where_frames_are_few(at, early, period):
     assert all(admitted[:at]) and all(admitted[at + 3 :])
 
 
+QUEUES = st.lists(st.tuples(st.integers(1, 30), st.integers(0, 600)), min_size=1, max_size=6)
+
+
 @given(
     at=st.integers(0, 60),
     stamp=st.one_of(st.integers(-2000, 2000), st.integers(-900_000, 10**12)),
-    queues=st.lists(st.tuples(st.integers(1, 30), st.integers(0, 600)), min_size=1, max_size=6),
+    queues=QUEUES,
 )
 def test_no_stamp_lets_in_what_is_too_old(at, stamp, queues):
     """Whatever one datagram says of its time, early or late: of the others only those come in that are fresh."""
+    only_fresh_ones_come_in({at: stamp}, queues)
+
+
+@given(
+    stamps=st.dictionaries(st.integers(0, 100), st.one_of(st.integers(1, 2000), st.integers(1, 10**12)), max_size=12),
+    queues=QUEUES,
+    twice=st.booleans(),
+)
+def test_nor_do_many_stamps_that_are_early(stamps, queues, twice):
+    """Up to twelve, whether they bear each other out or not."""
+    only_fresh_ones_come_in(stamps, queues, twice=twice)
+
+
+def only_fresh_ones_come_in(stamps, queues, *, twice=False):
     gate = Gate()
     waits = [0] + [wait for length, wait in queues for _ in range(length)]
     for k, wait in enumerate(waits):
         sent = 10**12 + 2 * k * PERIOD
-        if k == at:
-            gate.admit(header(2 * k, sent + stamp * MS), sent + 2 * MS + wait * MS)
+        if k in stamps:
+            for _ in range(1 + twice):
+                gate.admit(header(2 * k, sent + stamps[k] * MS), sent + 2 * MS + wait * MS)
         if gate.admit(header(2 * k + 1, sent), sent + 2 * MS + wait * MS):
             assert wait <= 100
             assert gate.age >= 1e-3 * wait - 1e-9  # never younger than it is
+
+
+def test_a_queue_that_empties_by_large_steps_is_not_a_row_of_false_stamps():
+    """It fills at once, and for long; that the way had been quick once is remembered."""
+    gate = Gate()
+    waits = [900, 900, 900, *range(800, -1, -100), *[880] * 100]
+    admitted = [gate.admit(header(k, k * 40 * MS), k * 40 * MS + wait * MS) for k, wait in enumerate(waits)]
+    assert all(admitted[:12]) and not any(admitted[12:])
 
 
 def test_a_way_that_was_quick_twice_is_not_forgotten():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from bisect import insort
 from collections import Counter, deque
+from dataclasses import dataclass
 from typing import TypeVar
 
 from imitarm.datagram import Header, decode
@@ -32,19 +34,39 @@ _MASK = 2**32 - 1
 _WINDOW = 60_000_000_000  # [ns] quicker than two clocks drift apart by what matters, longer than a queue lasts
 _AGREED = 3  # datagrams that agree on the quickest way
 _EARLIER = 2  # datagrams that show that a stamp was false
+_FALSE = 4  # stamps that may be false at once, where no later one was sent before them
+_KEPT = 16  # differences that are alone
 _RETIRED = 64  # sessions remembered
+
+
+@dataclass(slots=True)
+class _Alone:
+    """A difference that nothing has come near to, and what has spoken against it since."""
+
+    difference: int
+    stamp: int  # when it was sent, as it says
+    agreed: bool  # whether enough had agreed on what was known before it came
+    earlier: int = 0  # how many later ones were sent before it, as they say
+    agreeing: int = 0  # how many were fresh by what was known before
+    since: int = 0  # when the first of those came
+    turned: bool = False  # it came in the window of time before this one
 
 
 class Quickest:
     """Least difference of receiving and sending: two clocks' offset plus the shortest way.
 
-    A difference is *alone* when it is lower by more than half of ``max_age`` than all before it, and none has come as
-    near since. It counts at once, so that nothing old is taken for fresh, and is forgotten as a false stamp
+    A difference is *alone* when it is lower by more than half of ``max_age`` than what is known, and no later one that
+    was sent after it has come as near. It counts at once, so that nothing old is taken for fresh, but is not yet known:
+    each such one is weighed by itself, and forgotten as a false stamp
 
     * when two later datagrams say that they were sent before it: a sender's clock never goes back; or
-    * when for ``max_age`` three have come that are fresh by what at least three had agreed on before.
+    * when for ``max_age`` three have come that are fresh by what at least three had agreed on before it came; unless
+      more than four are alone: those are rather a queue that empties.
 
-    So it takes more than one false stamp to make old datagrams look fresh, or fresh ones look old for long.
+    So stamps that are early, each by itself, do not make what is fresh look old for long, nor a dozen of them what is
+    old look fresh, unless three had agreed on a slower way: after that up to four that were quicker count for nothing
+    when no two agree and the slow way goes on, true or false. Two stamps that are late can speak against a way that
+    was quick once and never again.
 
     Args:
         max_age: [ns].
@@ -52,18 +74,16 @@ class Quickest:
 
     def __init__(self, max_age: float) -> None:
         self._max_age, self._near = max_age, 0.5 * max_age
-        self._least = [math.inf, math.inf]  # in this window of time and the one before [ns]
+        self._known = [math.inf, math.inf]  # least of all that are not alone, in this window of time and the last [ns]
         self._window = 0
-        self._support = 0  # how many have come near to the least
-        self._before, self._before_support = self._least, 0  # what was known before the one that is alone
-        self._stamp = self._since = self._earlier = self._agreeing = 0  # of that one, and what spoke against it since
-        self._others = math.inf  # least of those since
+        self._support = 0  # how many have come near to that
+        self._alone: list[_Alone] = []  # all lower than that, the lowest first
         self._refused: tuple[int, int] | None = None  # the last one, when it was too early: difference and sending
 
     @property
     def least(self) -> float:
         """The least difference [ns]; infinite when nothing has come."""
-        return min(self._least)
+        return min(*self._known, self._alone[0].difference if self._alone else math.inf)
 
     def too_early(self, difference: int, sent: int, now: int) -> bool:
         """Whether a stamp is early by more than ten times ``max_age``: believed only if the next one bears it out.
@@ -74,7 +94,8 @@ class Quickest:
             now: by the receiver's [ns].
         """
         refused, self._refused = self._refused, None
-        if refused is not None and sent >= refused[1]:  # else that one was false: a clock never goes back
+        # One that was sent before it shows that it was false, as a clock never goes back; its own copy shows nothing.
+        if refused is not None and sent > refused[1]:
             self.age(*refused, now)
         early = difference < self.least - 10.0 * self._max_age
         if early:
@@ -90,17 +111,38 @@ class Quickest:
             now: by the receiver's [ns].
         """
         self._turn_window(now)
-        if difference < self.least - self._near:
-            self._before, self._before_support = list(self._least), self._support
-            self._support, self._stamp = 1, sent
-            self._since = self._earlier = self._agreeing = 0
-            self._others = math.inf
-        elif difference <= self.least + self._near:
-            self._support += 1
-        elif self._support == 1:
-            self._doubt(difference, sent, now)
-        self._least[0] = min(self._least[0], difference)
+        known = min(self._known)
+        usual = difference >= known - self._near
+        self._doubt(sent, now, fresh=usual and difference <= known + self._max_age)
+        if usual:
+            self._support += difference <= known + self._near
+            self._learn(difference)
+        elif any(abs(difference - one.difference) <= self._near and sent > one.stamp for one in self._alone):
+            self._support = 2
+            self._learn(difference)
+        else:
+            insort(self._alone, _Alone(difference, sent, self._support >= _AGREED), key=lambda one: one.difference)
+            del self._alone[_KEPT:]
         return difference - self.least
+
+    def _learn(self, difference: int) -> None:
+        """Let a difference be known, and with it each that it is near to."""
+        self._known[0] = min(self._known[0], difference)
+        while self._alone and self._alone[-1].difference >= min(self._known) - self._near:
+            self._known[0] = min(self._known[0], self._alone.pop().difference)
+
+    def _doubt(self, sent: int, now: int, *, fresh: bool) -> None:
+        """Count what a datagram, fresh by what is known or not, says against those alone; forget the false ones."""
+        few, left = len(self._alone) <= _FALSE, []
+        for one in self._alone:
+            one.earlier += sent < one.stamp
+            if fresh and one.agreed:
+                one.since = one.since if one.agreeing else now
+                one.agreeing += 1
+            outvoted = few and one.agreeing >= _AGREED and now - one.since >= self._max_age
+            if one.earlier < _EARLIER and not outvoted:
+                left.append(one)
+        self._alone = left
 
     def _turn_window(self, now: int) -> None:
         """Forget what is older than two windows of time."""
@@ -108,19 +150,11 @@ class Quickest:
             self._window = now
         elif now - self._window > _WINDOW:
             self._window = now
-            self._least, self._before = [math.inf, self._least[0]], [math.inf, self._before[0]]
-
-    def _doubt(self, difference: int, sent: int, now: int) -> None:
-        """Count what speaks against the one that is alone, and forget that one when it is enough."""
-        self._earlier += sent < self._stamp
-        self._others = min(self._others, difference)
-        if difference <= min(self._before) + self._max_age and self._before_support >= _AGREED:
-            self._since = self._since or now
-            self._agreeing += 1
-        agreed = self._agreeing >= _AGREED and now - self._since >= self._max_age
-        if self._earlier >= _EARLIER or agreed:
-            self._least = [min(self._before[0], self._others), self._before[1]]
-            self._support = max(self._before_support, _AGREED)
+            self._known = [math.inf, self._known[0]]
+            self._support = self._support if self._known[1] < math.inf else 0
+            self._alone = [one for one in self._alone if not one.turned]
+            for one in self._alone:
+                one.turned = True
 
 
 class Gate:
@@ -131,7 +165,7 @@ class Gate:
     *Age.* The clocks of two machines have nothing to do with each other. But the difference between receiving and
     sending is their offset plus the time on the way, and the least of it, over the last one to two minutes, is the
     offset plus the shortest way. What a datagram's difference exceeds that by is how long it was queued: its age.
-    One stamp that is early, by a fault or by malice, would make all others look late for as long; so a difference that
+    A stamp that is early, by a fault or by malice, would make all others look late for as long; so a difference that
     nothing else comes near is forgotten after about ``max_age`` (:class:`Quickest`).
 
     *Sessions.* A sender that is restarted begins a new session, which is admitted once the one before has been silent
