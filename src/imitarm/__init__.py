@@ -11,6 +11,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from inspect import Signature
+
     from imitarm.benchmark.experiment import Experiment, Result
     from imitarm.capture import Skeleton, SkeletonSource
     from imitarm.demonstrations import Finding, align, lint, read
@@ -159,7 +162,14 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-class _Verb(ModuleType):
+class _Module(ModuleType):
+    """A module that is pickled and copied by its name: what others do for plain modules at most."""
+
+    def __reduce__(self) -> tuple[Callable[[str], ModuleType], tuple[str]]:
+        return importlib.import_module, (self.__name__,)
+
+
+class _Verb(_Module):
     """A module that does, when it is called, what its function of the same name does.
 
     ``imitarm.retarget`` is a package and ``imitarm.reproduce`` a module; both are public verbs, too. One name can't be
@@ -167,10 +177,21 @@ class _Verb(ModuleType):
     """
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        return getattr(self, self.__name__.rpartition(".")[2])(*arguments, **options)
+        return self._function(*arguments, **options)
+
+    @property
+    def __signature__(self) -> Signature:
+        inspect = importlib.import_module("inspect")  # slow to import, and seldom asked for
+        signature: Signature = inspect.signature(self._function)
+        return signature
+
+    @property
+    def _function(self) -> Callable[..., Any]:
+        function: Callable[..., Any] = getattr(self, self.__name__.rpartition(".")[2])
+        return function
 
 
-class _Package(ModuleType):
+class _Package(_Module):
     """Makes a verb of each module that has a public name: importing it puts it in here."""
 
     def __setattr__(self, name: str, value: object) -> None:
