@@ -138,3 +138,21 @@ def test_writing_keeps_up_with_any_camera(tmp_path):
         for skeleton in frames:
             recorder.write(skeleton)
         assert (time.perf_counter() - began) / len(frames) < 0.005  # measured: 0.1 ms
+
+
+def test_another_recorder_that_begins_when_this_one_has_its_name_keeps_its_file(tmp_path, monkeypatch):
+    path, frames, others = tmp_path / "a.csv", skeletons(2), []
+    rename = Path.replace
+
+    def rename_and_begin(part, target):
+        rename(part, target)
+        others.append(SkeletonRecorder(path, replace=True))
+
+    first = SkeletonRecorder(path)
+    first.write(frames[0])
+    monkeypatch.setattr(Path, "replace", rename_and_begin)
+    first.close()
+    monkeypatch.undo()
+    others[0].write(frames[1])
+    others[0].close()
+    assert same(read_recording(path).skeletons[0], frames[1])

@@ -66,13 +66,14 @@ class PartFile:
         except OSError as error:
             raise InputError(f"{self.part}: can't be written: {error.strerror or error}") from error
 
-    def finish(self, take: Callable[[Path], None], *, begin: str = "") -> None:
+    def finish(self, take: Callable[[Path], bool], *, begin: str = "") -> None:
         """Let all of it reach the disk, and give it its name or remove it.
 
         A second call does nothing.
 
         Args:
-            take: is given ``part`` and makes ``path`` of it; what it leaves there is removed.
+            take: is given ``part`` and makes ``path`` of it, or nothing; returns whether it renamed it. If not, it is
+                removed; if so, another recorder may have begun one of that name, which is left alone.
             begin: replaces what was written first, and is as long.
 
         Raises:
@@ -88,7 +89,7 @@ class PartFile:
                     file.write(begin)
                 file.flush()
                 os.fsync(file.fileno())
-            take(self.part)
-            self.part.unlink(missing_ok=True)
+            if not take(self.part):
+                self.part.unlink(missing_ok=True)
         except OSError as error:
             raise InputError(f"{self.path}: can't be written: {error.strerror or error}") from error

@@ -55,9 +55,10 @@ class SkeletonRecorder:
         """
         self._file.finish(self._take, begin=header(self._source, str(self.n_frames)))
 
-    def _take(self, part: Path) -> None:
+    def _take(self, part: Path) -> bool:
         if self.n_frames:
             part.replace(self.path)
+        return self.n_frames > 0
 
     def __enter__(self) -> Self:
         return self

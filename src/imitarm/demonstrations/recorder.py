@@ -87,9 +87,10 @@ class DemonstrationRecorder:
         """
         self._file.finish(self._take)
 
-    def _take(self, part: Path) -> None:
+    def _take(self, part: Path) -> bool:
         if self.n_samples >= 2:
             replace(Demonstration.load(part), source=self._source).save(self.path)
+        return False  # it was copied
 
     def __enter__(self) -> Self:
         return self
