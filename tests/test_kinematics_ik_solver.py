@@ -44,3 +44,16 @@ def test_where_no_limit_is_near_it_changes_nothing(arm):
 def test_a_length_that_can_not_weigh_is_refused(arm, length):
     with pytest.raises(InputError, match="turn_length"):
         IKSolver(arm, turn_length=length)
+
+
+def test_a_turn_that_counts_less_is_left_no_sooner_while_no_limit_is_near(arm):
+    """Anywhere the joints may be: the effort that they are spared counts less too."""
+    rng, missed = np.random.default_rng(2), {0.1: [], 0.3: []}
+    for _ in range(300):
+        q, twist = rng.uniform(arm.lower, arm.upper), np.concatenate([np.zeros(3), 0.02 * rng.normal(size=3)])
+        for length, shares in missed.items():
+            step = IKSolver(arm, turn_length=length).step(q, twist)
+            if not step.limited.any():
+                shares.append(np.linalg.norm(step.error[3:]) / np.linalg.norm(twist[3:]))
+    assert len(missed[0.1]) > 200
+    assert np.percentile(missed[0.1], 90) < 1.2 * np.percentile(missed[0.3], 90)

@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
-from imitarm.capture.skeleton import HandState, Skeleton, Tracking
+from imitarm.capture.skeleton import JOINT, HandState, Skeleton, Tracking
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.errors import UnknownNameError
 from imitarm.retarget import FACING, Correspondence, LimbLengths
@@ -112,6 +114,25 @@ def test_a_hand_at_rest_that_is_hidden_now_and_then_wanders_less_than_half_as_fa
     anchored = wandered()
     monkeypatch.setattr(Anchoring, "anchor", lambda self, points, *_: points)
     assert anchored < 0.5 * wandered()
+
+
+def test_an_elbow_that_is_guessed_wrong_does_not_pull_the_wrist_away():
+    """Guessed 15 cm off, then seen again: what it was anchored to is doubtful, the wrist is seen all the time."""
+    still = Person(**{**PERSON.__dict__, "tremor": 0.0 * PERSON.tremor, "sway": 0.0 * PERSON.sway})
+    estimator, off = ArmEstimator(Correspondence(lengths=LENGTHS)), []
+    arm = still.skeleton(0.0, HOLD).arm()
+    along = (arm.wrist - arm.elbow) / np.linalg.norm(arm.wrist - arm.elbow)
+    for k in range(120):
+        true = still.skeleton(k / 30, HOLD)
+        positions, tracking = true.positions.copy(), true.tracking.copy()
+        elbow = JOINT["elbow_right"]
+        if 30 <= k < 90:  # the guess creeps away while the elbow is hidden
+            tracking[elbow] = Tracking.INFERRED
+            positions[elbow] += 0.15 * (k - 30) / 60 * along
+        estimate = estimator.update(replace(true, positions=positions, tracking=tracking))
+        off.append(np.linalg.norm(estimate.wrist - FACING.apply(true.arm().wrist)))
+    assert max(off[95:]) < 0.005  # it was 72 mm, for seconds
+    assert np.abs(np.diff(off)).max() < 0.02  # and leapt by 48 mm when the elbow was back
 
 
 def test_without_smoothing_nothing_is_anchored():

@@ -8,10 +8,12 @@ from imitarm.capture.motions import MotionCapture, reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import Skeleton
 from imitarm.capture.synthetic import SyntheticSource
+from imitarm.kinematics.pose import rotate
 from imitarm.kinematics.reach_of_links import _shapes, meeting_links
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.sew import sew_angle
 from imitarm.retarget import FACING, Correspondence, LimbLengths, ModernRetargeter, retarget
+from imitarm.retarget.retargeter import ticks
 
 DT = 0.01
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
@@ -244,7 +246,7 @@ def test_an_arm_that_is_held_is_not_pressed_on(arm, way):
         )
         assert_within_limits(arm, commands)
         gone = arm.tool_pose(commands[-1]).position - arm.tool_pose(arm.home).position
-        assert np.linalg.norm(targets[-1]) == pytest.approx(np.linalg.norm(way), abs=1e-3)
+        assert np.linalg.norm(targets[-1]) < 0.05  # the clutch slips
         return np.abs(commands - joints).max(), np.linalg.norm(gone) / np.linalg.norm(way)
 
     lead, _ = lead_and_way(max_lead=0.06)
@@ -274,10 +276,77 @@ def test_an_arm_that_is_held_in_one_direction_is_led_in_the_others(arm):
     assert_within_limits(arm, commands)
     assert np.abs(commands - joints).max() < 0.08
     held = (times > 3.0) & (times < 6.0)
-    assert (target[held, 0] - tool[held, 0] > 0.12).all()  # it is held indeed
+    assert (np.array([ways(time)[0] for time in times[held]]) - tool[held, 0] > 0.12).all()  # it is held indeed
+    assert (target[held, 0] - tool[held, 0] < 0.05).all()  # and the clutch slips
     assert np.abs(tool[held, 1] - target[held, 1]).max() < 0.03  # and goes aside as the hand does
     free = (times > 6.0) & (target[:, 0] < -0.02)
     assert np.linalg.norm(tool[free] - target[free], axis=1).max() < 0.02  # and comes back with it, at once
+
+
+@pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
+def test_an_arm_that_is_let_go_does_not_leap_after_the_hand(arm):
+    """Held while the hand goes 20 cm on, then free: it goes on from there, by little more than the clutch's slip."""
+    times, commands, _, tool, target = led(
+        arm,
+        lambda time: 0.2 * ramp(time, 1.5) * np.array([1.0, 0.0, 0.0]),
+        lambda time, command: arm.home if 1.5 < time < 3.0 else command,
+        5.0,
+    )
+    assert_within_limits(arm, commands)
+    assert np.linalg.norm(tool[times < 3.0], axis=1).max() < 0.01
+    assert np.linalg.norm(tool[times > 3.0], axis=1).max() < 0.06
+    assert np.linalg.norm(tool[-1] - target[-1]) < 2e-3
+
+
+@pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
+def test_the_clutch_does_not_slip_on_a_robot_that_is_only_late(arm):
+    """It answers 30 ms late and the hand is quick, there and back: in the end both are where they were."""
+    late = [arm.home] * 3
+
+    def measured(_, command):
+        late.append(command)
+        return late[-4]
+
+    def ways(time):
+        return 0.15 * np.array([0.0, np.sin(6.0 * max(time - 1.5, 0.0)) * (time < 1.5 + np.pi), 0.0])
+
+    times, _, _, tool, target = led(arm, ways, measured, 7.0, max_lead=0.5)
+    assert np.ptp(tool[times < 5.0, 1]) > 0.15
+    assert np.linalg.norm(target[-1]) < 2e-3
+    assert np.linalg.norm(tool[-1]) < 2e-3
+
+
+@pytest.mark.parametrize(("robot", "seed", "lost"), [("sawyer", 0, 5.6), ("sawyer", 2, 6.2), ("panda", 3, 2.0)])
+def test_an_arm_that_loses_sight_near_full_stretch_does_not_straighten_its_elbow(robot, seed, lost):
+    """Moments at which braking without the elbow's bound brought it up to 5 degrees from straight, or through."""
+    arm = ARMS[robot]
+    marked = arm.marked()
+    side = np.sign(arm.home[marked.elbow] - marked.elbow_straight)
+    person, _, frames = recording(seed, "edge")
+    retargeter = ModernRetargeter(arm, Correspondence(lengths=lengths(person), orientation="upright", scale=2.0))
+    seen = [frame for frame in frames if frame.time - frames[0].time < lost]
+    bent = [side * (arm.home[marked.elbow] - marked.elbow_straight)]
+    for skeleton in [*ticks(seen, DT), *[None] * round(1.0 / DT)]:
+        retargeter.step(skeleton, retargeter.command.q)
+        bent.append(side * (retargeter._q[marked.elbow] - marked.elbow_straight))
+    assert retargeter.command.state in {"stopped", "waiting"}
+    assert min(bent) > 0.149
+
+
+@pytest.mark.parametrize("kind", ["inside", "edge"])
+def test_a_tool_that_is_to_stay_upright_tilts_little(kind):
+    """A turn that the person did not ask for counts more than one that a camera saw."""
+    for seed in (3, 4):
+        person, _, frames = recording(seed, kind)
+        tilts = {}
+        for lengths_of_turn in (None, 0.05):
+            correspondence = Correspondence(lengths=lengths(person), orientation="upright")
+            retargeter = ModernRetargeter(ARMS["sawyer"], correspondence, turn_length=lengths_of_turn)
+            _, turned = ARMS["sawyer"].tool_path(retargeter.run(frames).joints)
+            down = rotate(turned, np.array([0.0, 0.0, 1.0]))
+            tilts[lengths_of_turn] = np.degrees(np.arccos(np.clip(down @ down[0], -1.0, 1.0)))
+        assert np.sqrt(np.mean(tilts[None] ** 2)) < (2.0 if kind == "inside" else 12.0)
+        assert tilts[None].max() < tilts[0.05].max()
 
 
 def test_an_arm_that_was_pushed_while_waiting_starts_where_it_is():

@@ -128,3 +128,10 @@ def test_a_lasting_change_is_believed():
 def test_settings_that_filter_nothing_are_refused(options):
     with pytest.raises(InputError, match="OneEuro"):
         OneEuro(**options)
+
+
+def test_a_vector_of_another_length_is_refused():
+    one = OneEuro()
+    one.filter(0.0, np.zeros(3))
+    with pytest.raises(InputError, match="shape"):
+        one.filter(T, np.zeros(2))

@@ -40,6 +40,7 @@ class Task(NamedTuple):
     rows: tuple[Array, Array] | None
     small_angle: str | None
     wrist: tuple[int, float, float] | None = None  # joint, side and least velocity to that side of the soft bound
+    thrift: float = 1.0  # factor of the weights of all that is not the task
 
 
 def quadratic_program(task: Task) -> Array:
@@ -50,11 +51,11 @@ def quadratic_program(task: Task) -> Array:
     effort = _EFFORT
     if task.previous is not None:
         effort += _CHANGE
-        linear += _CHANGE * task.previous
+        linear += (task.thrift * _CHANGE) * task.previous
     if task.posture is not None:
         effort += _POSTURE
-        linear += _POSTURE * task.posture
-    hessian += _scaled_eye(n, effort)
+        linear += (task.thrift * _POSTURE) * task.posture
+    hessian += _scaled_eye(n, task.thrift * effort)
     velocity = _least_cost(task, hessian, linear)
     if task.wrist is not None:
         joint, side, least = task.wrist

@@ -95,7 +95,7 @@ class IKSolver:
         singularity_bounds: keep the elbow 0.15 rad off its stretched position, always, and (``"qp"`` only) the
             wrist 0.1 rad off its singular ones, where the task can spare it (METHODS A.8).
         turn_length: what one radian counts as, beside a metre, where the joints can't do all of the twist [m]; less
-            lets the tool's turn go sooner, more its way.
+            lets the tool's turn go sooner, more its way. Three numbers: for turns about the base's x, y and z.
 
     Raises:
         UnknownNameError: when method, frame or small_angle is not known.
@@ -113,7 +113,7 @@ class IKSolver:
         max_speed: float | None = None,
         small_angle: str | None = None,
         singularity_bounds: bool = False,
-        turn_length: float = ANGLE_LENGTH,
+        turn_length: float | tuple[float, float, float] = ANGLE_LENGTH,
     ) -> None:
         if method not in METHODS:
             raise UnknownNameError.among("IK method", method, METHODS)
@@ -125,10 +125,12 @@ class IKSolver:
             raise InputError(
                 f"solve_ik: posture_gain must be finite and max_speed not negative, got {posture_gain} and {max_speed}"
             )
-        if not 0.0 < turn_length < math.inf:
-            raise InputError(f"solve_ik: turn_length must be a positive length [m], got {turn_length}")
+        lengths = np.broadcast_to(np.asarray(turn_length, dtype=float), 3)
+        if not (np.isfinite(lengths).all() and lengths.min() > 0.0):
+            raise InputError(f"solve_ik: turn_length must be one or three positive lengths [m], got {turn_length}")
         self.arm, self.method = arm, method
-        self._weights = np.array([1.0, 1.0, 1.0, turn_length, turn_length, turn_length])
+        self._weights = np.concatenate([np.ones(3), lengths])
+        self._thrift = min(1.0, float(lengths.min()) / ANGLE_LENGTH) ** 2  # else a light turn is left for less effort
         self._solve = METHODS[method]
         self._site = arm.site(frame)
         self._arm_sites = np.array([] if arm.landmarks is None else arm.marked().sites, dtype=np.intp)
@@ -208,6 +210,8 @@ class IKSolver:
         if sew is not None:
             jacobian, wanted = self._with_elbow(memory, jacobian, wanted, sew, previous, (lower, upper))
         bound = None if self._wrist is None else self._wrist.at(position)
+        if bound is not None and square == 0.0:  # an arm that is told to stand leaves no singularity by itself
+            bound = bound[0], bound[1], min(bound[2], 0.0)
         return Task(
             jacobian,
             wanted,
@@ -220,6 +224,7 @@ class IKSolver:
             checked,
             self._small_angle,
             bound,
+            self._thrift,
         )
 
     def _with_elbow(

@@ -61,6 +61,10 @@ class Anchoring:
         # of joint and confidence: when, and its offset
         self._kept: dict[tuple[int, float], tuple[float, list[float]]] = {}
 
+    def shift(self, joint: int) -> float:
+        """Return how far a joint is taken to be from where it is measured [m]."""
+        return 0.0 if self._offsets is None else math.hypot(*self._offsets[joint])
+
     def anchor(self, points: Array, confidence: list[float], velocity: Array, period: float) -> Array:
         """Return where the joints are taken to be, shape (k, 3) [m].
 

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 _LEARNING_FRAMES = 60  # lengths that were not given are learnt from so many, then kept
 _GRIP_FRAMES = 3  # a hand state counts when so many frames in a row have it
 _FILTER = (3.0, 25.0, 10.0)  # [Hz, Hz per m/s, Hz] of the points; a slower speed estimate makes the robot late
+_DOUBTFUL = 0.02  # [m] an elbow that is taken to be so far from where it is measured counts half
 _JUMP = 0.12  # [m] what a hand may go within half the outlier filter's window without being one
 
 
@@ -142,9 +143,22 @@ class ArmEstimator:
         if self._smoothing:
             velocity = self._filter.velocity if period <= GAP else np.zeros((3, 3))
             points = self._anchoring.anchor(points, confidence.tolist(), velocity, period)
+            confidence = self._believed(confidence)
         if self._limbs == "fit":
             return fit_limbs(points, confidence, lengths)
         return np.array([points[0], *correct_limbs(points[0], points[1], points[2], lengths)])
+
+    def _believed(self, confidence: Array) -> Array:
+        """Return how far the three points are believed: the elbow the less the farther off it was guessed.
+
+        Else it would pull the wrist with it, by the length of the forearm, and the tool follows the wrist.
+        """
+        shift = self._anchoring.shift(1)
+        if shift == 0.0:
+            return confidence
+        believed = confidence.copy()
+        believed[1] /= 1.0 + (shift / _DOUBTFUL) ** 2
+        return believed
 
     def _learn(self, skeleton: Skeleton) -> None:
         """Measure the arm over the first frames in which it is seen."""

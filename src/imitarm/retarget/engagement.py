@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from imitarm.kinematics.pose import Pose
 from imitarm.retarget.arm_estimator import ArmEstimate
 from imitarm.retarget.correspondence import Clutch, Correspondence
+
+Array = NDArray[np.float64]
 
 SEEN_FOR = 0.5  # [s] that an arm must have been seen
 LOST_AFTER = 0.1  # [s] a longer gap between two estimates begins the count anew
@@ -27,6 +33,12 @@ class Engagement:
         """Let go; the arm must be seen for half a second again."""
         self.clutch: Clutch | None = None
         self._since = self._last = math.inf
+
+    def slip(self, way: Array) -> None:
+        """Move where the tool is led by ``way``, shape (3,) [m]: from now on the hand leads it from there."""
+        if self.clutch is not None:
+            home = self.clutch.home
+            self.clutch = replace(self.clutch, home=Pose.trusted(home.position + way, home.quaternion))
 
     def update(self, estimate: ArmEstimate | None, tool_to_base: Pose | None) -> Clutch | None:
         """Take in what became of a frame, and return the clutch, engaged or None.

@@ -34,8 +34,11 @@ _SWING_GAIN, _SWING_RATE = 2.5, 1.0  # [1/s], [rad/s] of the elbow
 _BEHIND = 0.01  # [m] a tool that is farther than this from its target lets the elbow be, 1 rad counting as 0.3 m
 _BENT = 0.1  # squared sine of the angle at the person's elbow below which its swing tells less and less
 _BRAKING = 1.5  # [m/s^2] the tool can nearly always brake so hard, 1 rad counting as 0.3 m
-_TURN_SEEN = 0.1  # [m] what a radian of a turn that a camera saw counts as, beside a metre
+# [m] what a radian counts as beside a metre: little where a camera saw the turn, more where the tool is to keep it
+_TURN_LENGTHS = {"hand": (0.1, 0.1, 0.1), "upright": (0.2, 0.2, 0.05), "fixed": (0.3, 0.3, 0.3)}
 _HELD = 0.02  # [rad] a joint that is farther than this behind its command is held up by something
+_SLIP = 0.015  # [m] farther a hand does not lead the target from a tool that is held up
+_STANDS, _STUCK = 0.03, 0.05  # [m/s] a tool that is slower for so long [s] is stuck
 _METRES = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
 _STILL = 1e-3  # [rad/s] slower is at rest
 
@@ -70,8 +73,8 @@ class ModernRetargeter(Retargeter):
         gain: K [1/s].
         lead: share of the hand's velocity that is fed forward, 0 to 1.
         turn_length: what one radian of the tool's turn counts as, beside a metre of its way, where the joints can't do
-            both [m]; None: 0.3 where the tool is to stay as it is turned, and 0.1 where it turns with the hand, since
-            a camera sees where a hand is much better than how it is turned.
+            both [m], about the base's x, y and z; None: 0.1 where the tool turns with the hand, which a camera
+            sees badly, 0.3 where it keeps its turn; where it stays upright 0.2 against tilting and 0.05 about z.
         elbow: weight of the elbow's swing beside the tool [m^2]; 0: the elbow is free.
         clearance: to keep from the scene [m].
         own_clearance: of links from each other [m]; None: not watched.
@@ -93,7 +96,7 @@ class ModernRetargeter(Retargeter):
         scene: Scene | None = None,
         gain: float = 15.0,
         lead: float = 0.9,
-        turn_length: float | None = None,
+        turn_length: float | tuple[float, float, float] | None = None,
         elbow: float = 0.1,
         clearance: float = 0.01,
         own_clearance: float | None = 0.02,
@@ -108,10 +111,8 @@ class ModernRetargeter(Retargeter):
         self._clearance = clearance
         known = arm.landmarks is not None  # else neither its elbow's angle nor its singularities are
         if turn_length is None:
-            fixed = correspondence is not None and correspondence.orientation == "fixed"
-            turn_length = ANGLE_LENGTH if fixed else _TURN_SEEN
+            turn_length = _TURN_LENGTHS[(correspondence or Correspondence()).orientation]
         self._solver = IKSolver(arm, dt=dt, max_speed=max_speed, singularity_bounds=known, turn_length=turn_length)
-        self._brake = IKSolver(arm, dt=dt)  # its task is to stand: it leaves no singularity by itself
         self._elbow = elbow if known else 0.0
         self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).watch(dt)
         self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
@@ -127,6 +128,7 @@ class ModernRetargeter(Retargeter):
         if self._own is not None:
             self._own.reset()
         self._seeing = False  # a step with a new frame has less time for the rest
+        self._stuck, self._held_at = 0, np.zeros(3)  # steps for which the tool has been held, and where
         self._offset: float | None = None  # of the robot's elbow angle from the person's
 
     def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
@@ -225,8 +227,25 @@ class ModernRetargeter(Retargeter):
         twist = gain * error + ahead
         held = max(map(abs, (self._limiter.q - measured).tolist()))
         if held > _HELD:
+            self._slip(target, measured)
             twist = self._yielding(twist, measured, min((held - _HELD) / _HELD, 1.0))
+        else:
+            self._stuck = 0
         self._drive(twist, elbow)
+
+    def _slip(self, target: Pose, measured: Array) -> None:
+        """Let the clutch slip while the hand leads the target away from a tool that is held up and stands.
+
+        Else the tool would leap after the target, and against whatever is there, as soon as it is free. A robot that is
+        only late goes on, and is not taken for one that is held.
+        """
+        at = self.arm.tool_pose(measured).position
+        moved, way = at - self._held_at, target.position - at
+        self._held_at = at
+        self._stuck = self._stuck + 1 if float(moved.dot(moved)) < (_STANDS * self.dt) ** 2 else 0
+        length = math.sqrt(float(way.dot(way)))
+        if self._stuck > _STUCK / self.dt and length > _SLIP:
+            self._engagement.slip((_SLIP / length - 1.0) * way)
 
     def _yielding(self, twist: Array, measured: Array, share: float) -> Array:
         """Return a twist without a share of what goes on in the direction in which the tool is held back."""
@@ -245,8 +264,7 @@ class ModernRetargeter(Retargeter):
             rows = own if rows is None else (np.concatenate([rows[0], own[0]]), np.concatenate([rows[1], own[1]]))
         if rows is not None and not led:  # what is too near already is left when the person leads on
             rows = rows[0], np.minimum(rows[1], 0.0)
-        solver = self._solver if led else self._brake
-        velocity = solver.solve(self._q, twist, velocity=self._velocity, rows=rows, sew=elbow)
+        velocity = self._solver.solve(self._q, twist, velocity=self._velocity, rows=rows, sew=elbow)
         self._velocity = velocity
         self._q = self._q + self.dt * velocity
 

@@ -56,6 +56,7 @@ class OneEuro:
     def reset(self) -> None:
         """Forget the past."""
         self._time = -math.inf
+        self._shape: tuple[int, ...] = ()
         self._last: list[list[float]] = []  # the vectors as they were measured, smoothed, and their velocities
         self._smooth: list[list[float]] = []
         self._speed: list[list[float]] = []
@@ -75,7 +76,9 @@ class OneEuro:
             return self.value
         several = x.ndim == 2
         measured: list[list[float]] = x.tolist() if several else [x.tolist()]
-        self._time = time
+        if period <= GAP and x.shape != self._shape:
+            raise InputError(f"OneEuro: vectors of shape {self._shape} were begun with, got {x.shape}")
+        self._time, self._shape = time, x.shape
         if period > GAP:
             self._begin(measured)
         else:
