@@ -46,9 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument(
         "--first",
         type=int,
-        default=JUDGED,
         metavar="N",
-        help=f"first of them; default: {JUDGED}. Those below {JUDGED} are for working on methods, the others judge",
+        help=f"first of them; default: {JUDGED}, with --quick 0. Those below {JUDGED} are for working on methods, the "
+        "others judge",
     )
     mapping.add_argument("--repeats", type=int, metavar="N", help="closed-loop trials of each; default: 5, quick 1")
     mapping.add_argument("--quick", action="store_true", help="a few short recordings: shows that it runs, no more")
@@ -145,7 +145,7 @@ def _asked(arguments: argparse.Namespace) -> MappingBenchmark:
     data: Path | None = arguments.data
     return MappingBenchmark(
         people=_given(arguments.people, 2 if quick else 10),
-        first=arguments.first,
+        first=_given(arguments.first, 0 if quick else JUDGED),
         repeats=_given(arguments.repeats, 1 if quick else 5),
         methods=arguments.methods or tuple(METHODS),
         kinds=() if arguments.no_replay else arguments.kinds or KINDS,

@@ -54,9 +54,9 @@ class ModernRetargeter(Retargeter):
        velocity;
     3. a quadratic programme for the joints' velocities: the twist, the elbow's SEW angle, the box of position, velocity
        and acceleration that can always be kept, bounds that keep elbow and wrist off their singularities, rows that
-       keep the links off each other and off the scene;
+       keep the links off each other and off the scene; while nobody leads, the arm goes nowhere by itself;
     4. a follower that limits the jerk (:class:`~imitarm.retarget.jerk_limit.JerkLimiter`), guards the limits again,
-       and does not press on against what holds the arm up.
+       and does not press on against what holds the arm up; a clutch whose tool stands held slips.
 
     The elbow's angle changes as the person's does, from where both were when the clutch engaged:
     :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. It counts less the less surely the person's elbow is seen, and the
