@@ -7,6 +7,7 @@ import importlib
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -121,7 +122,7 @@ def _backend(name: str, workers: int) -> Iterator[Mapped]:
         yield _joblib(name, workers)
         return
     spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_leave_interrupts_to_the_parent)
+    pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin_worker)
 
     def mapped(function: Callable[[Job], Experiment], jobs: Sequence[Job]) -> Iterator[Experiment]:
         try:
@@ -153,8 +154,17 @@ def _joblib(name: str, workers: int) -> Mapped:
     return mapped
 
 
-def _leave_interrupts_to_the_parent() -> None:
+def _begin_worker() -> None:
+    """Leave Ctrl-C to the parent, and end with it: a pool's workers outlive a parent that was killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+
+
+def _end_with_the_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)  # results are written aside and renamed: nothing is lost but what was half done
 
 
 def _silent(_done: int, _total: int) -> None:
