@@ -38,11 +38,11 @@ def test_the_captured_arm_is_one_person_and_has_no_interval():
     results = [captured(m, camera, lag) for m in ("modern", "m3") for camera, lag in ((0, 0.044), (1, 0.075))]
     table = accuracy_table(Results(results), CAPTURED)
     lag = table.columns.index("lag [ms]>")
-    assert [row[lag] for row in table.rows] == ["60 (44 and 75)"] * 2
+    assert [row[lag] for row in table.rows] == ["60 (44 … 75)"] * 2
     assert not any(" to " in cell for row in table.rows for cell in row)
     assert "One person's" in table.note
     ((kind, n, who, *facts),) = recordings_table(Results(results)).rows
-    assert (kind, n, who, facts[0]) == (CAPTURED, "2", "1 person, 2 cameras", "43.0 (43.0 and 43.0)")
+    assert (kind, n, who, facts[0]) == (CAPTURED, "2", "1 person, 2 cameras", "43.0 (43.0 … 43.0)")
     titles = [t.title for t in tables(Results(results))]
     assert not any(title.startswith(("Paired", "Where another", "What the thesis")) for title in titles)
     other = [captured("modern", 0, 0.04, seed=0), captured("modern", 1, 0.04, seed=1)]

@@ -26,7 +26,7 @@ from imitarm.benchmark.tables import Table
 from imitarm.benchmark.thesis_table import claims_table, printed_table
 from imitarm.errors import InputError
 
-CAMERAS = 2  # before which the captured arm is put: it is one person's
+CAMERAS = 8  # before which the captured arm is put: it is one person's
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ _MEANS_NOTE = "Mean over persons (95 % interval)"
 _ACCURACY_NOTE = (
     "root mean squares. Executed: by an arm that keeps its limits, which a real one does. Led: share of the time."
 )
-_CAPTURED_NOTE = "One person's motion, so without an interval: mean (each of two cameras)"
+_CAPTURED_NOTE = "One person's motion, so without an interval: mean (least … greatest over the cameras)"
 _ONE = -1  # person of the captured arm, whichever made-up body carries it: it is one and the same
 
 
@@ -143,13 +143,13 @@ def written(found: Interval, figure: Figure) -> str:
 
 
 def written_each(values: Values, figure: Figure) -> str:
-    """Return a mean and, in brackets, what it is the mean of: for a few numbers that have no interval."""
+    """Return a mean and, in brackets, the least and greatest of what it is the mean of: for what has no interval."""
     known = [figure.factor * value for _, value in sorted(values.items()) if math.isfinite(value)]
     if not known:
         return f"– (0 of {len(values)})" if values else "–"
     text = f"{np.mean(known):.{figure.digits}f}"
     if len(known) > 1:
-        text += f" ({' and '.join(f'{value:.{figure.digits}f}' for value in known)})"
+        text += f" ({min(known):.{figure.digits}f} … {max(known):.{figure.digits}f})"
     return text if len(known) == len(values) else f"{text}, {len(known)} of {len(values)}"
 
 
