@@ -155,4 +155,4 @@ def test_what_was_calibrated_holds_unless_it_is_said_otherwise(tmp_path, capsys)
     assert (found.side, found.scale, found.orientation, found.lengths.upper_arm) == ("left", 1.0, "fixed", 0.3)
     assert of("--calibration", str(path), "--side", "right").lengths is None
     assert "the right one is learnt as it is seen" in capsys.readouterr().err
-    assert (of().side, of().scale, of().orientation) == ("right", 1.0, "hand")
+    assert (of().side, of().scale, of().orientation) == ("right", 1.0, "upright")

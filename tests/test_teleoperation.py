@@ -118,6 +118,21 @@ def test_what_the_robot_did_is_recorded_from_when_it_was_led(tmp_path):
     assert shown.trajectory.times[0] > 0.3
 
 
+def test_a_state_that_came_once_is_recorded_once(tmp_path, monkeypatch):
+    """Over UDP the newest state may be an old one: rows written again look like a robot that stood and then jumped."""
+    robot = SimulatedRobot(ArmModel.load("sawyer", tool="gripper"))
+    with DemonstrationRecorder(tmp_path / "shown.csv", robot.arm) as recorder:
+        one = loop(robot, recorder=recorder)
+        lead(one, 1.5)
+        before, last = recorder.n_samples, robot.state()
+        monkeypatch.setattr(robot, "state", lambda: last)
+        lead(one, 0.2, start=1.5)
+        assert recorder.n_samples == before
+        monkeypatch.undo()
+        lead(one, 0.2, start=1.7)
+        assert recorder.n_samples == before + 20
+
+
 # --- over the wire
 
 

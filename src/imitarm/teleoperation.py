@@ -126,6 +126,7 @@ class Teleoperation:
         self._wire = robot if isinstance(robot, UdpRobot) else None
         self._rest = np.zeros(robot.arm.n_joints)
         self._engaged, self._closed, self._followed = False, False, False
+        self._recorded = float("nan")  # time of the state that was recorded last, by the robot's clock
         self._arrival: Arrival | None = None
         self._made_from: dict[int, tuple[int, int]] = {}  # sequence of a command: row of the log, time of exposure
 
@@ -291,5 +292,6 @@ class Teleoperation:
 
     def _record(self, time: float, doing: str, state: ArmState) -> None:
         self._followed = self._followed or doing == "following"
-        if self._recorder is not None and self._followed:
+        if self._recorder is not None and self._followed and state.time != self._recorded:
+            self._recorded = state.time  # a robot at the end of a wire has not always told something new
             self._recorder.write(time, state.q)

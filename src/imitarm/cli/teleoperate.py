@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     person.add_argument(
         "--orientation",
         choices=get_args(Orientation),
-        help="what of the hand's turning the tool follows; default: hand",
+        help="what of the hand's turning the tool follows; default: as calibrated, else upright",
     )
     robot = parser.add_argument_group("the robot")
     robot.add_argument(
@@ -149,6 +149,8 @@ def _correspondence(arguments: argparse.Namespace) -> Correspondence:
     """Return what was calibrated, changed by what was given."""
     calibration = Calibration() if arguments.calibration is None else Calibration.load(arguments.calibration)
     found = calibration.correspondence()
+    if calibration.orientation is None:  # a camera sees the hand's turning badly
+        found = replace(found, orientation="upright")
     if arguments.side is not None and arguments.side != found.side:
         if found.lengths is not None:
             remark(f"the calibration is of the {found.side} arm; the {arguments.side} one is learnt as it is seen")

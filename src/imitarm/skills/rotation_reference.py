@@ -110,7 +110,8 @@ class RotationReference:
         raise InputError(
             f"orientations differ by up to {np.rad2deg(farthest):.0f} degrees at the same instant, most in "
             f"demonstration {worst}: the demonstrations don't turn the same way. Align them first, "
-            "or learn them as separate skills"
+            "learn them as separate skills, or show them with a tool that keeps its turn (imitarm retarget "
+            "--orientation fixed)"
         )
 
 
