@@ -13,6 +13,7 @@ from imitarm.benchmark.tracking import TrueArm, rms
 from imitarm.capture.motions import Truth
 from imitarm.capture.skeleton import Skeleton
 from imitarm.cli.following import FAR, Following
+from imitarm.kinematics.pose import quaternion_conjugate, quaternion_multiply
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import Correspondence, Retargeting
 from imitarm.retarget.retargeter import STATES
@@ -20,6 +21,7 @@ from imitarm.viewer.retarget_content import Measure, MethodResult, PlainTable
 
 Array = NDArray[np.float64]
 
+_WOUND = np.radians(200.0)  # no hand turns so far about the vertical
 TITLES = {
     "modern": "modern",
     "thesis": "thesis",
@@ -147,6 +149,12 @@ def warnings_of(run: Retargeting, m: MappingMetrics, following: Following) -> li
             f"the tool was more than {1e2 * FAR:.0f} cm from its target for {following.far_time:.1f} s (at most "
             f"{1e2 * following.farthest:.0f} cm): out of reach, or quicker than the joints may"
         )
+    wound = winding(run)
+    if wound > _WOUND:
+        lines.append(
+            f"the tool was to turn about the vertical by {np.degrees(wound):.0f} degrees in all: a hand that points "
+            "straight up or down does not tell its turn; --orientation fixed keeps the tool's"
+        )
     broken = {
         "position": m.position_violations,
         "velocity": m.velocity_violations,
@@ -160,6 +168,16 @@ def warnings_of(run: Retargeting, m: MappingMetrics, following: Following) -> li
     if run.closed.any():
         lines.append("the hand closed on the way; a demonstration holds no gripper, so that is not kept")
     return lines
+
+
+def winding(run: Retargeting) -> float:
+    """Return how far apart the farthest two headings of the tool's target are, full turns counted [rad]."""
+    turns = run.targets[1]
+    turns = turns[np.isfinite(turns).all(axis=1)]
+    if not len(turns):
+        return 0.0
+    away = quaternion_multiply(turns, quaternion_conjugate(turns[0]))
+    return float(np.ptp(np.unwrap(2.0 * np.arctan2(away[:, 3], away[:, 0]))))
 
 
 def _waiting_again(states: NDArray[np.str_]) -> int:
