@@ -45,3 +45,10 @@ def test_a_tool_that_winds_is_told_and_what_to_do(run):
 
 def test_a_run_without_a_target_has_not_wound(run):
     assert winding(replace(run, targets=(run.targets[0], np.full((len(run.times), 4), np.nan)))) == 0.0
+
+
+@pytest.mark.parametrize(("seconds", "told"), [(0.0, False), (0.02, False), (0.1, True)])
+def test_no_time_is_told_that_rounds_to_none(run, seconds, told):
+    metrics = measure(run, Correspondence(orientation="fixed"))
+    following = replace(Following.of("modern", run, metrics), far_time=seconds, farthest=0.06)
+    assert ("from its target for" in " ".join(warnings_of(run, metrics, following))) == told

@@ -21,6 +21,7 @@ from imitarm.viewer.retarget_content import Measure, MethodResult, PlainTable
 
 Array = NDArray[np.float64]
 
+_BRIEF = 0.05  # [s] less would be told as 0.0 s
 _WOUND = np.radians(200.0)  # no hand turns so far about the vertical
 TITLES = {
     "modern": "modern",
@@ -144,7 +145,7 @@ def warnings_of(run: Retargeting, m: MappingMetrics, following: Following) -> li
     stopped = int(np.sum(run.states == "stopped")) + _waiting_again(run.states)
     if stopped:
         lines.append(f"stopped or waited for {stopped * dt:.1f} s on the way, because the arm was not seen")
-    if following.far_time:
+    if following.far_time >= _BRIEF:
         lines.append(
             f"the tool was more than {1e2 * FAR:.0f} cm from its target for {following.far_time:.1f} s (at most "
             f"{1e2 * following.farthest:.0f} cm): out of reach, or quicker than the joints may"
