@@ -135,7 +135,7 @@ def test_a_loss_of_sight_is_coasted_held_and_stopped_and_needs_a_new_hold():
 
 @pytest.mark.parametrize("robot", ["sawyer", "panda"])
 def test_an_arm_nearer_to_itself_than_it_should_be_does_not_move_by_itself(robot):
-    """It did: a robot that began 3 mm too near moved off, 3 degrees, with nobody in view, and could not be led then."""
+    """It did: a robot that began a little too near moved off, with nobody in view, and could not be led meanwhile."""
     arm = ARMS[robot]
     own, rng = SelfClearance(arm, 0.02), np.random.default_rng(3)
     tried = 0
@@ -153,7 +153,7 @@ def test_an_arm_nearer_to_itself_than_it_should_be_does_not_move_by_itself(robot
 
 @pytest.mark.parametrize("robot", ["sawyer", "panda"])
 def test_an_arm_at_a_singularity_does_not_move_by_itself(robot):
-    """It did: the bounds that keep a wrist bent bent it, by up to 16 degrees, with nobody in view."""
+    """It did: the bounds that keep a wrist bent bent it, with nobody in view."""
     arm, rng = ARMS[robot], np.random.default_rng(4)
     retargeter = ModernRetargeter(arm)
     for _ in range(10):
@@ -318,7 +318,7 @@ def test_the_clutch_does_not_slip_on_a_robot_that_is_only_late(arm):
 
 @pytest.mark.parametrize(("robot", "seed", "lost"), [("sawyer", 0, 5.6), ("sawyer", 2, 6.2), ("panda", 3, 2.0)])
 def test_an_arm_that_loses_sight_near_full_stretch_does_not_straighten_its_elbow(robot, seed, lost):
-    """Moments at which braking without the elbow's bound brought it up to 5 degrees from straight, or through."""
+    """Moments at which braking without the elbow's bound brought it near to straight, or through."""
     arm = ARMS[robot]
     marked = arm.marked()
     side = np.sign(arm.home[marked.elbow] - marked.elbow_straight)
