@@ -26,7 +26,7 @@ from imitarm import (
     read,
     reproduce,
 )
-from imitarm.reproduce import Step
+from imitarm.control_loop.reproduce import Step
 from imitarm.tasks import DEMONSTRATIONS, SweepTask
 from imitarm.viewer import FrameRecorder, Report, SceneResult, write_report
 

@@ -21,7 +21,6 @@ from imitarm import (
     align,
     find_posture,
     reproduce,
-    retarget,
 )
 from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.motions import minimum_jerk
@@ -65,9 +64,9 @@ def main() -> None:
 
     demonstrations = []
     for number in range(5):
-        source, runs = take(number), []
-        whole = retarget(source, ModernRetargeter(arm, correspondence), q=start, task="put", on_done=runs.append)
-        run, part = runs[0], following(runs[0])
+        source = take(number)
+        run = ModernRetargeter(arm, correspondence).run(source, start)
+        part, whole = following(run), run.demonstration(task="put")
         times = whole.trajectory.times[part]
         positions = whole.trajectory.positions[part]
         demonstrations.append(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from imitarm import ArmModel, Scene, Sphere
-from imitarm.benchmark.driving import drive
 from imitarm.capture.synthetic import SyntheticSource
+from imitarm.evaluation.driving import drive
 from imitarm.retarget import Correspondence, ModernRetargeter
 
 ARM = ArmModel.load("sawyer", tool="gripper")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.benchmark.intervals import (
+from imitarm.evaluation.intervals import (
     bootstrap,
     compare,
     holm,

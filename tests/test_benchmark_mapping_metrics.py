@@ -6,12 +6,12 @@ import math
 import numpy as np
 import pytest
 
-from imitarm.benchmark.mapping_metrics import measure
-from imitarm.benchmark.tracking import TrueArm
 from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
 from imitarm.capture.synthetic import SyntheticSource
+from imitarm.evaluation.mapping_metrics import measure
+from imitarm.evaluation.tracking import TrueArm
 from imitarm.kinematics.arm import ArmModel
 from imitarm.retarget import Correspondence, LimbLengths, ModernRetargeter, Retargeting
 

@@ -3,7 +3,6 @@ from __future__ import annotations
 import math
 
 from imitarm.benchmark.experiment import Experiment, Result
-from imitarm.benchmark.intervals import Interval
 from imitarm.benchmark.mapping import tables
 from imitarm.benchmark.mapping_report import mapping_report_html
 from imitarm.benchmark.mapping_tables import (
@@ -19,6 +18,7 @@ from imitarm.benchmark.mapping_tables import (
 )
 from imitarm.benchmark.recording_plan import CAPTURED
 from imitarm.benchmark.stacking import failures
+from imitarm.evaluation.intervals import Interval
 from mapping_results import captured, live, replay
 
 

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.benchmark.motion_measures import (
+from imitarm.errors import InputError
+from imitarm.evaluation.motion import (
     ArmMotion,
     executed,
     jerk_rms,
@@ -13,7 +14,6 @@ from imitarm.benchmark.motion_measures import (
     spectral_arc_length,
     violations,
 )
-from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 
 ARM = ArmModel.load("sawyer", tool="gripper")

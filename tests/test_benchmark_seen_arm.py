@@ -3,12 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imitarm.benchmark.seen_arm import seen_arm, target_lag
-from imitarm.benchmark.tracking import TrueArm
 from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import JOINT, Skeleton
 from imitarm.errors import TaskFailedError
+from imitarm.evaluation.seen_arm import seen_arm, target_lag
+from imitarm.evaluation.tracking import TrueArm
 from imitarm.retarget import Correspondence
 
 TRUTH = reaching(Person.from_seed(3), 3, duration=5.0)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from imitarm.benchmark import thesis_table
-from imitarm.benchmark.intervals import Comparison, Interval
 from imitarm.benchmark.mapping_methods import MAIN
 from imitarm.benchmark.mapping_tables import (
     Results,
 )
 from imitarm.benchmark.thesis_table import PATH, TIME, TORQUES, claims_table, verdict
+from imitarm.evaluation.intervals import Comparison, Interval
 from mapping_results import ME, live, replay, world
 
 

@@ -5,7 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.benchmark.tracking import (
+from imitarm.capture.motions import reaching
+from imitarm.capture.person import Person
+from imitarm.evaluation.tracking import (
     Hold,
     TrueArm,
     best_lag,
@@ -18,8 +20,6 @@ from imitarm.benchmark.tracking import (
     rotation_errors,
     settling_time,
 )
-from imitarm.capture.motions import reaching
-from imitarm.capture.person import Person
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply, rotate
 from imitarm.retarget import FACING, Correspondence
 

@@ -5,7 +5,7 @@ import pytest
 
 from imitarm.benchmark import speed_rows, transmission_rows
 from imitarm.benchmark.transmission_rows import complete
-from imitarm.latency import LatencyLog
+from imitarm.transmission.latency import LatencyLog
 
 
 def test_only_skeletons_whose_whole_way_is_known_count():

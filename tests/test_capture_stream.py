@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from imitarm.capture.skeleton import JOINTS, Skeleton
 from imitarm.capture.stream import SkeletonSender, UdpSource, frame_of
 from imitarm.capture.synthetic import SyntheticSource
-from imitarm.datagram import Encoder, decode
 from imitarm.errors import InputError
+from imitarm.transmission.datagram import Encoder, decode
 from recording_samples import same, skeletons
 from wire_samples import MS, Clock, command, skeleton_frame
 

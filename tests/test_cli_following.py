@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imitarm import ArmModel
-from imitarm.benchmark.mapping_metrics import measure
 from imitarm.capture.skeleton import JOINT, Skeleton
 from imitarm.cli.following import FAR, MOSTLY, Following, remedy
+from imitarm.evaluation.mapping_metrics import measure
 from imitarm.retarget import Correspondence, ModernRetargeter
 from recording_samples import skeletons
 

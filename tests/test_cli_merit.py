@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from imitarm import ArmModel
-from imitarm.benchmark.mapping_metrics import measure
 from imitarm.cli.following import Following
 from imitarm.cli.merit import warnings_of, winding
+from imitarm.evaluation.mapping_metrics import measure
 from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply
 from imitarm.retarget import Correspondence, ModernRetargeter
 from recording_samples import skeletons

@@ -9,10 +9,10 @@ import pytest
 
 from imitarm.cli import main
 from imitarm.cli.serve import _summary, terminated_as_interrupted
+from imitarm.files.table import read_table
 from imitarm.kinematics.arm import ArmModel
-from imitarm.messages import Status
 from imitarm.robots import RobotServer, SimulatedRobot
-from imitarm.table import read_table
+from imitarm.transmission.messages import Status
 
 
 def test_it_serves_for_a_time_and_says_how_it_went(tmp_path, capfd):

@@ -10,11 +10,11 @@ import pytest
 from imitarm.capture.recording import SkeletonRecording
 from imitarm.cli import main, teleoperate
 from imitarm.cli.teleoperate import _correspondence, add_arguments
+from imitarm.files.table import read_table
 from imitarm.kinematics.arm import ArmModel
 from imitarm.retarget import RETARGETERS, LimbLengths
 from imitarm.retarget.calibration import Calibration
 from imitarm.robots import RobotServer, SimulatedRobot, UdpRobot
-from imitarm.table import read_table
 from imitarm.trajectory import Demonstration
 from recording_samples import skeletons
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.datagram import Encoder, decode, now_ns, size_of
-from imitarm.messages import DatagramError, JointCommand, JointState, Mode, SkeletonFrame
+from imitarm.transmission.datagram import Encoder, decode, now_ns, size_of
+from imitarm.transmission.messages import DatagramError, JointCommand, JointState, Mode, SkeletonFrame
 from wire_samples import command, joint_state, skeleton_frame
 
 ANY = [skeleton_frame, lambda rng: command(q=rng.normal(size=7), velocity=rng.normal(size=7)), joint_state]

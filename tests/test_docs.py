@@ -6,11 +6,8 @@ import argparse
 import ast
 import importlib
 import inspect
-import pkgutil
 import re
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -198,38 +195,6 @@ def test_every_public_name_exists_and_says_what_it_is(name: str) -> None:
     assert callable(thing) or not isinstance(thing, ModuleType), f"imitarm.{name} is the module of that name"
     if inspect.isclass(thing) or inspect.isroutine(thing):
         assert (thing.__doc__ or "").strip(), f"imitarm.{name} has no docstring"
-
-
-def test_public_names_are_listed_once_and_each_has_a_home() -> None:
-    assert len(imitarm.__all__) == len(set(imitarm.__all__))
-    assert set(imitarm.__all__) == set(imitarm._HOME)
-    tree = ast.parse(Path(imitarm.__file__).read_text(encoding="utf-8"))
-    typed = {alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names}
-    assert set(imitarm.__all__) <= typed  # what editors see
-
-
-_SAME = """
-import imitarm.{0} as again, imitarm
-assert it is again is imitarm.{0} is sys.modules["imitarm.{0}"], it
-assert type(it.{0}).__name__ == "function"
-try:
-    it(1, 2, nonsense=3)
-except TypeError as error:
-    assert "{0}() got an unexpected keyword" in str(error), error
-else:
-    raise AssertionError("it was not called")
-"""
-
-
-def test_a_verb_is_its_module_and_can_be_called_whichever_comes_first() -> None:
-    """``import imitarm.retarget as r`` gives the package; ``imitarm.retarget(...)`` does what its function does."""
-    verbs = [m.name for m in pkgutil.iter_modules(imitarm.__path__) if m.name in imitarm.__all__]
-    assert verbs == ["reproduce", "retarget"]
-    for first in ("import imitarm.{0} as it", "from imitarm import {0} as it"):
-        code = "import sys\n" + "\n".join(f"{first}\n{_SAME}".format(name) for name in verbs)
-        subprocess.run([sys.executable, "-c", code], check=True)
-    module = importlib.import_module("imitarm.retarget")
-    assert module.Correspondence is imitarm.Correspondence and "ModernRetargeter" in dir(module)
 
 
 @each_source

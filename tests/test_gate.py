@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.datagram import Encoder, Header
-from imitarm.gate import REASONS, Gate
-from imitarm.messages import JointCommand, SkeletonFrame
+from imitarm.transmission.datagram import Encoder, Header
+from imitarm.transmission.gate import REASONS, Gate
+from imitarm.transmission.messages import JointCommand, SkeletonFrame
 from wire_samples import MS, command, skeleton_frame
 
 PERIOD = 10 * MS

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from imitarm.errors import InputError, UnknownNameError
-from imitarm.latency import STAGES, LatencyLog
-from imitarm.table import read_table
+from imitarm.files.table import read_table
+from imitarm.transmission.latency import STAGES, LatencyLog
 
 
 def filled(n=5000):

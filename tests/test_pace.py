@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.pace import Pace
+from imitarm.transmission.pace import Pace
 from wire_samples import MS, Clock
 
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imitarm.errors import InputError
-from imitarm.part_file import PART, PartFile
+from imitarm.files.part_file import PART, PartFile
 
 
 @given(texts=st.lists(st.text(st.characters(codec="utf-8", exclude_characters="\r"))))

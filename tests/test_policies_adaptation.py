@@ -10,8 +10,8 @@ from imitarm.benchmark.families import sparse_clutter
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose, quaternion_exp, rotate
 from imitarm.policies import HORIZONTAL_ONLY, METHODS, adapt
+from imitarm.policies.baselines.potential_components import FORCES, component_distances, push_components
 from imitarm.policies.component_path import ComponentPath, quintic_step
-from imitarm.policies.potential_components import FORCES, component_distances, push_components
 from imitarm.scene import Box, Scene, Sphere
 from imitarm.skills import Skill
 from imitarm.trajectory import Demonstration, Trajectory

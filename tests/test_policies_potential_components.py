@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from imitarm.benchmark.avoidance import learn
 from imitarm.kinematics.pose import Pose, quaternion_exp
 from imitarm.policies import HORIZONTAL_ONLY
-from imitarm.policies.component_path import ComponentPath
-from imitarm.policies.potential_components import (
+from imitarm.policies.baselines.potential_components import (
     FORCES,
     INFLUENCE_DISTANCE,
     component_distances,
@@ -21,6 +20,7 @@ from imitarm.policies.potential_components import (
     modified_force,
     push_components,
 )
+from imitarm.policies.component_path import ComponentPath
 from imitarm.scene import Box, Sphere
 
 BALL = Sphere([0.1, -0.2, 0.3], 0.06)

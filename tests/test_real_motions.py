@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from imitarm import ArmModel, SimulatedRobot
-from imitarm.benchmark.seen_arm import seen_arm
 from imitarm.capture.checks import repaired
 from imitarm.capture.mediapipe_environment import find_python
 from imitarm.capture.recording import read_recording
 from imitarm.capture.slowing import slowed
 from imitarm.capture.sources import followed, open_source
 from imitarm.errors import InputError
+from imitarm.evaluation.seen_arm import seen_arm
 from imitarm.retarget import Correspondence, ModernRetargeter
 from imitarm.retarget.engagement import SEEN_FOR
 from imitarm.retarget.fitting import fit_motion

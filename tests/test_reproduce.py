@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from imitarm.control_loop.reproduce import reproduce
 from imitarm.errors import InfeasibleError, InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
 from imitarm.policies.policy import Policy
-from imitarm.reproduce import reproduce
 from imitarm.robots import SimulatedRobot
 from imitarm.scene import Box, Scene
 

@@ -3,8 +3,8 @@ import pytest
 
 from imitarm import ArmModel
 from imitarm.retarget import AdaptiveControl, Correspondence
-from imitarm.retarget.adaptive_control import CUT_OFF
-from imitarm.retarget.adaptive_law import START_STIFFNESS
+from imitarm.retarget.baselines.adaptive_control import CUT_OFF
+from imitarm.retarget.baselines.adaptive_law import START_STIFFNESS
 from shown_arm import EASY, LENGTHS, shown, swing
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}

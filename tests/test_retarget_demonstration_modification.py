@@ -10,7 +10,7 @@ from imitarm.capture.person import Person
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.errors import InputError
 from imitarm.retarget import Correspondence, DemonstrationModification, LimbLengths
-from imitarm.retarget.infeasible import above
+from imitarm.retarget.baselines.infeasible import above
 from shown_arm import EASY, LENGTHS, shown, swing
 
 SAWYER = ArmModel.load("sawyer", tool="gripper")

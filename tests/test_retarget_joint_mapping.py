@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 from imitarm import ArmModel
 from imitarm.errors import InputError
 from imitarm.retarget.arm_estimator import ArmEstimator
+from imitarm.retarget.baselines.joint_mapping import Approach, JointMapping, continued
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import human_arm_pose
-from imitarm.retarget.joint_mapping import Approach, JointMapping, continued
 from imitarm.retarget.limbs import LimbLengths
 from imitarm.tasks.operator import Operator
 from shown_arm import EASY, LENGTHS, skeleton

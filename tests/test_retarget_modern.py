@@ -12,7 +12,7 @@ from imitarm.kinematics.pose import rotate
 from imitarm.kinematics.reach_of_links import _shapes, meeting_links
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.sew import sew_angle
-from imitarm.retarget import FACING, Correspondence, LimbLengths, ModernRetargeter, retarget
+from imitarm.retarget import FACING, Correspondence, LimbLengths, ModernRetargeter
 from imitarm.retarget.retargeter import ticks
 
 DT = 0.01
@@ -416,7 +416,7 @@ def test_a_real_arm_drives_both_robots_within_their_limits(real_data):
 def test_a_recording_becomes_a_demonstration():
     person, _, frames = recording(3)
     arm = ARMS["sawyer"]
-    shown = retarget(frames, ModernRetargeter(arm, Correspondence(lengths=lengths(person))), task="reach")
+    shown = ModernRetargeter(arm, Correspondence(lengths=lengths(person))).run(frames).demonstration("reach")
     assert shown.task == "reach"
     assert shown.joints.shape == (len(shown.trajectory), 7)
     np.testing.assert_allclose(np.diff(shown.trajectory.times), DT)

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
 from imitarm.errors import InputError
-from imitarm.retarget.nurbs import NURBS, basis_functions
+from imitarm.retarget.baselines.nurbs import NURBS, basis_functions
 
 CIRCLE = NURBS([0, 0, 0, 1, 1, 1], [[1, 0], [1, 1], [0, 1]], [1, np.sqrt(0.5), 1], 2)  # a quarter of one
 

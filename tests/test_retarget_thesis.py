@@ -10,10 +10,10 @@ from imitarm.capture.person import Person
 from imitarm.capture.skeleton import Skeleton
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.errors import InputError, UnknownNameError
+from imitarm.retarget.baselines.thesis import PRINTED, ThesisRetargeter
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.limbs import LimbLengths
-from imitarm.retarget.retargeter import Retargeting, retarget
-from imitarm.retarget.thesis import PRINTED, ThesisRetargeter
+from imitarm.retarget.retargeter import Retargeting
 
 SAWYER = ArmModel.load("sawyer", tool="gripper")
 PERSON = Person.from_seed(1)
@@ -184,7 +184,7 @@ def test_the_elbow_is_reported_and_the_same_frames_give_the_same_motion():
 
 
 def test_a_recording_becomes_a_demonstration():
-    demonstration = retarget(recording(), ThesisRetargeter(SAWYER, FOLLOW), task="reach")
+    demonstration = ThesisRetargeter(SAWYER, FOLLOW).run(recording()).demonstration("reach")
     assert demonstration.joints.shape == (len(demonstration.trajectory.times), 7)
     assert demonstration.trajectory.path_length > 0.3
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from imitarm.errors import InputError
-from imitarm.messages import Status
 from imitarm.robots import RobotServer, UdpRobot
+from imitarm.transmission.messages import Status
 from wire_samples import ARM, N, Paper, Served, assert_within_limits
 
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imitarm.datagram import Encoder, decode
 from imitarm.kinematics.arm import ArmModel
-from imitarm.messages import JointState, Mode, Status
 from imitarm.robots import SimulatedRobot
 from imitarm.robots.supervisor import NEAR, Supervisor, fingerprint
+from imitarm.transmission.datagram import Encoder, decode
+from imitarm.transmission.messages import JointState, Mode, Status
 from test_datagram import signed
 from wire_samples import ARM, DT, MS, N, Paper, Sender, assert_within_limits, command, joint_state, skeleton_frame
 

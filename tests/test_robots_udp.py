@@ -5,8 +5,8 @@ import pytest
 
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.messages import Mode, Status
 from imitarm.robots import ROBOTS, SimulatedRobot, UdpRobot
+from imitarm.transmission.messages import Mode, Status
 from wire_samples import ARM, DT, MS, N, Paper, Served, assert_within_limits, command
 
 PERIOD = 0.012  # of the client

@@ -5,7 +5,7 @@ import time
 import pytest
 
 from imitarm.errors import InputError
-from imitarm.sockets import connected, listening, parse_address, resolved, try_to_send, wait_for, waiting
+from imitarm.transmission.sockets import connected, listening, parse_address, resolved, try_to_send, wait_for, waiting
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from imitarm.errors import FileFormatError, InputError
-from imitarm.table import read_table, write_table
+from imitarm.files.table import read_table, write_table
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
 
+from imitarm.control_loop.reproduce import reproduce
 from imitarm.demonstrations import align, read
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose
 from imitarm.policies.acfra import ACFRA
 from imitarm.policies.adaptation import HORIZONTAL_ONLY
 from imitarm.policies.policy import Policy
-from imitarm.reproduce import reproduce
 from imitarm.scene import Scene, load_scene, save_scene
 from imitarm.skills import Skill
 from imitarm.tasks.sweep import DEMONSTRATIONS, SCENES, SWEEPING, SweepTask

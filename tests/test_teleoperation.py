@@ -7,12 +7,12 @@ from imitarm.capture.sources import followed
 from imitarm.capture.stream import SkeletonSender, UdpSource
 from imitarm.demonstrations.recorder import DemonstrationRecorder
 from imitarm.kinematics.arm import ArmModel
-from imitarm.messages import Status
-from imitarm.pace import Pace
 from imitarm.retarget import Correspondence, ModernRetargeter
 from imitarm.robots import SimulatedRobot
-from imitarm.teleoperation import INTERRUPTED, Teleoperation
+from imitarm.teleoperation.loop import INTERRUPTED, Teleoperation
 from imitarm.trajectory import Demonstration
+from imitarm.transmission.messages import Status
+from imitarm.transmission.pace import Pace
 from recording_samples import Listed, skeletons
 from wire_samples import ARM, Clock, Paper, Served, assert_within_limits
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from imitarm.capture.recording import SkeletonRecording
+from imitarm.files.part_file import PART
 from imitarm.kinematics.arm import ArmModel
-from imitarm.messages import Status
-from imitarm.part_file import PART
 from imitarm.trajectory import Demonstration
+from imitarm.transmission.messages import Status
 from recording_samples import skeletons
 from wire_samples import assert_within_limits
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from imitarm.datagram import Encoder
 from imitarm.kinematics.arm import ArmModel, ArmState
-from imitarm.messages import JointCommand, JointState, Mode, SkeletonFrame, Status
 from imitarm.robots import Robot, RobotServer, UdpRobot
 from imitarm.robots.supervisor import fingerprint
+from imitarm.transmission.datagram import Encoder
+from imitarm.transmission.messages import JointCommand, JointState, Mode, SkeletonFrame, Status
 
 ARM = ArmModel.load("sawyer")
 N = ARM.n_joints

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import FileFormatError, InputError
+from imitarm.files.table import Table, read_table, write_table
 from imitarm.kinematics.pose import Pose, checked_unit_quaternions, continuous_signs, slerp
-from imitarm.table import Table, read_table, write_table
 
 Array = NDArray[np.float64]
 

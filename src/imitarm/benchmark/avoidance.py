@@ -21,8 +21,8 @@ from imitarm.benchmark.families import (
     s_shaped_demonstrations,
     sparse_clutter,
 )
-from imitarm.benchmark.intervals import wilson_interval
 from imitarm.benchmark.tables import Table
+from imitarm.evaluation.intervals import wilson_interval
 from imitarm.policies.adaptation import METHODS, Adaptation, adapt
 from imitarm.skills.gmm import DegenerateAxisWarning
 from imitarm.skills.skill import Skill

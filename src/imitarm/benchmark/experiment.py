@@ -17,11 +17,11 @@ import numpy as np
 
 from imitarm.benchmark.fingerprint import code_version
 from imitarm.benchmark.mapping_methods import method
-from imitarm.benchmark.mapping_metrics import measure
 from imitarm.benchmark.recording_plan import CAPTURED, KINDS, Plan
 from imitarm.benchmark.recordings import MappingRecording, beyond_reach, make_recording
 from imitarm.benchmark.stacking import StackingTrial, run_trial
 from imitarm.errors import FileFormatError, ImitarmError, InputError, TaskFailedError, UnknownNameError
+from imitarm.evaluation.mapping_metrics import measure
 from imitarm.kinematics.arm import ArmModel
 
 REPLAYS = (*KINDS, CAPTURED)
@@ -141,7 +141,7 @@ class Result:
     Attributes:
         experiment: which.
         version: of the code that did it, see :func:`imitarm.benchmark.fingerprint.code_version`.
-        values: what was measured, by name: those of :class:`~imitarm.benchmark.mapping_metrics.MappingMetrics` with
+        values: what was measured, by name: those of :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics` with
             ``recorded`` [s], ``beyond_reach`` (share of the time) and the method's own ``notes``; or those of
             :class:`~imitarm.benchmark.stacking.TrialOutcome`; empty after a failure.
         failure: why there is nothing to measure; empty when there is.

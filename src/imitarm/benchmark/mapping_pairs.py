@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator, Sequence
 
 from imitarm.benchmark.experiment import LIVE
-from imitarm.benchmark.intervals import Comparison, compare, holm
 from imitarm.benchmark.mapping_methods import METHODS
 from imitarm.benchmark.mapping_tables import ACCURACY, EFFORT, LED, LOOP, SMOOTHNESS, TORQUES, Figure, Results
 from imitarm.benchmark.tables import Table
+from imitarm.evaluation.intervals import Comparison, compare, holm
 
 OURS = "modern"
 COMPARED = (

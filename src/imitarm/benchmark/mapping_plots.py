@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from imitarm.benchmark.experiment import LIVE
-from imitarm.benchmark.intervals import Interval, Values, interval, rate_interval
 from imitarm.benchmark.mapping_methods import METHODS
 from imitarm.benchmark.mapping_tables import Results
+from imitarm.evaluation.intervals import Interval, Values, interval, rate_interval
 from imitarm.viewer import palette
 from imitarm.viewer.canvas import INK, canvas
 

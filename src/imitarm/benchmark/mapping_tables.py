@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from imitarm.benchmark.experiment import LIVE, REPLAYS, Result
-from imitarm.benchmark.intervals import Interval, Values, interval, rate_interval
 from imitarm.benchmark.mapping_methods import METHODS
 from imitarm.benchmark.recording_plan import CAPTURED, KINDS
 from imitarm.benchmark.stacking import failures
 from imitarm.benchmark.tables import Table
+from imitarm.evaluation.intervals import Interval, Values, interval, rate_interval
 
 JUDGED = 200
 """First of the persons that nobody looks at while a method is worked on."""

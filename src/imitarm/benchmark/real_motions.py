@@ -16,10 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imitarm.benchmark.driving import drive
 from imitarm.benchmark.experiment import write_text
-from imitarm.benchmark.mapping_metrics import measure
-from imitarm.benchmark.seen_arm import seen_arm, target_lag
 from imitarm.benchmark.tables import Table
 from imitarm.capture.checks import repaired
 from imitarm.capture.recording import SkeletonRecording
@@ -27,6 +24,9 @@ from imitarm.capture.skeleton import Skeleton
 from imitarm.capture.slowing import slowed
 from imitarm.capture.sources import followed, open_source
 from imitarm.errors import ImitarmError, InputError
+from imitarm.evaluation.driving import drive
+from imitarm.evaluation.mapping_metrics import measure
+from imitarm.evaluation.seen_arm import seen_arm, target_lag
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import RETARGETERS, Correspondence

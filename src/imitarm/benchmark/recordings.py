@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.benchmark.recording_plan import CAPTURED, REPEATS, Plan
-from imitarm.benchmark.tracking import TrueArm, motion_end
 from imitarm.capture.drawing import DRAWINGS, drawing
 from imitarm.capture.motions import REST, MotionCapture, Truth, reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import HandState, Skeleton
 from imitarm.errors import InputError, TaskFailedError, UnreachableError
+from imitarm.evaluation.tracking import TrueArm, motion_end
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.posture import find_posture

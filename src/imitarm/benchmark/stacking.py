@@ -10,8 +10,8 @@ from functools import partial
 import numpy as np
 
 from imitarm.benchmark.mapping_methods import method
-from imitarm.benchmark.motion_measures import violations
 from imitarm.capture.camera_model import SkeletonCamera
+from imitarm.evaluation.motion import violations
 from imitarm.kinematics.arm import ArmModel
 from imitarm.tasks.stack_trial import DT, stack_once
 

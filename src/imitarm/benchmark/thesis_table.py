@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.benchmark.experiment import LIVE
-from imitarm.benchmark.intervals import Comparison, Values, bootstrap, compare, holm, interval
 from imitarm.benchmark.mapping_methods import METHODS
 from imitarm.benchmark.mapping_tables import Figure, Results, written
 from imitarm.benchmark.tables import Table
+from imitarm.evaluation.intervals import Comparison, Values, bootstrap, compare, holm, interval
 from imitarm.kinematics.arm import ArmModel
 
 Array = NDArray[np.float64]

@@ -17,11 +17,11 @@ from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
 from imitarm.capture.stream import SkeletonSender, UdpSource
 from imitarm.kinematics.arm import ArmModel
-from imitarm.latency import LatencyLog
 from imitarm.retarget import Correspondence, LimbLengths, ModernRetargeter
 from imitarm.robots import RobotServer, SimulatedRobot, UdpRobot
-from imitarm.sockets import Address
-from imitarm.teleoperation import Teleoperation
+from imitarm.teleoperation.loop import Teleoperation
+from imitarm.transmission.latency import LatencyLog
+from imitarm.transmission.sockets import Address
 
 Array = NDArray[np.float64]
 

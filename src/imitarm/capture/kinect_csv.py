@@ -8,7 +8,7 @@ from imitarm.capture.finding import Finding
 from imitarm.capture.native import assembled
 from imitarm.capture.skeleton import JOINTS, Skeleton
 from imitarm.errors import FileFormatError
-from imitarm.table import parse_table
+from imitarm.files.table import parse_table
 
 TICK = 1e-7  # [s] of the SDK's TimeSpan
 COLUMNS = 1 + 4 * len(JOINTS)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from imitarm.capture.finding import Finding
 from imitarm.capture.skeleton import FARTHEST, JOINTS, HandState, Skeleton
 from imitarm.errors import FileFormatError
-from imitarm.table import Table, parse_table
+from imitarm.files.table import Table, parse_table
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from typing import Self
 
 from imitarm.capture.native import UNFINISHED, header, line_of
 from imitarm.capture.skeleton import Skeleton
-from imitarm.part_file import PartFile
+from imitarm.files.part_file import PartFile
 
 
 class SkeletonRecorder:

@@ -13,8 +13,8 @@ from imitarm.capture.finding import Finding
 from imitarm.capture.recorder import SkeletonRecorder
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
 from imitarm.errors import InputError
-from imitarm.part_file import PART
-from imitarm.table import read_bytes
+from imitarm.files.part_file import PART
+from imitarm.files.table import read_bytes
 
 
 class SkeletonRecording(SkeletonSource):

@@ -12,7 +12,7 @@ from imitarm.capture.recording import read_recording
 from imitarm.capture.sides import SwapGuard
 from imitarm.capture.skeleton import SkeletonSource
 from imitarm.errors import InputError, UnknownNameError
-from imitarm.part_file import PART
+from imitarm.files.part_file import PART
 
 WORDS = {
     "FILE": "a recording: imitarm's own, a table of the Kinect SDK, or motion capture",

@@ -9,10 +9,10 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from imitarm.capture.skeleton import HandState, Skeleton, SkeletonSource, Tracking
-from imitarm.datagram import Encoder, now_ns
-from imitarm.gate import Gate
-from imitarm.messages import SkeletonFrame
-from imitarm.sockets import LOOPBACK, Address, connected, listening, try_to_send, wait_for, waiting
+from imitarm.transmission.datagram import Encoder, now_ns
+from imitarm.transmission.gate import Gate
+from imitarm.transmission.messages import SkeletonFrame
+from imitarm.transmission.sockets import LOOPBACK, Address, connected, listening, try_to_send, wait_for, waiting
 
 _LONGEST_WAIT = 60_000_000_000  # [ns] what a datagram can say
 
@@ -95,9 +95,9 @@ class Arrival(NamedTuple):
 class UdpSource(SkeletonSource):
     """Skeletons that a :class:`SkeletonSender` sends, live.
 
-    What is late, damaged, foreign or hostile is dropped and counted by a :class:`~imitarm.gate.Gate`. A sender that is
-    killed and started again goes on after half a second of silence; its times are moved so that they go on, too, with
-    the gap in them, and every retargeter takes hold anew.
+    What is late, damaged, foreign or hostile is dropped and counted by a
+    :class:`~imitarm.transmission.gate.Gate`. A sender that is killed and started again goes on after half a second of
+    silence; its times are moved so that they go on, too, with the gap in them, and every retargeter takes hold anew.
 
     Args:
         port: to listen at; 0: any that is free.

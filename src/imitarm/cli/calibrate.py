@@ -14,13 +14,13 @@ from imitarm.cli.guiding import ask, choose, touched_points
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import remark, say, show_table
 from imitarm.errors import InputError, TaskFailedError
+from imitarm.files.table import read_table
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_file import ARMS
 from imitarm.retarget.calibration import ANCHORS, Anchor, Calibration, suggested_scale
 from imitarm.retarget.correspondence import Orientation
 from imitarm.retarget.limbs import ACCEPTED, LimbLengths, measure_limbs
 from imitarm.retarget.sensor import SensorFit, fit_sensor_to_base
-from imitarm.table import read_table
 
 EPILOG = """\
 examples:

@@ -21,7 +21,7 @@ from imitarm.cli.gathering import add_side_and_person, gather, show_findings, so
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import remark, say, show_table
 from imitarm.errors import InputError, TaskFailedError
-from imitarm.sockets import parse_address
+from imitarm.transmission.sockets import parse_address
 
 EPILOG = """\
 examples:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imitarm.benchmark.driving import Driven
+from imitarm.evaluation.driving import Driven
 from imitarm.viewer.retarget_content import Measure, MethodResult
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imitarm.benchmark.mapping_metrics import MappingMetrics
 from imitarm.capture.skeleton import SIDES, Skeleton
+from imitarm.evaluation.mapping_metrics import MappingMetrics
 from imitarm.retarget import Correspondence, Retargeting
 
 FAR = 0.05  # [m] a tool farther from its target has not reached it

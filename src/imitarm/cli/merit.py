@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark.mapping_metrics import MappingMetrics, measure
-from imitarm.benchmark.seen_arm import seen_arm, target_lag
-from imitarm.benchmark.tracking import TrueArm, rms
 from imitarm.capture.motions import Truth
 from imitarm.capture.skeleton import Skeleton
 from imitarm.cli.following import FAR, Following
+from imitarm.evaluation.mapping_metrics import MappingMetrics, measure
+from imitarm.evaluation.seen_arm import seen_arm, target_lag
+from imitarm.evaluation.tracking import TrueArm, rms
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_multiply
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import Correspondence, Retargeting

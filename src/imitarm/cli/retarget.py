@@ -11,8 +11,6 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark.driving import drive as drive_run
-from imitarm.benchmark.seen_arm import seen_arm
 from imitarm.capture.motions import Truth
 from imitarm.capture.skeleton import SIDES, Skeleton
 from imitarm.capture.slowing import slowed
@@ -25,6 +23,8 @@ from imitarm.cli.person import person_of
 from imitarm.cli.screen import remark, say, show_table, watched, working
 from imitarm.cli.trial import provenance
 from imitarm.errors import InputError, TaskFailedError
+from imitarm.evaluation.driving import drive as drive_run
+from imitarm.evaluation.seen_arm import seen_arm
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_file import ARMS, TOOLS
 from imitarm.retarget import RETARGETERS, Correspondence, Retargeter, Retargeting

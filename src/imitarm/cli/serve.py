@@ -16,12 +16,12 @@ from rich.text import Text
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.errors import InputError
-from imitarm.gate import REASONS
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_file import ARMS, TOOLS
 from imitarm.robots import RobotServer, SimulatedRobot
 from imitarm.scene import Scene, load_scene
-from imitarm.sockets import LOOPBACK
+from imitarm.transmission.gate import REASONS
+from imitarm.transmission.sockets import LOOPBACK
 
 EPILOG = """\
 examples:

@@ -24,14 +24,14 @@ from imitarm.demonstrations.recorder import DemonstrationRecorder
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_file import ARMS, TOOLS
-from imitarm.latency import STAGES, LatencyLog
 from imitarm.retarget import RETARGETERS, Correspondence
 from imitarm.retarget.calibration import Calibration
 from imitarm.retarget.correspondence import Orientation
 from imitarm.robots import Robot, SimulatedRobot, UdpRobot
 from imitarm.scene import Scene, load_scene
-from imitarm.sockets import parse_address
-from imitarm.teleoperation import INTERRUPTED, Moment, Tally, Teleoperation
+from imitarm.teleoperation.loop import INTERRUPTED, Moment, Tally, Teleoperation
+from imitarm.transmission.latency import STAGES, LatencyLog
+from imitarm.transmission.sockets import parse_address
 
 EPILOG = """\
 examples:

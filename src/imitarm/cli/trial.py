@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from imitarm import __version__
 from imitarm.cli.screen import remark, say, show_table
+from imitarm.control_loop.reproduce import Step, reproduce
 from imitarm.demonstrations import Alignment, Finding
 from imitarm.errors import InfeasibleError
 from imitarm.policies import ACFRA
-from imitarm.reproduce import Step, reproduce
 from imitarm.robots import SimulatedRobot
 from imitarm.skills import Skill
 from imitarm.trajectory import Demonstration, Rollout, Trajectory

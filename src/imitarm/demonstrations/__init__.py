@@ -23,7 +23,7 @@ from imitarm.demonstrations.plain import PlainReader
 from imitarm.demonstrations.raw import RawDemonstration
 from imitarm.demonstrations.reader import Reader, ReadOptions
 from imitarm.errors import FileFormatError, InputError
-from imitarm.table import kind_of, read_bytes
+from imitarm.files.table import kind_of, read_bytes
 from imitarm.trajectory import Demonstration
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from imitarm.demonstrations.columns import COUNTS, UNNAMED, in_space, unnamed_co
 from imitarm.demonstrations.raw import RawDemonstration
 from imitarm.demonstrations.reader import Reader, ReadOptions
 from imitarm.errors import FileFormatError
-from imitarm.table import read_bytes
+from imitarm.files.table import read_bytes
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from imitarm.demonstrations.columns import named_columns
 from imitarm.demonstrations.raw import RawDemonstration
 from imitarm.demonstrations.reader import Reader, ReadOptions
 from imitarm.errors import FileFormatError, InputError
-from imitarm.table import read_table
+from imitarm.files.table import read_table
 
 _HEADING = re.compile(rb"(?:\xef\xbb\xbf)?\s*time,(?:[a-z_]+,)*(?:left|right)_j\d", re.IGNORECASE)
 _LIMB = re.compile(r"(left|right)_j\d+")

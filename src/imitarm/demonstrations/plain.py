@@ -7,7 +7,7 @@ from dataclasses import replace
 from imitarm.demonstrations.columns import named_columns, unnamed_columns
 from imitarm.demonstrations.raw import RawDemonstration
 from imitarm.demonstrations.reader import Reader, ReadOptions
-from imitarm.table import kind_of, read_table
+from imitarm.files.table import kind_of, read_table
 
 
 class PlainReader(Reader):

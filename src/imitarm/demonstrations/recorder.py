@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.files.part_file import PartFile
 from imitarm.kinematics.arm import ArmModel
-from imitarm.part_file import PartFile
 from imitarm.trajectory import FORMAT, VERSION, Demonstration
 
 Array = NDArray[np.float64]

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose
+from imitarm.policies.baselines.potential_components import push_components
 from imitarm.policies.certificate import Detour, distances, judged
 from imitarm.policies.certified import find_detour
 from imitarm.policies.component_path import STILL, ComponentPath
-from imitarm.policies.potential_components import push_components
 from imitarm.scene.scene import Scene
 from imitarm.trajectory import Trajectory
 

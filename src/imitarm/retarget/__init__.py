@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping
 
-from imitarm.retarget.adaptive_control import AdaptiveControl
+from imitarm.retarget.baselines.adaptive_control import AdaptiveControl
+from imitarm.retarget.baselines.demonstration_modification import DemonstrationModification
+from imitarm.retarget.baselines.incremental_ik import IncrementalIK
+from imitarm.retarget.baselines.thesis import ThesisRetargeter
 from imitarm.retarget.correspondence import FACING, Correspondence
-from imitarm.retarget.demonstration_modification import DemonstrationModification
-from imitarm.retarget.incremental_ik import IncrementalIK
 from imitarm.retarget.limbs import LimbLengths, measure_limbs
 from imitarm.retarget.modern import ModernRetargeter
-from imitarm.retarget.retargeter import Command, Retargeter, Retargeting, retarget
-from imitarm.retarget.thesis import ThesisRetargeter
+from imitarm.retarget.retargeter import Command, Retargeter, Retargeting
 
 RETARGETERS: Mapping[str, type[Retargeter]] = {
     "modern": ModernRetargeter,
@@ -34,5 +34,4 @@ __all__ = [
     "Retargeting",
     "ThesisRetargeter",
     "measure_limbs",
-    "retarget",
 ]

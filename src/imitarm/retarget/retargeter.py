@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar
@@ -227,32 +227,3 @@ def ticks(frames: Sequence[Skeleton], dt: float) -> Iterable[Skeleton | None]:
             newest = frames[k]
             k += 1
         yield newest
-
-
-def retarget(
-    source: Iterable[Skeleton],
-    retargeter: Retargeter,
-    *,
-    q: ArrayLike | None = None,
-    task: str = "",
-    on_done: Callable[[Retargeting], None] | None = None,
-) -> Demonstration:
-    """Turn a recording of a person into a demonstration by the robot.
-
-    Args:
-        source: skeletons in the order of their times, for example a :class:`~imitarm.capture.SkeletonSource`.
-        retargeter: the method.
-        q: where the arm is at first, shape (n_joints,) [rad]; None: ``arm.home``.
-        task: a word or two for what was shown.
-        on_done: is given the whole run, with states and targets.
-
-    Returns:
-        Tool poses and joint positions at the retargeter's control period.
-
-    Raises:
-        InputError: when the recording is too short or out of order.
-    """
-    run = retargeter.run(source, q)
-    if on_done is not None:
-        on_done(run)
-    return run.demonstration(task, getattr(source, "name", ""))

@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable
 from typing import Self
 
-from imitarm.datagram import now_ns
 from imitarm.errors import InputError
-from imitarm.pace import Pace
 from imitarm.robots.robot import Robot
 from imitarm.robots.supervisor import Supervisor
-from imitarm.sockets import LOOPBACK, Address, listening, try_to_send, wait_for, waiting
+from imitarm.transmission.datagram import now_ns
+from imitarm.transmission.pace import Pace
+from imitarm.transmission.sockets import LOOPBACK, Address, listening, try_to_send, wait_for, waiting
 
 _AT_ONCE = 64  # datagrams taken in one period: a flood must not keep the robot waiting
 _ANSWERED = 8  # addresses answered in one period

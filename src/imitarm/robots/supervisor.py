@@ -10,11 +10,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.datagram import Encoder, Header, decode, now_ns
-from imitarm.gate import Gate
 from imitarm.kinematics.arm import ArmModel
-from imitarm.messages import MAX_JOINTS, DatagramError, JointCommand, JointState, Mode, Status
 from imitarm.robots.robot import Robot
+from imitarm.transmission.datagram import Encoder, Header, decode, now_ns
+from imitarm.transmission.gate import Gate
+from imitarm.transmission.messages import MAX_JOINTS, DatagramError, JointCommand, JointState, Mode, Status
 
 Array = NDArray[np.float64]
 
@@ -47,8 +47,9 @@ class Supervisor:
     started again must have its operator enable the robot again. Whoever enables it owns it until the next stop.
     Anybody may stop it.
 
-    A command is valid when the gate admits it (:class:`~imitarm.gate.Gate`), it is for this arm, within the joints'
-    limits of position and velocity, and not farther from the set-point than the joints get in 0.15 s at full speed.
+    A command is valid when the gate admits it (:class:`~imitarm.transmission.gate.Gate`), it is for this arm, within
+    the joints' limits of position and velocity, and not farther from the set-point than the joints get in 0.15 s at
+    full speed.
 
     The robot goes from its own set-point towards the one received, at
 

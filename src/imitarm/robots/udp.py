@@ -9,14 +9,14 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.datagram import Encoder, Header, now_ns
 from imitarm.errors import InputError, TaskFailedError
-from imitarm.gate import Gate
 from imitarm.kinematics.arm import ArmModel, ArmState
-from imitarm.messages import JointCommand, JointState, Mode, Status
 from imitarm.robots.robot import Robot
 from imitarm.robots.supervisor import fingerprint
-from imitarm.sockets import Address, connected, resolved, try_to_send, waiting
+from imitarm.transmission.datagram import Encoder, Header, now_ns
+from imitarm.transmission.gate import Gate
+from imitarm.transmission.messages import JointCommand, JointState, Mode, Status
+from imitarm.transmission.sockets import Address, connected, resolved, try_to_send, waiting
 
 Array = NDArray[np.float64]
 

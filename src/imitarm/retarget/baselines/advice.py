@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.retarget.advice_operators import (
+from imitarm.retarget.baselines.advice_operators import (
     SPEED_LEFT,
     TURNS,
     elbow_turned,
@@ -17,10 +17,10 @@ from imitarm.retarget.advice_operators import (
     slowed,
     with_points,
 )
+from imitarm.retarget.baselines.infeasible import Infeasible, blend, segments
+from imitarm.retarget.baselines.joint_mapping import JointMapping
+from imitarm.retarget.baselines.shown_motion import ShownMotion
 from imitarm.retarget.correspondence import Clutch
-from imitarm.retarget.infeasible import Infeasible, blend, segments
-from imitarm.retarget.joint_mapping import JointMapping
-from imitarm.retarget.shown_motion import ShownMotion
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.benchmark.tracking import LAGS, TrueArm, rms
 from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import TaskFailedError
+from imitarm.evaluation.tracking import LAGS, TrueArm, rms
 from imitarm.kinematics.pose import matrix_to_quaternion
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import hand_rotation

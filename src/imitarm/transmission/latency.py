@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import UnknownNameError
-from imitarm.table import write_table
+from imitarm.files.table import write_table
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark.motion_measures import (
+from imitarm.evaluation.motion import (
     ArmMotion,
     executed,
     jerk_rms,
@@ -16,7 +16,7 @@ from imitarm.benchmark.motion_measures import (
     spectral_arc_length,
     violations,
 )
-from imitarm.benchmark.tracking import (
+from imitarm.evaluation.tracking import (
     Hold,
     TrueArm,
     best_lag,
@@ -61,7 +61,7 @@ class MappingMetrics:
         target_rms: distance of the tool to the method's own target [m].
         orientation_rms: angle between the tool's rotation and the reference [rad].
         elbow_direction_rms: angle between the robot's upper arm and where it should point, see
-            :func:`~imitarm.benchmark.tracking.elbow_direction_errors` [rad].
+            :func:`~imitarm.evaluation.tracking.elbow_direction_errors` [rad].
         elbow_angle_rms: difference of the changes of the SEW angles of robot and person [rad].
         path_length: of the tool [m].
         settling_time: from the end of the true hand's motion until the tool stays for 0.5 s within 1 cm of the

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import InputError
-from imitarm.retarget.nurbs import NURBS
-from imitarm.retarget.nurbs_fit import Smoothing, fit_nurbs
-from imitarm.retarget.rotation_curve import RotationCurve, fit_rotations
+from imitarm.retarget.baselines.nurbs import NURBS
+from imitarm.retarget.baselines.nurbs_fit import Smoothing, fit_nurbs
+from imitarm.retarget.baselines.rotation_curve import RotationCurve, fit_rotations
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from imitarm.kinematics.pose import (
     quaternion_log,
     quaternion_multiply,
 )
-from imitarm.retarget.nurbs import NURBS
-from imitarm.retarget.nurbs_fit import Smoothing, fit_nurbs
+from imitarm.retarget.baselines.nurbs import NURBS
+from imitarm.retarget.baselines.nurbs_fit import Smoothing, fit_nurbs
 
 Array = NDArray[np.float64]
 

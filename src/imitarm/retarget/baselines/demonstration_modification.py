@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.retarget.advice import COUNTED, Advice
 from imitarm.retarget.arm_estimator import ArmEstimate
+from imitarm.retarget.baselines.advice import COUNTED, Advice
+from imitarm.retarget.baselines.baseline_retargeter import HOLD, RivalRetargeter
+from imitarm.retarget.baselines.infeasible import Constraint, Infeasible
+from imitarm.retarget.baselines.joint_mapping import Approach, JointMapping
+from imitarm.retarget.baselines.shown_motion import ShownMotion, holds
 from imitarm.retarget.correspondence import Clutch, Correspondence
-from imitarm.retarget.infeasible import Constraint, Infeasible
-from imitarm.retarget.joint_mapping import Approach, JointMapping
 from imitarm.retarget.retargeter import Command, Retargeting, in_order
-from imitarm.retarget.rival import HOLD, RivalRetargeter
-from imitarm.retarget.shown_motion import ShownMotion, holds
 from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -39,10 +39,10 @@ class DemonstrationModification(RivalRetargeter):
     The method is an offline one. :meth:`run` takes the whole recording:
 
     1. the person's joint angles in closed form are the robot's
-       (:class:`~imitarm.retarget.joint_mapping.JointMapping`);
-    2. :class:`~imitarm.retarget.infeasible.Infeasible` says where the arm can't do that;
+       (:class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`);
+    2. :class:`~imitarm.retarget.baselines.infeasible.Infeasible` says where the arm can't do that;
     3. for each such segment, widened by 0.2 s, the first that clears it is taken of: slower, wrist pulled in, elbow
-       turned; else its key frames are repaired (:mod:`imitarm.retarget.advice_operators`);
+       turned; else its key frames are repaired (:mod:`imitarm.retarget.baselines.advice_operators`);
     4. up to five rounds; what is still infeasible then is counted, and cut at the limits of position.
 
     :meth:`step` is the mapping of step 1, uncorrected, cut at the limits of position, for what must be live.
@@ -60,7 +60,7 @@ class DemonstrationModification(RivalRetargeter):
         scene: not heeded.
         velocity_scaling: scale every step as a whole so that no joint exceeds its velocity limit.
         relative: map the change of the person's joints since the hold was taken; else the joints themselves, which are
-            approached at limited speed. See :class:`~imitarm.retarget.joint_mapping.JointMapping`.
+            approached at limited speed. See :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
         constraints: more that must hold, by name, for example ``{"table": above(0.02)}``.
         advice_time: that a teacher takes for each segment besides watching it [s].
         seed: of the samples that repair key frames.

@@ -16,10 +16,10 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_multiply
 from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
+from imitarm.retarget.baselines.human_arm_tracker import HumanArmTracker
+from imitarm.retarget.baselines.playback import HandCurve, HandSample, Playback
 from imitarm.retarget.correspondence import Clutch, Correspondence
 from imitarm.retarget.engagement import Engagement
-from imitarm.retarget.human_arm_tracker import HumanArmTracker
-from imitarm.retarget.playback import HandCurve, HandSample, Playback
 from imitarm.retarget.retargeter import Command, Retargeter, Retargeting, in_order, ticks
 from imitarm.scene import Scene
 
@@ -51,10 +51,10 @@ class ThesisRetargeter(Retargeter):
 
     1. the bones get their true lengths (Eq 3.1 to 3.4);
     2. the person's joint angles follow by increments :math:`\tau \leftarrow \tau + J^+ \varepsilon`
-       (:class:`~imitarm.retarget.human_arm_tracker.HumanArmTracker`), and Denavit-Hartenberg forward kinematics
-       (Eq 3.5) gives the hand from the shoulder, then in the robot's base frame;
+       (:class:`~imitarm.retarget.baselines.human_arm_tracker.HumanArmTracker`), and Denavit-Hartenberg forward
+       kinematics (Eq 3.5) gives the hand from the shoulder, then in the robot's base frame;
     3. a NURBS is fitted to the last 0.6 s and read 70 ms late (Eq 3.6 and 3.7,
-       :class:`~imitarm.retarget.playback.Playback`).
+       :class:`~imitarm.retarget.baselines.playback.Playback`).
 
     At each control step the tool goes towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
     3.9), every step clamped, since otherwise the arm freezes. The joints keep their limits of position and velocity;

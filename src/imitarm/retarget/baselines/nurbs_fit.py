@@ -11,7 +11,7 @@ from scipy.linalg import lapack
 from scipy.optimize import brentq, minimize_scalar
 
 from imitarm.errors import InputError
-from imitarm.retarget.nurbs import NURBS, Indices, basis_functions
+from imitarm.retarget.baselines.nurbs import NURBS, Indices, basis_functions
 
 Array = NDArray[np.float64]
 Smoothing = float | str

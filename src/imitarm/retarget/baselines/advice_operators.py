@@ -1,7 +1,7 @@
 r"""What a teacher may advise where an arm can't do what was shown: slower, nearer, another elbow, or a repair.
 
-Each operator changes one segment of a :class:`~imitarm.retarget.shown_motion.ShownMotion`, by a weight that is 1 where
-the change is needed and falls to 0 at the segment's ends, so that the motion stays in one piece (METHODS B, M1).
+Each operator changes one segment of a :class:`~imitarm.retarget.baselines.shown_motion.ShownMotion`, by a weight that
+is 1 where the change is needed and falls to 0 at the segment's ends, so that the motion stays in one piece.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from imitarm.retarget.infeasible import ELBOW, Infeasible
-from imitarm.retarget.shown_motion import ShownMotion
+from imitarm.retarget.baselines.infeasible import ELBOW, Infeasible
+from imitarm.retarget.baselines.shown_motion import ShownMotion
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import TypeVar
 
-from imitarm.datagram import Header, decode
-from imitarm.messages import DatagramError, JointCommand, JointState, SkeletonFrame
+from imitarm.transmission.datagram import Header, decode
+from imitarm.transmission.messages import DatagramError, JointCommand, JointState, SkeletonFrame
 
 Kind = TypeVar("Kind", SkeletonFrame, JointCommand, JointState)
 

@@ -11,8 +11,8 @@ from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
 from imitarm.retarget.arm_estimator import ArmEstimate
+from imitarm.retarget.baselines.baseline_retargeter import RivalRetargeter
 from imitarm.retarget.correspondence import Clutch, Correspondence
-from imitarm.retarget.rival import RivalRetargeter
 from imitarm.scene import Scene
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imitarm.messages import KINDS, DatagramError, Message
+from imitarm.transmission.messages import KINDS, DatagramError, Message
 
 MAGIC, VERSION = b"IMTR", 1
 

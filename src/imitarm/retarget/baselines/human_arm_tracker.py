@@ -43,8 +43,8 @@ class HumanArmTracker:
 
     Args:
         iterations: per frame.
-        faults: what of the print to put back, of :data:`imitarm.retarget.thesis.PRINTED`: ``"limbs"``, ``"dh"``,
-            ``"error"``, ``"rpy"`` and ``"step"`` concern this part.
+        faults: what of the print to put back, of :data:`imitarm.retarget.baselines.thesis.PRINTED`: ``"limbs"``,
+            ``"dh"``, ``"error"``, ``"rpy"`` and ``"step"`` concern this part.
     """
 
     def __init__(self, iterations: int = 3, faults: Collection[str] = ()) -> None:

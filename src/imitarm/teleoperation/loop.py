@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
 from imitarm.capture.stream import Arrival, UdpSource
-from imitarm.datagram import now_ns
 from imitarm.demonstrations.recorder import DemonstrationRecorder
 from imitarm.kinematics.arm import ArmState
-from imitarm.latency import LatencyLog
-from imitarm.messages import Status
-from imitarm.pace import Pace
 from imitarm.retarget import Command, Retargeter
 from imitarm.robots import Robot, UdpRobot
+from imitarm.transmission.datagram import now_ns
+from imitarm.transmission.latency import LatencyLog
+from imitarm.transmission.messages import Status
+from imitarm.transmission.pace import Pace
 
 Array = NDArray[np.float64]
 

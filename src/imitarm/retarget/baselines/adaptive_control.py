@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.kinematics.arm import ArmModel
-from imitarm.retarget.adaptive_law import AdaptiveLaw
 from imitarm.retarget.arm_estimator import ArmEstimate
+from imitarm.retarget.baselines.adaptive_law import AdaptiveLaw
+from imitarm.retarget.baselines.baseline_retargeter import RivalRetargeter
+from imitarm.retarget.baselines.joint_mapping import Approach, JointMapping
+from imitarm.retarget.baselines.joint_plant import JointPlant
 from imitarm.retarget.correspondence import Clutch, Correspondence
-from imitarm.retarget.joint_mapping import Approach, JointMapping
-from imitarm.retarget.joint_plant import JointPlant
-from imitarm.retarget.rival import RivalRetargeter
 from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -33,9 +33,9 @@ class AdaptiveControl(RivalRetargeter):
 
     The person's joint angles, held from frame to frame, go through a low-pass of first order at 3 Hz,
     :math:`q_r \leftarrow q_r + (1 - e^{-2\pi f T})(q_h - q_r)`; an
-    :class:`~imitarm.retarget.adaptive_law.AdaptiveLaw` gives torques, cut to the rated ones, at which the
-    arm's own dynamics (:class:`~imitarm.retarget.joint_plant.JointPlant`) move. Where they have moved it to is the
-    command. What it adapts is joints: the tool is not where the hand is.
+    :class:`~imitarm.retarget.baselines.adaptive_law.AdaptiveLaw` gives torques, cut to the rated ones, at which the
+    arm's own dynamics (:class:`~imitarm.retarget.baselines.joint_plant.JointPlant`) move. Where they have moved it to
+    is the command. What it adapts is joints: the tool is not where the hand is.
 
     A joint's velocity is limited by nothing but its torque. In ``notes``: ``"saturated"``, joints and steps at the
     rated torque, ``"peak_torque"`` as a share of it before it is cut, and ``"rms_torque"`` [N m] over all joints and
@@ -48,7 +48,7 @@ class AdaptiveControl(RivalRetargeter):
         scene: not heeded.
         velocity_scaling: scale every step, of the reference and of the command, so that no joint exceeds its limit.
         relative: map the change of the person's joints since the hold was taken; else the joints themselves, which are
-            approached at limited speed. See :class:`~imitarm.retarget.joint_mapping.JointMapping`.
+            approached at limited speed. See :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
 
     Attributes:
         torque: of the last control period, shape (n_joints,) [N m].
@@ -123,7 +123,7 @@ class AdaptiveControl(RivalRetargeter):
 
     @property
     def notes(self) -> dict[str, float]:
-        """What there is to count so far; see the class, and :class:`~imitarm.retarget.rival.RivalRetargeter`."""
+        """Counts and RMS torque so far; see the class and its base."""
         rms = math.sqrt(self._squares / self._periods) if self._periods else 0.0
         return {
             **super().notes,

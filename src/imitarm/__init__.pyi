@@ -1,0 +1,80 @@
+from .benchmark.experiment import Experiment, Result
+from .capture import Skeleton, SkeletonSource
+from .control_loop import reproduce
+from .demonstrations import Finding, align, lint, read
+from .errors import ImitarmError, InfeasibleError, InputError, TaskFailedError, UnreachableError
+from .kinematics.arm import ArmModel, ArmState
+from .kinematics.ik import find_posture, solve_ik
+from .kinematics.pose import Pose
+from .policies import ACFRA, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Adaptation, Observation, Policy, adapt
+from .retarget import RETARGETERS, Correspondence, Retargeter
+from .robots import Robot, SimulatedRobot
+from .scene import (
+    Box,
+    Capsule,
+    Cone,
+    ConvexHull,
+    Cylinder,
+    Ellipsoid,
+    Obstacle,
+    Scene,
+    Sphere,
+    load_scene,
+    save_scene,
+)
+from .skills import DMP, GMR, GaussianMixture, Skill
+from .trajectory import Demonstration, Rollout, Trajectory
+
+__version__: str
+__all__ = [
+    "ACFRA",
+    "DMP",
+    "GMR",
+    "HORIZONTAL_ONLY",
+    "NOT_DOWN",
+    "POLICIES",
+    "RETARGETERS",
+    "Adaptation",
+    "ArmModel",
+    "ArmState",
+    "Box",
+    "Capsule",
+    "Cone",
+    "ConvexHull",
+    "Correspondence",
+    "Cylinder",
+    "Demonstration",
+    "Ellipsoid",
+    "Experiment",
+    "Finding",
+    "GaussianMixture",
+    "ImitarmError",
+    "InfeasibleError",
+    "InputError",
+    "Observation",
+    "Obstacle",
+    "Policy",
+    "Pose",
+    "Result",
+    "Retargeter",
+    "Robot",
+    "Rollout",
+    "Scene",
+    "SimulatedRobot",
+    "Skeleton",
+    "SkeletonSource",
+    "Skill",
+    "Sphere",
+    "TaskFailedError",
+    "Trajectory",
+    "UnreachableError",
+    "adapt",
+    "align",
+    "find_posture",
+    "lint",
+    "load_scene",
+    "read",
+    "reproduce",
+    "save_scene",
+    "solve_ik",
+]

@@ -1,0 +1,1 @@
+"""Avoidance methods to compare with."""
