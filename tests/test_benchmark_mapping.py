@@ -2,12 +2,10 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 import pytest
 
 from imitarm.benchmark.experiment import LIVE
-from imitarm.benchmark.fingerprint import code_version, tables_version
 from imitarm.benchmark.mapping import BEGIN, CAMERAS, END, MappingBenchmark, fill_document, tables, write_tables
 from imitarm.benchmark.mapping_methods import MAIN, METHODS
 from imitarm.benchmark.mapping_pairs import COMPARED
@@ -67,18 +65,18 @@ def test_tables_go_between_the_marks_and_nothing_else_changes(tmp_path):
     page.write_text(f"# Title\n\nbefore\n\n{BEGIN}\nold\n{END}\n\nafter\n")
     table = Table("T", ("a", "b>"), (("x|y", "1"),), "note")
     for _ in range(2):
-        fill_document(page, [table], "imitarm benchmark mapping", "0+abc", "0+def")
+        fill_document(page, [table], "imitarm benchmark mapping", ["commit abc"])
         text = page.read_text()
         assert text.startswith(f"# Title\n\nbefore\n\n{BEGIN}\n")
         assert text.endswith(f"{END}\n\nafter\n")
         assert "old" not in text
-        assert "Printed by `imitarm benchmark mapping`, code 0+abc, tables 0+def.\n" in text
+        assert "Printed by `imitarm benchmark mapping`. Results of commit abc, not of the code" in text
         assert "| x\\|y | 1 |" in text
         assert text.count("**T**") == 1
     for wrong in ("no marks\n", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{BEGIN}\n{END}\n"):
         page.write_text(wrong)
         with pytest.raises(InputError, match="between"):
-            fill_document(page, [table], "", "", "")
+            fill_document(page, [table], "", [])
         assert page.read_text() == wrong
 
 
@@ -125,16 +123,3 @@ def test_the_report_is_complete_and_asks_nothing_of_the_network(small):
     assert 'id="method-m3"' in page
     assert "0 of 4 recordings" in page
     assert not re.search(r"""(?:src|href)\s*=\s*["'](?:https?:)?//""", page)
-
-
-def test_the_documents_tables_are_of_this_code_or_it_says_that_they_are_not():
-    text = (Path(__file__).parents[1] / "docs" / "mapping_benchmark.md").read_text(encoding="utf-8")
-    printed = text.split(f"{BEGIN}\n")[1].split("\n")[0]
-    code = f"code {code_version()}, tables {tables_version()}"
-    present = printed.endswith(f", {code}.")
-    told = re.search(r"Printed [^.]*at commit [0-9a-f]{7,40}\b.*has to be run again", " ".join(text.split()))
-    assert present or told, (
-        f"docs/mapping_benchmark.md: {printed!r} is not {code}. Print it anew with --fill, or say in it that it was "
-        "printed at commit ... and that the command has to be run again"
-    )
-    assert not (present and told), "docs/mapping_benchmark.md: these tables are of this code; take the paragraph out"

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from imitarm.benchmark import experiment as experiments
 from imitarm.benchmark.experiment import LIVE, Experiment, Result
 from imitarm.benchmark.mapping_methods import METHODS
+from imitarm.benchmark.provenance import code_version
 from imitarm.benchmark.running import run_all
 from imitarm.errors import FileFormatError, InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
@@ -40,7 +40,7 @@ def test_a_run_is_the_same_every_time_and_whoever_made_the_recording(tmp_path):
 
 def test_a_result_is_read_as_it_was_written(tmp_path):
     done = ONE.run()
-    never = Result(done.experiment, done.version, {**done.values, "settling_time": float("nan")}, "", 1.0)
+    never = Result(done.experiment, done.code, {**done.values, "settling_time": float("nan")}, "", 1.0)
     for result in (done, never):
         read = Result.load(result.save(tmp_path))
         assert json.dumps(read.values) == json.dumps(
@@ -74,11 +74,21 @@ def test_what_was_run_is_not_run_again(tmp_path):
     assert stamps(tmp_path) != before
 
 
-def test_another_setting_or_another_code_is_another_run(tmp_path, monkeypatch):
+def test_another_configuration_has_another_file(tmp_path):
     places = {Result.path(tmp_path, e) for e in (ONE, replace(ONE, seconds=5.0), replace(ONE, sigma=0.01))}
-    monkeypatch.setattr(experiments, "code_version", lambda: "0+other")
-    places.add(Result.path(tmp_path, ONE))
-    assert len(places) == 4
+    assert len(places) == 3
+
+
+def test_a_result_of_other_code_is_read_only_when_that_is_asked_for(tmp_path):
+    saved = Result(ONE, "commit of long ago", {"led_share": 2.0}, "", 1.0)
+    saved.save(tmp_path / "runs")
+    (reused,) = run_all([ONE], tmp_path, jobs=1, reuse=True)
+    assert (reused.code, reused.value("led_share")) == ("commit of long ago", 2.0)
+    (done,) = run_all([ONE], tmp_path, jobs=1)
+    assert done.code == code_version() and done.value("led_share") <= 1.0
+    before = stamps(tmp_path)
+    run_all([ONE], tmp_path, jobs=1)
+    assert stamps(tmp_path) == before
 
 
 def test_a_damaged_result_is_run_again(tmp_path):

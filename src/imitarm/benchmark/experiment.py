@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from imitarm.benchmark.fingerprint import code_version
 from imitarm.benchmark.mapping_methods import method
+from imitarm.benchmark.provenance import code_version
 from imitarm.benchmark.recording_plan import CAPTURED, KINDS, Plan
 from imitarm.benchmark.recordings import MappingRecording, beyond_reach, make_recording
 from imitarm.benchmark.stacking import StackingTrial, run_trial
@@ -140,7 +140,7 @@ class Result:
 
     Attributes:
         experiment: which.
-        version: of the code that did it, see :func:`imitarm.benchmark.fingerprint.code_version`.
+        code: which code did it, see :func:`imitarm.benchmark.provenance.code_version`.
         values: what was measured, by name: those of :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics` with
             ``recorded`` [s], ``beyond_reach`` (share of the time) and the method's own ``notes``; or those of
             :class:`~imitarm.benchmark.stacking.TrialOutcome`; empty after a failure.
@@ -149,7 +149,7 @@ class Result:
     """
 
     experiment: Experiment
-    version: str
+    code: str
     values: Mapping[str, Any]
     failure: str
     seconds: float
@@ -166,8 +166,8 @@ class Result:
 
     @staticmethod
     def path(folder: Path, experiment: Experiment) -> Path:
-        """Return where the result of an experiment with this code is kept: settings and version are in its name."""
-        facts = json.dumps([asdict(experiment), code_version()], sort_keys=True)
+        """Return where the result of an experiment is kept: a digest of its configuration is in the name."""
+        facts = json.dumps(asdict(experiment), sort_keys=True)
         return folder / f"{experiment.name}-{hashlib.sha256(facts.encode()).hexdigest()[:12]}.json"
 
     def save(self, folder: Path) -> Path:
@@ -178,7 +178,7 @@ class Result:
             "format": FORMAT,
             "version": VERSION,
             "experiment": asdict(self.experiment),
-            "code": self.version,
+            "code": self.code,
             "failure": self.failure,
             "seconds": self.seconds,
             "values": plain(dict(self.values)),

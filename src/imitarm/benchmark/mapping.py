@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from imitarm.benchmark.mapping_tables import (
     success_table,
     torque_table,
 )
+from imitarm.benchmark.provenance import origin
 from imitarm.benchmark.recording_plan import CAPTURED, KINDS
 from imitarm.benchmark.tables import Table
 from imitarm.benchmark.thesis_table import claims_table, printed_table
@@ -133,7 +134,7 @@ def write_tables(results: Results, found: Sequence[Table], folder: Path) -> tupl
             for t in found
         ],
         "results": [
-            {"name": r.experiment.name, "failure": r.failure, "code": r.version, "values": plain(dict(r.values))}
+            {"name": r.experiment.name, "failure": r.failure, "code": r.code, "values": plain(dict(r.values))}
             for r in results.all
         ],
     }
@@ -145,15 +146,14 @@ BEGIN, END = "<!-- imitarm benchmark mapping -->", "<!-- end -->"
 """Between these lines of a document stand the tables."""
 
 
-def fill_document(path: Path, found: Sequence[Table], command: str, code: str, statistics: str) -> None:
+def fill_document(path: Path, found: Sequence[Table], command: str, versions: Iterable[str]) -> None:
     """Put the tables into a document, between the lines :data:`BEGIN` and :data:`END`; the rest stays as it is.
 
     Args:
         path: of the document, Markdown.
         found: the tables.
         command: that printed them.
-        code: fingerprint of what was measured, :func:`imitarm.benchmark.fingerprint.code_version`.
-        statistics: fingerprint of what makes tables of it, too.
+        versions: of the code of each result; the document says when it is not the code that is running.
 
     Raises:
         InputError: when the document can't be read, or has not these two lines in this order, once each.
@@ -162,9 +162,7 @@ def fill_document(path: Path, found: Sequence[Table], command: str, code: str, s
     head, rest = path.read_text(encoding="utf-8").split(f"{BEGIN}\n")
     tail = rest.split(f"{END}\n")[1]
     body = "\n".join(table.markdown() for table in found)
-    write_text(
-        path, f"{head}{BEGIN}\nPrinted by `{command}`, code {code}, tables {statistics}.\n\n{body}\n{END}\n{tail}"
-    )
+    write_text(path, f"{head}{BEGIN}\nPrinted by `{command}`. {origin(versions)}\n\n{body}\n{END}\n{tail}")
 
 
 def check_document(path: Path) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from imitarm.benchmark.experiment import REPLAYS, Experiment, Result
-from imitarm.benchmark.fingerprint import code_version
+from imitarm.benchmark.provenance import code_version
 from imitarm.errors import FileFormatError, ImitarmError, InputError, TaskFailedError
 
 LOCAL = "local"
@@ -32,19 +32,21 @@ def run_all(
     *,
     jobs: int | None = None,
     fresh: bool = False,
+    reuse: bool = False,
     backend: str = LOCAL,
     on_done: OnDone | None = None,
 ) -> list[Result]:
     """Run experiments side by side and return their results, in their order.
 
-    Each result is a file of its own in ``folder/runs``, written when it is there. One that exists, of the same settings
-    and the same code, is read instead of run again.
+    Each result is a file of its own in ``folder/runs``, written as soon as the experiment is done. A saved result of
+    the same configuration and the same code is read instead of run again.
 
     Args:
         experiments: what to run.
         folder: where results and recordings are kept; made when it is not there.
         jobs: processes; None: one for each processor.
         fresh: run again what has been run.
+        reuse: read saved results of the same configuration whatever code made them; each says which.
         backend: ``"local"``, or the name of a joblib backend, such as ``"loky"``, ``"dask"`` or ``"ray"``, whose
             workers see the same folder.
         on_done: is told of the progress.
@@ -55,7 +57,7 @@ def run_all(
         KeyboardInterrupt: after Ctrl-C; what was finished is kept.
     """
     place = _prepared(folder)
-    known = {} if fresh else {e: found for e in experiments if (found := _kept(place, e)) is not None}
+    known = {} if fresh else {e: found for e in experiments if (found := _kept(place, e, reuse)) is not None}
     missing = [e for e in experiments if e not in known]
     total, done = len(experiments), len(known)
     tell = on_done if on_done is not None else _silent
@@ -83,13 +85,14 @@ def _prepared(folder: str | Path) -> Path:
     return place
 
 
-def _kept(place: Path, experiment: Experiment) -> Result | None:
-    """Return the result that is there; one that can't be read is as good as none."""
+def _kept(place: Path, experiment: Experiment, reuse: bool) -> Result | None:
+    """Return the saved result; None when there is none, it can't be read, or other code made it and that counts."""
     path = Result.path(place / _RUNS, experiment)
     try:
-        return Result.load(path) if path.exists() else None
+        found = Result.load(path) if path.exists() else None
     except FileFormatError:
         return None
+    return found if found is not None and (reuse or found.code == code_version()) else None
 
 
 Job = tuple[Experiment, str, str]

@@ -11,10 +11,10 @@ from pathlib import Path
 
 from imitarm.benchmark import avoidance
 from imitarm.benchmark.experiment import Result
-from imitarm.benchmark.fingerprint import code_version, tables_version
 from imitarm.benchmark.mapping import MappingBenchmark, check_document, fill_document, tables, write_tables
 from imitarm.benchmark.mapping_methods import METHODS
 from imitarm.benchmark.mapping_tables import JUDGED, Results
+from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recording_plan import KINDS
 from imitarm.benchmark.running import LOCAL, run_all
 from imitarm.benchmark.tables import Table
@@ -65,6 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument("--report", type=Path, metavar="FILE", help="a page with figures and playback (HTML)")
     mapping.add_argument("--fill", type=Path, metavar="FILE", help="put the tables into this document, between marks")
     mapping.add_argument("--fresh", action="store_true", help="run again what has been run")
+    mapping.add_argument(
+        "--reuse", action="store_true", help="take saved results of the same configuration, whatever code made them"
+    )
     mapping.add_argument("--jobs", type=int, metavar="N", help="processes; default: one for each processor")
     mapping.add_argument("--backend", default=LOCAL, metavar="NAME", help="local, or a joblib backend: dask, ray")
     mapping.set_defaults(benchmark=_mapping)
@@ -101,6 +104,7 @@ def _mapping(arguments: argparse.Namespace) -> int:
             folder,
             jobs=arguments.jobs,
             fresh=arguments.fresh,
+            reuse=arguments.reuse,
             backend=arguments.backend,
             on_done=lambda finished, of: bar.update(task, completed=finished, total=of),
         )
@@ -110,15 +114,18 @@ def _mapping(arguments: argparse.Namespace) -> int:
         _show(table)
     for text in _not_done(done):
         remark(text)
+    versions = [result.code for result in done]
+    if set(versions) != {code_version()}:
+        remark(origin(versions))
     for path in write_tables(results, found, folder):
         say(f"wrote {path}")
     if arguments.fill is not None:
-        fill_document(arguments.fill, found, _command(), code_version(), tables_version())
+        fill_document(arguments.fill, found, _command(), versions)
         say(f"filled {arguments.fill}")
     if arguments.report is not None:
         from imitarm.benchmark.mapping_report import write_mapping_report  # noqa: PLC0415 (draws: needs an extra)
 
-        facts = provenance(code=code_version(), tables=tables_version(), experiments=len(done))
+        facts = provenance(results=origin(versions), experiments=len(done))
         kept = folder / "recordings"
         say(f"wrote {write_mapping_report(results, found, arguments.report, provenance=facts, folder=kept)}")
     return 0
@@ -159,7 +166,11 @@ def _asked(arguments: argparse.Namespace) -> MappingBenchmark:
 def _command() -> str:
     """Return the command without the places where this machine keeps its files."""
     words, places = sys.argv[1:], {"--out", "--report", "--fill", "--jobs", "--backend"}
-    kept = [w for i, w in enumerate(words) if w not in places | {"--fresh"} and (i == 0 or words[i - 1] not in places)]
+    kept = [
+        w
+        for i, w in enumerate(words)
+        if w not in places | {"--fresh", "--reuse"} and (i == 0 or words[i - 1] not in places)
+    ]
     named = ["recordings" if i > 0 and kept[i - 1] == "--data" else w for i, w in enumerate(kept)]
     return shlex.join(["imitarm", *named])
 

@@ -1,0 +1,70 @@
+"""Which code made a result: the commit of the checkout that it ran from, or the version that is installed."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+
+import imitarm
+
+_PACKAGE = Path(imitarm.__file__).parent
+
+
+@lru_cache(maxsize=1)
+def code_version() -> str:
+    """Return which code is running, as a phrase; read once per process.
+
+    In a checkout this is the last commit that changed the package, so commits of documentation or tests leave it as it
+    is. Uncommitted changes of the package are named by a hash of their text: results of two different states of a
+    working tree are never taken for each other.
+
+    Returns:
+        ``"commit 0123456789"``, ``"commit 0123456789 with uncommitted changes 01234567"``, or ``"version 0.1.0"`` when
+        the package is not in a checkout.
+    """
+    return version_of(_PACKAGE, f"version {imitarm.__version__}")
+
+
+def version_of(package: Path, installed: str) -> str:
+    """Return which code is in a folder: see :func:`code_version`.
+
+    Args:
+        package: the folder, with an ``__init__.py``.
+        installed: what to return when Git does not know the folder.
+    """
+    if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
+        return installed  # also for an environment that lies inside somebody's repository
+    commit = (_git(package, "log", "-1", "--format=%h", "--abbrev=10", "--", ".") or b"").decode().strip()
+    if not commit:
+        return installed
+    changes = _git(package, "diff", "HEAD", "--no-ext-diff", "--no-color", "--binary", "--", ".") or b""
+    new = (_git(package, "ls-files", "--others", "--exclude-standard", "-z", "--", ".") or b"").split(b"\0")
+    for name in sorted(filter(None, new)):
+        changes += name + b"\0" + (package / name.decode()).read_bytes()
+    mark = hashlib.sha256(changes).hexdigest()[:8]
+    return f"commit {commit} with uncommitted changes {mark}" if changes else f"commit {commit}"
+
+
+def origin(versions: Iterable[str]) -> str:
+    """Return a sentence that says which code made the results, and whether it is other code than this.
+
+    Args:
+        versions: of the code of each result, see :func:`code_version`.
+    """
+    found, now = sorted(set(versions)), code_version()
+    if found == [now]:
+        return f"Results of {now}."
+    text = f"Results of {' and '.join(found) or 'no run'}"
+    return f"{text}, not of the code that made these tables ({now}): run the command again for current figures."
+
+
+def _git(folder: Path, *words: str) -> bytes | None:
+    """Return what a Git command prints; None when it fails, or there is no Git."""
+    try:
+        done = subprocess.run(["git", "-C", folder, *words], capture_output=True, check=False, timeout=60)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout if done.returncode == 0 else None
