@@ -255,13 +255,13 @@ def test_different_durations_are_scaled_with_a_warning() -> None:
     np.testing.assert_allclose(gmr.predict([1.0])[0], GMR(4).fit([a, b, c]).predict([1.0])[0], atol=1e-9)
 
 
-def test_trajectory_is_the_mean_motion() -> None:
+def test_trajectory_is_the_nominal_path() -> None:
     gmr = GMR(5).fit(shown(turn=1.0, offset=7.0))
     k = gmr.trajectory(50)
     assert len(k) == 50
     assert (k.times[0], k.times[-1]) == (0.0, pytest.approx(2.0))
     assert k.quaternions is not None
-    np.testing.assert_allclose(k.positions, gmr.predict(k.times)[0], atol=1e-12)
+    np.testing.assert_allclose(k.positions, gmr.nominal(k.times)[0], atol=1e-12)
 
 
 def test_bad_demonstrations_are_named() -> None:

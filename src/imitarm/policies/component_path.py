@@ -113,8 +113,7 @@ class ComponentPath:
             return replace(_learnt(skill.gmr_, n_samples, window), spheres=rows)
         learnt = _learnt(skill.gmr_, n_samples, window)
         times = learnt.nominal.times
-        generated = skill.generate(start, goal, skill.duration_, skill.duration_ / (n_samples - 1))
-        moved = Trajectory(times, *generated.at(times))
+        moved = skill.nominal(times, start, goal)
         shift = moved.positions - learnt.nominal.positions
         centre_times = np.clip(skill.gmr_.time_means_, times[0], times[-1])
         carried = np.stack([np.interp(centre_times, times, column) for column in shift.T], axis=1)
@@ -157,18 +156,13 @@ def _learnt(gmr: GMR, n_samples: int, pins: tuple[float, ...]) -> ComponentPath:
     if gmr in _PATHS and _PATHS[gmr][0] is gmr.means_ and _PATHS[gmr][1] == key:  # fitting again makes new means
         return _PATHS[gmr][2]
     times = _instants(n_samples, pins)
-    quaternions: Array | None = None
-    if gmr.has_orientation_:
-        mean, quaternions, covariance = gmr.predict_pose(times)
-        tolerance = covariance[:, :3, :3]
-    else:
-        mean, tolerance = gmr.predict(times)
+    tolerance = gmr.predict(times)[1]
     responsibilities = gmr.responsibilities(times)
     centres = _nearest(times, gmr.time_means_)
     yields = tolerance[centres] + TOLERANCE_FLOOR**2 * np.eye(3)
     influence = np.where(responsibilities < NEGLIGIBLE_RESPONSIBILITY, 0.0, responsibilities)
     path = ComponentPath(
-        nominal=Trajectory(times, mean, quaternions),
+        nominal=Trajectory(times, *gmr.nominal(times)),
         responsibilities=responsibilities,
         basis=_window(times, pins)[:, None] * influence,
         means=gmr.position_means_,

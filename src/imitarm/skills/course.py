@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.skills.phase_basis import DECAY, on_grid, phase_basis
-from imitarm.skills.spring import Gains, propagator
+from imitarm.skills.spring import Gains, by_step, propagator
 
 Array = NDArray[np.float64]
 Adjustment = Literal["progress", "hoffmann", "rotodilatation"]
@@ -73,13 +73,14 @@ class Course:
         plan = self._plans[step]
         if plan is None and 1.0 / step < _LONGEST_PLAN:
             n = round(1.0 / step)
+            one = propagator(gains, step)
+            m = one.n_parts
             if abs(n * step - 1.0) < _SAME_STEP:
-                y = self.target_on_grid(n)
+                y = self.target_on_grid(n * m)
             else:
                 n = int(np.ceil(1.0 / step))
-                y = self.target(np.exp(-0.5 * DECAY * step * np.arange(2 * n + 1)))
-            E, G, _ = propagator(gains, step)
-            plan = Plan(E, G @ np.stack([y[:-1:2], y[1::2], y[2::2]], axis=1))
+                y = self.target(np.exp(-0.5 * DECAY * step / m * np.arange(2 * n * m + 1)))
+            plan = Plan(one.transition, np.asarray(one.drive @ np.moveaxis(by_step(one, y), 0, 1)))
             self._plans[step] = plan
         return plan
 

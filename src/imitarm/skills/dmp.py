@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose
 from imitarm.skills.course import ADJUSTMENTS, Adjustment, Course, rotodilatation
-from imitarm.skills.dmp_fit import imitate
+from imitarm.skills.dmp_fit import imitate, progress_at
 from imitarm.skills.dmp_state import DMPState
 from imitarm.skills.phase_basis import DECAY, phase_basis
 from imitarm.skills.quaternion_dmp import QuaternionDMP
@@ -19,7 +19,6 @@ from imitarm.skills.spring import Gains, gains_named, propagator, roll_out
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-_BEGIN_MIDDLE_END = np.array([0.0, 0.5, 1.0])
 
 Coupling = Callable[[Array, Array], ArrayLike]
 
@@ -90,8 +89,14 @@ class DMP:
         self.n_basis = int(n_basis)
         self.regularisation = regularisation
 
-    def fit(self, trajectory: Trajectory) -> Self:
+    def fit(self, trajectory: Trajectory, *, exact_ends: bool = False) -> Self:
         """Learn from one trajectory; its times may start anywhere.
+
+        Args:
+            trajectory: the motion to reproduce.
+            exact_ends: start and end exactly at the first and the last sample and rotation. Otherwise a noisy first or
+                last sample is smoothed: where it lies more than 0.1 mm beside the path that fits all samples, the
+                motion starts or ends on that path.
 
         Raises:
             InputError: when it has fewer than 3 samples.
@@ -99,13 +104,15 @@ class DMP:
         if len(trajectory) < 3:
             raise InputError(f"DMP.fit: needs at least 3 samples, got {len(trajectory)}")
         share = (trajectory.times - trajectory.times[0]) / trajectory.duration
-        learnt = imitate(share, trajectory.positions, self.gains_, self.n_basis, self.regularisation)
+        learnt = imitate(
+            share, trajectory.positions, self.gains_, self.n_basis, self.regularisation, exact_ends=exact_ends
+        )
         self.weights_, self.progress_weights_ = learnt.weights, learnt.progress_weights
         self.start_, self.goal_, self.duration_ = learnt.start, learnt.goal, trajectory.duration
         self.start_velocity_, self.path_length_ = learnt.start_rate / self.duration_, learnt.path_length
         self.orientation_ = None
         if trajectory.quaternions is not None:
-            self.orientation_ = QuaternionDMP(self.gains_).fit(trajectory)
+            self.orientation_ = QuaternionDMP(self.gains_).fit(trajectory, exact_ends=exact_ends)
         return self
 
     @classmethod
@@ -148,6 +155,11 @@ class DMP:
     def widths_(self) -> Array:
         """Widths h_i of the basis functions, shape (N,)."""
         return phase_basis(self.n_basis).widths
+
+    def progress(self, times: ArrayLike) -> Array:
+        """Return p, the fraction of the learned path that is done at ``times`` (n,) [s] of the learned duration."""
+        t = np.atleast_1d(np.asarray(times, dtype=float))
+        return progress_at(t / self.duration_, self.progress_weights_, self.gains_)
 
     def _course(self, start: Array, goal: Array, duration: float, adjustment: Adjustment) -> Course:
         learnt, asked = self.goal_ - self.start_, goal - start
@@ -238,9 +250,9 @@ class DMP:
         if plan is not None and done < len(plan.pushes):
             motion = plan.transition.dot(state.motion) + plan.pushes[done]  # dot: @ is slower on small arrays
         else:
-            E, G, _ = propagator(self.gains_, h)
-            y = course.target(np.exp(-DECAY * (state.share + h * _BEGIN_MIDDLE_END)))
-            motion = E.dot(state.motion) + G.dot(y)
+            one = propagator(self.gains_, h)
+            y = course.target(np.exp(-DECAY * (state.share + one.instants)))
+            motion = one.transition.dot(state.motion) + one.drive.dot(y)
         turning = None
         if coupling is not None:
             T = course.duration
@@ -294,7 +306,8 @@ class DMP:
                 states.append(self.step(states[-1], T / n, coupling=coupling))
             quaternions = None if state.turn is None else np.stack([s.turn.quaternion for s in states if s.turn])
             return Trajectory(times, np.stack([s.position for s in states]), quaternions)
-        positions = roll_out(propagator(self.gains_, 1.0 / n), state.motion, state.course.target_on_grid(n))[0]
+        one = propagator(self.gains_, 1.0 / n)
+        positions = roll_out(one, state.motion, state.course.target_on_grid(n * one.n_parts))[0]
         if self.orientation_ is None or state.turn is None:
             return Trajectory(times, positions)
         return Trajectory(times, positions, self.orientation_.target(state.turn, times / T))

@@ -59,7 +59,9 @@ def _responses(gains: Gains, n_basis: int) -> _Responses:
     return _Responses(z[0], z[1], CubicHermiteSpline(np.linspace(0.0, 1.0, _FINE + 1), z[0], z[1]))
 
 
-def imitate(share: Array, x: Array, gains: Gains, n_basis: int, regularisation: float) -> Imitation:
+def imitate(
+    share: Array, x: Array, gains: Gains, n_basis: int, regularisation: float, *, exact_ends: bool = False
+) -> Imitation:
     r"""Learn a path.
 
     The motion is linear in the drives ``d_i = w_i - (g - x_0)``: with R the spring's responses to a start, a rate, a
@@ -79,15 +81,17 @@ def imitate(share: Array, x: Array, gains: Gains, n_basis: int, regularisation: 
         gains: of the spring.
         n_basis: number N of basis functions.
         regularisation: ridge, relative to the mean square response.
+        exact_ends: take the first and the last sample as they are, without smoothing.
     """
     responses = _responses(gains, n_basis)
     R = responses.spline(share)
     rate = start_rate(share, x)
     ends = np.stack([x[0], rate, x[-1]])
-    beside = _beside(R, x - R[:, :3] @ ends, n_basis, regularisation)
-    if start_rate(1.0 - share[::-1], x[::-1]).any():  # cut off under way: the last sample is as good as any
-        beside[2] = 0.0
-    ends += np.where(np.linalg.norm(beside, axis=1, keepdims=True) > _NOISE, beside, 0.0)
+    if not exact_ends:
+        beside = _beside(R, x - R[:, :3] @ ends, n_basis, regularisation)
+        if start_rate(1.0 - share[::-1], x[::-1]).any():  # cut off under way: the last sample is as good as any
+            beside[2] = 0.0
+        ends += np.where(np.linalg.norm(beside, axis=1, keepdims=True) > _NOISE, beside, 0.0)
     base = R[:, :3] @ ends
     force = phase_basis(n_basis).centers  # of a drive of 1: late ones carry the factor s = 0.01
     drives = _without_last(R[:, 3:], x - base, force, regularisation, ends[2] - base[-1])
@@ -98,6 +102,12 @@ def imitate(share: Array, x: Array, gains: Gains, n_basis: int, regularisation: 
     )
     weights = drives + (ends[2] - ends[0])
     return Imitation(ends[0], ends[2], weights, progress_drives[:, 0] + 1.0, rate, path_length)
+
+
+def progress_at(share: Array, progress_weights: Array, gains: Gains) -> Array:
+    """Return the fraction of the path that is done at ``share`` (n,) of the duration: 0 at the start, 1 at the end."""
+    R = _responses(gains, len(progress_weights)).spline(np.clip(share, 0.0, 1.0))
+    return np.asarray(R[:, 2] + R[:, 3:] @ (progress_weights - 1.0))
 
 
 def _without_last(R: Array, y: Array, force: Array, regularisation: float, end: Array) -> Array:

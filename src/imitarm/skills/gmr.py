@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
+from imitarm.kinematics.pose import mean_quaternion
 from imitarm.skills.gmm import DegenerateAxisWarning, GaussianMixture
 from imitarm.skills.rotation_reference import RotationReference, left_jacobian
 from imitarm.skills.samples import SingleDemonstrationWarning, samples_of
@@ -19,6 +20,7 @@ from imitarm.trajectory import Demonstration, Trajectory
 Array = NDArray[np.float64]
 
 _AXES = ("x", "y", "z")
+_LEAST_CORRECTED = 0.05  # of the duration: the shortest time over which the nominal path leaves an end's correction
 
 
 class GMR:
@@ -63,6 +65,7 @@ class GMR:
         means_: of [t; x], shape (K, 1 + D), D = 3 or 6.
         covariances_: of [t; x], shape (K, 1 + D, 1 + D).
         reference_: the rotation near which rotations are vectors; None without rotations.
+        ends_: mean start and mean goal of the demonstrations, as x (position, rotation vector), shape (2, D).
         degenerate_axes_: columns of x that don't move, 0 to 2 for x, y, z, 3 to 5 for rotations.
         converged_: whether the fit converged.
         lower_bound_: mean log-likelihood per sample.
@@ -79,6 +82,7 @@ class GMR:
     means_: Array
     covariances_: Array
     reference_: RotationReference | None
+    ends_: Array
     degenerate_axes_: tuple[int, ...]
     converged_: bool
     lower_bound_: float
@@ -146,6 +150,7 @@ class GMR:
             warnings.simplefilter("ignore", DegenerateAxisWarning)
             mixture.fit(np.concatenate(tables))
         self._learn(mixture.weights_, mixture.means_, mixture.covariances_)
+        self.ends_ = self._mean_ends(demonstrations)
         self.converged_, self.lower_bound_ = mixture.converged_, mixture.lower_bound_
         self.degenerate_axes_ = tuple(i - 1 for i in mixture.degenerate_axes_)
         still = [_AXES[i] for i in self.degenerate_axes_ if i < len(_AXES)]
@@ -168,6 +173,7 @@ class GMR:
         duration: float,
         n_demonstrations: int = 1,
         reference: RotationReference | None = None,
+        ends: ArrayLike | None = None,
         selection: Sequence[Candidate] = (),
         degenerate_axes: Sequence[int] = (),
         converged: bool = True,
@@ -182,6 +188,8 @@ class GMR:
             duration: demonstrated span [s].
             n_demonstrations: how many it was learnt from.
             reference: the rotation near which the last three columns are rotation vectors.
+            ends: mean start and mean goal of the demonstrations, shape (2, D); None: where the mixture's mean begins
+                and ends.
             selection: what was tried.
             degenerate_axes: columns of x that don't move.
             converged: whether the fit converged.
@@ -214,6 +222,12 @@ class GMR:
         gmr.selection_, gmr.degenerate_axes_ = tuple(selection), tuple(int(i) for i in degenerate_axes)
         gmr.converged_, gmr.lower_bound_ = converged, float(lower_bound)
         gmr._learn(w, mu, sigma)
+        gmr.ends_ = gmr._regress(np.array([0.0, gmr.duration_]), columns - 1)[0]
+        if ends is not None:
+            given = np.array(ends, dtype=float)
+            if given.shape != gmr.ends_.shape or not np.all(np.isfinite(given)):
+                raise InputError(f"GMR.from_mixture: ends must be 2 rows of {columns - 1} finite numbers")
+            gmr.ends_ = given
         return gmr
 
     def _learn(self, weights: Array, means: Array, covariances: Array) -> None:
@@ -323,10 +337,47 @@ class GMR:
         covariance = transport @ covariance @ np.swapaxes(transport, 1, 2)
         return mean[:, :3], self.reference_.to_quaternions(t, mean[:, 3:]), covariance
 
+    def nominal(self, times: ArrayLike) -> tuple[Array, Array | None]:
+        r"""Return the nominal path at ``times`` (n,) [s]: the mean motion, made to begin and end exactly as shown.
+
+        The mean :math:`\hat x` consists of straight pieces, blended, and misses the mean start and goal of the
+        demonstrations by millimetres. The nominal path closes both gaps by smooth steps that depend on time alone:
+
+        .. math::
+            x_0(t) = \hat x(t) + b(t / w_1) (x_{start} - \hat x(0)) + b((T - t) / w_K) (x_{goal} - \hat x(T)), \quad
+            b(u) = 1 - 10 u^3 + 15 u^4 - 6 u^5
+
+        The widths :math:`w_1 = \mu_1^t` and :math:`w_K = T - \mu_K^t` reach to the centres of the first and the last
+        Gaussian, at least a twentieth of the duration. Moving the mean of Gaussian k by :math:`\Delta_k` still moves
+        the path by :math:`h_k(t) \Delta_k`.
+
+        Returns:
+            Positions (n, 3) [m], and quaternions wxyz (n, 4), None without rotations.
+        """
+        t = self._clamped(times)
+        x = self._regress(t, self.means_.shape[1] - 1)[0] + self._end_correction(t)
+        return x[:, :3], None if self.reference_ is None else self.reference_.to_quaternions(t, x[:, 3:])
+
+    def _end_correction(self, t: Array) -> Array:
+        """Return what the nominal path adds to the mean at clamped times (n,), shape (n, D)."""
+        T, centres = self.duration_, self.time_means_
+        widths = np.clip(np.array([centres[0], T - centres[-1]]), _LEAST_CORRECTED * T, T)
+        u = np.minimum(np.stack([t, T - t], axis=1) / widths, 1.0)
+        blend = 1.0 - u**3 * (10.0 + u * (6.0 * u - 15.0))
+        gaps = self.ends_ - self._regress(np.array([0.0, T]), self.ends_.shape[1])[0]
+        return np.asarray(blend @ gaps)
+
+    def _mean_ends(self, demonstrations: Sequence[Demonstration | Trajectory]) -> Array:
+        """Return the mean of the demonstrated starts and of the goals, as x, shape (2, D)."""
+        motions = [d.trajectory if isinstance(d, Demonstration) else d for d in demonstrations]
+        rows = [np.mean([m.positions[i] for m in motions], axis=0) for i in (0, -1)]
+        if self.reference_ is not None:
+            for i, t in ((0, 0.0), (-1, self.duration_)):
+                turned = mean_quaternion(np.stack([m.quaternions[i] for m in motions if m.quaternions is not None]))
+                rows[i] = np.concatenate([rows[i], self.reference_.to_vectors([t], turned[None])[0]])
+        return np.stack(rows)
+
     def trajectory(self, n: int = 200) -> Trajectory:
-        """Return the mean motion at ``n`` equally spaced times of the demonstrated span."""
+        """Return the nominal path at ``n`` equally spaced times of the demonstrated span."""
         times = np.linspace(0.0, self.duration_, n)
-        if self.has_orientation_:
-            positions, quaternions, _ = self.predict_pose(times)
-            return Trajectory(times, positions, quaternions)
-        return Trajectory(times, self.predict(times)[0])
+        return Trajectory(times, *self.nominal(times))

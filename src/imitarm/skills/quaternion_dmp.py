@@ -80,8 +80,12 @@ class QuaternionDMP:
         self.gains_ = gains_named(gains) if isinstance(gains, str) else Gains(*gains)
         self.n_pieces = n_pieces
 
-    def fit(self, trajectory: Trajectory) -> Self:
+    def fit(self, trajectory: Trajectory, *, exact_ends: bool = False) -> Self:
         """Learn from one trajectory with quaternions.
+
+        Args:
+            trajectory: the motion to reproduce.
+            exact_ends: start and end exactly at the first and the last rotation, instead of smoothing them.
 
         Raises:
             InputError: when it has no quaternions, or neighbouring samples are so far apart that the way between
@@ -102,14 +106,17 @@ class QuaternionDMP:
             )
         if len(share) <= _DEGREE + 1:  # too few for a spline of that degree: fill in along the shortest arcs
             dense = trajectory.resample(4 * (_DEGREE + 1))
-            return self.fit(dense)
+            return self.fit(dense, exact_ends=exact_ends)
         pieces = max(1, min(self.n_pieces, (len(share) - _DEGREE) // 3))
         inner = np.quantile(share, np.linspace(0.0, 1.0, pieces + 1)[1:-1])  # as many samples in each piece
         knots = np.concatenate([np.zeros(_DEGREE + 1), inner, np.ones(_DEGREE + 1)])
         weights = np.ones(len(share))
         weights[[0, -1]] = _END_WEIGHT
         spline = make_lsq_spline(share, quaternions, knots, k=_DEGREE, w=weights)
-        self._take(knots, np.asarray(spline.c))
+        coefficients = np.array(spline.c)
+        if exact_ends:  # a clamped spline passes through its first and its last coefficient
+            coefficients[[0, -1]] = quaternions[[0, -1]]
+        self._take(knots, coefficients)
         return self
 
     @classmethod
@@ -179,10 +186,7 @@ class QuaternionDMP:
 
     def target(self, turn: Turn, share: Array) -> Array:
         """Return the target rotations (n, 4) wxyz at shares (n,) of the duration, for the ends that ``turn`` has."""
-        u = np.clip(share, 0.0, 1.0)[:, None]
-        blend = u**3 * (10.0 + u * (6.0 * u - 15.0))
-        q = quaternion_multiply(quaternion_exp(blend * turn.goal_change), self._learnt(share))
-        return continuous_signs(quaternion_multiply(quaternion_exp((1.0 - blend) * turn.start_change), q))
+        return with_other_ends(self._learnt(share), share, turn.start_change, turn.goal_change)
 
     def step(self, turn: Turn, step: float, acceleration: Array | None = None) -> Turn:
         """Return the state after ``step`` of the duration.
@@ -192,11 +196,26 @@ class QuaternionDMP:
             step: share of the duration.
             acceleration: T^2 times an angular acceleration (3,) [rad] in the base frame, held during the step.
         """
-        E, _, push = propagator(self.gains_, step)
-        offset = E @ turn.offset
+        one = propagator(self.gains_, step)
+        offset = one.transition @ turn.offset
         if acceleration is not None:
-            offset = offset + push[:, None] * acceleration
+            offset = offset + one.push[:, None] * acceleration
         share = turn.share + step
         q = quaternion_multiply(quaternion_exp(offset[0]), self.target(turn, np.array([share]))[0])
         q = -q if q @ turn.quaternion < 0.0 else q
         return turn._replace(quaternion=q, offset=offset, share=share)
+
+
+def with_other_ends(quaternions: Array, share: Array, start_change: Array, goal_change: Array) -> Array:
+    """Return ``exp((1 - b) d_start) exp(b d_goal) R`` with b the minimum-jerk profile, quaternions wxyz (n, 4).
+
+    Args:
+        quaternions: R, the learned rotations wxyz, shape (n, 4).
+        share: fraction of the duration at each of them, shape (n,).
+        start_change: d_start, rotation vector in the base frame, shape (3,) [rad].
+        goal_change: d_goal, likewise.
+    """
+    u = np.clip(share, 0.0, 1.0)[:, None]
+    blend = u**3 * (10.0 + u * (6.0 * u - 15.0))
+    q = quaternion_multiply(quaternion_exp(blend * goal_change), quaternions)
+    return continuous_signs(quaternion_multiply(quaternion_exp((1.0 - blend) * start_change), q))

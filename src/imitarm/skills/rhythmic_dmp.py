@@ -209,11 +209,11 @@ class RhythmicDMP:
             coupling: from position and velocity to an acceleration (3,) [m/s^2] that is added during this step.
         """
         h = dt / state.period
-        E, G, push = propagator(self.gains_, h)
-        motion = E @ state.motion + G @ self._target(state, state.turns + h * np.array([0.0, 0.5, 1.0]))
+        one = propagator(self.gains_, h)
+        motion = one.transition @ state.motion + one.drive @ self._target(state, state.turns + one.instants)
         if coupling is not None:
             acceleration = np.asarray(coupling(state.position, state.velocity), dtype=float) * state.period**2
-            motion[:, :3] += push[:, None] * acceleration
+            motion[:, :3] += one.push[:, None] * acceleration
         return state._replace(motion=motion, turns=state.turns + h)
 
     def quaternion(self, state: RhythmState) -> Array | None:
@@ -251,8 +251,9 @@ class RhythmicDMP:
         if n < 1:
             raise InputError(f"RhythmicDMP.generate: dt must be above 0 and not above the duration {T:g} s, got {dt!r}")
         h = T / n / state.period
-        target = self._target(state, np.linspace(0.0, n * h, 2 * n + 1))
-        x = roll_out(propagator(self.gains_, h), state.motion, target)[0]
+        one = propagator(self.gains_, h)
+        target = self._target(state, np.linspace(0.0, n * h, 2 * n * one.n_parts + 1))
+        x = roll_out(one, state.motion, target)[0]
         times = np.linspace(0.0, T, n + 1)
         if self.reference_ is None:
             return Trajectory(times, x)

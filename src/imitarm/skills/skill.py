@@ -15,6 +15,7 @@ from imitarm.kinematics.pose import Pose
 from imitarm.skills.course import Adjustment
 from imitarm.skills.dmp import DMP
 from imitarm.skills.gmr import GMR
+from imitarm.skills.quaternion_dmp import with_other_ends
 from imitarm.skills.skill_content import dmp_content, gmr_content, read_dmp, read_gmr
 from imitarm.skills.skill_file import read_skill, write_skill
 from imitarm.skills.spring import Gains
@@ -90,7 +91,7 @@ class Skill:
         provenance: dict[str, Any] = {"imitarm": imitarm.__version__, "sources": sources, "notes": list(notes)}
         if date is not None:
             provenance["date"] = date
-        self._take(gmr, self._dmp.fit(gmr.trajectory(_SAMPLES)), " + ".join(tasks), provenance)
+        self._take(gmr, self._dmp.fit(gmr.trajectory(_SAMPLES), exact_ends=True), " + ".join(tasks), provenance)
         return self
 
     def _take(self, gmr: GMR, dmp: DMP, task: str, provenance: Mapping[str, Any]) -> None:
@@ -126,6 +127,38 @@ class Skill:
         """Learnt goal, tool_to_base."""
         dmp = self._fitted()
         return _pose(dmp.goal_, None if dmp.orientation_ is None else dmp.orientation_.goal_)
+
+    def nominal(
+        self, times: ArrayLike, start: Pose | ArrayLike | None = None, goal: Pose | ArrayLike | None = None
+    ) -> Trajectory:
+        r"""Return the nominal path, which policies reproduce, at ``times`` [s] of the learned duration.
+
+        It starts and ends exactly at ``start`` and ``goal``, for any number of samples. The learned path is
+        :meth:`~imitarm.skills.gmr.GMR.nominal`. Other ends change it as in the primitive's adjustment ``"progress"``:
+
+        .. math:: x(t) = x_0(t) + (1 - p(t)) \delta_{start} + p(t) \delta_{goal}
+
+        with p the fraction of the path that is done. The rotation changes likewise, along a minimum-jerk profile.
+
+        Args:
+            times: strictly increasing, from 0 to the learned duration, shape (n,) [s].
+            start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
+            goal: likewise.
+
+        Raises:
+            InputError: when not fitted, or a start, a goal or a time is not valid.
+        """
+        state = self._fitted().begin(start, goal)
+        t = np.asarray(times, dtype=float)
+        positions, quaternions = self.gmr_.nominal(t)
+        moved = np.stack([state.course.start - self.dmp_.start_, state.course.goal - self.dmp_.goal_])
+        if moved.any():
+            p = self.dmp_.progress(t)
+            positions = positions + np.stack([1.0 - p, p], axis=1) @ moved
+        if quaternions is not None and state.turn is not None:
+            changes = state.turn.start_change, state.turn.goal_change
+            quaternions = with_other_ends(quaternions, t / self.duration_, *changes)
+        return Trajectory(t, positions, quaternions)
 
     def generate(
         self,
@@ -200,6 +233,8 @@ class Skill:
             if provenance.has("date"):
                 origin["date"] = provenance.text("date")
             task = fields.text("task")
+            if not fields.group("gmr").has("ends"):  # a file of before: the primitive's ends are the nominal path's
+                gmr.ends_ = _ends_of(dmp, gmr)
         except FileFormatError:
             raise
         except InputError as error:
@@ -211,3 +246,12 @@ class Skill:
 
 def _pose(position: Array, quaternion: Array | None) -> Pose:
     return Pose(position, np.array([1.0, 0.0, 0.0, 0.0]) if quaternion is None else quaternion)
+
+
+def _ends_of(dmp: DMP, gmr: GMR) -> Array:
+    """Return start and goal of a primitive in the columns of a regression, shape (2, D)."""
+    ends = np.stack([dmp.start_, dmp.goal_])
+    if gmr.reference_ is None or dmp.orientation_ is None:
+        return ends
+    quaternions = np.stack([dmp.orientation_.start_, dmp.orientation_.goal_])
+    return np.hstack([ends, gmr.reference_.to_vectors([0.0, gmr.duration_], quaternions)])

@@ -24,6 +24,7 @@ def gmr_content(gmr: GMR) -> dict[str, Any]:
         "weights": gmr.weights_,
         "means": gmr.means_,
         "covariances": gmr.covariances_,
+        "ends": gmr.ends_,
         "degenerate_axes": gmr.degenerate_axes_,
         "converged": gmr.converged_,
     }
@@ -67,6 +68,7 @@ def read_gmr(fields: Fields) -> GMR:
         duration=fields.number("duration"),
         n_demonstrations=fields.integer("n_demonstrations"),
         reference=reference,
+        ends=fields.array("ends", 2) if fields.has("ends") else None,
         selection=selection,
         degenerate_axes=[int(i) for i in fields.array("degenerate_axes", 1)],
         converged=fields.flag("converged"),
