@@ -54,5 +54,5 @@ def test_a_cut_file_is_refused(tmp_path):
     file = tmp_path / "a.csv"
     motion(n=20).save(file)
     file.write_text("\n".join(file.read_text().splitlines()[:-3]) + "\n")
-    with pytest.raises(FileFormatError, match="announces 20 samples, holds 17"):
+    with pytest.raises(FileFormatError, match="announces 20 samples, but the file holds 17"):
         read_raw(file)

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from dataclasses import replace
+from xml.etree import ElementTree
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -35,16 +38,16 @@ def test_arrays_are_copies_and_read_only():
 @pytest.mark.parametrize(
     ("times", "positions", "quaternions", "message"),
     [
-        ([0, 1], np.zeros((2, 2)), None, r"positions: shape must be \(2, 3\)"),
-        ([0, 1], np.zeros((3, 3)), None, "positions: shape"),
+        ([0, 1], np.zeros((2, 2)), None, r"positions must be an array of shape \(2, 3\)"),
+        ([0, 1], np.zeros((3, 3)), None, "positions must be an array of shape"),
         ([0], np.zeros((1, 3)), None, "at least 2 samples"),
         ([0, 0], np.zeros((2, 3)), None, "row 1 .* not later"),
         ([0, 2, 1], np.zeros((3, 3)), None, "row 2 .* not later"),
-        ([0, np.nan], np.zeros((2, 3)), None, "row 1 is not finite"),
-        ([0, 1], [[0, 0, 0], [0, np.inf, 0]], None, "positions: row 1 is not finite"),
+        ([0, np.nan], np.zeros((2, 3)), None, r"times\[1\] is nan"),
+        ([0, 1], [[0, 0, 0], [0, np.inf, 0]], None, r"positions\[1, 1\] is inf"),
         ([0, 1], np.zeros((2, 3)), [[1, 0, 0, 0], [0, 0, 0, 0]], "quaternion 1 has length 0"),
-        ([0, 1], np.zeros((2, 3)), np.zeros((2, 3)), "quaternions: shape"),
-        (["a", "b"], np.zeros((2, 3)), None, "not a table of numbers"),
+        ([0, 1], np.zeros((2, 3)), np.zeros((2, 3)), "quaternions must be an array of shape"),
+        (["a", "b"], np.zeros((2, 3)), None, r"times must be numbers \[s\]"),
     ],
 )
 def test_what_is_wrong_is_said_at_construction(times, positions, quaternions, message):
@@ -80,7 +83,7 @@ def test_from_zero_changes_the_clock_only():
 def test_joints_have_a_row_for_each_sample_and_a_name_for_each_column():
     assert Demonstration(LINE, np.zeros((3, 2))).joint_names == ("joint_1", "joint_2")
     assert Demonstration(LINE, None, joint_names=("a",)).joint_names == ()
-    with pytest.raises(InputError, match=r"joints of recorder: shape must be \(3, 2\), got \(4, 2\)"):
+    with pytest.raises(InputError, match=r"joints of recorder must be .* shape \(3, n\) \[rad\], got shape \(4, 2\)"):
         Demonstration(LINE, np.zeros((4, 2)), source="recorder")
     for names in (("a",), ("a", "a")):
         with pytest.raises(InputError, match="2 columns need as many different joint_names"):
@@ -137,11 +140,11 @@ def test_the_file_says_units_and_frame(tmp_path):
     ("old", "new", "message"),
     [
         ("# format: imitarm-demonstration\n", "", "no line '# format: imitarm-demonstration'"),
-        ("version: 1", "version: 2", r"format version '2', this imitarm reads up to 1; update"),
+        ("version: 1", "version: 2", r"format version '2'; this imitarm reads versions up to 1; update"),
         ("version: 1", "version: one", "format version 'one'"),
         ("units: m s rad", "units: mm s rad", "units are 'mm s rad'"),
         ("frame: tool_to_base", "frame: camera", "frame are 'camera'"),
-        ("samples: 300", "samples: 301", "announces 301 samples, holds 300; the file was cut off"),
+        ("samples: 300", "samples: 301", "announces 301 samples, but the file holds 300; it is incomplete"),
         ("t,x,y,z", "t,x,z,y", "columns must begin t,x,y,z"),
         ("t,x,y,z\n", "", "columns must begin t,x,y,z, got no names"),
     ],
@@ -166,7 +169,7 @@ def test_a_file_that_was_cut_anywhere_is_refused(tmp_path, keep):
     with pytest.raises(FileFormatError, match="cut off"):
         Demonstration.load(file)
     file.write_bytes(content[: content.rindex(b"\n", 0, int(keep * len(content))) + 1])  # between two rows
-    with pytest.raises(FileFormatError, match="cut off"):
+    with pytest.raises(FileFormatError, match="incomplete"):
         Demonstration.load(file)
 
 
@@ -185,3 +188,75 @@ def test_a_joint_that_could_not_be_a_column_is_refused(tmp_path, name):
     with pytest.raises(InputError, match="can't be the name of a joint's column"):
         Demonstration(LINE, np.zeros((3, 1)), joint_names=(name,)).save(tmp_path / "one.csv")
     assert not list(tmp_path.iterdir())
+
+
+ZEROS = np.zeros((3, 7))
+ROLLOUT = Rollout(LINE, ZEROS, ZEROS, ZEROS, np.array([0.2, 0.1, np.inf]), True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"trajectory": None}, "trajectory must be a Trajectory"),
+        ({"joints": np.zeros((2, 7))}, r"joints must be an array of shape \(3, n\)"),
+        ({"velocities": np.zeros((3, 6))}, r"velocities must be an array of shape \(3, 7\)"),
+        ({"torques": np.full((3, 7), np.nan)}, r"torques\[0, 0\] is nan"),
+        ({"clearance": [0.1, np.nan, 0.1]}, "NaN in row 1"),
+        ({"success": "no"}, "success must be True or False"),
+        ({"reason": None}, "reason must be text"),
+        ({"details": [1]}, "details must be a mapping"),
+    ],
+)
+def test_a_rollout_is_checked(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(ROLLOUT, **change)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: Demonstration(None),
+        lambda: Demonstration(LINE, task=3),
+        lambda: Demonstration(LINE, source=None),
+        lambda: Demonstration(LINE, np.zeros((3, 2)), joint_names="ab"),
+        lambda: Demonstration(LINE, np.zeros((3, 2)), joint_names=(1, 2)),
+        lambda: Demonstration(LINE).save(None),
+        lambda: Demonstration(LINE).save("a\0b"),
+        lambda: Demonstration.load(3),
+        lambda: Demonstration.load(b"a"),
+        lambda: LINE.at([0.0, np.nan]),
+        lambda: LINE.at("now"),
+        lambda: LINE.at([[0.0]]),
+        lambda: LINE.at(None),
+        lambda: LINE.pose(3),
+        lambda: LINE.pose(-4),
+        lambda: LINE.pose(1.0),
+        lambda: LINE.resample(2.5),
+        lambda: LINE.resample(np.nan),
+        lambda: LINE.resample(10**12),
+        lambda: Trajectory(None, None),
+        lambda: Trajectory([0.0, np.inf], np.zeros((2, 3))),
+        lambda: Trajectory([True, False], np.zeros((2, 3))),
+    ],
+)
+def test_what_cannot_be_used_is_refused(call):
+    with pytest.raises(InputError):
+        call()
+
+
+def test_short_reprs_name_the_figures():
+    assert repr(LINE) == "Trajectory(3 samples, 3 s, path 3 m, without rotation)"
+    one = Demonstration(LINE, np.zeros((3, 2)), task="sweep")
+    assert repr(one) == "Demonstration('sweep', 3 samples, 3 s, path 3 m, without rotation, 2 joints)"
+    assert repr(ROLLOUT) == "Rollout(succeeded, 3 samples, 3 s, smallest clearance 0.1 m)"
+
+
+def test_a_notebook_shows_a_table():
+    one = Demonstration(LINE, np.zeros((3, 2)), task="<sweep>", joint_names=("a", "b"))
+    for thing, texts in (
+        (LINE, ["Trajectory", "samples", "3", "3 s", "3 m", "(0, 0, 0), (1, 2, 0) m"]),
+        (one, ["Demonstration", "<sweep>", "a, b"]),
+        (ROLLOUT, ["Rollout", "yes", "0.1 m", "0 rad/s", "0 N m"]),
+    ):
+        shown = [element.text for element in ElementTree.fromstring(thing._repr_html_()).iter()]
+        assert set(texts) <= set(shown)

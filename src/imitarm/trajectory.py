@@ -1,10 +1,11 @@
-"""One motion in three tenses: Trajectory (timed poses), Demonstration (was shown), Rollout (was done).
+"""Motions: Trajectory (timed poses), Demonstration (a motion that was shown), Rollout (a motion that a robot did).
 
-All three are frozen and their arrays read-only: state comes in as an argument, results come out.
+All three are frozen, and their arrays are read-only copies.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -16,12 +17,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import FileFormatError, InputError
 from imitarm.files.table import Table, read_table, write_table
+from imitarm.html_table import html_table
 from imitarm.kinematics.pose import Pose, checked_unit_quaternions, continuous_signs, slerp
+from imitarm.validation import finite_array, flag, instance, real_array, text, whole_number
 
 Array = NDArray[np.float64]
 
 FORMAT = "imitarm-demonstration"
 VERSION = 1
+_MOST_SAMPLES = 10_000_000
 _UNITS = "m s rad"
 _FRAME = "tool_to_base"
 _POSE_COLUMNS = ("t", "x", "y", "z")
@@ -30,34 +34,26 @@ _COLUMN_NAME = re.compile(r"[A-Za-z_][\w./:-]*")
 _RESERVED = {*_POSE_COLUMNS, *_QUATERNION_COLUMNS, "nan", "inf", "infinity"}
 
 
-def _frozen(values: ArrayLike, shape: tuple[int | None, ...], what: str) -> Array:
-    """Return a read-only float copy of ``values``, or say which shape or which row is wrong."""
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{what}: not a table of numbers ({error})") from error
-    wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
-    if array.ndim != len(shape) or any(s is not None and s != a for s, a in zip(shape, array.shape, strict=True)):
-        raise InputError(f"{what}: shape must be {wanted}, got {array.shape}")
-    bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1) if len(array) else np.zeros(0, bool)
-    if bad.any():
-        raise InputError(f"{what}: row {int(np.flatnonzero(bad)[0])} is not finite; remove or repair it")
+def _frozen(values: ArrayLike, shape: tuple[int | None, ...], what: str, unit: str = "") -> Array:
+    """Return a read-only copy of ``values``, which must be finite numbers of this shape."""
+    array = finite_array(values, shape, what, unit).copy()
     array.setflags(write=False)
     return array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
     """Timed poses of the tool in the base frame.
 
     Attributes:
         times: strictly increasing, shape (n,) [s].
         positions: shape (n, 3) [m].
-        quaternions: unit quaternions w, x, y, z with continuous signs, shape (n, 4); None when not known.
+        quaternions: unit quaternions w, x, y, z with continuous signs, shape (n, 4); None when the rotation is not
+            known.
 
     Raises:
-        InputError: when shapes disagree, a number is not finite, times do not increase, or there are fewer
-            than 2 samples.
+        InputError: when shapes disagree, a number is not finite, the times do not increase, or there are fewer than
+            2 samples.
     """
 
     times: Array
@@ -66,7 +62,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         name = type(self).__name__
-        times = _frozen(self.times, (None,), f"{name} times")
+        times = _frozen(self.times, (None,), f"{name} times", "s")
         if len(times) < 2:
             raise InputError(f"{name}: needs at least 2 samples, got {len(times)}")
         late = np.flatnonzero(np.diff(times) <= 0.0)
@@ -74,7 +70,7 @@ class Trajectory:
             raise InputError(
                 f"{name} times: row {late[0] + 1} ({times[late[0] + 1]:g} s) is not later than the row before"
             )
-        positions = _frozen(self.positions, (len(times), 3), f"{name} positions")
+        positions = _frozen(self.positions, (len(times), 3), f"{name} positions", "m")
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "positions", positions)
         if self.quaternions is not None:
@@ -85,6 +81,24 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.times)
+
+    def __repr__(self) -> str:
+        return f"Trajectory({', '.join(self._facts())})"
+
+    def _repr_html_(self) -> str:
+        samples, duration, path, rotation = self._facts()
+        rows = {"samples": samples.split()[0], "duration": duration, "path length": path.removeprefix("path ")}
+        first, last = (_triple(x) for x in self.positions[[0, -1]])
+        return html_table("Trajectory", {**rows, "first, last position": f"{first}, {last} m", "rotation": rotation})
+
+    def _facts(self) -> tuple[str, str, str, str]:
+        rotation = "with" if self.quaternions is not None else "without"
+        return (
+            f"{len(self)} samples",
+            f"{self.duration:.4g} s",
+            f"path {self.path_length:.4g} m",
+            f"{rotation} rotation",
+        )
 
     @property
     def duration(self) -> float:
@@ -97,20 +111,28 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
     def at(self, times: ArrayLike) -> tuple[Array, Array | None]:
-        """Interpolate: positions linearly, rotations along the shortest arc; the ends are held.
+        """Interpolate positions linearly and rotations along the shortest arc; outside the motion, hold its ends.
 
         Args:
-            times: query times [s], shape (m,).
+            times: query times [s], shape (m,), or one number.
 
         Returns:
             positions (m, 3) [m] and quaternions (m, 4) wxyz or None.
+
+        Raises:
+            InputError: when the times are not finite numbers.
         """
-        t = np.atleast_1d(np.asarray(times, dtype=float))
+        t = finite_array(np.atleast_1d(times), (None,), "Trajectory.at: times", "s")
         positions = np.stack([np.interp(t, self.times, column) for column in self.positions.T], axis=1)
         return positions, None if self.quaternions is None else slerp(t, self.times, self.quaternions)
 
     def pose(self, index: int) -> Pose:
-        """Return sample ``index`` as a pose; without quaternions the rotation is the identity."""
+        """Return sample ``index`` as a pose; without quaternions the rotation is the identity.
+
+        Raises:
+            InputError: when ``index`` is not a whole number from ``-n`` to ``n - 1``.
+        """
+        index = whole_number(index, "Trajectory.pose: index", at_least=-len(self), at_most=len(self) - 1)
         q = np.array([1.0, 0.0, 0.0, 0.0]) if self.quaternions is None else self.quaternions[index]
         return Pose(self.positions[index], q)
 
@@ -118,10 +140,9 @@ class Trajectory:
         """Return ``n`` samples equally spaced in time, first and last kept.
 
         Raises:
-            InputError: when ``n`` is below 2.
+            InputError: when ``n`` is not a whole number from 2 to 10 million.
         """
-        if n < 2:
-            raise InputError(f"resample: n must be at least 2, got {n}")
+        n = whole_number(n, "Trajectory.resample: n", at_least=2, at_most=_MOST_SAMPLES)
         times = np.linspace(self.times[0], self.times[-1], n)
         return Trajectory(times, *self.at(times))
 
@@ -130,19 +151,20 @@ class Trajectory:
         return Trajectory(self.times - self.times[0], self.positions, self.quaternions)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Demonstration:
-    """A motion that was shown, with where it came from.
+    """A motion that was shown, and its origin.
 
     Attributes:
         trajectory: timed poses of the tool in the base frame.
-        joints: joint angles (n, n_joints) [rad] of the arm that was guided, None when not recorded.
+        joints: joint angles (n, n_joints) [rad] of the arm that was guided; None when they were not recorded.
         task: what was shown, for example ``"sweep"``.
-        source: where it came from: a file, a row range, a recorder.
+        source: where it comes from, for example a file, a range of rows or a recorder.
         joint_names: one name for each column of ``joints``; ``joint_1``, ``joint_2``, ... when not given.
 
     Raises:
-        InputError: when ``joints`` has not one row for each sample, or ``joint_names`` not one name for each column.
+        InputError: when ``joints`` does not have one row for each sample, or ``joint_names`` does not have one name for
+            each column.
     """
 
     trajectory: Trajectory
@@ -152,12 +174,16 @@ class Demonstration:
     joint_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        instance(self.trajectory, Trajectory, "Demonstration: trajectory")
+        for name in ("task", "source"):
+            text(getattr(self, name), f"Demonstration: {name}")
         if self.joints is None:
             object.__setattr__(self, "joint_names", ())
             return
         what = f"Demonstration joints of {self.source or self.task}"
-        columns = np.shape(self.joints)[1] if np.ndim(self.joints) == 2 else None
-        joints = _frozen(self.joints, (len(self.trajectory), columns), what)
+        joints = _frozen(self.joints, (len(self.trajectory), None), what, "rad")
+        if isinstance(self.joint_names, str) or not all(isinstance(name, str) for name in self.joint_names):
+            raise InputError(f"{what}: joint_names must be a sequence of texts, got {self.joint_names!r:.80}")
         names = tuple(self.joint_names) or tuple(f"joint_{i + 1}" for i in range(joints.shape[1]))
         if len(names) != joints.shape[1] or len(set(names)) != len(names):
             raise InputError(f"{what}: {joints.shape[1]} columns need as many different joint_names, got {names}")
@@ -167,18 +193,31 @@ class Demonstration:
     def __len__(self) -> int:
         return len(self.trajectory)
 
+    def __repr__(self) -> str:
+        joints = "no joints" if self.joints is None else f"{len(self.joint_names)} joints"
+        return f"Demonstration({self.task or 'unnamed'!r}, {', '.join(self.trajectory._facts())}, {joints})"
+
+    def _repr_html_(self) -> str:
+        samples, *facts = self.trajectory._facts()
+        rows = {"task": self.task, "source": self.source, "samples": samples.split()[0], "motion": ", ".join(facts)}
+        return html_table("Demonstration", {**rows, "joints": ", ".join(self.joint_names) or "not recorded"})
+
     def with_trajectory(self, trajectory: Trajectory, joints: Array | None) -> Demonstration:
-        """Return a copy that keeps task and source."""
+        """Return a copy with another motion and the same task, source and joint names."""
         return replace(self, trajectory=trajectory, joints=joints)
 
-    def save(self, path: str | Path) -> None:
-        """Write a CSV file that says its units and frame and loses no digit; an older file is replaced.
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a CSV file that names its units and its frame. No digit is lost. An existing file is replaced.
 
         Columns: ``t`` [s], ``x y z`` [m], ``qw qx qy qz`` when the rotation is known, then the joints by name [rad].
+
+        Args:
+            path: of the file.
 
         Raises:
             InputError: when a joint's name can't be a column name, or the file can't be written.
         """
+        path = _checked_path(path, "Demonstration.save")
         for name in self.joint_names:
             if not _COLUMN_NAME.fullmatch(name) or name.lower() in _RESERVED:
                 raise InputError(f"{path}: {name!r} can't be the name of a joint's column; rename that joint")
@@ -198,15 +237,19 @@ class Demonstration:
         write_table(path, {key: str(value) for key, value in remarks.items()}, names, values)
 
     @classmethod
-    def load(cls, path: str | Path) -> Demonstration:
-        """Read what :meth:`save` wrote. Other formats: ``imitarm.demonstrations.read``.
+    def load(cls, path: str | os.PathLike[str]) -> Demonstration:
+        """Read a file that :meth:`save` wrote; ``imitarm.demonstrations.read`` reads other formats.
 
-        ``source`` becomes the path.
+        The ``source`` of the result is the path.
+
+        Args:
+            path: of the file.
 
         Raises:
             InputError: when the file can't be opened.
-            FileFormatError: when it is damaged, cut off, of another format or of a newer version.
+            FileFormatError: when it is damaged or incomplete, or has another format or a newer version.
         """
+        path = _checked_path(path, "Demonstration.load")
         table = read_demonstration_table(path)
         names = table.names or ()
         n_pose = 8 if "qw" in names else 4
@@ -219,28 +262,35 @@ class Demonstration:
             raise FileFormatError(f"{path} (row 0 is line {table.lines[0]}): {error}") from error
 
 
-def read_demonstration_table(path: str | Path) -> Table:
-    """Read the file of a demonstration as a table: the header is checked, the numbers are not.
+def read_demonstration_table(path: str | os.PathLike[str]) -> Table:
+    """Read the file of a demonstration as a table. The header is checked, the numbers are not.
+
+    Args:
+        path: of the file.
 
     Raises:
         InputError: when the file can't be opened.
-        FileFormatError: when it is damaged, cut off, of another format or of a newer version.
+        FileFormatError: when it is damaged or incomplete, or has another format or a newer version.
     """
+    path = _checked_path(path, "read_demonstration_table")
     table = read_table(path)
     if table.remarks.get("format") != FORMAT:
         raise FileFormatError(
-            f"{path}: no line '# format: {FORMAT}' at its head; read other formats with imitarm.demonstrations.read"
+            f"{path}: its header has no line '# format: {FORMAT}'; read other formats with imitarm.demonstrations.read"
         )
     version = table.remarks.get("version", "")
     if not version.isdecimal() or int(version) > VERSION:
-        raise FileFormatError(f"{path}: format version {version!r}, this imitarm reads up to {VERSION}; update imitarm")
+        raise FileFormatError(
+            f"{path}: format version {version!r}; this imitarm reads versions up to {VERSION}; update imitarm"
+        )
     for key, wanted in (("units", _UNITS), ("frame", _FRAME)):
         if table.remarks.get(key, wanted) != wanted:
             raise FileFormatError(f"{path}: {key} are {table.remarks[key]!r}, must be {wanted!r}; convert the numbers")
     samples = table.remarks.get("samples", str(len(table.values)))
     if samples != str(len(table.values)) or not table.ends_in_newline:
         raise FileFormatError(
-            f"{path}: announces {samples} samples, holds {len(table.values)}; the file was cut off, copy it again"
+            f"{path}: the header announces {samples} samples, but the file holds {len(table.values)}; "
+            "it is incomplete, copy it again"
         )
     names = table.names or ()
     pose = _POSE_COLUMNS + (_QUATERNION_COLUMNS if "qw" in names else ())
@@ -249,20 +299,23 @@ def read_demonstration_table(path: str | Path) -> Table:
     return table
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
-    """A motion that was done by a robot, as it was measured.
+    """A motion that a robot did, as it was measured.
 
     Attributes:
-        trajectory: measured poses of the tool in the base frame.
+        trajectory: measured poses of the tool in the base frame, n samples.
         joints: measured joint angles (n, n_joints) [rad].
         velocities: measured joint velocities (n, n_joints) [rad/s].
-        torques: torques that the joints' drives gave (n, n_joints) [N m].
-        clearance: smallest distance from the arm or its tool to an obstacle (n,) [m]; negative when they overlap;
-            inf when there was no obstacle.
+        torques: torques of the joints' drives (n, n_joints) [N m].
+        clearance: smallest distance between the arm (with its tool) and any obstacle (n,) [m]; negative when they
+            overlap, inf when there was no obstacle.
         success: whether the motion was finished in time.
-        reason: why it ended, in words.
-        details: anything more that the robot or the task measured, by name.
+        reason: why it ended.
+        details: further measurements of the robot or the task, by name.
+
+    Raises:
+        InputError: when shapes disagree, or a number is NaN.
     """
 
     trajectory: Trajectory
@@ -274,7 +327,51 @@ class Rollout:
     reason: str = ""
     details: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        n = len(instance(self.trajectory, Trajectory, "Rollout: trajectory"))
+        joints = _frozen(self.joints, (n, None), "Rollout: joints", "rad")
+        object.__setattr__(self, "joints", joints)
+        for name, unit in (("velocities", "rad/s"), ("torques", "N m")):
+            object.__setattr__(self, name, _frozen(getattr(self, name), joints.shape, f"Rollout: {name}", unit))
+        clearance = real_array(self.clearance, (n,), "Rollout: clearance", "m").copy()
+        if np.isnan(clearance).any():
+            raise InputError(f"Rollout: clearance [m] is NaN in row {int(np.argmax(np.isnan(clearance)))}")
+        clearance.setflags(write=False)
+        object.__setattr__(self, "clearance", clearance)
+        object.__setattr__(self, "success", flag(self.success, "Rollout: success"))
+        text(self.reason, "Rollout: reason")
+        if not isinstance(self.details, Mapping):
+            raise InputError(f"Rollout: details must be a mapping from names to values, got {self.details!r:.80}")
+
+    def __repr__(self) -> str:
+        samples, duration, *_ = self.trajectory._facts()
+        success = "succeeded" if self.success else "failed"
+        return f"Rollout({success}, {samples}, {duration}, smallest clearance {self.min_clearance:.4g} m)"
+
+    def _repr_html_(self) -> str:
+        samples, *facts = self.trajectory._facts()
+        rows = {
+            "success": "yes" if self.success else "no",
+            "reason": self.reason,
+            "samples": samples.split()[0],
+            "motion": ", ".join(facts),
+            "smallest clearance": f"{self.min_clearance:.4g} m",
+            "largest joint velocity": f"{np.abs(self.velocities).max(initial=0.0):.4g} rad/s",
+            "largest torque": f"{np.abs(self.torques).max(initial=0.0):.4g} N m",
+        }
+        return html_table("Rollout", rows)
+
     @property
     def min_clearance(self) -> float:
         """Smallest clearance of the whole motion [m]."""
         return float(np.min(self.clearance, initial=np.inf))
+
+
+def _triple(position: Array) -> str:
+    return f"({', '.join(f'{x:.4g}' for x in position)})"
+
+
+def _checked_path(path: str | os.PathLike[str], what: str) -> Path:
+    if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str) or "\0" in os.fspath(path):
+        raise InputError(f"{what}: path must be text or a pathlib.Path, got {path!r:.80}")
+    return Path(path)
