@@ -26,8 +26,9 @@ def test_a_slow_motion_of_the_persons_joint_is_the_robots(arm, joint):
 def test_its_reference_is_a_low_pass_of_first_order():
     """A jump of the person's joint reaches 1 - 1/e of itself after 1/(2 pi 3 Hz) = 53 ms."""
     method = AdaptiveControl(ARMS["sawyer"], HAND)
+    method.start(ARMS["sawyer"].home)
     method._approach.active = False
-    method._driven, method._goal, method._held_goal = True, ARMS["sawyer"].home + 0.1, ARMS["sawyer"].home + 0.1
+    method._driven, method._joint_goal, method._held_goal = True, ARMS["sawyer"].home + 0.1, ARMS["sawyer"].home + 0.1
     shares = []
     for _ in range(20):
         method._driven_on()

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,11 +42,12 @@ def test_a_deviation_dies_out_by_half_a_frame():
     method = IncrementalIK(arm, Correspondence(lengths=LENGTHS, orientation="fixed"), dt=1 / 30)
     for frame in shown(lambda _: EASY, 1.0):
         method.step(frame, arm.home)
-    method._q = method._q + 0.02 * np.array([1, -1, 1, 1, -1, 1, 1])  # as if the arm had been moved aside
+    moved = method.latest.q + 0.02 * np.array([1, -1, 1, 1, -1, 1, 1])
+    method.latest = replace(method.latest, q=moved)  # as if the arm had been moved aside
     errors = []
     for frame in shown(lambda _: EASY, 1.4)[31:]:
-        method.step(frame, method._q)
-        errors.append(np.linalg.norm(arm.tool_pose(method._q).error_to(method.command.target)))
+        method.step(frame, method.latest.q)
+        errors.append(np.linalg.norm(arm.tool_pose(method.latest.q).error_to(method.latest.target)))
     np.testing.assert_allclose(np.array(errors[1:5]) / errors[:4], 0.5, atol=0.05)
 
 
@@ -80,8 +83,7 @@ def test_without_the_caps_the_steps_would_be_many_times_too_long():
     method.start(straight)
     pose = arm.tool_pose(straight)
     out = type(pose)(pose.position + [0.01, 0.0, 0.0], pose.quaternion)
-    method._target = pose
-    assert (np.abs(method._increment(straight, out)) / (arm.max_velocity / 30)).max() > 50.0
+    assert (np.abs(method._increment(straight, pose, out)) / (arm.max_velocity / 30)).max() > 50.0
 
 
 def test_scaled_as_a_whole_the_tool_keeps_its_direction_and_is_cut_no_joint_by_itself():

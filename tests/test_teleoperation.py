@@ -54,7 +54,7 @@ def test_a_robot_here_is_led_within_its_limits():
     assert np.abs(robot.q - ARM.home).max() > 0.05
     assert one.tally.speed <= 1.0 and one.tally.acceleration <= 1.0 + 1e-9
     assert_within_limits(robot.steps)
-    np.testing.assert_allclose(robot.set_point, one.retargeter.command.q, atol=2e-3)
+    np.testing.assert_allclose(robot.set_point, one.retargeter.latest.q, atol=2e-3)
 
 
 def test_the_hand_leads_the_gripper():
@@ -200,10 +200,10 @@ def test_the_latency_of_each_stage_is_noted(wired):
 
 def test_a_capture_process_that_dies_stops_the_arm_and_begins_anew(wired):
     wired.run(2.0)
-    assert wired.loop.retargeter.command.state == "following"
+    assert wired.loop.retargeter.latest.state == "following"
     wired.capturing = False
     wired.run(1.5)
-    assert wired.loop.retargeter.command.state in ("stopped", "waiting")
+    assert wired.loop.retargeter.latest.state in ("stopped", "waiting")
     assert np.abs(wired.served.robot.velocity).max() < 1e-4 and wired.served.status is Status.FOLLOWING
     wired.sender.close()
     wired.sender = SkeletonSender(wired.stream.address, clock_ns=wired.clock)
@@ -212,7 +212,7 @@ def test_a_capture_process_that_dies_stops_the_arm_and_begins_anew(wired):
         type(s)(s.time - wired.frames[0].time, s.positions, s.tracking, s.hand_states) for s in wired.frames
     ]
     wired.run(2.0)
-    assert wired.loop.retargeter.command.state == "following"
+    assert wired.loop.retargeter.latest.state == "following"
     assert_within_limits(wired.served.robot.steps)
 
 
@@ -222,8 +222,8 @@ def test_a_loop_that_was_held_up_takes_hold_anew_from_where_the_arm_is(wired):
         wired.served.sleep(pause)
         wired.run(3.0)
         assert wired.loop.tally.interruptions >= 1
-        assert wired.loop.retargeter.command.state == "following"
-        np.testing.assert_allclose(wired.robot.set_point, wired.loop.retargeter.command.q, atol=5e-3)
+        assert wired.loop.retargeter.latest.state == "following"
+        np.testing.assert_allclose(wired.robot.set_point, wired.loop.retargeter.latest.q, atol=5e-3)
     assert_within_limits(wired.served.robot.steps)
 
 
@@ -239,7 +239,7 @@ def test_a_robot_process_that_dies_and_comes_back_elsewhere_is_not_pulled_to_whe
     assert np.array_equal(wired.served.robot.q, ARM.home + 0.2)
     wired.loop._operator = lambda trouble, stopped: stopped
     wired.run(3.0)
-    assert wired.loop.retargeter.command.state == "following"
+    assert wired.loop.retargeter.latest.state == "following"
     assert_within_limits(wired.served.robot.steps)
 
 

@@ -13,8 +13,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from imitarm.benchmark.mapping_methods import method
 from imitarm.benchmark.provenance import code_version
 from imitarm.benchmark.recording_plan import CAPTURED, KINDS, Plan
@@ -121,9 +119,9 @@ class Experiment:
             raise TaskFailedError(f"{_NO_RECORDING}: {error}") from error
         retargeter = method(self.method)(_arm(self.robot), recording.correspondence)
         run = retargeter.run(recording.skeletons, recording.start)
-        # a method that slows the motion afterwards is measured against the moment that it reproduces
-        clock = np.asarray(getattr(retargeter, "clock", run.times), dtype=float)
-        metrics = measure(run, recording.correspondence, recording.true_arm(clock))
+        # a method that slows the motion afterwards is measured against the time that it reproduces
+        shown = run.times if run.shown_times is None else run.shown_times
+        metrics = measure(run, recording.correspondence, recording.true_arm(shown))
         facts = {
             "recorded": float(recording.true_times[-1]),
             "beyond_reach": beyond_reach(recording, _arm(self.robot)) if self.robot == "sawyer" else math.nan,

@@ -38,12 +38,12 @@ def skeleton_to_command() -> Row:
             if steps % len(frames) == 0:  # from the beginning: the person takes hold anew
                 retargeter.start(arm.home)
             steps += 1
-            skeleton, q = next(turns), retargeter.command.q
+            skeleton, q = next(turns), retargeter.latest.q
             begin = time.perf_counter()
             retargeter.step(skeleton, q)
             seconds = time.perf_counter() - begin
             if skeleton is not None:
-                states.append(retargeter.command.state)
+                states.append(retargeter.latest.state)
                 if states[-1] == "following":
                     return seconds
 

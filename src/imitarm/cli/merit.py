@@ -16,7 +16,7 @@ from imitarm.evaluation.tracking import TrueArm, rms
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_multiply
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import Correspondence, Retargeting
-from imitarm.retarget.retargeter import STATES
+from imitarm.retarget.engagement import EngagementState
 from imitarm.viewer.retarget_content import Measure, MethodResult, PlainTable
 
 Array = NDArray[np.float64]
@@ -49,7 +49,6 @@ def judged(
     skeletons: Sequence[Skeleton],
     correspondence: Correspondence,
     truth: Truth | None = None,
-    clock: Array | None = None,
 ) -> tuple[MethodResult, Following]:
     """Measure what a method made of a recording.
 
@@ -58,13 +57,11 @@ def judged(
         skeletons: of the person.
         correspondence: that the method was given.
         truth: where the person truly was, when that is known; None: what the camera saw stands for it.
-        clock: for each sample of the run when the person did it, since the first skeleton, shape (n,) [s]: a method
-            that slows the motion afterwards is measured against the moments that it reproduces; None: then.
 
     Returns:
         the result for the report, and how well the tool followed its target.
     """
-    times = run.times if clock is None else clock
+    times = run.times if run.shown_times is None else run.shown_times
     if truth is None:
         true = seen_arm(skeletons, times, correspondence)
     else:
@@ -82,7 +79,7 @@ def judged(
         tables=[_torques(run, metrics)],
         notes=warnings_of(run, metrics, following),
         caption=CAPTIONS.get(run.method, ""),
-        clock=clock,
+        clock=run.shown_times,
     )
     return result, following
 
@@ -90,7 +87,7 @@ def judged(
 def _measures(run: Retargeting, m: MappingMetrics, following: Following, hand: str, lags: bool) -> list[Measure]:
     """Return the figures of merit, in the units in which people think; what does not follow the hand has no lag."""
     tool = run.arm.tool_path(run.joints)[0]
-    shares = [Measure(state, 100.0 * float(np.mean(run.states == state)), "% of the time", 1) for state in STATES]
+    shares = [Measure(s, 100.0 * float(np.mean(run.states == s)), "% of the time", 1) for s in EngagementState]
     return [
         Measure("duration", m.duration, "s", 2),
         *shares,

@@ -207,10 +207,9 @@ def _retargeted(
     """Let one method retarget the recording, and measure what it made of it."""
     retargeter: Retargeter = RETARGETERS[name](setting.arm, setting.correspondence, dt=PERIOD, scene=setting.scene)
     duration = max(skeletons[-1].time - skeletons[0].time, PERIOD)
-    with watched(f"retargeting by {name}", lambda: retargeter.command.time / duration):
+    with watched(f"retargeting by {name}", lambda: retargeter.latest.time / duration):
         made = retargeter.run(skeletons, setting.q)
-    clock = getattr(retargeter, "clock", None)  # of a method that slows the motion afterwards
-    result, following = judged(made, skeletons, setting.correspondence, truth, clock)
+    result, following = judged(made, skeletons, setting.correspondence, truth)
     if drive:
         shares = [0.0]
         with watched(f"driving {setting.arm.name}", lambda: shares[-1]):
@@ -220,7 +219,7 @@ def _retargeted(
 
 def _demonstration(made: Retargeting, task: str, source: str, whole: bool) -> Demonstration:
     """Return what was followed as a demonstration, from 0 s; with ``whole`` the waiting before and after it, too."""
-    led = np.flatnonzero(np.isin(made.states, ("following", "coasting", "holding")))
+    led = np.flatnonzero(made.engaged)
     first, last = (0, len(made.times) - 1) if whole else (max(int(led[0]) - 1, 0), int(led[-1]))
     part = slice(first, max(last, first + 1) + 1)
     joints = made.joints[part]

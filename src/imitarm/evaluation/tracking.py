@@ -15,13 +15,12 @@ from imitarm.kinematics.pose import (
 )
 from imitarm.kinematics.sew import sew_derivatives
 from imitarm.retarget.correspondence import Correspondence
+from imitarm.retarget.engagement import engaged_samples
 from imitarm.retarget.human_arm import hand_rotation
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LED = ("following", "coasting", "holding")
-"""States of a retargeter in which its clutch is engaged."""
 LAGS = np.round(np.arange(-0.10, 0.801, 0.01), 2)  # [s] among which the best constant lag is sought
 _BENT = 0.04  # squared sine of the angle at an elbow below which where it is on its circle is not asked
 _MOVES = 1e-3  # [m] a hand that moves less has no lag
@@ -101,10 +100,10 @@ class Hold:
         """Find it in the states of a run, shape (n,).
 
         Args:
-            states: see :data:`imitarm.retarget.retargeter.STATES`.
+            states: values of :class:`~imitarm.retarget.engagement.EngagementState`.
             first_only: judge all that comes after the first engagement by it, as if the person had never been let go.
         """
-        led = np.isin(np.asarray(states), LED)
+        led = engaged_samples(states)
         begins = np.flatnonzero(led & ~np.concatenate([[False], led[:-1]]))
         frames = np.arange(len(led))
         if len(begins) == 0:

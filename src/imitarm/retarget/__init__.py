@@ -9,7 +9,7 @@ from imitarm.retarget.baselines.thesis import ThesisRetargeter
 from imitarm.retarget.correspondence import FACING, Correspondence
 from imitarm.retarget.limbs import LimbLengths, measure_limbs
 from imitarm.retarget.modern import ModernRetargeter
-from imitarm.retarget.retargeter import Command, Retargeter, Retargeting
+from imitarm.retarget.retargeter import Retargeter, Retargeting, RetargetStep
 
 RETARGETERS: Mapping[str, type[Retargeter]] = {
     "modern": ModernRetargeter,
@@ -24,12 +24,12 @@ __all__ = [
     "FACING",
     "RETARGETERS",
     "AdaptiveControl",
-    "Command",
     "Correspondence",
     "DemonstrationModification",
     "IncrementalIK",
     "LimbLengths",
     "ModernRetargeter",
+    "RetargetStep",
     "Retargeter",
     "Retargeting",
     "ThesisRetargeter",

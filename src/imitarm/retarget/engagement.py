@@ -1,12 +1,13 @@
-"""Engagement: when a person takes hold of the robot; the same rule for all methods."""
+"""Engagement: the state machine that decides when a person leads the robot; the same one for every method."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from imitarm.kinematics.pose import Pose
 from imitarm.retarget.arm_estimator import ArmEstimate
@@ -14,45 +15,146 @@ from imitarm.retarget.correspondence import Clutch, Correspondence
 
 Array = NDArray[np.float64]
 
-SEEN_FOR = 0.5  # [s] that an arm must have been seen
-LOST_AFTER = 0.1  # [s] a longer gap between two estimates begins the count anew
+SEEN_FOR = 0.5  # [s] the arm must be seen without a gap before the robot follows it
+LONGEST_GAP = 0.1  # [s] between two estimates; a longer gap restarts that count
+
+
+class EngagementState(StrEnum):
+    """What the robot does at a time. A member equals its value, so ``state == "following"`` works.
+
+    * ``WAITING``: the arm stands still until a person has been seen for half a second.
+    * ``FOLLOWING``: the person is seen and leads the tool.
+    * ``COASTING``: the person has just been lost; the motion is extrapolated.
+    * ``HOLDING``: the person has been lost for longer; the last target is held.
+    * ``STOPPED``: the person has been lost for too long. The robot brakes, and stays stopped until it is at rest and
+      the person is seen again.
+    """
+
+    WAITING = "waiting"
+    FOLLOWING = "following"
+    COASTING = "coasting"
+    HOLDING = "holding"
+    STOPPED = "stopped"
+
+    @property
+    def engaged(self) -> bool:
+        """Whether the person leads the tool, or is expected back within a moment."""
+        return self in _ENGAGED
+
+
+_ENGAGED = frozenset({EngagementState.FOLLOWING, EngagementState.COASTING, EngagementState.HOLDING})
+
+
+def engaged_samples(states: ArrayLike) -> NDArray[np.bool_]:
+    """Return in which samples of a run the person leads the tool, shape (n,).
+
+    Args:
+        states: of the run, values of :class:`EngagementState`, shape (n,).
+    """
+    return np.isin(np.asarray(states, dtype=str), [state.value for state in _ENGAGED])
+
+
+@dataclass(frozen=True)
+class EngagementRule:
+    """The times of the state machine, all in s.
+
+    Attributes:
+        seen_for: how long the arm must be seen before the robot follows it.
+        follow_until: time since the arm was last seen, up to which the state is FOLLOWING (a camera drops frames).
+        coast_until: likewise COASTING.
+        hold_until: likewise HOLDING; inf: the robot never stops.
+    """
+
+    seen_for: float = SEEN_FOR
+    follow_until: float = 0.1
+    coast_until: float = 0.1
+    hold_until: float = 0.3
 
 
 class Engagement:
-    """Engages the clutch once the arm has been seen for half a second without a gap.
+    """Decides, one control period at a time, whether a person leads the robot.
+
+    ::
+
+        WAITING --(seen for 0.5 s)--> FOLLOWING --(lost)--> COASTING --> HOLDING --> STOPPED --> WAITING
+                                          ^                    |            |
+                                          +------(seen again)--+------------+
+
+    Args:
+        correspondence: between the person's arm and the robot's.
+        rule: the times of the transitions.
 
     Attributes:
-        clutch: what is engaged; None while nothing is.
+        state: the current state.
+        clutch: the poses of hand and tool when the person began to lead; None while nobody leads.
+        ready: whether the person may begin to lead in this control period; the caller then calls :meth:`engage`.
+        time_since_seen: since the arm was last seen [s]; inf before it was ever seen.
     """
 
-    def __init__(self, correspondence: Correspondence) -> None:
+    def __init__(self, correspondence: Correspondence, rule: EngagementRule | None = None) -> None:
         self._correspondence = correspondence
-        self.release()
+        self._rule = EngagementRule() if rule is None else rule
+        self.reset()
 
-    def release(self) -> None:
-        """Let go; the arm must be seen for half a second again."""
+    def reset(self) -> None:
+        """Forget the person."""
+        self.state = EngagementState.WAITING
         self.clutch: Clutch | None = None
-        self._since = self._last = math.inf
+        self.ready = False
+        self.time_since_seen = math.inf
+        self._first_seen = self._last_seen = math.inf
 
-    def slip(self, way: Array) -> None:
-        """Move where the tool is led by ``way``, shape (3,) [m]: from now on the hand leads it from there."""
-        if self.clutch is not None:
-            home = self.clutch.home
-            self.clutch = replace(self.clutch, home=Pose.trusted(home.position + way, home.quaternion))
-
-    def update(self, estimate: ArmEstimate | None, tool_to_base: Pose | None) -> Clutch | None:
-        """Take in what became of a frame, and return the clutch, engaged or None.
+    def update(self, estimate: ArmEstimate | None, period: float, *, at_rest: bool = True) -> EngagementState:
+        """Advance by one control period and return the new state.
 
         Args:
-            estimate: of the person's arm; None when the frame did not show it.
-            tool_to_base: where the robot's tool is now; None while the robot can't be taken hold of, then only how long
-                the arm has been seen is counted.
+            estimate: of the person's arm from a new frame; None: there was no frame, or it does not show the arm.
+            period: since the last call [s].
+            at_rest: whether the robot stands still: only then can a person begin to lead it. How long the person has
+                been seen is counted meanwhile.
         """
-        if estimate is None or self.clutch is not None:
-            return self.clutch
-        if not 0.0 <= estimate.time - self._last <= LOST_AFTER:
-            self._since = estimate.time
-        self._last = estimate.time
-        if tool_to_base is not None and estimate.time - self._since >= SEEN_FOR:
-            self.clutch = self._correspondence.engage(estimate.wrist, estimate.hand, tool_to_base)
+        self.time_since_seen = self.time_since_seen + period if estimate is None else 0.0
+        self.ready = False
+        if self.clutch is not None:
+            self.state = self._after(self.time_since_seen)
+            if self.state is EngagementState.STOPPED:
+                self.clutch, self._first_seen = None, math.inf
+                self._last_seen = math.inf
+            return self.state
+        if estimate is None:
+            return self.state
+        if not 0.0 <= estimate.time - self._last_seen <= LONGEST_GAP:
+            self._first_seen = estimate.time
+        self._last_seen = estimate.time
+        if at_rest:
+            self.state = EngagementState.WAITING
+            self.ready = estimate.time - self._first_seen >= self._rule.seen_for
+        return self.state
+
+    def engage(self, wrist: ArrayLike, hand: Array, tool_to_base: Pose) -> Clutch:
+        """Let the person lead from here on; call it when :attr:`ready`.
+
+        Args:
+            wrist: position of the person's wrist in the base frame, shape (3,) [m].
+            hand: rotation of the hand in the base frame, quaternion wxyz, shape (4,).
+            tool_to_base: pose of the robot's tool in the base frame.
+        """
+        self.ready, self.state = False, EngagementState.FOLLOWING
+        self.clutch = self._correspondence.engage(wrist, hand, tool_to_base)
         return self.clutch
+
+    def shift(self, displacement: Array) -> None:
+        """Shift the target of the tool by ``displacement``, shape (3,) [m], from now on."""
+        if self.clutch is not None:
+            home = self.clutch.home
+            home = Pose.trusted(home.position + displacement, home.quaternion)
+            self.clutch = replace(self.clutch, home=home)
+
+    def _after(self, lost: float) -> EngagementState:
+        """Return the state of an engaged robot ``lost`` seconds after the arm was last seen."""
+        rule = self._rule
+        if lost <= rule.follow_until:
+            return EngagementState.FOLLOWING
+        if lost <= rule.coast_until:
+            return EngagementState.COASTING
+        return EngagementState.HOLDING if lost <= rule.hold_until else EngagementState.STOPPED

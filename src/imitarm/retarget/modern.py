@@ -6,7 +6,7 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
@@ -16,20 +16,18 @@ from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
 from imitarm.kinematics.posture import ANGLE_LENGTH
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.sew import one_angle
-from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
+from imitarm.retarget.arm_estimator import ArmEstimate
 from imitarm.retarget.correspondence import Correspondence
-from imitarm.retarget.engagement import Engagement
+from imitarm.retarget.engagement import EngagementRule
 from imitarm.retarget.jerk_limit import JerkLimiter
-from imitarm.retarget.retargeter import Command, Retargeter
+from imitarm.retarget.retargeter import Goal, Retargeter
 from imitarm.scene import Scene
 from imitarm.scene.barrier import clearance_rows
 
 Array = NDArray[np.float64]
 
-COAST, HOLD = 0.1, 0.3  # [s] without a sight of the arm: until then the motion fades out; until then the target stands
 _FADE = 0.05  # [s] time constant of the fading motion
-_PUSHED = 0.05  # [rad] an arm found farther than this from its command was moved by somebody
-_BETWEEN = 0.07  # [s] cameras leave out a frame now and then
+_BETWEEN = 0.07  # [s] since the last frame: cameras drop a frame now and then, which is no loss of the arm
 _SWING_GAIN, _SWING_RATE = 2.5, 1.0  # [1/s], [rad/s] of the elbow
 _BEHIND = 0.01  # [m] a tool that is farther than this from its target lets the elbow be, 1 rad counting as 0.3 m
 _BENT = 0.1  # squared sine of the angle at the person's elbow below which its swing tells less and less
@@ -86,6 +84,10 @@ class ModernRetargeter(Retargeter):
     """
 
     name: ClassVar[str] = "modern"
+    caption: ClassVar[str] = (
+        "The method to use on a robot: it keeps every limit, follows the elbow, and copes with a person who is lost."
+    )
+    rule: ClassVar[EngagementRule] = EngagementRule(follow_until=_BETWEEN)
 
     def __init__(
         self,
@@ -118,86 +120,53 @@ class ModernRetargeter(Retargeter):
         self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
         super().__init__(arm, correspondence, dt=dt, scene=scene)
 
-    def _begin(self, q: Array) -> None:
-        self._limiter.start(q)
-        self._q, self._velocity = q.copy(), np.zeros(self.arm.n_joints)  # of the reference
-        self._silence = math.inf
-        self._estimate: ArmEstimate | None = None
-        self._engagement = Engagement(self.correspondence)
-        self._estimator = ArmEstimator(self.correspondence)
+    def _begin(self) -> None:
         if self._own is not None:
             self._own.reset()
         self._seeing = False  # a step with a new frame has less time for the rest
         self._stuck, self._held_at = 0, np.zeros(3)  # steps for which the tool has been held, and where
         self._offset: float | None = None  # of the robot's elbow angle from the person's
 
-    def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
-        """Return the joint positions to be at after ``dt``; see :class:`~imitarm.retarget.retargeter.Retargeter`."""
-        measured = np.asarray(q, dtype=float)
-        self._look(skeleton)
-        state = self._state(measured)
-        target = closed = None
-        if state in _LED and self._estimate is not None:
-            target, ahead = self._target(self._estimate)
-            closed = self._estimate.closed
-            self._reach(target, ahead, self._elbow_task(self._estimate), measured)
-        else:
-            self._offset = None
-            self._drive(np.zeros(6), None, led=False)
-        reached = self._limiter.follow(self._q, self._velocity, measured)
-        elbow = None if target is None or self._estimate is None else self._estimate.upper_arm
-        time, velocity = self.command.time + self.dt, self._limiter.velocity
-        self.command = Command(time, reached, velocity, closed, state, target, elbow)
-        return reached
+    def _rest_at(self, q: Array) -> None:
+        self._limiter.start(q)
+        self._q, self._velocity = self._limiter.q.copy(), np.zeros(self.arm.n_joints)  # of the reference
 
-    def _look(self, skeleton: Skeleton | None) -> None:
-        """Take in a skeleton, and count the time in which none showed the arm."""
-        self._silence += self.dt
+    def _see(self, skeleton: Skeleton | None) -> ArmEstimate | None:
         self._seeing = skeleton is not None
-        estimate = None if skeleton is None else self._estimator.update(skeleton)
-        if estimate is not None:
-            self._estimate, self._silence = estimate, 0.0
+        return super()._see(skeleton)
 
-    def _state(self, q: Array) -> str:
-        """Return what to do now; engage or let go."""
-        if self._engagement.clutch is not None:
-            if self._silence <= HOLD:
-                return "following" if self._silence <= _BETWEEN else "coasting" if self._silence <= COAST else "holding"
-            self._engagement.release()
-        new = self._estimate if self._silence == 0.0 else None
-        if not self._at_rest():
-            self._engagement.update(new, None)
-            return "stopped"
-        if np.abs(q - self._q).max() > _PUSHED:  # somebody has moved the arm: go on from there
-            self._q = np.clip(q, self.arm.lower, self.arm.upper)
-            self._limiter.start(self._q)
-        if new is not None and self._engagement.update(new, self.arm.tool_pose(self._q)) is not None:
-            return "following"
-        return "waiting"
-
-    def _at_rest(self) -> bool:
-        """Return whether the arm stands; what is left of its motion, too slow to be seen, is taken off."""
-        if max(np.abs(self._velocity).max(), np.abs(self._limiter.velocity).max()) > _STILL:
-            return False
-        if self._velocity.any() or self._limiter.velocity.any():
-            self._limiter.start(self._limiter.q)
-            self._q, self._velocity = self._limiter.q.copy(), np.zeros(self.arm.n_joints)
-        return True
-
-    def _target(self, estimate: ArmEstimate) -> tuple[Pose, Array]:
-        """Return where the tool should be now, and the twist (6,) with which that moves."""
-        clutch = self._engagement.clutch
-        assert clutch is not None
-        wrist, hand, left = estimate.wrist, estimate.hand, 1.0
-        if self._silence > 0.0:
-            left = math.exp(-self._silence / _FADE)
-            seconds = _FADE * (1.0 - left)
+    def _hand(self) -> tuple[Array, Array]:
+        """Return wrist and hand, extrapolated from the last frame at a velocity that decays."""
+        estimate, age = self._estimate, self._engagement.time_since_seen
+        assert estimate is not None
+        wrist, hand = estimate.wrist, estimate.hand
+        if age > 0.0:
+            seconds = _FADE * (1.0 - math.exp(-age / _FADE))
             wrist = wrist + seconds * estimate.velocity
             if self.correspondence.orientation != "fixed":
                 hand = quaternion_multiply(quaternion_exp(seconds * estimate.angular_velocity), hand)
-        ahead = np.zeros(6)
-        ahead[:3] = (self._lead * left * self.correspondence.scale) * estimate.velocity
-        return clutch.target(wrist, hand), ahead
+        return wrist, hand
+
+    def _at_rest(self) -> bool:
+        """Return whether the arm stands still; the rest of its motion, too slow to be seen, is removed."""
+        if max(np.abs(self._velocity).max(), np.abs(self._limiter.velocity).max()) > _STILL:
+            return False
+        if self._velocity.any() or self._limiter.velocity.any():
+            self._rest_at(self._limiter.q)
+        return True
+
+    def _velocity_at(self, before: Array, after: Array) -> Array:
+        return self._limiter.velocity
+
+    def _advance(self, goal: Goal | None, measured: Array) -> Array:
+        if goal is None:
+            self._offset = None
+            self._drive(np.zeros(6), None, led=False)
+        else:
+            ahead = np.zeros(6)
+            ahead[:3] = (self._lead * math.exp(-goal.age / _FADE) * self.correspondence.scale) * goal.estimate.velocity
+            self._reach(goal.target, ahead, self._elbow_task(goal.estimate), measured)
+        return self._limiter.follow(self._q, self._velocity, measured)
 
     def _elbow_task(self, estimate: ArmEstimate) -> ElbowTask | None:
         """Return where the elbow should be; None when it is free, or one of the two angles is lost."""
@@ -245,7 +214,7 @@ class ModernRetargeter(Retargeter):
         self._stuck = self._stuck + 1 if float(moved.dot(moved)) < (_STANDS * self.dt) ** 2 else 0
         length = math.sqrt(float(way.dot(way)))
         if self._stuck > _STUCK / self.dt and length > _SLIP:
-            self._engagement.slip((_SLIP / length - 1.0) * way)
+            self._engagement.shift((_SLIP / length - 1.0) * way)
 
     def _yielding(self, twist: Array, measured: Array, share: float) -> Array:
         """Return a twist without a share of what goes on in the direction in which the tool is held back."""
@@ -267,6 +236,3 @@ class ModernRetargeter(Retargeter):
         velocity = self._solver.solve(self._q, twist, velocity=self._velocity, rows=rows, sew=elbow)
         self._velocity = velocity
         self._q = self._q + self.dt * velocity
-
-
-_LED = frozenset({"following", "coasting", "holding"})

@@ -1,12 +1,12 @@
-"""Retargeter: what turns a person's arm into a robot's, one control step at a time; and runs of whole recordings."""
+"""Retargeter: converts a person's arm motion into a robot's joint motion, one control period at a time."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,57 +15,118 @@ from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
-from imitarm.retarget.correspondence import Correspondence
+from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
+from imitarm.retarget.correspondence import Clutch, Correspondence
+from imitarm.retarget.engagement import Engagement, EngagementRule, EngagementState, engaged_samples
 from imitarm.scene import Scene
 from imitarm.trajectory import Demonstration, Trajectory
 
 Array = NDArray[np.float64]
 
-STATES = ("waiting", "following", "coasting", "holding", "stopped")
-"""What a retargeter may be doing: waiting for a person to take hold; following; bridging a short gap by coasting, a
-longer one by holding; stopped until the person takes hold anew."""
+PUSHED = 0.05  # [rad] a joint at rest that is found farther than this from its command was moved by hand
 
 
 @dataclass(frozen=True, eq=False)
-class Command:
-    """What one control step of a retargeter came to.
+class RetargetStep:
+    """Result of one control step of a retargeter.
 
     Attributes:
         time: since :meth:`Retargeter.start` [s].
-        q: joint positions to be at when the step is over, shape (n_joints,) [rad].
-        velocity: joint velocity at that moment, shape (n_joints,) [rad/s].
-        closed: whether the gripper is to be closed; None: as it is.
-        state: one of :data:`STATES`.
-        target: where the tool should be, ``tool_to_base``, before any limit; None while nothing is followed.
-        elbow: direction from the shoulder to the elbow of the person in the base frame, shape (3,); None when unknown.
+        q: joint positions to reach by the end of the step, shape (n_joints,) [rad].
+        velocity: joint velocities at the end of the step, shape (n_joints,) [rad/s].
+        closed: whether the gripper should be closed; None: leave it as it is.
+        state: of the engagement.
+        target: desired pose of the tool in the base frame, before any limit; None while nobody leads.
+        elbow: unit vector from the person's shoulder to the elbow in the base frame, shape (3,); None when unknown.
     """
 
     time: float
     q: Array
     velocity: Array
     closed: bool | None = None
-    state: str = "waiting"
+    state: EngagementState = EngagementState.WAITING
     target: Pose | None = None
     elbow: Array | None = None
 
 
-class Retargeter(ABC):
-    """Turns a person's arm, seen as skeletons, into joint positions of a robot arm, at a fixed control period.
-
-    A method is one subclass. :meth:`start` puts it at rest at a posture; then :meth:`step` is called once every
-    ``dt``, with the skeleton that came in since the last call, or None. Cameras give 30 frames a second and a robot
-    wants 100 commands: most steps get None.
+class Goal(NamedTuple):
+    """What a method is asked for in one control step while the person leads.
 
     Attributes:
-        name: of the method, as in :data:`imitarm.retarget.RETARGETERS`.
-        arm: the robot's arm with its tool.
-        correspondence: what of the person's arm stands for what of the robot's.
-        dt: control period [s].
-        scene: obstacles that a method which heeds them keeps clear of.
-        command: what the last step came to.
+        target: desired pose of the tool in the base frame, now.
+        estimate: of the person's arm, from the last frame that shows it.
+        fresh: whether that frame came in during this step.
+        age: time since that frame came in [s].
+        state: FOLLOWING, COASTING or HOLDING.
+        clutch: the poses of hand and tool when the person began to lead.
     """
 
-    name: ClassVar[str]
+    target: Pose
+    estimate: ArmEstimate
+    fresh: bool
+    age: float
+    state: EngagementState
+    clutch: Clutch
+
+
+class Retargeter(ABC):
+    """Converts a person's arm motion, seen as skeletons, into joint positions of a robot arm.
+
+    :meth:`start` puts the robot at rest at a posture. :meth:`step` is then called once per control period ``dt`` with
+    the skeleton that came in since the last call, or None: cameras give 30 frames per second and a robot takes 100
+    commands per second, so most calls get None. Every step does the same for all methods:
+
+    1. ``_see`` turns a new skeleton into an estimate of the person's arm;
+    2. the :class:`~imitarm.retarget.engagement.Engagement` decides whether the person leads;
+    3. if so, ``_hand`` and ``_target`` say where the tool should be;
+    4. ``_advance`` returns the joint positions of the next period: **this is the method**.
+
+    A method is a subclass that implements ``_advance``. The other functions with a leading underscore have defaults
+    that it may replace. It sets ``name``, and ``title`` and ``caption`` for tables and reports::
+
+        class Damped(Retargeter):
+            name, title = "damped", "Damped least squares"
+
+            def _advance(self, goal, measured):
+                q = self.latest.q
+                if goal is None:
+                    return q
+                J = self.arm.tool_jacobian(q)
+                error = self.arm.tool_pose(q).error_to(goal.target)
+                return q + 0.1 * J.T @ np.linalg.solve(J @ J.T + 0.01 * np.eye(6), error)
+
+    Attributes:
+        name: of the method, as in :data:`imitarm.retarget.RETARGETERS`; default: the class's name.
+        title: of the method in tables and reports; default: ``name``.
+        caption: one sentence about the method for reports.
+        rule: times after which the robot follows, coasts, holds and stops.
+        arm: the robot's arm with its tool.
+        correspondence: between the person's arm and the robot's.
+        dt: control period [s].
+        scene: obstacles; only some methods avoid them.
+        latest: result of the last step.
+
+    Args:
+        arm: the robot's arm with its tool.
+        correspondence: between the person's arm and the robot's; None: the default one.
+        dt: control period [s].
+        scene: obstacles; None: none.
+
+    Raises:
+        InputError: when ``dt`` is out of range.
+    """
+
+    name: ClassVar[str] = ""
+    title: ClassVar[str] = ""
+    caption: ClassVar[str] = ""
+    rule: ClassVar[EngagementRule] = EngagementRule()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        own = cls.__dict__  # a subclass of a method is another method: it does not inherit these
+        cls.name = own.get("name", cls.__name__)
+        cls.title = own.get("title", cls.name)
+        cls.caption = own.get("caption", "")
 
     def __init__(
         self,
@@ -81,75 +142,166 @@ class Retargeter(ABC):
         self.correspondence = Correspondence() if correspondence is None else correspondence
         self.dt = dt
         self.scene = Scene() if scene is None else scene
-        self.command: Command
-        self.start(arm.home)
+        self.latest = RetargetStep(0.0, np.array(arm.home), np.zeros(arm.n_joints))
+        self._engagement = Engagement(self.correspondence, self.rule)
+        self._estimator: ArmEstimator  # made by start
+        self._estimate: ArmEstimate | None = None
+        self._started = False
 
     def start(self, q: ArrayLike) -> None:
         """Forget the past and be at rest at ``q``, shape (n_joints,) [rad].
 
         Raises:
-            InputError: when ``q`` has a wrong shape or is beyond the joints' limits.
+            InputError: when ``q`` has the wrong shape or is beyond the joint limits.
         """
         posture = np.array(q, dtype=float)
         self.arm.check_limits(posture)
-        self.command = Command(0.0, posture, np.zeros(self.arm.n_joints))
-        self._begin(posture)
+        self.latest = RetargetStep(0.0, posture, np.zeros(self.arm.n_joints))
+        self._engagement.reset()
+        self._estimator = self._new_estimator()
+        self._estimate = None
+        self._started = True
+        self._begin()
+        self._rest_at(posture)
 
-    @abstractmethod
-    def _begin(self, q: Array) -> None:
-        """Forget the past; ``command`` has been set to rest at ``q``."""
-
-    @abstractmethod
     def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
-        """Return the joint positions to be at after ``dt``, and set ``command``.
+        """Advance by one control period; see the class. The first call starts at ``arm.home`` unless already started.
 
         Args:
             skeleton: the newest one since the last step, or None.
             q: measured joint positions, shape (n_joints,) [rad].
 
         Returns:
-            shape (n_joints,) [rad].
+            The joint positions to reach by the end of the period, shape (n_joints,) [rad]; also in :attr:`latest`.
         """
+        if not self._started:
+            self.start(self.arm.home)
+        measured, engagement, dt = np.asarray(q, dtype=float), self._engagement, self.dt
+        fresh = self._see(skeleton)
+        if fresh is not None:
+            self._estimate = fresh
+        at_rest = engagement.clutch is None and self._at_rest()
+        if at_rest:
+            self._start_where_pushed(measured)
+        engagement.update(fresh, dt, at_rest=at_rest)
+        if engagement.ready:
+            engagement.engage(*self._hand(), self.arm.tool_pose(self.latest.q))
+        goal = self._goal(fresh is not None)
+        before = self.latest
+        reached = self._advance(goal, measured)
+        velocity, time = self._velocity_at(before.q, reached), before.time + dt
+        if goal is None:
+            self.latest = RetargetStep(time, reached, velocity, None, engagement.state)
+        else:
+            arm = goal.estimate
+            self.latest = RetargetStep(time, reached, velocity, arm.closed, goal.state, goal.target, arm.upper_arm)
+        return reached
 
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
-        """Retarget a whole recording with a robot that does what it is told.
+        """Retarget a whole recording with a robot that reaches every commanded position.
 
         Args:
-            skeletons: in the order of their times.
-            q: where the arm is at first, shape (n_joints,) [rad]; None: ``arm.home``.
+            skeletons: in order of time.
+            q: start posture, shape (n_joints,) [rad]; None: ``arm.home``.
 
         Raises:
             InputError: when there are fewer than two skeletons, or times do not increase.
         """
         frames = in_order(skeletons)
         self.start(self.arm.home if q is None else q)
-        commands = [self.command]
+        steps = [self.latest]
         for skeleton in ticks(frames, self.dt):
-            self.step(skeleton, commands[-1].q)
-            commands.append(self.command)
-        return Retargeting.of(self, commands, self.notes)
+            self.step(skeleton, steps[-1].q)
+            steps.append(self.latest)
+        return Retargeting.of(self, steps, self.notes)
 
     @property
     def notes(self) -> dict[str, float]:
-        """What there is to count so far, by name; a method without anything to count has none."""
+        """Counts and figures that the method keeps, by name; none by default."""
         return {}
+
+    # --- the method
+
+    @abstractmethod
+    def _advance(self, goal: Goal | None, measured: Array) -> Array:
+        """Return the joint positions to reach by the end of this period, shape (n_joints,) [rad].
+
+        The last commanded ones are ``self.latest.q``.
+
+        Args:
+            goal: what the person asks for; None while nobody leads: the robot must come to rest and stay there.
+            measured: measured joint positions, shape (n_joints,) [rad].
+        """
+
+    # --- what a method may replace
+
+    def _begin(self) -> None:  # noqa: B027 (optional)
+        """Forget the past; called by :meth:`start`, before ``_rest_at``."""
+
+    def _rest_at(self, q: Array) -> None:  # noqa: B027 (optional)
+        """The robot is at rest at ``q``, shape (n_joints,) [rad]: at the start, or since it was pushed there."""
+
+    def _new_estimator(self) -> ArmEstimator:
+        """Return the estimator of the person's arm."""
+        return ArmEstimator(self.correspondence)
+
+    def _see(self, skeleton: Skeleton | None) -> ArmEstimate | None:
+        """Return the estimate of the person's arm from a new skeleton; None when there is none, or it shows no arm."""
+        return None if skeleton is None else self._estimator.update(skeleton)
+
+    def _hand(self) -> tuple[Array, Array]:
+        """Return the wrist (3,) [m] and the hand's quaternion (4,) wxyz to follow now, in the base frame."""
+        assert self._estimate is not None
+        return self._estimate.wrist, self._estimate.hand
+
+    def _target(self, clutch: Clutch, wrist: Array, hand: Array) -> Pose:
+        """Return the desired pose of the tool in the base frame for a wrist (3,) [m] and a hand (4,) wxyz."""
+        return clutch.target(wrist, hand)
+
+    def _at_rest(self) -> bool:
+        """Return whether the robot stands still: only then can a person begin to lead it."""
+        return True
+
+    def _velocity_at(self, before: Array, after: Array) -> Array:
+        """Return the joint velocities at the end of this period, shape (n_joints,) [rad/s]; the mean over it."""
+        return (after - before) / self.dt
+
+    # --- the same for all
+
+    def _start_where_pushed(self, measured: Array) -> None:
+        """Rest where the arm is when somebody has moved it by hand while nobody led it."""
+        if PUSHED < float(np.abs(measured - self.latest.q).max()) < np.inf:
+            q = np.clip(measured, self.arm.lower, self.arm.upper)
+            self.latest = RetargetStep(self.latest.time, q, np.zeros(self.arm.n_joints), state=self.latest.state)
+            self._rest_at(q)
+
+    def _goal(self, fresh: bool) -> Goal | None:
+        clutch, estimate = self._engagement.clutch, self._estimate
+        if clutch is None or estimate is None:
+            return None
+        target = self._target(clutch, *self._hand())
+        return Goal(target, estimate, fresh, self._engagement.time_since_seen, self._engagement.state, clutch)
 
 
 @dataclass(frozen=True, eq=False)
 class Retargeting:
-    """What a method made of a recording, sampled at its control period.
+    """The motion of a robot that a method made from a recording, sampled at the control period.
 
     Attributes:
-        method: its name.
+        method: name of the method.
         arm: the robot's arm.
         times: shape (n,) [s], from 0.
-        joints: shape (n, n_joints) [rad].
-        velocities: as commanded, shape (n, n_joints) [rad/s].
-        targets: of the tool, positions (n, 3) [m] and quaternions (n, 4); nan while nothing was followed.
-        elbows: directions from the person's shoulder to the elbow in the base frame, (n, 3); nan where unknown.
-        closed: whether the gripper was to be closed, shape (n,) bool.
-        states: shape (n,), each one of :data:`STATES`.
-        notes: what else the method has to say, for example corrections made and failures left, by name.
+        joints: joint positions, shape (n, n_joints) [rad].
+        velocities: commanded joint velocities, shape (n, n_joints) [rad/s].
+        targets: of the tool: positions (n, 3) [m] and quaternions wxyz (n, 4); nan while nobody led.
+        elbows: unit vectors from the person's shoulder to the elbow in the base frame, (n, 3); nan where unknown.
+        closed: whether the gripper should be closed, shape (n,) bool.
+        states: of the engagement, shape (n,), values of :class:`~imitarm.retarget.engagement.EngagementState`.
+        notes: counts and figures of the method, by name.
+        title: of the method for tables and reports; empty: ``method``.
+        caption: one sentence about the method for reports.
+        shown_times: for each sample the time since the first skeleton at which the person showed it, shape (n,) [s]:
+            methods that slow the motion down afterwards are later than that. None: ``times``.
     """
 
     method: str
@@ -161,33 +313,48 @@ class Retargeting:
     elbows: Array
     closed: NDArray[np.bool_]
     states: NDArray[np.str_]
-    notes: dict[str, float]
+    notes: dict[str, float] = field(default_factory=dict)
+    title: str = ""
+    caption: str = ""
+    shown_times: Array | None = None
 
     @classmethod
     def of(
-        cls, retargeter: Retargeter, commands: Sequence[Command], notes: dict[str, float] | None = None
+        cls,
+        retargeter: Retargeter,
+        steps: Sequence[RetargetStep],
+        notes: dict[str, float] | None = None,
+        shown_times: Array | None = None,
     ) -> Retargeting:
-        """Stack the commands of a run."""
+        """Stack the steps of a run."""
         nowhere, unknown = np.full(3, np.nan), np.full(4, np.nan)
-        closed, now = np.zeros(len(commands), dtype=bool), False
-        for i, command in enumerate(commands):
-            now = now if command.closed is None else command.closed
+        closed, now = np.zeros(len(steps), dtype=bool), False
+        for i, step in enumerate(steps):
+            now = now if step.closed is None else step.closed
             closed[i] = now
         return cls(
             retargeter.name,
             retargeter.arm,
-            np.array([c.time for c in commands]),
-            np.array([c.q for c in commands]),
-            np.array([c.velocity for c in commands]),
+            np.array([step.time for step in steps]),
+            np.array([step.q for step in steps]),
+            np.array([step.velocity for step in steps]),
             (
-                np.array([nowhere if c.target is None else c.target.position for c in commands]),
-                np.array([unknown if c.target is None else c.target.quaternion for c in commands]),
+                np.array([nowhere if step.target is None else step.target.position for step in steps]),
+                np.array([unknown if step.target is None else step.target.quaternion for step in steps]),
             ),
-            np.array([nowhere if c.elbow is None else c.elbow for c in commands]),
+            np.array([nowhere if step.elbow is None else step.elbow for step in steps]),
             closed,
-            np.array([c.state for c in commands]),
+            np.array([step.state.value for step in steps]),
             {} if notes is None else notes,
+            retargeter.title,
+            retargeter.caption,
+            shown_times,
         )
+
+    @property
+    def engaged(self) -> NDArray[np.bool_]:
+        """Whether the person led, shape (n,)."""
+        return engaged_samples(self.states)
 
     def demonstration(self, task: str = "", source: str = "") -> Demonstration:
         """Return the motion of the robot's tool and joints as a demonstration to learn from."""
@@ -196,7 +363,7 @@ class Retargeting:
 
 
 def in_order(skeletons: Iterable[Skeleton]) -> list[Skeleton]:
-    """Return a recording as a list, or say where it is not one.
+    """Return a recording as a list.
 
     Raises:
         InputError: when there are fewer than two skeletons, or a time is not later than the one before.
@@ -214,10 +381,10 @@ def in_order(skeletons: Iterable[Skeleton]) -> list[Skeleton]:
 
 
 def ticks(frames: Sequence[Skeleton], dt: float) -> Iterable[Skeleton | None]:
-    """Give for each control period of a recording the newest skeleton that came in during it, or None.
+    """Yield for each control period of a recording the newest skeleton that came in during it, or None.
 
     Args:
-        frames: in order, at least one.
+        frames: in order of time, at least one.
         dt: control period [s].
     """
     start, k = frames[0].time, 0

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.skeleton import HandState, Skeleton
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import matrix_to_quaternion
-from imitarm.retarget.correspondence import Clutch
+from imitarm.retarget.arm_estimator import ArmEstimate
+from imitarm.retarget.engagement import EngagementRule
 from imitarm.retarget.human_arm import hand_rotation
-from imitarm.retarget.retargeter import Command, Retargeter
+from imitarm.retarget.retargeter import Goal, Retargeter
 
 Array = NDArray[np.float64]
 
@@ -30,38 +32,36 @@ class IdealFollower(Retargeter):
     """
 
     name: ClassVar[str] = "ideal"
+    rule: ClassVar[EngagementRule] = EngagementRule(seen_for=0.0, follow_until=math.inf)
 
-    def _begin(self, q: Array) -> None:
-        self._q, self._velocity = q.copy(), np.zeros(self.arm.n_joints)
-        self._clutch: Clutch | None = None
-        self._wrist, self._hand = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    def _begin(self) -> None:
+        self._rotation = np.array([1.0, 0.0, 0.0, 0.0])
         self._closed: bool | None = None
 
-    def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
-        """Return the joint positions to be at after ``dt``; it takes hold at the first skeleton."""
-        if skeleton is not None:
-            self._take(skeleton)
-        target, twist = None, np.zeros(6)
-        if self._clutch is not None:
-            target = self._clutch.target(self._wrist, self._hand)
-            twist = (_SHARE / self.dt) * self.arm.tool_pose(self._q).error_to(target)
-        self._velocity = solve_ik(self.arm, self._q, twist, dt=self.dt, velocity=self._velocity)
-        self._q = self._q + self.dt * self._velocity
-        state = "waiting" if target is None else "following"
-        self.command = Command(self.command.time + self.dt, self._q, self._velocity, self._closed, state, target)
-        return self._q
+    def _rest_at(self, q: Array) -> None:
+        self._velocity = np.zeros(self.arm.n_joints)
 
-    def _take(self, skeleton: Skeleton) -> None:
-        arm, sensor_to_base = skeleton.arm(self.correspondence.side), self.correspondence.sensor_to_base
+    def _see(self, skeleton: Skeleton | None) -> ArmEstimate | None:
+        """Return the arm exactly as the skeleton shows it."""
+        if skeleton is None:
+            return None
+        arm = skeleton.arm(self.correspondence.side)
         if not arm.seen:
-            return
-        points = sensor_to_base.apply(arm.points)
+            return None
+        points = self.correspondence.sensor_to_base.apply(arm.points)
         rotation = hand_rotation(points[2], points[4], points[5])
-        self._wrist = points[2]
-        self._hand = self._hand if rotation is None else matrix_to_quaternion(rotation)
+        self._rotation = self._rotation if rotation is None else matrix_to_quaternion(rotation)
         self._closed = _HELD.get(arm.hand_state, self._closed)
-        if self._clutch is None:
-            self._clutch = self.correspondence.engage(self._wrist, self._hand, self.arm.tool_pose(self._q))
+        still, sure = np.zeros((3, 3)), (1.0, 1.0, 1.0)
+        shoulder, elbow, wrist = points[:3]
+        return ArmEstimate(arm.time, shoulder, elbow, wrist, still, self._rotation, still[0], sure, self._closed)
+
+    def _advance(self, goal: Goal | None, measured: Array) -> Array:
+        q, twist = self.latest.q, np.zeros(6)
+        if goal is not None:
+            twist = (_SHARE / self.dt) * self.arm.tool_pose(q).error_to(goal.target)
+        self._velocity = solve_ik(self.arm, q, twist, dt=self.dt, velocity=self._velocity)
+        return q + self.dt * self._velocity
 
 
 def ideal_camera(seed: int = 0) -> SkeletonCamera:

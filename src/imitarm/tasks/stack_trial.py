@@ -28,7 +28,6 @@ TIMEOUT = 90.0  # [s]
 _WATCH_EVERY = 3  # control steps between two looks at the cubes
 _SETTLE = 1.0  # [s] that the robot rests before the verdict
 _FOLLOW = 5.0  # [1/s] how quickly the set-point is brought back to the commands after a limit cut one
-_FOLLOWING = frozenset({"following", "coasting", "holding"})
 _CALIBRATION = 3.0  # [s] for which a person holds an arm before the sensor, to have it measured
 
 
@@ -189,12 +188,12 @@ class _Trial:
         """One control step."""
         self.operator.see(self.sight(time))
         self.expose(time)
-        robot, before = self.robot, self.retargeter.command.q
+        robot, before = self.robot, self.retargeter.latest.q
         self.retargeter.step(self.newest(time), robot.state().q)
-        if self.retargeter.command.closed is not None and self.retargeter.command.closed != self.closed:
-            self.closed = self.retargeter.command.closed
+        if self.retargeter.latest.closed is not None and self.retargeter.latest.closed != self.closed:
+            self.closed = self.retargeter.latest.closed
             robot.grasp(CLOSED if self.closed else OPEN)
-        robot.move(self.retargeter.command.velocity + _FOLLOW * (before - robot.set_point), DT)
+        robot.move(self.retargeter.latest.velocity + _FOLLOW * (before - robot.set_point), DT)
         self.clamped += bool(robot.clamped)
         state = robot.state()
         self.tool = robot.tool_to_base.position
@@ -203,7 +202,7 @@ class _Trial:
     def sight(self, time: float) -> Sight:
         """Return what there is to see."""
         robot = self.robot
-        lamp = self.retargeter.command.state in _FOLLOWING
+        lamp = self.retargeter.latest.state.engaged
         return Sight(time, self.tool, robot.opening, self.task.cubes(robot), lamp)
 
     def expose(self, time: float) -> None:

@@ -13,7 +13,7 @@ from imitarm.capture.skeleton import Skeleton, SkeletonSource
 from imitarm.capture.stream import Arrival, UdpSource
 from imitarm.demonstrations.recorder import DemonstrationRecorder
 from imitarm.kinematics.arm import ArmState
-from imitarm.retarget import Command, Retargeter
+from imitarm.retarget import Retargeter, RetargetStep
 from imitarm.robots import Robot, UdpRobot
 from imitarm.transmission.datagram import now_ns
 from imitarm.transmission.latency import LatencyLog
@@ -38,7 +38,7 @@ class Moment:
     Attributes:
         time: since the beginning [s].
         skeleton: that came in, the newest one; None: none.
-        command: of the retargeter.
+        command: the retargeter's result.
         state: of the robot, as measured.
         doing: the retargeter's state, or :data:`INTERRUPTED`.
         trouble: why the robot can't be led, in words; empty when it can.
@@ -46,7 +46,7 @@ class Moment:
 
     time: float
     skeleton: Skeleton | None
-    command: Command
+    command: RetargetStep
     state: ArmState
     doing: str
     trouble: str
@@ -177,7 +177,7 @@ class Teleoperation:
             self._begin()
         else:
             self._lead(skeleton)
-        doing = self.retargeter.command.state if self._engaged else INTERRUPTED
+        doing = self.retargeter.latest.state if self._engaged else INTERRUPTED
         tally.doing[doing] += 1
         tally.frames += skeleton is not None
         if self._wire is not None:
@@ -189,7 +189,7 @@ class Teleoperation:
         state = self.robot.state()
         self._record(time, doing, state)
         if self._on_step is not None:
-            self._on_step(Moment(time, skeleton, self.retargeter.command, state, doing, trouble))
+            self._on_step(Moment(time, skeleton, self.retargeter.latest, state, doing, trouble))
 
     # --- what comes in
 
@@ -241,11 +241,11 @@ class Teleoperation:
     def _lead(self, skeleton: Skeleton | None) -> None:
         """Let the retargeter decide, and the robot do it."""
         robot, retargeter = self.robot, self.retargeter
-        before, taken = retargeter.command.q, self._clock_ns()
+        before, taken = retargeter.latest.q, self._clock_ns()
         retargeter.step(skeleton, robot.state().q)
         ready = self._clock_ns()
-        self._grasp(retargeter.command.closed)
-        robot.move(retargeter.command.velocity + _FOLLOW * (before - robot.set_point), retargeter.dt)
+        self._grasp(retargeter.latest.closed)
+        robot.move(retargeter.latest.velocity + _FOLLOW * (before - robot.set_point), retargeter.dt)
         self.tally.clamped.update(robot.clamped)
         if skeleton is not None and self._arrival is not None:
             self._note(self._arrival, taken, ready, self._clock_ns())

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.retarget import Retargeting
-from imitarm.retarget.retargeter import STATES
+from imitarm.retarget.engagement import EngagementState
 from imitarm.viewer import palette
 from imitarm.viewer.canvas import INK, MM, canvas, thin, thin_extremes
 from imitarm.viewer.small_multiples import JointCurve, small_multiples
 
 Array = NDArray[np.float64]
 
-STATE_COLOURS: Final = dict(zip(STATES, ("#bfc5cf", "#009e73", "#56b4e9", "#e69f00", "#d55e00"), strict=True))
+STATE_COLOURS: Final = dict(zip(EngagementState, ("#bfc5cf", "#009e73", "#56b4e9", "#e69f00", "#d55e00"), strict=True))
 """Of the states of a retargeter; their order in a band's legend repeats what the colours say."""
 _DEGREES: Final = 180.0 / np.pi
 
@@ -39,14 +39,21 @@ def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> 
         for row, (_, run) in enumerate(runs):
             for first, last in stretches(run.states):
                 start, end = run.times[first], run.times[min(last + 1, len(run.times) - 1)]
-                axes.barh(-row, end - start, left=start, height=0.72, color=STATE_COLOURS[str(run.states[first])], lw=0)
+                axes.barh(
+                    -row,
+                    end - start,
+                    left=start,
+                    height=0.72,
+                    color=STATE_COLOURS[EngagementState(run.states[first])],
+                    lw=0,
+                )
         axes.set_yticks([-row for row in range(len(runs))], [title for title, _ in runs])
         axes.tick_params(axis="y", length=0)
         axes.set_xlim(0.0, longest)
         axes.set_ylim(-len(runs) + 0.5, 0.5)
         axes.grid(axis="y", visible=False)
         axes.set_xlabel("time [s]", labelpad=1)
-        for state in STATES:
+        for state in EngagementState:
             axes.bar(0.0, 0.0, color=STATE_COLOURS[state], label=state)
         drawing.legend(5)
     return drawing.svg

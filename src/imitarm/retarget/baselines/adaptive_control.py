@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.kinematics.arm import ArmModel
-from imitarm.retarget.arm_estimator import ArmEstimate
 from imitarm.retarget.baselines.adaptive_law import AdaptiveLaw
-from imitarm.retarget.baselines.baseline_retargeter import RivalRetargeter
+from imitarm.retarget.baselines.baseline_retargeter import BaselineRetargeter
 from imitarm.retarget.baselines.joint_mapping import Approach, JointMapping
 from imitarm.retarget.baselines.joint_plant import JointPlant
-from imitarm.retarget.correspondence import Clutch, Correspondence
+from imitarm.retarget.correspondence import Correspondence
+from imitarm.retarget.retargeter import Goal
 from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ CUT_OFF = 3.0  # [Hz] of the reference's low-pass
 _GRIP = 0.2  # [s] in which a hand counts as closed more and more
 
 
-class AdaptiveControl(RivalRetargeter):
+class AdaptiveControl(BaselineRetargeter):
     r"""Rival M2: our reading of "discrete-time adaptive control" in the thesis (METHODS B).
 
     It stands for Liang et al. 2016, of which the abstract is known: the arm's configuration from a Kinect by vectors, a
@@ -58,6 +58,8 @@ class AdaptiveControl(RivalRetargeter):
     """
 
     name: ClassVar[str] = "m2"
+    title: ClassVar[str] = "M2"
+    caption: ClassVar[str] = "Our reading of an adaptive controller in discrete time that follows the person's joints."
 
     def __init__(
         self,
@@ -69,41 +71,41 @@ class AdaptiveControl(RivalRetargeter):
         velocity_scaling: bool = False,
         relative: bool = True,
     ) -> None:
+        super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
         self._mapping = JointMapping(arm, relative=relative)
         self._law = AdaptiveLaw(arm, dt)
         self._plant = JointPlant(arm, dt)
         self._share = 1.0 - math.exp(-2.0 * math.pi * CUT_OFF * dt)
         self.torque = np.zeros(arm.n_joints)
-        super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
-
-    def _begin(self, q: Array) -> None:
         self._peak = self._squares = 0.0
         self._periods = 0
-        super()._begin(q)
 
-    def _restart(self, q: Array) -> None:
+    def _begin(self) -> None:
+        super()._begin()
+        self._peak = self._squares = 0.0
+        self._periods = 0
+
+    def _rest_at(self, q: Array) -> None:
         self._mapping.start(q)
         self._approach = Approach(self.arm, self.dt)
-        self._goal, self._held_goal, self._reference = q, q, q
+        self._joint_goal, self._held_goal, self._reference = q, q, q
         self._closure, self._driven = 0.0, False
         self._law.start()
         self._plant.start(q)
         self.torque = self.arm.gravity_torque(q)
 
-    def _engaged(self, estimate: ArmEstimate, clutch: Clutch) -> None:
+    def _wanted(self, goal: Goal) -> Array:
         self._driven = True  # the brakes open
-
-    def _advance(self, estimate: ArmEstimate | None, clutch: Clutch) -> Array:
-        if estimate is not None:
-            joints = self._mapping.joints(estimate, clutch)
-            self._goal = np.minimum(np.maximum(joints, self.arm.lower), self.arm.upper)
-            closed = 1.0 if estimate.closed else 0.0
+        if goal.fresh:
+            joints = self._mapping.joints(goal.estimate, goal.clutch)
+            self._joint_goal = np.minimum(np.maximum(joints, self.arm.lower), self.arm.upper)
+            closed = 1.0 if goal.estimate.closed else 0.0
             self._closure += (closed - self._closure) * min(self._period / _GRIP, 1.0)
-        self._held_goal = self._approach.towards(self._held_goal, self._goal)
+        self._held_goal = self._approach.towards(self._held_goal, self._joint_goal)
         return self._driven_on()
 
-    def _hold(self) -> Array:
-        return self._driven_on() if self._driven else self._q
+    def _holding(self) -> Array:
+        return self._driven_on() if self._driven else self.latest.q
 
     def _driven_on(self) -> Array:
         """Let the reference, the controller and the arm go on by one period; return where the arm is then."""

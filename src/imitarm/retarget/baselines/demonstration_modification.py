@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.retarget.arm_estimator import ArmEstimate
 from imitarm.retarget.baselines.advice import COUNTED, Advice
-from imitarm.retarget.baselines.baseline_retargeter import HOLD, RivalRetargeter
+from imitarm.retarget.baselines.baseline_retargeter import BaselineRetargeter
 from imitarm.retarget.baselines.infeasible import Constraint, Infeasible
 from imitarm.retarget.baselines.joint_mapping import Approach, JointMapping
 from imitarm.retarget.baselines.shown_motion import ShownMotion, holds
 from imitarm.retarget.correspondence import Clutch, Correspondence
-from imitarm.retarget.retargeter import Command, Retargeting, in_order
+from imitarm.retarget.engagement import EngagementState
+from imitarm.retarget.retargeter import Goal, Retargeting, RetargetStep, in_order
 from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -28,7 +28,7 @@ ROUNDS = 5
 SECONDS_A_SEGMENT = 5.0  # [s] that a teacher takes to advise on one segment, besides watching it
 
 
-class DemonstrationModification(RivalRetargeter):
+class DemonstrationModification(BaselineRetargeter):
     r"""Rival M1: our reading of "demonstration modification" in the thesis (METHODS B).
 
     It stands for Argall's advice operators, by which corrected data are made from an execution and a teacher's advice
@@ -67,14 +67,16 @@ class DemonstrationModification(RivalRetargeter):
 
     Attributes:
         infeasible: what the arm can't do.
-        clock: for each sample of the last run when the person did it, from the first skeleton on, shape (n,) [s]:
-            a slowed motion is later than its clock. Empty before.
 
     Raises:
         InputError: when the arm has not the axes of a person's arm, or a number can't be used.
     """
 
     name: ClassVar[str] = "m1"
+    title: ClassVar[str] = "M1"
+    caption: ClassVar[str] = (
+        "Our reading of demonstration modification: the person's joint angles, corrected where the arm can't follow."
+    )
 
     def __init__(
         self,
@@ -91,31 +93,29 @@ class DemonstrationModification(RivalRetargeter):
     ) -> None:
         if not 0.0 <= advice_time < np.inf:
             raise InputError(f"DemonstrationModification: advice_time must not be negative [s], got {advice_time!r}")
+        super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
         self._mapping = JointMapping(arm, relative=relative)
         self.infeasible = Infeasible(arm, dt, constraints)
         self._advice_time, self._seed = advice_time, seed
-        self.clock = np.empty(0)
-        super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
+        self._shown_times = np.empty(0)
 
-    def _restart(self, q: Array) -> None:
+    def _rest_at(self, q: Array) -> None:
         self._mapping.start(q)
         self._approach = Approach(self.arm, self.dt)
-        self._goal, self._left = q, 0
+        self._joint_goal, self._left = q, 0
 
-    def _engaged(self, estimate: ArmEstimate, clutch: Clutch) -> None:
-        pass  # the mapping begins with the first frame that is mapped
-
-    def _advance(self, estimate: ArmEstimate | None, clutch: Clutch) -> Array:
-        if estimate is not None:
-            self._goal = self._mapping.joints(estimate, clutch)
-            self._left = self._steps
+    def _wanted(self, goal: Goal) -> Array:
+        q = self.latest.q
+        if goal.fresh:
+            self._joint_goal = self._mapping.joints(goal.estimate, goal.clutch)
+            self._left = self._steps_per_frame
         if self._approach.active:
-            return self._approach.towards(self._q, self._goal)
+            return self._approach.towards(q, self._joint_goal)
         if self._left <= 0:
-            return self._q
-        step = (self._goal - self._q) / self._left
+            return q
+        step = (self._joint_goal - q) / self._left
         self._left -= 1
-        return np.asarray(self._q + step)
+        return np.asarray(q + step)
 
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
         """Retarget a whole recording, correct it, and say in ``notes`` what that took.
@@ -133,25 +133,27 @@ class DemonstrationModification(RivalRetargeter):
         frames = in_order(skeletons)
         self.start(self.arm.home if q is None else q)
         rng = np.random.default_rng(self._seed)
-        commands, now = [self.command], frames[0].time
-        self.clock = np.empty(0)
+        steps, now = [self.latest], frames[0].time
+        self._shown_times = np.empty(0)
         lessons: list[Advice] = []
         performed = 0
-        for estimates in holds(frames, self.correspondence, HOLD):
+        state = EngagementState.WAITING
+        for estimates in holds(frames, self.correspondence, self.rule):
             first, last = estimates[0], estimates[-1]
-            self._rest(commands, first.time - now)
-            clutch = self.correspondence.engage(first.wrist, first.hand, self.arm.tool_pose(self._q))
-            self._mapping.start(self._q)
+            self._rest(steps, first.time - now, state)
+            q = self.latest.q
+            clutch = self.correspondence.engage(first.wrist, first.hand, self.arm.tool_pose(q))
+            self._mapping.start(q)
             lessons.append(Advice(self._mapping, clutch, self.infeasible, rng))
             motion = lessons[-1].corrected(ShownMotion.through(estimates, self.dt), ROUNDS)
-            performed -= len(commands)
-            self._perform(commands, motion, clutch)
-            performed += len(commands)
-            self._told(commands, motion.clock - frames[0].time)
-            now = last.time
-        self._rest(commands, frames[-1].time - now)
-        self._told(commands, np.empty(0))
-        return Retargeting.of(self, commands, {**self.notes, **self._notes_of(lessons, performed)})
+            performed -= len(steps)
+            self._perform(steps, motion, clutch)
+            performed += len(steps)
+            self._append_shown_times(steps, motion.clock - frames[0].time)
+            now, state = last.time, EngagementState.STOPPED
+        self._rest(steps, frames[-1].time - now, state)
+        self._append_shown_times(steps, np.empty(0))
+        return Retargeting.of(self, steps, {**self.notes, **self._notes_of(lessons, performed)}, self._shown_times)
 
     def _notes_of(self, lessons: Sequence[Advice], performed: int) -> dict[str, float]:
         """Return what a run came to, over all holds."""
@@ -164,26 +166,25 @@ class DemonstrationModification(RivalRetargeter):
             "teaching_time": watched + self._advice_time * counts["segments"],
         }
 
-    def _told(self, commands: list[Command], clock: Array) -> None:
-        """Complete ``clock`` up to the last command; the last ones are at ``clock``, what is before them at rest."""
-        rest = len(commands) - len(self.clock) - len(clock)
-        begin = float(self.clock[-1]) if len(self.clock) else -self.dt
+    def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
+        """Complete the shown times: of the last steps they are ``shown``, of those before them those of waiting."""
+        rest = len(steps) - len(self._shown_times) - len(shown)
+        begin = float(self._shown_times[-1]) if len(self._shown_times) else -self.dt
         waited = begin + self.dt * np.arange(1, rest + 1)
-        ahead = float(clock[0]) if len(clock) else np.inf
-        self.clock = np.concatenate([self.clock, np.minimum(waited, ahead), clock])
+        ahead = float(shown[0]) if len(shown) else np.inf
+        self._shown_times = np.concatenate([self._shown_times, np.minimum(waited, ahead), shown])
 
-    def _rest(self, commands: list[Command], duration: float) -> None:
-        """Stand still for a while, at the end or between two holds."""
-        state = "stopped" if self._held else "waiting"
+    def _rest(self, steps: list[RetargetStep], duration: float, state: EngagementState) -> None:
+        """Stand still for a while, at the end or between two engagements."""
+        q = self.latest.q
         for _ in range(round(duration / self.dt)):
-            self._order(commands, Command(0.0, self._q, self._q, None, state), self._q)
+            self._append(steps, RetargetStep(0.0, q, q, None, state), q)
 
-    def _perform(self, commands: list[Command], motion: ShownMotion, clutch: Clutch) -> None:
+    def _perform(self, steps: list[RetargetStep], motion: ShownMotion, clutch: Clutch) -> None:
         """Go to where the motion begins, at limited speed, then through it."""
-        self._held = True
         approach = Approach(self.arm, self.dt)
         start = np.clip(motion.joints[0], self.arm.lower, self.arm.upper)
-        at = self._q
+        at = self.latest.q
         path: list[tuple[int, Array]] = []
         while (at != start).any():
             at = approach.towards(at, start)
@@ -192,12 +193,12 @@ class DemonstrationModification(RivalRetargeter):
             shoulder, elbow, wrist = motion.shown[i]
             upper = (elbow - shoulder) / max(float(np.linalg.norm(elbow - shoulder)), 1e-9)
             target = clutch.target(wrist, motion.hands[i])
-            done = Command(0.0, q, q, motion.closed[i], "following", target, upper)
-            self._order(commands, done, q)
+            done = RetargetStep(0.0, q, q, motion.closed[i], EngagementState.FOLLOWING, target, upper)
+            self._append(steps, done, q)
 
-    def _order(self, commands: list[Command], command: Command, wanted: Array) -> None:
-        """Append a command that leads to joints (n_joints,) [rad], as far as limits let it."""
-        before, self._q = self._q, self._limited(wanted)
-        velocity = (self._q - before) / self.dt
-        self.command = replace(command, time=self.command.time + self.dt, q=self._q, velocity=velocity)
-        commands.append(self.command)
+    def _append(self, steps: list[RetargetStep], step: RetargetStep, wanted: Array) -> None:
+        """Append a step that leads to joints (n_joints,) [rad], as far as limits let it."""
+        before, q = self.latest, self._limited(wanted)
+        velocity = (q - before.q) / self.dt
+        self.latest = replace(step, time=before.time + self.dt, q=q, velocity=velocity)
+        steps.append(self.latest)

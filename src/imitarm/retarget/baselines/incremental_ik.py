@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
-from imitarm.retarget.arm_estimator import ArmEstimate
-from imitarm.retarget.baselines.baseline_retargeter import RivalRetargeter
-from imitarm.retarget.correspondence import Clutch, Correspondence
+from imitarm.retarget.baselines.baseline_retargeter import BaselineRetargeter
+from imitarm.retarget.correspondence import Correspondence
+from imitarm.retarget.retargeter import Goal
 from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _RCOND = 1e-6  # only what is numerically no direction at all is left out
 
 
-class IncrementalIK(RivalRetargeter):
+class IncrementalIK(BaselineRetargeter):
     r"""Rival M3: our reading of "incremental inverse kinematics" in the thesis (METHODS B).
 
     The thesis cites Ijspeert et al. 2002 for it. That paper is the one on movement primitives, and its abstract has
@@ -51,6 +51,8 @@ class IncrementalIK(RivalRetargeter):
     """
 
     name: ClassVar[str] = "m3"
+    title: ClassVar[str] = "M3"
+    caption: ClassVar[str] = "Our reading of incremental inverse kinematics: no treatment of singularities."
 
     def __init__(
         self,
@@ -67,29 +69,26 @@ class IncrementalIK(RivalRetargeter):
         self._gain = gain
         super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
 
-    def _restart(self, q: Array) -> None:
-        self._target: Pose | None = None
-        self._share, self._left = np.zeros(self.arm.n_joints), 0
+    def _rest_at(self, q: Array) -> None:
+        self._last_target: Pose | None = None
+        self._step, self._left = np.zeros(self.arm.n_joints), 0
 
-    def _engaged(self, estimate: ArmEstimate, clutch: Clutch) -> None:
-        self._target = clutch.home
-
-    def _advance(self, estimate: ArmEstimate | None, clutch: Clutch) -> Array:
-        if estimate is not None:
-            target = clutch.target(estimate.wrist, estimate.hand)
-            rest = self._left * self._capped(self._share)  # of the last frame, when this one came early
-            self._left = self._steps
-            self._share = (rest + self._increment(self._q + rest, target)) / self._left
-            self._target = target
+    def _wanted(self, goal: Goal) -> Array:
+        q = self.latest.q
+        if goal.fresh:
+            before = goal.clutch.home if self._last_target is None else self._last_target
+            rest = self._left * self._capped(self._step)  # of the last frame, when this one came early
+            self._left = self._steps_per_frame
+            self._step = (rest + self._increment(q + rest, before, goal.target)) / self._left
+            self._last_target = goal.target
         if self._left <= 0:
-            return self._q
+            return q
         self._left -= 1
-        self._count(self._share)
-        return self._q + (self._share if self.velocity_scaling else self._capped(self._share))
+        self._count(self._step)
+        return q + (self._step if self.velocity_scaling else self._capped(self._step))
 
-    def _increment(self, q: Array, target: Pose) -> Array:
-        """Return the joints' way of one frame from where they will be, (n_joints,) [rad]; shape (n_joints,) [rad]."""
-        before = target if self._target is None else self._target
+    def _increment(self, q: Array, before: Pose, target: Pose) -> Array:
+        """Return the displacement of the joints for one frame from ``q``, shape (n_joints,) [rad]."""
         twist = before.error_to(target) + self._gain * self.arm.tool_pose(q).error_to(before)
         return np.asarray(np.linalg.pinv(self.arm.tool_jacobian(q), rcond=_RCOND) @ twist)
 

@@ -13,7 +13,7 @@ from imitarm.capture.skeleton import Skeleton
 from imitarm.kinematics.pose import Pose, slerp
 from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
 from imitarm.retarget.correspondence import Correspondence
-from imitarm.retarget.engagement import Engagement
+from imitarm.retarget.engagement import Engagement, EngagementRule
 
 Array = NDArray[np.float64]
 
@@ -82,26 +82,33 @@ class ShownMotion:
         return replace(self, joints=joints)
 
 
-def holds(frames: Iterable[Skeleton], correspondence: Correspondence, gap: float) -> Iterator[tuple[ArmEstimate, ...]]:
-    """Give the holds of a recording one by one, by the rule that all methods share: estimates, at least two of each.
+def holds(
+    frames: Iterable[Skeleton], correspondence: Correspondence, rule: EngagementRule
+) -> Iterator[tuple[ArmEstimate, ...]]:
+    """Yield for each engagement in a recording its estimates, at least two, by the rule that all methods share.
 
     Args:
-        frames: in the order of their times.
-        correspondence: what follows what.
-        gap: without a sight of the arm after which a hold is lost [s].
+        frames: in order of time.
+        correspondence: between the person's arm and the robot's.
+        rule: the times of the engagement.
     """
-    estimator, engagement = ArmEstimator(correspondence), Engagement(correspondence)
+    estimator, engagement = ArmEstimator(correspondence), Engagement(correspondence, rule)
     held: list[ArmEstimate] = []
+    last = -np.inf
     for frame in frames:
         estimate = estimator.update(frame)
         if estimate is None:
             continue
-        if held and estimate.time - held[-1].time > gap:
+        engagement.update(None, estimate.time - last)  # the time for which the arm was not seen
+        if engagement.clutch is None:
             if len(held) > 1:
                 yield tuple(held)
             held = []
-            engagement.release()
-        if engagement.update(estimate, Pose.identity()) is not None:
+        last = estimate.time
+        engagement.update(estimate, 0.0)
+        if engagement.ready:
+            engagement.engage(estimate.wrist, estimate.hand, Pose.identity())
+        if engagement.clutch is not None:
             held.append(estimate)
     if len(held) > 1:
         yield tuple(held)

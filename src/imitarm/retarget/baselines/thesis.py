@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable
-from dataclasses import replace
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
@@ -19,8 +18,8 @@ from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
 from imitarm.retarget.baselines.human_arm_tracker import HumanArmTracker
 from imitarm.retarget.baselines.playback import HandCurve, HandSample, Playback
 from imitarm.retarget.correspondence import Clutch, Correspondence
-from imitarm.retarget.engagement import Engagement
-from imitarm.retarget.retargeter import Command, Retargeter, Retargeting, in_order, ticks
+from imitarm.retarget.engagement import EngagementRule
+from imitarm.retarget.retargeter import Goal, Retargeter, Retargeting, in_order
 from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -38,8 +37,6 @@ PRINTED = {
 }
 """What of the print can be run, by the names that ``as_printed`` takes."""
 
-_SHOWN = 0.1  # [s] without a sight of the arm before a held target is called one
-_PUSHED = 0.05  # [rad] an arm found farther than this from its command was moved by somebody
 _UNCLAMPED = 1e6  # [m/s] a twist that no clamp reaches
 _UNSEEN = 0.2  # weight of a hand's rotation that was only carried along
 
@@ -81,6 +78,8 @@ class ThesisRetargeter(Retargeter):
     """
 
     name: ClassVar[str] = "thesis"
+    caption: ClassVar[str] = "The thesis's Chapter 3, corrected: damped least squares towards a smooth curve."
+    rule: ClassVar[EngagementRule] = EngagementRule(hold_until=math.inf)
 
     def __init__(
         self,
@@ -114,84 +113,56 @@ class ThesisRetargeter(Retargeter):
         self._whole: HandCurve | None = None
         super().__init__(arm, correspondence, dt=dt, scene=scene)
 
-    def _begin(self, q: Array) -> None:
-        self._q = q.copy()
-        self._silence = math.inf
-        self._estimate: ArmEstimate | None = None
-        self._estimator = ArmEstimator(self.correspondence, smoothing=False, limbs="direction")
+    def _begin(self) -> None:
         self._tracker = HumanArmTracker(self._iterations, self.faults)
-        self._engagement = Engagement(self.correspondence)
         self._playback = Playback(lag=self._lag, smooth=self._smoothing is not None, whole=self._whole)
 
-    def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
-        """Return the joint positions to be at after ``dt``; see :class:`~imitarm.retarget.retargeter.Retargeter`."""
-        sample = None if skeleton is None else self._look(skeleton)
-        self._silence = 0.0 if sample is not None else self._silence + self.dt
-        self._playback.step(self.dt)
-        if sample is not None:
-            self._playback.add(sample)
-        hand = self._playback.now()
-        clutch = self._clutch(hand, sample is not None, np.asarray(q, dtype=float))
-        velocity, state, target, closed, elbow = np.zeros(self.arm.n_joints), "waiting", None, None, None
-        if clutch is not None and hand is not None and self._estimate is not None:
-            target = self._target(clutch, *hand)
-            velocity = self._drive(target)
-            state = "following" if self._silence <= _SHOWN else "holding"
-            closed = self._estimate.closed
-            elbow = self._estimate.upper_arm
-        self._q = np.clip(self._q + self.dt * velocity, self.arm.lower, self.arm.upper)
-        self.command = Command(self.command.time + self.dt, self._q, velocity, closed, state, target, elbow)
-        return self._q
+    def _new_estimator(self) -> ArmEstimator:
+        return ArmEstimator(self.correspondence, smoothing=False, limbs="direction")
 
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
         """Retarget a whole recording; with ``smoothing="global"`` through one curve for all of it.
 
         Args:
-            skeletons: in the order of their times.
-            q: where the arm is at first, shape (n_joints,) [rad]; None: ``arm.home``.
+            skeletons: in order of time.
+            q: start posture, shape (n_joints,) [rad]; None: ``arm.home``.
 
         Raises:
             InputError: when there are fewer than two skeletons, times do not increase, or, with one curve for all,
                 fewer than four show the arm.
         """
         frames = in_order(skeletons)
-        start = self.arm.home if q is None else q
         if self._smoothing == "global":
-            self.start(start)
-            samples = [sample for sample in map(self._look, frames) if sample is not None]
-            self._whole = HandCurve.through(samples)
+            self.start(self.arm.home if q is None else q)
+            estimates = [self._estimator.update(frame) for frame in frames]
+            self._whole = HandCurve.through([self._sample(e) for e in estimates if e is not None])
         try:
-            self.start(start)
-            commands = [self.command]
-            for skeleton in ticks(frames, self.dt):
-                self.step(skeleton, commands[-1].q)
-                commands.append(self.command)
+            return super().run(frames, q)
         finally:
             self._whole = None
-        return Retargeting.of(self, commands)
 
-    def _look(self, skeleton: Skeleton) -> HandSample | None:
-        """Return where the hand of the followed human arm is; None when the arm is not seen."""
-        estimate = self._estimator.update(skeleton)
+    def _see(self, skeleton: Skeleton | None) -> ArmEstimate | None:
+        self._playback.step(self.dt)
+        estimate = super()._see(skeleton)
+        if estimate is not None:
+            self._playback.add(self._sample(estimate))
+        return estimate
+
+    def _sample(self, estimate: ArmEstimate) -> HandSample:
+        """Return where the hand of the followed human arm is."""
         lengths = self._estimator.lengths
-        if estimate is None or lengths is None:
-            return None
+        assert lengths is not None  # else there would be no estimate
         wrist, hand = self._tracker.follow(estimate, lengths)
-        self._estimate = estimate
         _, known, turned = estimate.confidence
         return HandSample(estimate.time, wrist, hand, (known, max(turned, _UNSEEN)))
 
-    def _clutch(self, hand: tuple[Array, Array] | None, seen: bool, q: Array) -> Clutch | None:
-        """Return the clutch, engaged where the smoothed hand is, so that the tool does not jump."""
-        if self._engagement.clutch is not None or not seen or hand is None or self._estimate is None:
-            return self._engagement.clutch
-        if np.abs(q - self._q).max() > _PUSHED:  # somebody has moved the arm: begin there
-            self._q = np.clip(q, self.arm.lower, self.arm.upper)
-        smooth = replace(self._estimate, wrist=hand[0], hand=hand[1])
-        return self._engagement.update(smooth, self.arm.tool_pose(self._q))
+    def _hand(self) -> tuple[Array, Array]:
+        """Return wrist and hand on the smoothed curve: there the clutch engages, so that the tool does not jump."""
+        hand = self._playback.now()
+        assert hand is not None
+        return hand
 
     def _target(self, clutch: Clutch, wrist: Array, hand: Array) -> Pose:
-        """Return where the tool should be."""
         if "order" in self.faults:
             sensor_to_base = self.correspondence.sensor_to_base
             back = quaternion_conjugate(sensor_to_base.quaternion)
@@ -201,18 +172,22 @@ class ThesisRetargeter(Retargeter):
             hand = quaternion_multiply(turn, clutch.hand)
         return clutch.target(wrist, hand)
 
-    def _drive(self, target: Pose) -> Array:
-        """Return the joints' velocity towards a target by damped least squares, shape (n_joints,) [rad/s]."""
-        error = self.arm.tool_pose(self._q).error_to(target)
-        return solve_ik(
+    def _advance(self, goal: Goal | None, measured: Array) -> Array:
+        """Move towards the target by damped least squares."""
+        q = self.latest.q
+        if goal is None:
+            return q
+        error = self.arm.tool_pose(q).error_to(goal.target)
+        velocity = solve_ik(
             self.arm,
-            self._q,
+            q,
             self._gain * error,
             method="dls",
             dt=self.dt,
             max_speed=self._max_speed,
             small_angle=self._small_angle,
         )
+        return np.clip(q + self.dt * velocity, self.arm.lower, self.arm.upper)
 
 
 def _faults(as_printed: bool | Collection[str]) -> frozenset[str]:
