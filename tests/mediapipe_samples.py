@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imitarm.capture.mediapipe_landmarks import FIELD_OF_VIEW, N_LANDMARKS, Landmarks
+from imitarm.capture.mediapipe import FIELD_OF_VIEW, N_LANDMARKS, Landmarks
 
 VIDEOS = Path(__file__).resolve().parents[1] / ".cache" / "pose2sim"
 SIZE = (1280, 720)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imitarm.capture.checks import check, repaired
-from imitarm.capture.finding import Finding
+from imitarm.capture.issue import RecordingIssue
 from imitarm.capture.recording import SkeletonRecording, read_recording
 from imitarm.capture.skeleton import JOINT, JOINTS, Skeleton, Tracking
 from imitarm.errors import UnknownNameError
@@ -135,7 +135,7 @@ def test_errors_come_first_and_read_well():
         "error arm-lost: frame 0 (0.00 s): the right arm is lost in 80 % of the frames; "
         "keep it in view, away from the body"
     )
-    assert str(Finding("note", "x", "all is well")) == "note x: all is well"
+    assert str(RecordingIssue("note", "x", "all is well")) == "note x: all is well"
 
 
 def test_nothing_is_mended_where_nothing_is_wrong():

@@ -9,9 +9,9 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
-from imitarm.capture import body_camera, kinect, kinect_azure
+from imitarm.capture import kinect
+from imitarm.capture.filters import SwapGuard
 from imitarm.capture.kinect import AzureKinectSource, KinectV2Source
-from imitarm.capture.sides import SwapGuard
 from imitarm.capture.skeleton import JOINT, JOINTS, HandState, Tracking
 from imitarm.capture.sources import live, open_source
 from imitarm.errors import InputError, TaskFailedError
@@ -80,8 +80,8 @@ def kinect_next(monkeypatch):
     for name in names:
         setattr(driver, name.__name__, name)
     monkeypatch.setitem(sys.modules, "kinect_next", driver)
-    monkeypatch.setattr(kinect, "_START", 0.05)
-    monkeypatch.setattr(body_camera, "_SILENT", 0.05)
+    monkeypatch.setattr(kinect, "_V2_START", 0.05)
+    monkeypatch.setattr(kinect, "_SILENT", 0.05)
     return driver
 
 
@@ -253,8 +253,8 @@ def azure(monkeypatch):
         monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setitem(sys.modules, "pykinect_azure.k4a", ModuleType("pykinect_azure.k4a"))
     monkeypatch.setitem(sys.modules, "pykinect_azure.k4abt", ModuleType("pykinect_azure.k4abt"))
-    monkeypatch.setattr(kinect_azure, "_START", 0.05)
-    monkeypatch.setattr(body_camera, "_SILENT", 0.05)
+    monkeypatch.setattr(kinect, "_AZURE_START", 0.05)
+    monkeypatch.setattr(kinect, "_SILENT", 0.05)
     return sdk
 
 
@@ -330,7 +330,7 @@ def test_an_azure_kinect_that_is_not_there_is_told_and_does_not_end_the_program(
     with pytest.raises(InputError, match=r"could not find the SDKs \(Failed to load library libk4a\.so\).*video:FILE"):
         AzureKinectSource()
     azure.missing, azure.devices, azure.frames = False, 1, [1]
-    with pytest.raises(InputError, match=r"could not get a picture.*graphics card"):
+    with pytest.raises(InputError, match=r"could not get an image.*graphics card"):
         AzureKinectSource()
     assert azure.live == set()
     monkeypatch.setitem(sys.modules, "pykinect_azure", None)

@@ -55,7 +55,7 @@ def test_skeletons_come_with_the_films_times_and_the_process_is_gone_afterwards(
     with open_source(f"video:{film}") as source:
         assert isinstance(source, MediaPipeSource) and source.name == "video:film.mp4"
         skeletons = list(source)
-        assert source.over and source.pictures == 90 and source.read(0.0) is None
+        assert source.over and source.images == 90 and source.read(0.0) is None
         assert not alive(source._process.pid)
     assert [s.time for s in skeletons] == pytest.approx([i / 30 for i in range(90) if i != 1], abs=1e-6)
     wrist = (standing()[16] + PLACE) * (-1.0, -1.0, 1.0)
@@ -76,21 +76,21 @@ def test_the_worker_is_told_what_to_read_and_may_not_import_what_lies_around(wor
 @pytest.mark.parametrize(
     ("program", "error", "message"),
     [
-        (said("error is no video that can be read"), InputError, r"film\.mp4: is no video that can be read$"),
-        ("sys.exit('no module named cv2')", InputError, "does not start.*no module named cv2.*make its environment"),
-        (said("hello world"), InputError, "does not speak as MediaPipe's process should: 'hello world'"),
-        (said("imitarm-mediapipe 2 1280 720"), InputError, "does not speak as"),
-        (said("imitarm-mediapipe 1 wide high"), InputError, "no size of the pictures"),
-        (said("imitarm-mediapipe 1 0 720"), InputError, "needs a picture"),
-        (said(HELLO, frame(0)) + "\nos.kill(os.getpid(), signal.SIGKILL)", TaskFailedError, "gone.*status -9.*1 pict"),
-        (said(HELLO, frame(0), "error it is cut off"), TaskFailedError, "it is cut off; 1 pictures were good"),
-        (said(HELLO, frame(0), "frame 0.1 1 2 3"), TaskFailedError, "no line of landmarks: 'frame 0.1 1 2 3'"),
-        (said(HELLO, frame(0), frame(1)[:-3] + "nan"), TaskFailedError, "no line of landmarks"),
-        (said(HELLO, frame(1), frame(0)), TaskFailedError, "no line of landmarks"),
-        (said(HELLO, frame(0), "nobody soon"), TaskFailedError, "no line of landmarks"),
-        (said(HELLO, frame(0), ""), TaskFailedError, "no line of landmarks: ''"),
-        (said(HELLO, frame(0), "x" * 100000), TaskFailedError, "no line of landmarks: 'xxx"),
-        (said(HELLO) + "\nos.write(1, os.urandom(5000))", TaskFailedError, "landmarks|gone"),
+        (said("error is not a video that can be read"), InputError, r"film\.mp4: is no video that can be read$"),
+        ("sys.exit('no module named cv2')", InputError, "does not start.*no module named cv2.*rebuild its environment"),
+        (said("hello world"), InputError, "does not send what MediaPipe's process should: 'hello world'"),
+        (said("imitarm-mediapipe 2 1280 720"), InputError, "does not send what"),
+        (said("imitarm-mediapipe 1 wide high"), InputError, "no image size"),
+        (said("imitarm-mediapipe 1 0 720"), InputError, "needs an image size"),
+        (said(HELLO, frame(0)) + "\nos.kill(os.getpid(), signal.SIGKILL)", TaskFailedError, "gone.*status -9.*1 image"),
+        (said(HELLO, frame(0), "error it is cut off"), TaskFailedError, "it is cut off; 1 images were processed"),
+        (said(HELLO, frame(0), "frame 0.1 1 2 3"), TaskFailedError, "sent an invalid line: 'frame 0.1 1 2 3'"),
+        (said(HELLO, frame(0), frame(1)[:-3] + "nan"), TaskFailedError, "sent an invalid line"),
+        (said(HELLO, frame(1), frame(0)), TaskFailedError, "sent an invalid line"),
+        (said(HELLO, frame(0), "nobody soon"), TaskFailedError, "sent an invalid line"),
+        (said(HELLO, frame(0), ""), TaskFailedError, "sent an invalid line: ''"),
+        (said(HELLO, frame(0), "x" * 100000), TaskFailedError, "sent an invalid line: 'xxx"),
+        (said(HELLO) + "\nos.write(1, os.urandom(5000))", TaskFailedError, "invalid line|gone"),
     ],
 )  # fmt: skip
 def test_a_worker_that_fails_is_told_from_one_that_is_done(program, error, message, worker, film):
@@ -100,7 +100,7 @@ def test_a_worker_that_fails_is_told_from_one_that_is_done(program, error, messa
 
 
 def test_a_python_that_can_not_be_started_is_told(film, tmp_path):
-    with pytest.raises(InputError, match=r"python: can't be started: No such file.*make its environment anew"):
+    with pytest.raises(InputError, match=r"python: can't be started: No such file.*rebuild its environment"):
         MediaPipeSource(film, python=tmp_path / "python")
 
 
@@ -111,12 +111,12 @@ def test_a_worker_that_hangs_is_ended(worker, film, monkeypatch):
     assert source.read(5.0) is not None
     time.sleep(1.2)  # nobody asks: that is no silence
     assert source.read(0.1) is None
-    with pytest.raises(TaskFailedError, match=r"said nothing for 1 s"):
+    with pytest.raises(TaskFailedError, match=r"sent nothing for 1 s"):
         source.read(5.0)
     assert source.over and not alive(source._process.pid)
     monkeypatch.setattr(mediapipe, "_START", 0.3)
     worker(FOREVER)
-    with pytest.raises(InputError, match=r"no picture within 0\.3 s"):
+    with pytest.raises(InputError, match=r"no image within 0\.3 s"):
         MediaPipeSource(film)
 
 
@@ -143,7 +143,7 @@ def test_a_webcam_gives_its_newest_picture(worker):
         until = time.monotonic() + 20.0
         while late.time < 499 / 30 - 1e-6 and time.monotonic() < until:
             late = source.read(1.0) or late
-        assert late.time == pytest.approx(499 / 30, abs=1e-6) and source.pictures < 500
+        assert late.time == pytest.approx(499 / 30, abs=1e-6) and source.images < 500
 
 
 def test_realtime_gives_a_film_at_its_own_pace(worker, film):
@@ -167,5 +167,5 @@ def test_a_film_that_is_cut_off_loses_nothing(worker, film, tmp_path, capsys):
     worker(said(HELLO, *(frame(i) for i in range(20)), "error ends after 20 of 90 pictures"))
     out = tmp_path / "out.csv"
     assert main(["capture", f"video:{film}", "--out", str(out)]) == 1
-    assert "ends after 20 of 90 pictures; 20 pictures were good" in capsys.readouterr().err
+    assert "ends after 20 of 90 pictures; 20 images were processed before" in capsys.readouterr().err
     assert len(list(open_source(out))) == 20

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from imitarm.capture import mediapipe_environment as environment
-from imitarm.capture.mediapipe_environment import VARIABLE, find_python, fitting_python, folders, main, make, python_of
+from imitarm.capture.mediapipe_environment import VARIABLE, find_python, folders, main, make, python_of, suitable_python
 from imitarm.errors import InputError, TaskFailedError
 
 
@@ -31,7 +31,7 @@ def test_the_variable_goes_before_folders_and_a_folder_counts_when_it_is_finishe
     monkeypatch.setenv(VARIABLE, sys.executable)
     assert find_python() == Path(sys.executable)
     monkeypatch.setenv(VARIABLE, "/nowhere/python")
-    with pytest.raises(InputError, match="/nowhere/python, which is no file"):
+    with pytest.raises(InputError, match="/nowhere/python is not a file"):
         find_python()
 
 
@@ -80,15 +80,15 @@ def test_it_is_made_by_these_steps_and_marked_when_all_are_done(tmp_path, monkey
 def test_a_folder_with_something_else_in_it_is_left_alone(tmp_path, capsys):
     (tmp_path / "thesis.tex").touch()
     assert main([str(tmp_path)]) == 2
-    assert "is no environment of Python" in capsys.readouterr().err and (tmp_path / "thesis.tex").exists()
+    assert "is not a Python environment" in capsys.readouterr().err and (tmp_path / "thesis.tex").exists()
 
 
 def test_a_python_that_fits_is_chosen(monkeypatch):
     monkeypatch.setattr(sys, "version_info", (3, 12, 1))
-    assert fitting_python() == sys.executable
+    assert suitable_python() == sys.executable
     monkeypatch.setattr(sys, "version_info", (3, 14, 0))
     monkeypatch.setattr("shutil.which", lambda name: f"/bin/{name}" if name in {"python3.10", "python3.9"} else None)
-    assert fitting_python() == "/bin/python3.10"
+    assert suitable_python() == "/bin/python3.10"
     monkeypatch.setattr("shutil.which", lambda _: None)
     with pytest.raises(InputError, match=r"exists for Python 3\.9 to 3\.12; this is 3\.14"):
-        fitting_python()
+        suitable_python()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.capture.mediapipe_landmarks import (
+from imitarm.capture.mediapipe import (
     DEPTH_MEMORY,
     INFERRED,
     TRACKED,
@@ -143,5 +143,5 @@ def test_landmarks_that_are_none_are_refused():
         Landmarks(0.0, good.world * np.inf, good.image, good.visibility)
     with pytest.raises(InputError, match="10 to 150"):
         LandmarkConverter(SIZE, 5.0)
-    with pytest.raises(InputError, match="needs a picture"):
+    with pytest.raises(InputError, match="needs an image size"):
         LandmarkConverter((0, 720))

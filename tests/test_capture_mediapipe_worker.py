@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from imitarm.capture import mediapipe_worker as worker
-from imitarm.capture.mediapipe_landmarks import N_LANDMARKS
+from imitarm.capture.mediapipe import N_LANDMARKS
 
 PICTURE = np.zeros((72, 128, 3), np.uint8)
 
@@ -115,10 +115,10 @@ def test_times_always_increase(film, expected, libraries):
 @pytest.mark.parametrize(
     ("film", "message"),
     [
-        (None, "error is no video that can be read"),
-        ({"pictures": 0, "times": []}, "error there is not one picture in it"),
+        (None, "error is not a video that can be read"),
+        ({"pictures": 0, "times": []}, "error it holds no image"),
         ({"pictures": 4, "times": [], "rate": 0.0}, "error has neither times nor a frame rate"),
-        ({"pictures": 40, "announced": 100, "rate": 30.0, "times": []}, "error ends after 40 of 100 pictures"),
+        ({"pictures": 40, "announced": 100, "rate": 30.0, "times": []}, "error ends after 40 of 100 images"),
     ],
 )
 def test_what_is_no_film_says_so_last(film, message, libraries):
@@ -133,10 +133,10 @@ def test_a_webcam_gives_pictures_until_it_is_gone(libraries, monkeypatch):
     before = time.monotonic()
     status, said = lines("webcam", "0")
     times = [float(line.split(" ")[1]) for line in said[1:-1]]
-    assert status == 1 and "camera 0 gives no pictures any more" in said[-1]
+    assert status == 1 and "camera 0 gives no images any more" in said[-1]
     assert 1 <= len(times) <= 3 and times == sorted(times)
     assert before <= times[0] and times[-1] <= time.monotonic()
-    assert lines("webcam", "1")[1] == ["error there is no camera number 1, or another program has it"]
+    assert lines("webcam", "1")[1] == ["error there is no camera number 1, or another program uses it"]
 
 
 def test_a_mediapipe_that_will_not_do_is_named(libraries, monkeypatch):

@@ -38,7 +38,7 @@ def test_every_skeleton_comes_back_to_the_last_bit(tmp_path):
     SkeletonRecording(frames).save(tmp_path / "a.csv")
     back = read_recording(tmp_path / "a.csv")
     assert len(back) == 6 and all(map(same, back.skeletons, frames))
-    assert back.findings == () and back.name == "a.csv"
+    assert back.issues == () and back.name == "a.csv"
     assert back.persons == (0, 72057594037944738)
 
 
@@ -129,7 +129,7 @@ def test_a_joint_at_infinity_is_lost_and_is_said(saved):
     recording = read_recording(saved)
     skeleton = recording.skeletons[2]
     assert skeleton.tracking[10] == skeleton.tracking[11] == Tracking.LOST and not skeleton.arm("right").seen
-    (finding,) = recording.findings
+    (finding,) = recording.issues
     assert finding.code == "far-joint" and finding.frame == 2
     assert "2 joints in 1 frames" in finding.message and "wrist_right in line 12" in finding.message
 
@@ -147,7 +147,7 @@ def test_the_real_gestures_are_read(real_data):
         assert recording.rate == pytest.approx(30.3, abs=0.1) and 5.0 < recording.duration < 8.0
         first = lines[-1].split(",")
         np.testing.assert_array_equal(recording.skeletons[-1].positions[24], [float(x) for x in first[97:100]])
-        assert recording.skeletons[-1].arm("right").seen and recording.findings == ()
+        assert recording.skeletons[-1].arm("right").seen and recording.issues == ()
 
 
 def kinect_table(tmp_path, n=6, tick=10_000_000 / 30, end=",\n"):

@@ -6,7 +6,7 @@ from types import ModuleType
 import pytest
 
 from imitarm.capture import sources
-from imitarm.capture.people import PersonFilter
+from imitarm.capture.filters import PersonFilter
 from imitarm.capture.recording import SkeletonRecording
 from imitarm.capture.sources import followed, live, open_source
 from imitarm.capture.synthetic import SyntheticSource

@@ -14,8 +14,7 @@ import pytest
 from imitarm import ArmModel, SimulatedRobot
 from imitarm.capture.checks import repaired
 from imitarm.capture.mediapipe_environment import find_python
-from imitarm.capture.recording import read_recording
-from imitarm.capture.slowing import slowed
+from imitarm.capture.recording import read_recording, slowed
 from imitarm.capture.sources import followed, open_source
 from imitarm.errors import InputError
 from imitarm.evaluation.seen_arm import seen_arm

@@ -4,7 +4,8 @@ import pytest
 
 from imitarm import ArmModel, InputError, Scene, Sphere
 from imitarm.capture.camera_model import SkeletonCamera
-from imitarm.capture.motions import MotionCapture, reaching
+from imitarm.capture.motion_capture import MotionCapture
+from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import Skeleton
 from imitarm.capture.synthetic import SyntheticSource

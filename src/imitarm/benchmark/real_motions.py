@@ -19,9 +19,8 @@ import numpy as np
 from imitarm.benchmark.experiment import write_text
 from imitarm.benchmark.tables import Table
 from imitarm.capture.checks import repaired
-from imitarm.capture.recording import SkeletonRecording
+from imitarm.capture.recording import SkeletonRecording, slowed
 from imitarm.capture.skeleton import Skeleton
-from imitarm.capture.slowing import slowed
 from imitarm.capture.sources import followed, open_source
 from imitarm.errors import ImitarmError, InputError
 from imitarm.evaluation.driving import drive

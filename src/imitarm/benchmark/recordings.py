@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.benchmark.recording_plan import CAPTURED, REPEATS, Plan
-from imitarm.capture.drawing import DRAWINGS, drawing
-from imitarm.capture.motions import REST, MotionCapture, Truth, reaching
+from imitarm.capture.motion_capture import MotionCapture
+from imitarm.capture.motions import DRAWINGS, REST, Truth, drawing, reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import HandState, Skeleton
 from imitarm.errors import InputError, TaskFailedError, UnreachableError

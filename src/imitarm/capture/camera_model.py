@@ -1,4 +1,4 @@
-"""SkeletonCamera: what a skeleton camera makes of a person: noise, bias, jitter, dropouts, occlusion; seeded."""
+"""SkeletonCamera: a simulated skeleton camera with noise, bias, jitter, dropouts and occlusion; seeded."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from imitarm.errors import InputError
 
 Array = NDArray[np.float64]
 
-# As measured in real recordings of a Kinect v2: tests/test_capture_noise.py compares.
-WAY = 0.08  # [m] a joint has to move so far for its error to become another one
-MEMORY = 5.0  # [s] in which the error of a joint at rest becomes another one
-DEPTH = 1.4  # the error along the line of sight over that across it
-TIPS = 1.5  # the error of finger tips and thumbs over that of other joints
+# Measured on real recordings of a Kinect v2; tests/test_capture_sensor_quality_noise.py compares.
+MEMORY_LENGTH = 0.08  # [m] the error of a moving joint is correlated over this path length
+MEMORY = 5.0  # [s] the error of a joint at rest is correlated over this time
+DEPTH = 1.4  # error along the line of sight over that across it
+TIPS = 1.5  # error of finger tips and thumbs over that of other joints
 _WHITE = {"elbow": (0.02, 0.40), "wrist": (0.02, 0.40), "hand": (0.075, 0.12), "hand_tip": (0.14, 0.08)}
-_WHITE |= {"thumb": (0.16, 0.30)}  # of sigma, and of TIPS: at rest, and more for each m/s
+_WHITE |= {"thumb": (0.16, 0.30)}  # white noise over sigma (and TIPS): at rest, and its increase per m/s
 _WHITE_BODY = (0.01, 0.20)
-# the error of the second goes along with that of the first: correlation
+# correlation of the second joint's error with the first one's
 _MIDDLE_CHAIN = (
     ("spine_base", "spine_mid", 0.9),
     ("spine_mid", "spine_shoulder", 0.9),
@@ -44,22 +44,22 @@ _ARM = {
     side: np.array([JOINT[f"{part}_{side}"] for part in ("elbow", "wrist", "hand", "hand_tip", "thumb")])
     for side in SIDES
 }
-_HIDDEN = 3.0  # an inferred joint's error over that of a tracked one
-_SKIPPED, _SLIPPED = 0.03, 0.01  # share of frame intervals that are twice as long; of frames that are lost
-_MISREAD = 0.02  # share of frames in which the hand state begins to be misread, for one or two frames
+_HIDDEN = 3.0  # error of an inferred joint over that of a tracked one
+_SKIPPED, _SLIPPED = 0.03, 0.01  # fraction of frame intervals that are twice as long; of frames that are lost
+_MISREAD = 0.02  # fraction of frames at which a wrong hand state begins; it lasts one or two frames
 _DROP_LENGTH = (2, 20)  # [frames] of a dropout
-_NOBODY, _LOST = 0.1, 0.3  # share of dropouts in which nobody is seen; of the rest, in which the arm is lost
-_TORSO = 0.16  # [m] half the width of what hides a hand that is behind it
-_BEFORE = math.radians(3.0)  # a hand in line with the elbow hides it
+_NOBODY, _LOST = 0.1, 0.3  # fraction of dropouts in which nobody is seen; of the others, in which the arm is lost
+_TORSO = 0.16  # [m] half the width of the torso, which hides a hand behind it
+_IN_LINE = math.radians(3.0)  # a hand that is this close to the line of sight to its elbow hides the elbow
 
 
 def _mixing() -> Array:
-    """Return what makes independent errors of the joints into correlated ones, rows of unit length, shape (25, 25)."""
+    """Return the matrix that correlates independent errors of the joints; rows of unit length, shape (25, 25)."""
     rows = np.eye(len(JOINTS))
     sides = [
-        (near if near in JOINT else f"{near}_{side}", f"{far}_{side}", share)
+        (near if near in JOINT else f"{near}_{side}", f"{far}_{side}", correlation)
         for side in SIDES
-        for near, far, share in _SIDE_CHAIN
+        for near, far, correlation in _SIDE_CHAIN
     ]
     for near, far, correlation in (*_MIDDLE_CHAIN, *sides):
         rows[JOINT[far]] *= math.sqrt(1.0 - correlation**2)
@@ -67,48 +67,49 @@ def _mixing() -> Array:
     return rows
 
 
-def _white_shares() -> Array:
-    """Return white noise over sigma at rest and for each m/s, shape (2, 25)."""
+def _white_ratios() -> Array:
+    """Return white noise over sigma: at rest, and its increase per m/s, shape (2, 25)."""
     return np.array([_WHITE.get(name.removesuffix("_left").removesuffix("_right"), _WHITE_BODY) for name in JOINTS]).T
 
 
-_MIXING, _WHITE_SHARES = _mixing(), _white_shares()
+_MIXING, _WHITE_RATIOS = _mixing(), _white_ratios()
 _SHAPE = (len(JOINTS), 3)
 
 
 class SkeletonCamera:
-    r"""A skeleton camera with the faults of a real one (METHODS B, "noise model").
+    r"""A simulated skeleton camera with the errors of a real one; docs/capture.md says how they were measured.
 
-    A joint is seen at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma`` on each axis
-    across the line of sight, 1.4 of it along, half as much again for finger tips and thumbs. It is a Matern process
-    of order 3/2, not over time but over time and way together,
+    A joint at x is seen at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma`` on each axis
+    across the line of sight and 1.4 times that along it; both are half as large again for finger tips and thumbs. It is
+    a Matern process of order 3/2 over time t and path length :math:`|dx|` together,
 
     .. math:: du = dt / 5\,\mathrm{s} + |dx| / 8\,\mathrm{cm}, \qquad
               \mathrm{E}\,[c(0)\,c(u)] = \sigma^2 (1 + u)\,e^{-u},
 
-    because in recordings of a Kinect v2 a bone hardly changes its length while the arm is at rest, and by all of its
-    1 to 2 cm within a way of 10 to 20 cm. ``M`` lets neighbours share their errors: a forearm keeps its length
-    better than an upper arm. ``n`` is white and grows with a joint's speed: at elbow and wrist, with ``sigma`` of
-    12 mm, from 0.2 mm at rest by 5 mm for each m/s. ``b`` is a bias of the elbow's depth.
+    because in recordings of a Kinect v2 the length of a bone hardly changes while the arm is at rest, and changes by 1
+    to 2 cm while the joint moves by 10 to 20 cm. ``M`` correlates the errors of neighbouring joints: the length of a
+    forearm varies less than that of an upper arm. ``n`` is white noise and grows with the joint's speed: for elbow and
+    wrist and ``sigma`` of 12 mm, it is 0.2 mm at rest plus 5 mm per m/s. ``b`` is a bias of the elbow's depth.
 
     * Frames come at ``rate`` with ``jitter``; 3 % of the intervals are twice as long, 1 % of the frames show nobody.
-    * Dropouts: at ``dropout`` a second an arm is inferred (error three times as large), or lost, or nobody is
+    * Dropouts: ``dropout`` times per second an arm is inferred (error three times as large), or lost, or nobody is
       seen at all, for 2 to 20 frames.
     * Occlusion: a forearm behind the torso, and an elbow behind its own hand, are inferred.
-    * The hand's state is misread for one or two frames now and then.
+    * Now and then the hand state is wrong for one or two frames.
 
     Args:
         seed: of everything random.
-        sigma: [m].
-        rate: frames a second [Hz].
+        sigma: standard deviation of the slow error [m].
+        rate: frames per second [Hz].
         jitter: standard deviation of the time between frames [s].
-        dropout: dropouts of each arm a second [Hz].
-        occlusion: whether what is behind something else is inferred.
-        elbow_bias: largest bias of the elbow's depth [m]; the person's own is uniform within it.
-        faultless: no dropouts, occlusions, jitter, misreadings; with ``sigma=0`` and ``elbow_bias=0`` the truth.
+        dropout: dropouts of each arm per second [Hz].
+        occlusion: whether hidden joints are inferred.
+        elbow_bias: largest bias of the elbow's depth [m]; the actual bias is drawn uniformly within it.
+        faultless: no dropouts, occlusions, jitter or wrong hand states; with ``sigma=0`` and ``elbow_bias=0`` the
+            camera reports the truth.
 
     Raises:
-        InputError: when a value is that of no camera.
+        InputError: when a value is out of range.
     """
 
     def __init__(
@@ -143,16 +144,16 @@ class SkeletonCamera:
 
     @classmethod
     def from_seed(cls, seed: int, *, rate: float = 30.0) -> SkeletonCamera:
-        """Return camera number ``seed``: its sigma is between 1 and 2 cm, the rest as usual."""
+        """Return camera number ``seed``: its sigma is between 1 and 2 cm, everything else is default."""
         return cls(seed, sigma=float(np.random.default_rng([30314, seed]).uniform(0.01, 0.02)), rate=rate)
 
     @classmethod
     def ideal(cls, rate: float = 30.0) -> SkeletonCamera:
-        """Return a camera that sees the truth."""
+        """Return a camera that reports the truth."""
         return cls(0, sigma=0.0, rate=rate, jitter=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
 
     def next_time(self, time: float) -> float:
-        """Return when the frame after one at ``time`` is exposed [s]."""
+        """Return the time of the frame after the one at ``time`` [s]."""
         period = 1.0 / self.rate
         if self.faultless:
             return time + period
@@ -164,7 +165,7 @@ class SkeletonCamera:
         """Return the skeleton the camera reports, or None when it reports none.
 
         Args:
-            truth: of one instant; later than that of the call before.
+            truth: at one instant, later than that of the previous call.
         """
         period = max(truth.time - self._time, 0.0) if math.isfinite(self._time) else 0.0
         error = self._error(truth.positions, period)
@@ -190,8 +191,8 @@ class SkeletonCamera:
     def _error(self, points: Array, period: float) -> Array:
         """Return the errors of this frame over sigma and scale, shape (25, 3)."""
         step = points - self._last if period > 0.0 else np.zeros(_SHAPE)
-        way = np.nan_to_num(np.sqrt(np.sum(step * step, axis=1)))[:, None]
-        u = period / MEMORY + way / WAY
+        path = np.nan_to_num(np.sqrt(np.sum(step * step, axis=1)))[:, None]
+        u = period / MEMORY + path / MEMORY_LENGTH
         # exact step of the process (slow, slope) with unit covariance: A = e^-u [[1+u, u], [-u, 1-u]], Q = 1 - A A^T
         keep = np.exp(-u)
         s, v = self._slow, self._slope
@@ -202,8 +203,8 @@ class SkeletonCamera:
             q_sv / np.sqrt(q_vv) * new + np.sqrt(np.maximum(q_ss - q_sv**2 / q_vv, 0.0)) * other
         )
         self._slope = keep * ((1.0 - u) * v - u * s) + np.sqrt(q_vv) * new
-        at_rest, with_speed = _WHITE_SHARES
-        speed = way[:, 0] / period if period > 0.0 else 0.0
+        at_rest, with_speed = _WHITE_RATIOS
+        speed = path[:, 0] / period if period > 0.0 else 0.0
         return np.asarray(_MIXING @ self._slow + (at_rest + with_speed * speed)[:, None] * white)
 
     def _drop(self, tracking: NDArray[np.int8], period: float) -> None:
@@ -220,7 +221,7 @@ class SkeletonCamera:
 
     @staticmethod
     def _hide(points: Array, tracking: NDArray[np.int8]) -> None:
-        """Mark as inferred what something nearer to the sensor hides."""
+        """Mark joints as inferred that something closer to the sensor hides."""
         top, low = points[JOINT["spine_shoulder"]], points[JOINT["spine_base"]]
         for index in _ARM.values():
             arm = points[index]
@@ -228,7 +229,7 @@ class SkeletonCamera:
             behind &= (arm[:, 1] > low[1]) & (arm[:, 1] < top[1])
             elbow, wrist = arm[0], arm[1]
             sight = float(elbow @ wrist / max(np.linalg.norm(elbow) * np.linalg.norm(wrist), 1e-9))
-            behind[0] |= math.acos(min(max(sight, -1.0), 1.0)) < _BEFORE and wrist[2] < elbow[2]
+            behind[0] |= math.acos(min(max(sight, -1.0), 1.0)) < _IN_LINE and wrist[2] < elbow[2]
             tracking[index[behind]] = np.minimum(tracking[index[behind]], Tracking.INFERRED)
 
     def _read(self, truth: Skeleton, hand: int) -> HandState:

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.capture.finding import SEVERITIES, Finding, Severity
+from imitarm.capture.filters import SideMemory
+from imitarm.capture.issue import SEVERITIES, RecordingIssue, Severity
 from imitarm.capture.recording import SkeletonRecording
-from imitarm.capture.sides import SideMemory
 from imitarm.capture.skeleton import JOINT, SIDES, Skeleton, Tracking
 from imitarm.errors import UnknownNameError
 
@@ -28,7 +28,7 @@ _TURNED = 0.3  # share of frames in which left is where right should be
 _MAD_TO_SIGMA = 1.4826
 
 
-def check(recording: SkeletonRecording, side: str = "right") -> list[Finding]:
+def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIssue]:
     """Return all that is wrong with a recording, errors first.
 
     Args:
@@ -40,7 +40,7 @@ def check(recording: SkeletonRecording, side: str = "right") -> list[Finding]:
     """
     if side not in SIDES:
         raise UnknownNameError.among("side", side, SIDES)
-    findings = [*recording.findings, *_people(recording)]
+    findings = [*recording.issues, *_people(recording)]
     seen = [skeleton for skeleton in recording.skeletons if (skeleton.tracking > Tracking.LOST).any()]
     if seen:
         view = _View(recording, side)
@@ -75,7 +75,7 @@ def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]
     right = [memory.update(skeleton) for skeleton in kept]
     if memory.swaps:
         notes.append(f"exchanged left and right back in {memory.swaps} frames")
-    return SkeletonRecording(right, name=recording.name, findings=recording.findings), notes
+    return SkeletonRecording(right, name=recording.name, issues=recording.issues), notes
 
 
 class _View:
@@ -94,24 +94,24 @@ class _View:
         stamps = np.unique(self.times)
         self.period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
 
-    def finding(self, severity: Severity, code: str, message: str, remedy: str, i: int | None = None) -> Finding:
+    def finding(self, severity: Severity, code: str, message: str, remedy: str, i: int | None = None) -> RecordingIssue:
         """Build a finding about sample ``i``."""
         if i is None:
-            return Finding(severity, code, message, remedy=remedy)
-        return Finding(severity, code, message, self.frames[i], float(self.times[i] - self.times[0]), remedy)
+            return RecordingIssue(severity, code, message, remedy=remedy)
+        return RecordingIssue(severity, code, message, self.frames[i], float(self.times[i] - self.times[0]), remedy)
 
 
-def _people(recording: SkeletonRecording) -> Iterator[Finding]:
+def _people(recording: SkeletonRecording) -> Iterator[RecordingIssue]:
     n = len(recording)
     if not any((skeleton.tracking > Tracking.LOST).any() for skeleton in recording.skeletons):
         message = f"nobody is seen in any of {n} frames" if n else "holds no frames"
-        yield Finding("error", "nobody", message, remedy="stand 1.5 to 3 m before the sensor and record again")
+        yield RecordingIssue("error", "nobody", message, remedy="stand 1.5 to 3 m before the sensor and record again")
         return
     if len(recording.persons) > 1:
         everybody = [skeleton.person for skeleton in recording.skeletons]
         shares = ", ".join(f"{person} ({everybody.count(person)} frames)" for person in recording.persons)
         second = next(i for i, person in enumerate(everybody) if person != everybody[0])
-        yield Finding(
+        yield RecordingIssue(
             "warning",
             "several-persons",
             f"{len(recording.persons)} persons: {shares}; the rest of these findings is about the one seen most",
@@ -121,7 +121,7 @@ def _people(recording: SkeletonRecording) -> Iterator[Finding]:
         )
 
 
-def _times(view: _View) -> Iterator[Finding]:
+def _times(view: _View) -> Iterator[RecordingIssue]:
     steps = np.diff(view.times)
     if (steps <= 0.0).any():
         i = int(np.argmax(steps <= 0.0)) + 1
@@ -132,7 +132,7 @@ def _times(view: _View) -> Iterator[Finding]:
         yield view.finding("error", "few-frames", f"{len(view.times)} frames only", "record for longer")
 
 
-def _rate(view: _View) -> Iterator[Finding]:
+def _rate(view: _View) -> Iterator[RecordingIssue]:
     if view.period == 0.0:
         return
     rate = 1.0 / view.period
@@ -144,7 +144,7 @@ def _rate(view: _View) -> Iterator[Finding]:
         yield view.finding("warning", "frame-rate", message, "more light or a smaller model; 30 are usual")
 
 
-def _gaps(view: _View) -> Iterator[Finding]:
+def _gaps(view: _View) -> Iterator[RecordingIssue]:
     steps = np.diff(view.times)
     long = steps > max(_GAP, 3.0 * view.period)
     if long.any():
@@ -155,7 +155,7 @@ def _gaps(view: _View) -> Iterator[Finding]:
         yield view.finding("warning", "gap", message, "cut there by trim, or record again", i)
 
 
-def _arm(view: _View) -> Iterator[Finding]:
+def _arm(view: _View) -> Iterator[RecordingIssue]:
     known = view.confidence[:, :3].min(axis=1)
     lost, guessed = known == 0.0, (known > 0.0) & (known < 1.0)
     if lost.mean() > _LOST[0]:
@@ -170,7 +170,7 @@ def _arm(view: _View) -> Iterator[Finding]:
         yield view.finding("warning", "arm-inferred", message, "keep it in view", int(np.argmax(guessed)))
 
 
-def _hand(view: _View) -> Iterator[Finding]:
+def _hand(view: _View) -> Iterator[RecordingIssue]:
     lost = view.confidence[:, [2, 4, 5]].min(axis=1) < 1.0
     if lost.mean() > _HAND_LOST:
         message = f"wrist, hand tip and thumb are not all tracked in {100 * lost.mean():.0f} % of the frames; the tool "
@@ -178,7 +178,7 @@ def _hand(view: _View) -> Iterator[Finding]:
         yield view.finding("note", "hand-lost", message, "use orientation 'fixed', or spread the thumb")
 
 
-def _limbs(view: _View) -> Iterator[Finding]:
+def _limbs(view: _View) -> Iterator[RecordingIssue]:
     tracked = view.points[view.confidence[:, :3].min(axis=1) >= 1.0, :3]
     if len(tracked) < _FEW:
         return
@@ -194,7 +194,7 @@ def _limbs(view: _View) -> Iterator[Finding]:
             yield view.finding("warning", "limb-length", message, "more light, or turn to the sensor")
 
 
-def _sides(view: _View) -> Iterator[Finding]:
+def _sides(view: _View) -> Iterator[RecordingIssue]:
     memory = SideMemory()
     first: int | None = None
     for i, skeleton in enumerate(view.skeletons):

@@ -1,37 +1,138 @@
-"""KinectV2Source: skeletons of a Kinect v2, by its driver on Windows; AzureKinectSource is named here too."""
+"""Kinect v2 and Azure Kinect: cameras whose own drivers track bodies."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
+import time as clock
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from imitarm.capture.body_camera import INSTEAD, BodyCamera
-from imitarm.capture.kinect_azure import AzureKinectSource
-from imitarm.capture.skeleton import JOINTS, HandState, Skeleton
-from imitarm.errors import InputError
+from imitarm.capture.skeleton import JOINTS, SIDES, HandState, Skeleton, SkeletonSource, Tracking
+from imitarm.errors import InputError, TaskFailedError
 
-__all__ = ["AzureKinectSource", "KinectV2Source"]
+INSTEAD = (
+    "without it: record elsewhere as a table of the Kinect SDK and open the file, receive udp:PORT from a machine that "
+    "has the camera, or use webcam:NUMBER or video:FILE"
+)
+"""What to do instead when a camera can't be opened."""
 
-_NEEDED = (
+_SILENT = 3.0  # [s] without a frame: the camera is gone, since it sends frames with or without a person
+_LONGEST_WAIT = 0.5  # [s] for one call of the driver, so that Ctrl-C is noticed
+
+
+class BodyCamera(SkeletonSource):
+    """A camera whose driver delivers frames of all bodies in view.
+
+    Attributes:
+        name: for messages.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: deque[Skeleton] = deque()
+        self._over, self._silent = False, 0.0
+        self._numbers: dict[int, int] = {}
+
+    @abstractmethod
+    def _frame(self, timeout: float) -> list[Skeleton] | None:
+        """Return all bodies of the next frame, or None when none came within ``timeout`` seconds.
+
+        Raises:
+            TaskFailedError: when the driver reports a failure.
+        """
+
+    def _release(self) -> None:
+        """Release the device."""
+
+    @property
+    def over(self) -> bool:
+        """Whether the source is closed, or the camera gone."""
+        return self._over
+
+    def close(self) -> None:
+        """Release the camera; a second call does nothing."""
+        if not self._over:
+            self._over = True
+            self._release()
+
+    def read(self, timeout: float = 1.0) -> Skeleton | None:
+        """Return the next skeleton, or None when none came within ``timeout`` seconds or the source is over.
+
+        Raises:
+            TaskFailedError: when the driver fails, or no frame came for 3 s: the camera was unplugged.
+        """
+        until = clock.monotonic() + timeout
+        while not self._over and not self._waiting:
+            began = clock.monotonic()
+            if not self._take(min(max(until - began, 0.0), _LONGEST_WAIT)):
+                self._silent += clock.monotonic() - began
+                if self._silent > _SILENT:
+                    raise self._failed(f"no frames for {_SILENT:g} s; is the camera still plugged in?")
+            if clock.monotonic() >= until:
+                break
+        return self._waiting.popleft() if self._waiting and not self._over else None
+
+    def _take(self, timeout: float) -> bool:
+        """Fetch the next frame; return whether there was one."""
+        bodies = self._frame(timeout)
+        if bodies is None:
+            return False
+        self._silent = 0.0
+        self._waiting.extend(bodies)
+        return True
+
+    def _wait_for_first(self, seconds: float, missing: str) -> None:
+        """Wait for the first frame of all.
+
+        Raises:
+            InputError: when none came within ``seconds``, or the driver fails; the camera is released.
+        """
+        until = clock.monotonic() + seconds
+        try:
+            while not self._take(_LONGEST_WAIT):
+                if clock.monotonic() >= until:
+                    raise InputError(f"{self.name}: no frame within {seconds:g} s; {missing}; {INSTEAD}")
+        except TaskFailedError as error:
+            raise InputError(f"{error}; {missing}; {INSTEAD}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _number(self, driver_id: int) -> int:
+        """Return the person for a driver's number: 0 for the first who was seen, and so on."""
+        return self._numbers.setdefault(int(driver_id), len(self._numbers))
+
+    def _failed(self, why: str) -> TaskFailedError:
+        """Close the camera and return the error to raise."""
+        self.close()
+        return TaskFailedError(f"{self.name}: {why}")
+
+
+# --- Kinect v2
+
+_V2_NEEDS = (
     "a Kinect v2 needs 64-bit Windows, the Kinect for Windows SDK 2.0, a USB 3 port, and the package kinect-next "
     "(pip install kinect-next)"
 )
-_START = 10.0  # [s] in which the first frame must come: a cold camera takes 1 to 3
+_V2_START = 10.0  # [s] within which the first frame must come: a cold camera takes 1 to 3
 
 
 class KinectV2Source(BodyCamera):
-    """All persons before a Kinect v2, with the states of their hands.
+    """All persons in front of a Kinect v2, with the states of their hands.
 
-    The SDK's frame and its 25 joints are ours as they are. A hand's state counts when the SDK is sure of it. Times are
-    the sensor's own clock.
+    Coordinate frame and joints are those of the SDK. A hand state is used when the SDK reports high confidence. Times
+    are those of the sensor's clock.
 
-    It follows the documentation of `kinect-next` 3.0 and has not met a device yet.
+    Written after the documentation of `kinect-next` 3.0; not yet tested on a device.
 
     Raises:
-        InputError: when driver or camera is missing; the message says what, and what else can be done.
-        TaskFailedError: from :meth:`read`, when the camera goes.
+        InputError: when driver or camera is missing; the message says which, and what to do.
+        TaskFailedError: from :meth:`read`, when the camera is gone.
     """
 
     name = "kinect2"
@@ -41,12 +142,12 @@ class KinectV2Source(BodyCamera):
         try:
             self._driver: Any = importlib.import_module("kinect_next")
         except ImportError as error:
-            raise InputError(f"{self.name}: there is no driver ({error}); {_NEEDED}; {INSTEAD}") from error
+            raise InputError(f"{self.name}: there is no driver ({error}); {_V2_NEEDS}; {INSTEAD}") from error
         try:
             self._sensor = self._driver.KinectSensor(self._driver.StreamType.BODY)
         except (self._driver.KinectError, OSError) as error:
-            raise InputError(f"{self.name}: can't be opened ({error}); {_NEEDED}; {INSTEAD}") from error
-        self._wait_for_first(_START, "is the camera plugged in, with its power supply")
+            raise InputError(f"{self.name}: can't be opened ({error}); {_V2_NEEDS}; {INSTEAD}") from error
+        self._wait_for_first(_V2_START, "is the camera plugged in, with its power supply")
 
     def _frame(self, timeout: float) -> list[Skeleton] | None:
         try:
@@ -59,7 +160,7 @@ class KinectV2Source(BodyCamera):
         return [self._skeleton(time, body) for body in frames.tracked_bodies]
 
     def _skeleton(self, time: float, body: Any) -> Skeleton:
-        joints = [body.joints[i] for i in range(len(JOINTS))]  # the SDK's order is ours
+        joints = [body.joints[i] for i in range(len(JOINTS))]  # in the order of JOINTS
         return Skeleton(
             time,
             np.array([(joint.position.x, joint.position.y, joint.position.z) for joint in joints]),
@@ -75,3 +176,157 @@ class KinectV2Source(BodyCamera):
 
     def _release(self) -> None:
         self._sensor.close()
+
+
+# --- Azure Kinect
+
+_AZURE_NEEDS = (
+    "an Azure Kinect needs the Azure Kinect Sensor SDK 1.4, the Body Tracking SDK 1.1, and the package pykinect-azure "
+    "(pip install pykinect-azure)"
+)
+_AZURE_START = 40.0  # [s] within which the first frame must come: the tracker loads its network first
+_N_JOINTS = 32
+_TRACKING = np.array([Tracking.LOST, Tracking.INFERRED, Tracking.TRACKED, Tracking.TRACKED], dtype=np.int8)
+
+
+def _joint_indices() -> tuple[tuple[int, ...], ...]:
+    """Return for each of the 25 joints the SDK's joints whose middle it is."""
+    named: dict[str, tuple[int, ...]] = {"spine_base": (0,), "spine_mid": (1,), "spine_shoulder": (4, 11)}
+    named |= {"neck": (3,), "head": (26,)}  # spine_shoulder: between the clavicles
+    arm = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
+    for side, first_arm, first_leg in zip(SIDES, (5, 12), (18, 22), strict=True):
+        named |= {f"{part}_{side}": (first_arm + i,) for i, part in enumerate(arm)}
+        named |= {f"{part}_{side}": (first_leg + i,) for i, part in enumerate(("hip", "knee", "ankle", "foot"))}
+    return tuple(named[joint] for joint in JOINTS)
+
+
+_FROM = _joint_indices()
+
+
+class AzureKinectSource(BodyCamera):
+    """All persons in front of an Azure Kinect.
+
+    The SDK's 32 joints are converted to the 25 of the Kinect v2, and the depth camera's frame (x right, y down,
+    millimetres) to that of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK can't tell open from closed hands, so
+    hand states are unknown. Times are those of the device's clock.
+
+    `pykinect-azure` ends the program when the SDK fails; this class raises an error instead. Frames are fetched by the
+    C functions that it wraps, because these distinguish a late frame from a failure.
+
+    Written after the documentation of the SDKs; not yet tested on a device.
+
+    Raises:
+        InputError: when driver, SDK or camera is missing; the message says which, and what to do.
+        TaskFailedError: from :meth:`read`, when the camera is gone.
+    """
+
+    name = "azure"
+
+    def __init__(self) -> None:
+        super().__init__()
+        try:
+            driver: Any = importlib.import_module("pykinect_azure")
+            self._k4a: Any = importlib.import_module("pykinect_azure.k4a._k4a")
+            self._k4abt: Any = importlib.import_module("pykinect_azure.k4abt._k4abt")
+        except ImportError as error:
+            raise InputError(f"{self.name}: there is no driver ({error}); {_AZURE_NEEDS}; {INSTEAD}") from error
+        self._device: Any = None
+        self._tracker: Any = None
+        self._pending = False  # an image was given to the tracker, its bodies have not come yet
+        try:
+            self._opened(driver)
+        except BaseException:
+            self.close()
+            raise
+        self._wait_for_first(_AZURE_START, "does the body tracking SDK find its graphics card or, slower, its CPU mode")
+
+    def _opened(self, driver: Any) -> None:
+        self._kept_alive("find the SDKs", lambda: driver.initialize_libraries(track_body=True))
+        if self._k4a.k4a_device_get_installed_count() < 1:
+            raise InputError(f"{self.name}: no Azure Kinect is plugged in; {_AZURE_NEEDS}; {INSTEAD}")
+        settings = driver.Configuration()
+        settings.color_resolution = driver.K4A_COLOR_RESOLUTION_OFF
+        settings.depth_mode = driver.K4A_DEPTH_MODE_NFOV_UNBINNED
+        settings.camera_fps = driver.K4A_FRAMES_PER_SECOND_30
+        self._device = self._kept_alive("open the camera", lambda: driver.start_device(config=settings))
+        self._tracker = self._kept_alive("start body tracking", driver.start_body_tracker)
+
+    def _kept_alive(self, what: str, call: Callable[[], Any]) -> Any:
+        """Call the driver and raise an error when it fails, where it would print a message and end the program."""
+        said = io.StringIO()
+        try:
+            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+                return call()
+        except (SystemExit, OSError, AttributeError) as error:
+            lines = said.getvalue().strip().splitlines()
+            why = lines[0] if lines else str(error)
+            raise InputError(f"{self.name}: could not {what} ({why}); {_AZURE_NEEDS}; {INSTEAD}") from error
+
+    def _frame(self, timeout: float) -> list[Skeleton] | None:
+        wait = max(int(1000.0 * timeout), 1)
+        if not self._pending and not self._give(wait):
+            return None
+        frame = self._k4abt.k4abt_frame_t()
+        if not self._came(self._k4abt.k4abt_tracker_pop_result(self._tracker.handle(), frame, wait), "track bodies"):
+            return None
+        self._pending = False
+        try:
+            return self._bodies(frame)
+        finally:
+            self._k4abt.k4abt_frame_release(frame)
+
+    def _give(self, wait: int) -> bool:
+        """Give the next image to the tracker; return whether there was one in time."""
+        capture = self._k4a.k4a_capture_t()
+        result = self._k4a.k4a_device_get_capture(self._device.handle(), capture, wait)
+        if not self._came(result, "get an image; is the camera still plugged in?"):
+            return False
+        try:
+            result = self._k4abt.k4abt_tracker_enqueue_capture(self._tracker.handle(), capture, wait)
+        finally:
+            self._k4a.k4a_capture_release(capture)
+        self._pending = self._came(result, "hand an image to body tracking")
+        return self._pending
+
+    def _came(self, result: int, what: str) -> bool:
+        """Return whether a call succeeded; False when it timed out.
+
+        Raises:
+            TaskFailedError: when the driver reports a failure.
+        """
+        if result == self._k4a.K4A_WAIT_RESULT_TIMEOUT:
+            return False
+        if result != self._k4a.K4A_WAIT_RESULT_SUCCEEDED:
+            raise self._failed(f"the SDK could not {what}")
+        return True
+
+    def _bodies(self, frame: Any) -> list[Skeleton]:
+        time = 1e-6 * self._k4abt.k4abt_frame_get_device_timestamp_usec(frame)
+        found = []
+        for i in range(self._k4abt.k4abt_frame_get_num_bodies(frame)):
+            body = self._k4abt.k4abt_skeleton_t()
+            if self._k4abt.k4abt_frame_get_body_skeleton(frame, i, body) != self._k4a.K4A_WAIT_RESULT_SUCCEEDED:
+                continue
+            number = self._number(self._k4abt.k4abt_frame_get_body_id(frame, i))
+            found.append(_skeleton(time, body, number))
+        return found
+
+    def _release(self) -> None:
+        for part, end in ((self._tracker, "destroy"), (self._device, "close")):
+            if part is not None:
+                with contextlib.suppress(SystemExit, OSError):
+                    getattr(part, end)()
+
+
+def _skeleton(time: float, body: Any, person: int) -> Skeleton:
+    """Return a body of the SDK as a skeleton."""
+    joints = [body.joints[i] for i in range(_N_JOINTS)]
+    points = np.array([(j.position.xyz.x, j.position.xyz.y, j.position.xyz.z) for j in joints])
+    known = _TRACKING[np.clip([int(j.confidence_level) for j in joints], 0, 3)]
+    points = points * (-0.001, -0.001, 0.001)  # from mm, x right and y down, to m, x left and y up
+    return Skeleton(
+        time,
+        np.array([points[list(index)].mean(axis=0) for index in _FROM]),
+        np.array([known[list(index)].min() for index in _FROM], dtype=np.int8),
+        person=person,
+    )

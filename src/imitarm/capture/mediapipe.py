@@ -1,53 +1,230 @@
-"""MediaPipeSource: skeletons of a person in a video or before a webcam, by MediaPipe in a process of its own."""
+r"""MediaPipe: skeletons of a person in a video or in front of a webcam, and how its 33 landmarks become a Skeleton.
+
+MediaPipe gives each landmark twice: in the image, and in metres relative to the middle of the hips (x to the image's
+right, y down, z away), as seen by a camera that looks straight at the person. The sensor frame of
+:class:`~imitarm.capture.skeleton.Skeleton` (x to the sensor's left, y up, z away) is that one rotated by 180 degrees
+about z.
+"""
 
 from __future__ import annotations
 
 import importlib.resources
+import math
 import time as clock
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from imitarm.capture.line_process import LineProcess
-from imitarm.capture.mediapipe_environment import find_python
-from imitarm.capture.mediapipe_landmarks import FIELD_OF_VIEW, N_LANDMARKS, LandmarkConverter, Landmarks
-from imitarm.capture.skeleton import Skeleton, SkeletonSource
+from imitarm.capture.mediapipe_environment import LineProcess, find_python
+from imitarm.capture.skeleton import JOINTS, SIDES, Skeleton, SkeletonSource, Tracking
 from imitarm.errors import InputError, TaskFailedError
 
-PROTOCOL = 1
-"""Version of the lines that are spoken; :mod:`imitarm.capture.mediapipe_worker` has them."""
+Array = NDArray[np.float64]
 
-_START = 60.0  # [s] in which the first picture must be through: the first start of all reads 400 MB
-_SILENT = 20.0  # [s] after which a process without a word hangs
-_TICK = 0.01  # [s] more, so that the time is over and not just about
-_KEPT = 64  # pictures of a video that are tracked ahead
+N_LANDMARKS = 33
+FIELD_OF_VIEW = 60.0  # [deg] of the longer side of the image: phones and webcams have 55 to 70
+TRACKED, INFERRED = 0.5, 0.1  # least visibility of a landmark whose joint is tracked, inferred
+DEPTH_MEMORY = 0.1  # [s] over which the distance is averaged
+_GAP = 0.5  # [s] after a longer gap the earlier distance is not used
+_NEAREST, _FARTHEST = 0.3, 15.0  # [m] plausible distances of a person
+_TIP = 1.8  # distance from wrist to finger tip over that from wrist to knuckles
+_FITTED = np.array([11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28])  # shoulders to wrists, hips to ankles
+_ROUNDS = 3  # place and line of sight depend on each other: three rounds make them agree to a millimetre
+_LEAST_WEIGHT = 2.0  # sum of the visibilities needed to locate a person
+
+
+def _joint_weights() -> Array:
+    """Return the weights that make joints from landmarks, joints = weights @ landmarks, shape (25, 33)."""
+    mixed: dict[str, dict[int, float]] = {
+        "spine_base": {23: 0.5, 24: 0.5},
+        "spine_mid": {11: 0.25, 12: 0.25, 23: 0.25, 24: 0.25},
+        "spine_shoulder": {11: 0.5, 12: 0.5},
+        "neck": {11: 1 / 3, 12: 1 / 3, 7: 1 / 6, 8: 1 / 6},  # a third of the way from the shoulders to the head
+        "head": {7: 0.5, 8: 0.5},  # between the ears
+    }
+    for i, side in enumerate(SIDES):
+        wrist, little, index = 15 + i, 17 + i, 19 + i
+        named = {"shoulder": 11, "elbow": 13, "wrist": 15, "thumb": 21, "hip": 23, "knee": 25, "ankle": 27, "foot": 31}
+        mixed |= {f"{part}_{side}": {first + i: 1.0} for part, first in named.items()}
+        mixed[f"hand_{side}"] = {wrist: 0.2, little: 0.4, index: 0.4}  # the palm, short of the knuckles
+        mixed[f"hand_tip_{side}"] = {wrist: 1.0 - _TIP, little: 0.5 * _TIP, index: 0.5 * _TIP}
+    weights = np.zeros((len(JOINTS), N_LANDMARKS))
+    for row, name in enumerate(JOINTS):
+        for landmark, weight in mixed[name].items():
+            weights[row, landmark] = weight
+    return weights
+
+
+_WEIGHTS = _joint_weights()
+_USED = _WEIGHTS != 0.0
+_TO_SENSOR = np.array([-1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """What MediaPipe found in one image.
+
+    Attributes:
+        time: of the image [s].
+        world: relative to the middle of the hips, x to the image's right, y down, z away, shape (33, 3) [m].
+        image: place in the image, 0 to 1 from the left and from the top, shape (33, 2); outside when not in view.
+        visibility: of each landmark, 0 to 1, shape (33,).
+
+    Raises:
+        InputError: when a shape is wrong or a value is not finite.
+    """
+
+    time: float
+    world: Array
+    image: Array
+    visibility: Array
+
+    def __post_init__(self) -> None:
+        n = N_LANDMARKS
+        if self.world.shape != (n, 3) or self.image.shape != (n, 2) or self.visibility.shape != (n,):
+            raise InputError(f"Landmarks: there must be {n} of them, with 3, 2 and 1 numbers each")
+        finite = all(np.isfinite(part).all() for part in (self.time, self.world, self.image, self.visibility))
+        if not finite:
+            raise InputError("Landmarks: all numbers must be finite")
+
+
+class LandmarkConverter:
+    r"""Converts landmarks to skeletons.
+
+    **Where the person stands.** MediaPipe's metres are relative to the hips, so a hip that moves would move a hand that
+    is at rest. The translation t of the hips is the one for which landmarks :math:`X_j, Y_j, Z_j` and image agree. With
+    image coordinates :math:`u, v` from the middle, in units of the focal length, and visibility :math:`k`,
+
+    .. math:: \min_t \sum_j k_j^2 \left( (X_j + t_x - u_j (Z_j + t_z))^2 + (Y_j + t_y - v_j (Z_j + t_z))^2 \right)
+
+    which is linear in t. Across the line of sight t is accurate to centimetres. Along it, t is as accurate as
+    MediaPipe's metres and the field of view, and noisy; so the distance is averaged over 0.1 s before x and y are
+    fitted again. All joints move by the same t, so positions relative to other joints do not change.
+
+    **Perspective.** MediaPipe's metres are those of a camera that looks straight at the person. They are rotated by the
+    angle between the camera's axis and the line of sight to the hips.
+
+    Args:
+        size: width and height of the image [pixels]; only their ratio matters.
+        field_of_view: of the longer side [deg].
+
+    Raises:
+        InputError: when the size is not positive, or the field of view is not between 10 and 150 degrees.
+    """
+
+    def __init__(self, size: tuple[int, int], field_of_view: float = FIELD_OF_VIEW) -> None:
+        if not (min(size) > 0 and 10.0 <= field_of_view <= 150.0):
+            raise InputError(
+                f"LandmarkConverter: needs an image size and a field of view of 10 to 150 degrees, got {size} and "
+                f"{field_of_view!r}"
+            )
+        focal = 0.5 * max(size) / math.tan(math.radians(0.5 * field_of_view))
+        self._scale = np.array(size, dtype=float) / focal
+        self._distance: tuple[float, float] | None = None  # time and t_z of the image before
+
+    def skeleton(self, landmarks: Landmarks) -> Skeleton | None:
+        """Return the skeleton; None when the image shows too little of the person to locate them.
+
+        A joint is tracked, inferred or lost according to the least visibility of the landmarks that it is made of;
+        outside the image it is inferred at best. MediaPipe can't tell open from closed hands, so hand states are
+        unknown.
+        """
+        uv = (landmarks.image - 0.5) * self._scale
+        world, place = landmarks.world, None
+        for _ in range(_ROUNDS):
+            place = self._fit(world, uv, landmarks.visibility)
+            if place is None:
+                self._distance = None
+                return None
+            world = landmarks.world @ _rotation_towards(place).T
+        assert place is not None
+        depth = self._averaged(landmarks.time, place[2])
+        weight = np.square(landmarks.visibility[_FITTED])[:, None]
+        seen = uv[_FITTED] * (world[_FITTED, 2:] + depth) - world[_FITTED, :2]
+        across = (weight * seen).sum(axis=0) / weight.sum()
+        positions = _WEIGHTS @ (world + np.append(across, depth))
+        return Skeleton(landmarks.time, positions * _TO_SENSOR, _tracking(landmarks))
+
+    @staticmethod
+    def _fit(world: Array, uv: Array, visibility: Array) -> Array | None:
+        """Return the translation from the hips to the camera, shape (3,) [m]; None when there is none that fits."""
+        weight = visibility[_FITTED]
+        if weight.sum() < _LEAST_WEIGHT:
+            return None
+        u, x = uv[_FITTED], world[_FITTED]
+        n = len(_FITTED)
+        rows, sides = np.zeros((2, n, 3)), np.empty((2, n))
+        for axis in (0, 1):
+            rows[axis, :, axis] = weight
+            rows[axis, :, 2] = -weight * u[:, axis]
+            sides[axis] = weight * (u[:, axis] * x[:, 2] - x[:, axis])
+        place = np.linalg.lstsq(rows.reshape(-1, 3), sides.ravel(), rcond=None)[0]
+        if not _NEAREST <= place[2] <= _FARTHEST:
+            return None
+        return np.asarray(place)
+
+    def _averaged(self, time: float, depth: float) -> float:
+        """Return the distance averaged over the last images [m]."""
+        if self._distance is not None and 0.0 < time - self._distance[0] <= _GAP:
+            before, past = self._distance
+            depth = past + (1.0 - math.exp(-(time - before) / DEPTH_MEMORY)) * (depth - past)
+        self._distance = (time, depth)
+        return depth
+
+
+def _rotation_towards(place: Array) -> Array:
+    """Return the rotation from the camera's axis to the line of sight to a place, shape (3, 3)."""
+    x, y, z = place / math.sqrt(float(place @ place))
+    cross = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + z))
+
+
+def _tracking(landmarks: Landmarks) -> NDArray[np.int8]:
+    """Return the tracking state of each joint, shape (25,)."""
+    inside = ((landmarks.image >= 0.0) & (landmarks.image <= 1.0)).all(axis=1)
+    known = (landmarks.visibility >= INFERRED).astype(np.int8)
+    known += (landmarks.visibility >= TRACKED) & inside
+    return np.asarray(np.where(_USED, known, Tracking.TRACKED).min(axis=1), dtype=np.int8)
+
+
+# --- the process that runs MediaPipe
+
+PROTOCOL = 1
+"""Version of the lines of text; :mod:`imitarm.capture.mediapipe_worker` describes them."""
+
+_START = 60.0  # [s] within which the first image must be processed: the very first start reads 400 MB
+_SILENT = 20.0  # [s] without a line: the process hangs
+_TICK = 0.01  # [s] added to a wait, so that the time is certainly over
+_KEPT = 64  # images of a video that are processed ahead
 _NUMBERS = 6 * N_LANDMARKS
-_ANEW = "make its environment anew: python -m imitarm.capture.mediapipe_environment"
+_ANEW = "rebuild its environment: python -m imitarm.capture.mediapipe_environment"
 _CHATTER = r"[IW]\d{4} |INFO: |WARNING: All log messages"  # what MediaPipe logs when all is well
 
 
 class MediaPipeSource(SkeletonSource):
-    """Skeletons of the person in a video, or before a webcam.
+    """Skeletons of the person in a video, or in front of a webcam.
 
     MediaPipe tracks one person. It runs in another process, in another environment (see
-    :mod:`imitarm.capture.mediapipe_environment`), and sends its landmarks as lines of text; what it makes of them is
-    said in :class:`LandmarkConverter`. Times are the video's own, from zero; a webcam's are those of the monotonic
-    clock when a picture came.
+    :mod:`imitarm.capture.mediapipe_environment`), and sends its landmarks as lines of text, which
+    :class:`LandmarkConverter` turns into skeletons. Times are the video's own, from zero; for a webcam, the monotonic
+    clock when an image came.
 
     Args:
         film: a video file, or the number of a webcam.
-        realtime: give a video's skeletons not before their times; else as fast as they are tracked.
-        field_of_view: of the longer side of the picture [deg].
-        python: that has MediaPipe; None: the one that is found.
+        realtime: give a video's skeletons no earlier than the video would show them; else as fast as they are tracked.
+        field_of_view: of the longer side of the image [deg].
+        python: interpreter that has MediaPipe; None: :func:`~imitarm.capture.mediapipe_environment.find_python`.
 
     Attributes:
-        pictures: how many were looked at so far.
+        images: number of images processed so far.
 
     Raises:
-        InputError: when MediaPipe is not there, the file is no video, or there is no such webcam.
-        TaskFailedError: from :meth:`read` too: when MediaPipe's process dies, hangs or speaks nonsense, the video is
-            cut off, or the webcam is gone. What came before is good.
+        InputError: when MediaPipe is not installed, the file is not a video, or there is no such webcam.
+        TaskFailedError: from :meth:`read`, when MediaPipe's process dies, hangs or sends invalid lines, the video is
+            cut off, or the webcam is gone. Skeletons that came before are valid.
     """
 
     def __init__(
@@ -60,12 +237,12 @@ class MediaPipeSource(SkeletonSource):
     ) -> None:
         webcam = isinstance(film, int)
         if isinstance(film, int):
-            self.name = self._said = f"webcam:{film}"
+            self.name = self._shown_name = f"webcam:{film}"
             what = ["webcam", str(film)]
         else:
-            self.name, self._said = f"video:{Path(film).name}", str(film)
+            self.name, self._shown_name = f"video:{Path(film).name}", str(film)
             what = ["video", str(Path(film).resolve())]
-        self.pictures = 0
+        self.images = 0
         self._over, self._silent, self._last = False, 0.0, -np.inf
         self._realtime, self._began = realtime and not webcam, -np.inf
         self._next: Skeleton | None = None
@@ -102,7 +279,7 @@ class MediaPipeSource(SkeletonSource):
         while not self._over:
             if self._next is None:
                 line = self._line(max(until - clock.monotonic(), 0.0))
-                self._next = None if line is None else self._understood(line)
+                self._next = None if line is None else self._parsed(line)
             if self._next is not None and self._due(self._next.time, until):
                 skeleton, self._next = self._next, None
                 return skeleton
@@ -111,7 +288,7 @@ class MediaPipeSource(SkeletonSource):
         return None
 
     def _due(self, time: float, until: float) -> bool:
-        """Wait until a skeleton's time has come, if that is asked for; False when that is later than ``until``."""
+        """In real time wait until a skeleton is due; return False when that is later than ``until``."""
         if not self._realtime:
             return True
         if self._began == -np.inf:
@@ -130,33 +307,33 @@ class MediaPipeSource(SkeletonSource):
         if line is not None:
             self._silent = 0.0
             return line.split(b" ")
-        self._silent += clock.monotonic() - before  # only waiting counts: nobody may have asked for long
+        self._silent += clock.monotonic() - before  # only waiting counts: the caller may have been busy elsewhere
         if self._silent > _SILENT:
-            raise self._failed(f"MediaPipe's process has said nothing for {_SILENT:g} s; it was ended")
+            raise self._failed(f"MediaPipe's process has sent nothing for {_SILENT:g} s; it was ended")
         return None
 
     def _greeting(self, python: Path) -> tuple[int, int]:
-        """Return width and height of the pictures, which is what the process says first."""
+        """Return width and height of the images, which the process sends first."""
         until = clock.monotonic() + _START
         try:
             line = self._process.line(_START)
         except EOFError:
             raise InputError(
-                f"{self._said}: MediaPipe does not start with {python} ({self._process.ended()}); {_ANEW}"
+                f"{self._shown_name}: MediaPipe does not start with {python} ({self._process.ended()}); {_ANEW}"
             ) from None
         if line is None or clock.monotonic() > until:
-            raise InputError(f"{self._said}: no picture within {_START:g} s; MediaPipe's process was ended")
+            raise InputError(f"{self._shown_name}: no image within {_START:g} s; MediaPipe's process was ended")
         words = line.split(b" ")
         if words[0] == b"error":
-            raise InputError(f"{self._said}: {_text(words[1:])}")
+            raise InputError(f"{self._shown_name}: {_text(words[1:])}")
         if words[:2] != [b"imitarm-mediapipe", str(PROTOCOL).encode()] or len(words) != 4:
-            raise InputError(f"{python} does not speak as MediaPipe's process should: {_text(words)[:80]!r}")
+            raise InputError(f"{python} does not send what MediaPipe's process should: {_text(words)[:80]!r}")
         if not (words[2].isdigit() and words[3].isdigit()):
-            raise InputError(f"{python} gives no size of the pictures: {_text(words)[:80]!r}")
+            raise InputError(f"{python} gives no image size: {_text(words)[:80]!r}")
         return int(words[2]), int(words[3])
 
-    def _understood(self, words: list[bytes]) -> Skeleton | None:
-        """Return the skeleton in a line, None when there is nobody in the picture; know when it is the last."""
+    def _parsed(self, words: list[bytes]) -> Skeleton | None:
+        """Return the skeleton in a line, None when nobody is in the image; close after the last line."""
         kind = words[0]
         if kind == b"error":
             raise self._failed(_text(words[1:]))
@@ -169,9 +346,9 @@ class MediaPipeSource(SkeletonSource):
             numbers = np.empty(0)
         n = {b"frame": 1 + _NUMBERS, b"nobody": 1}.get(kind, -1)
         if len(numbers) != n or not np.isfinite(numbers).all() or numbers[0] <= self._last:
-            raise self._failed(f"MediaPipe's process sent what is no line of landmarks: {_text(words)[:80]!r}")
+            raise self._failed(f"MediaPipe's process sent an invalid line: {_text(words)[:80]!r}")
         self._last = float(numbers[0])
-        self.pictures += 1
+        self.images += 1
         if kind == b"nobody":
             return None
         each = numbers[1:].reshape(N_LANDMARKS, 6)
@@ -180,7 +357,7 @@ class MediaPipeSource(SkeletonSource):
     def _failed(self, why: str) -> TaskFailedError:
         """Close, and return the error that says why."""
         self.close()
-        return TaskFailedError(f"{self._said}: {why}; {self.pictures} pictures were good")
+        return TaskFailedError(f"{self._shown_name}: {why}; {self.images} images were processed before")
 
 
 def _text(words: list[bytes]) -> str:

@@ -1,26 +1,34 @@
-"""Where MediaPipe is: an environment of its own, found or made.
+"""MediaPipe's own Python environment: how it is found, made, and run as a process that writes lines of text.
 
-MediaPipe 0.10.21, the last version that brings its models along, needs numpy below 2; imitarm needs numpy 2. So it
-lives in another environment, which need not know imitarm::
+MediaPipe 0.10.21, the last version that includes its models, needs numpy below 2; imitarm needs numpy 2. So MediaPipe
+is installed in another environment, without imitarm::
 
     python -m imitarm.capture.mediapipe_environment            # makes it where imitarm looks for it
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tempfile
+import threading
+import time as clock
+import weakref
+from collections import deque
 from pathlib import Path
+from typing import IO
 
 from imitarm.errors import ImitarmError, InputError, TaskFailedError
 
 VARIABLE = "IMITARM_MEDIAPIPE_PYTHON"
-"""Environment variable that names the Python that has MediaPipe; it goes before every folder."""
+"""Environment variable that names the Python that has MediaPipe; it takes precedence over the folders."""
 
 VERSION = "0.10.21"
-VERSIONS = ((3, 9), (3, 12))  # of Python, for which that version exists
+VERSIONS = ((3, 9), (3, 12))  # versions of Python for which it exists
 REQUIREMENTS = (
     "numpy<2",
     "opencv-python-headless>=4.9,<4.12",  # headless: no libGL; the next one needs numpy 2
@@ -30,24 +38,24 @@ REQUIREMENTS = (
     "flatbuffers>=2.0",
     "matplotlib",
 )
-"""What tracking a pose needs. MediaPipe also names jax, sentencepiece and sounddevice, which are for other tasks, and
-an OpenCV with windows; it is installed without its own list."""
+"""What pose tracking needs. MediaPipe also requires jax, sentencepiece and sounddevice, which are for other tasks, and
+an OpenCV with windows; so it is installed without its requirements."""
 
-_STAMP = "imitarm-mediapipe.txt"  # is written last: without it the environment is half made
+_STAMP = "imitarm-mediapipe.txt"  # written last: without it the environment is incomplete
 _COMMAND = "-m imitarm.capture.mediapipe_environment"
 _TRIAL = "import cv2, mediapipe; mediapipe.solutions.pose.Pose(model_complexity=1).close()"
 
 
 def find_python() -> Path:
-    """Return the Python that has MediaPipe: the one that ``IMITARM_MEDIAPIPE_PYTHON`` names, else of a folder.
+    """Return the Python that has MediaPipe: ``IMITARM_MEDIAPIPE_PYTHON``, else that of the first of :func:`folders`.
 
     Raises:
-        InputError: when there is none; the message says how to make it.
+        InputError: when there is none; the message says how to make the environment.
     """
     named = os.environ.get(VARIABLE)
     if named:
         if not Path(named).is_file():
-            raise InputError(f"{VARIABLE} names {named}, which is no file; name a Python that has mediapipe {VERSION}")
+            raise InputError(f"{VARIABLE}: {named} is not a file; name a Python that has mediapipe {VERSION}")
         return Path(named)
     for folder in folders():
         if (folder / _STAMP).is_file():
@@ -59,7 +67,7 @@ def find_python() -> Path:
 
 
 def folders() -> list[Path]:
-    """Return where it is looked for, and made in the first: beside a checkout, then where a user's own data are."""
+    """Return the folders searched: in a checkout, then in the user's data; the environment is made in the first."""
     checkout = Path(__file__).resolve().parents[3]
     beside = [checkout / ".venv-mediapipe"] if (checkout / "pyproject.toml").is_file() else []
     if sys.platform == "win32":
@@ -77,20 +85,20 @@ def python_of(folder: Path) -> Path:
 
 
 def make(folder: Path) -> Path:
-    """Make the environment, anew if it is there; return its Python.
+    """Make the environment, from scratch if it exists; return its Python.
 
     Args:
         folder: to make; nothing else may be in it.
 
     Raises:
-        InputError: when the folder holds something else, or this machine has no Python that fits.
-        TaskFailedError: when a step of it fails; the message ends with what that step said.
+        InputError: when the folder holds something else, or this machine has no suitable Python.
+        TaskFailedError: when a step fails; the message ends with the output of that step.
     """
     if folder.exists() and any(folder.iterdir()) and not (folder / "pyvenv.cfg").is_file():
-        raise InputError(f"{folder}: is there and is no environment of Python; name a new folder")
+        raise InputError(f"{folder}: exists and is not a Python environment; name a new folder")
     python = python_of(folder)
     (folder / _STAMP).unlink(missing_ok=True)
-    _run("make an environment", [fitting_python(), "-m", "venv", "--clear", str(folder)])
+    _run("make an environment", [suitable_python(), "-m", "venv", "--clear", str(folder)])
     install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     _run("fetch mediapipe", [*install, "--no-deps", f"mediapipe=={VERSION}"])
     _run("fetch what mediapipe needs", [*install, *REQUIREMENTS])
@@ -99,7 +107,7 @@ def make(folder: Path) -> Path:
     return python
 
 
-def fitting_python() -> str:
+def suitable_python() -> str:
     """Return a Python for which MediaPipe exists: this one, else one on the path.
 
     Raises:
@@ -127,7 +135,7 @@ def _run(what: str, command: list[str]) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Make the environment in the folder that is named, else where imitarm looks for it; return the exit status."""
+    """Make the environment in the given folder, else where imitarm looks for it; return the exit status."""
     folder = Path(arguments[0]) if arguments else folders()[0]
     try:
         sys.stdout.write(f"made {make(folder)}\n")
@@ -135,6 +143,144 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"error: {error}\n")
         return error.exit_status
     return 0
+
+
+# --- the process
+
+LONGEST = 65536  # [bytes] of a line
+_GRACE = 1.0  # [s] within which the program may end by itself
+_READ, _TAIL = 20000, 600  # [characters] of its last output that are read, and returned
+
+
+class LineProcess:
+    """Another program whose standard output is read line by line, with a timeout.
+
+    The program must end when its standard input ends, so it does not outlive this process even if that is killed.
+    :meth:`close` ends it in any case, and so does deleting this object.
+
+    Args:
+        command: with all its arguments.
+        keep: number of lines that may wait to be read.
+        newest: when more would wait, drop the oldest line, but never the first of all; else the program waits.
+        chatter: regular expression of lines on its standard error to leave out of :meth:`ended`.
+
+    Raises:
+        OSError: when it can't be started.
+    """
+
+    def __init__(
+        self, command: list[str | Path], *, keep: int = 64, newest: bool = False, chatter: str | None = None
+    ) -> None:
+        self._chatter = None if chatter is None else re.compile(chatter)
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (is closed at the end)
+        try:
+            self._process = subprocess.Popen(
+                [str(part) for part in command],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+            )
+        except BaseException:
+            self._errors.close()
+            raise
+        self._lines = _Lines(keep, newest)
+        thread = threading.Thread(target=self._lines.fill, args=(self._process.stdout,), daemon=True)
+        thread.start()
+        self._finish = weakref.finalize(self, _finish, self._process, self._lines, thread, self._errors)
+
+    @property
+    def pid(self) -> int:
+        """Process number."""
+        return self._process.pid
+
+    def line(self, timeout: float) -> bytes | None:
+        """Return the next line without its end, or None when none came within ``timeout`` seconds.
+
+        Raises:
+            EOFError: when there will be no more.
+        """
+        return self._lines.take(timeout)
+
+    def ended(self) -> str:
+        """Wait up to a second for the end; return the exit status and the last output on standard error."""
+        try:
+            status = f"exit status {self._process.wait(_GRACE)}"
+        except subprocess.TimeoutExpired:
+            status = "still running"
+        self._errors.seek(0, 2)
+        self._errors.seek(max(self._errors.tell() - _READ, 0))
+        lines = self._errors.read().decode("utf-8", "replace").splitlines()
+        kept = [line for line in lines if self._chatter is None or not self._chatter.match(line)]
+        said = " ".join(" ".join(kept).split())[-_TAIL:]
+        return f"{status}{': ' + said if said else ''}"
+
+    def close(self) -> None:
+        """End the program; a second call does nothing."""
+        self._finish()
+
+
+class _Lines:
+    """A queue of lines, filled by one thread and emptied by another."""
+
+    def __init__(self, keep: int, newest: bool) -> None:
+        self._waiting: deque[bytes] = deque()
+        self._keep, self._newest = keep, newest
+        self._changed = threading.Condition()
+        self._over = self._stopped = self._begun = False
+
+    def fill(self, pipe: IO[bytes]) -> None:
+        try:
+            while line := pipe.readline(LONGEST):
+                with self._changed:
+                    if self._newest and self._begun and len(self._waiting) >= self._keep:
+                        self._waiting.popleft()
+                    self._changed.wait_for(lambda: self._stopped or len(self._waiting) < self._keep)
+                    if self._stopped:
+                        return
+                    self._waiting.append(line.rstrip(b"\r\n"))
+                    self._changed.notify_all()
+        finally:
+            with self._changed:
+                self._over = True
+                self._changed.notify_all()
+
+    def take(self, timeout: float) -> bytes | None:
+        until = clock.monotonic() + timeout
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._over, max(until - clock.monotonic(), 0.0))
+            if self._waiting:
+                line, self._begun = self._waiting.popleft(), True
+                self._changed.notify_all()
+                return line
+            if self._over:
+                raise EOFError
+            return None
+
+    def stop(self) -> None:
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+
+
+def _finish(process: subprocess.Popen[bytes], lines: _Lines, thread: threading.Thread, errors: IO[bytes]) -> None:
+    """End a process, first by request, then by force, and release everything that belongs to it."""
+    lines.stop()
+    with contextlib.suppress(OSError):
+        assert process.stdin is not None
+        process.stdin.close()
+    try:
+        process.wait(0.2 * _GRACE)
+    except subprocess.TimeoutExpired:
+        process.terminate()
+        try:
+            process.wait(_GRACE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+    thread.join()
+    assert process.stdout is not None
+    process.stdout.close()
+    errors.close()
 
 
 if __name__ == "__main__":

@@ -1,15 +1,15 @@
-"""The process that runs MediaPipe: pictures in, landmarks out as lines of text.
+"""The process that runs MediaPipe: reads images, writes landmarks as lines of text.
 
-It runs on another environment's Python (3.9 to 3.12) that has mediapipe 0.10.21 and no imitarm, so it imports neither
-imitarm nor anything that is not there; :mod:`imitarm.capture.mediapipe` starts it and reads its standard output::
+It runs in another Python environment (3.9 to 3.12) that has mediapipe 0.10.21 but not imitarm, so it must not import
+imitarm. :mod:`imitarm.capture.mediapipe` starts it and reads its standard output::
 
-    imitarm-mediapipe 1 WIDTH HEIGHT          first, once pictures come
-    frame TIME 198 numbers                    33 times: world x y z [m], picture x y (0 to 1), visibility
-    nobody TIME                               a picture without a person
-    end PICTURES                              last, when the video is over
+    imitarm-mediapipe 1 WIDTH HEIGHT          first, with the first image
+    frame TIME 198 numbers                    33 times: world x y z [m], image x y (0 to 1), visibility
+    nobody TIME                               an image without a person
+    end IMAGES                                last, when the video is over
     error TEXT                                last, when it can't go on
 
-TIME is that of the picture: the video's own, or for a webcam the monotonic clock's when the picture came. By hand::
+TIME is that of the image: the video's own time, or for a webcam the monotonic clock when the image came. By hand::
 
     .venv-mediapipe/bin/python -I src/imitarm/capture/mediapipe_worker.py video FILE
 """
@@ -25,13 +25,13 @@ import time
 from typing import Any, Callable, Iterator, TextIO  # noqa: UP035 (runs on Python 3.9 too)
 
 VERSION = 1
-_SILENT = 5.0  # [s] without a picture from a webcam
-_WHOLE = 0.9  # of the pictures that a video announces: the number is an estimate in some kinds of file
-_SLIP = 1e-4  # [s] a picture must be later than the one before by more
+_SILENT = 5.0  # [s] without an image: the webcam is gone
+_WHOLE = 0.9  # least fraction of the announced images: their number is an estimate in some kinds of file
+_SLIP = 1e-4  # [s] each image must be later than the one before by more than this
 
 
 class StopError(Exception):
-    """What can't go on, said in one line."""
+    """A reason to stop, in one line."""
 
 
 def main(arguments: list[str], out: TextIO) -> int:
@@ -40,15 +40,15 @@ def main(arguments: list[str], out: TextIO) -> int:
         if len(arguments) != 2 or arguments[0] not in {"video", "webcam"}:
             raise StopError("expects: video FILE, or webcam NUMBER")
         cv2, pose = _imported("cv2"), _pose(_imported("mediapipe"))
-        pictures = _film(cv2, arguments[1]) if arguments[0] == "video" else _webcam(cv2, int(arguments[1]))
+        images = _film(cv2, arguments[1]) if arguments[0] == "video" else _webcam(cv2, int(arguments[1]))
         count = -1
-        for count, (when, picture) in enumerate(pictures):
+        for count, (when, image) in enumerate(images):
             if count == 0:
-                height, width = picture.shape[:2]
+                height, width = image.shape[:2]
                 _say(out, f"imitarm-mediapipe {VERSION} {width} {height}")
-            _say(out, _line(when, pose.process(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))))
+            _say(out, _line(when, pose.process(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))))
         if count < 0:
-            raise StopError("there is not one picture in it")
+            raise StopError("it holds no image")
         _say(out, f"end {count + 1}")
         return 0
     except StopError as error:
@@ -90,19 +90,19 @@ def _line(when: float, result: Any) -> str:
 
 
 def _film(cv2: Any, path: str) -> Iterator[tuple[float, Any]]:
-    """Give the pictures of a video and their times [s], which always increase."""
+    """Yield the images of a video and their times [s], which always increase."""
     film = cv2.VideoCapture(path)
     if not film.isOpened():
-        raise StopError("is no video that can be read (damaged, cut off, or of an unknown kind)")
+        raise StopError("is not a video that can be read (damaged, cut off, or of an unknown kind)")
     rate, announced = film.get(cv2.CAP_PROP_FPS), film.get(cv2.CAP_PROP_FRAME_COUNT)
     period = 1.0 / rate if 0.5 <= rate <= 1000.0 else None
     last, count = None, 0
     try:
         while True:
-            known, picture = film.read()
+            known, image = film.read()
             if not known:
                 if 0 < count < _WHOLE * announced:
-                    raise StopError(f"ends after {count} of {announced:.0f} pictures: it is cut off or damaged there")
+                    raise StopError(f"ends after {count} of {announced:.0f} images: it is cut off or damaged there")
                 return
             count += 1
             when = film.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
@@ -111,37 +111,37 @@ def _film(cv2: Any, path: str) -> Iterator[tuple[float, Any]]:
                     raise StopError("has neither times nor a frame rate; convert it, for example to mp4")
                 when = last + period
             last = when
-            yield when, picture
+            yield when, image
     finally:
         film.release()
 
 
 def _webcam(cv2: Any, number: int) -> Iterator[tuple[float, Any]]:
-    """Give a webcam's newest picture, whenever there is a new one, and when it came [s]."""
+    """Yield a webcam's newest image, whenever there is a new one, and the time at which it came [s]."""
     camera = cv2.VideoCapture(number)
     if not camera.isOpened():
-        raise StopError(f"there is no camera number {number}, or another program has it")
+        raise StopError(f"there is no camera number {number}, or another program uses it")
     latest: list[Any] = [None, 0.0]
     came = threading.Condition()
 
-    def watch() -> None:  # apart, so that pictures that came while the tracker worked don't pile up
+    def watch() -> None:  # in a thread, so that images that came while the tracker worked don't pile up
         while True:
-            known, picture = camera.read()
+            known, image = camera.read()
             if not known:
                 time.sleep(0.02)
                 continue
             with came:
-                latest[:] = picture, time.monotonic()
+                latest[:] = image, time.monotonic()
                 came.notify()
 
     threading.Thread(target=watch, daemon=True).start()
     while True:
         with came:
             if not came.wait_for(lambda: latest[0] is not None, _SILENT):
-                raise StopError(f"camera {number} gives no pictures any more; is it still plugged in?")
-            picture, when = latest
+                raise StopError(f"camera {number} gives no images any more; is it still plugged in?")
+            image, when = latest
             latest[0] = None
-        yield when, picture
+        yield when, image
 
 
 def _end_with(parent: TextIO, leave: Callable[[int], Any] = os._exit) -> None:
@@ -154,7 +154,7 @@ def _start() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one
     os.environ.setdefault("MPLBACKEND", "Agg")
     out = os.fdopen(os.dup(1), "w", encoding="utf-8", newline="\n")
-    os.dup2(2, 1)  # what libraries print must not come between the lines
+    os.dup2(2, 1)  # output of libraries must not come between the lines
     threading.Thread(target=_end_with, args=(sys.stdin,), daemon=True).start()
     try:
         status = main(sys.argv[1:], out)

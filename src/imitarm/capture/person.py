@@ -1,4 +1,4 @@
-"""Person: a made-up person, seeded: how long the limbs are, where the person stands, how the elbow is carried."""
+"""Person: a synthetic person, seeded: lengths of the limbs, place in front of the sensor, posture of the elbow."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from imitarm.errors import InputError, UnknownNameError
 
 Array = NDArray[np.float64]
 
-STRETCHED = 0.98  # share of the arm's length beyond which nobody reaches
+STRETCHED = 0.98  # reach over the arm's length: nobody stretches the arm completely
 SENSOR_HEIGHT = 1.1  # [m] above the floor
 _TREMOR_BAND = (4.0, 9.0)  # [Hz] physiological tremor
 _WAVES = 4
 
-# Shares of the stature (Drillis and Contini 1966)
+# Lengths over the stature (Drillis and Contini 1966)
 _UPPER_ARM, _FOREARM, _HAND = 0.186, 0.146, 0.108
 _SHOULDER_HEIGHT, _HALF_SHOULDERS = 0.818, 0.1295
 _HEIGHTS = {
@@ -35,32 +35,37 @@ _HEIGHTS = {
 }
 _HALF_HIPS, _FOOT = 0.0955, 0.10
 _FORWARD = np.array([0.0, 0.0, -1.0])
-_TO_HAND, _TO_TIP, _TO_THUMB = 0.45, 0.85, (0.35, 0.35)  # of the hand's length, from the wrist: as a Kinect has them
+_TO_HAND, _TO_TIP, _TO_THUMB = (
+    0.45,
+    0.85,
+    (0.35, 0.35),
+)  # distances from the wrist over the hand's length, as a Kinect reports them
 
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    r"""A made-up person before a sensor, upright and facing it, in the sensor's frame (x left, y up, z away).
+    r"""A synthetic person who faces a sensor, upright, in the sensor's frame (x left, y up, z away).
 
-    An arm is two straight bones. Where the wrist W is given, the elbow is on a circle about the line from shoulder to
-    wrist; with :math:`\hat d` down and :math:`\hat o` outwards, both at right angles to that line (those of an arm that
-    points forward, turned by the smallest rotation to where it points), it is at
+    An arm is two straight bones, of lengths :math:`L_U` and :math:`L_F`. For a given shoulder S and wrist W the elbow E
+    lies on a circle about the line from S to W. With :math:`\hat w` along that line, and :math:`\hat d` (down) and
+    :math:`\hat o` (outwards) perpendicular to it (those of an arm that points forward, rotated by the smallest rotation
+    to where the arm points), it is at
 
     .. math:: E = S + a\,\hat w + h\,(\cos\psi\,\hat d + \sin\psi\,\hat o), \qquad
               a = \frac{L_U^2 + r^2 - L_F^2}{2r},\quad h = \sqrt{L_U^2 - a^2},\quad r = |W - S| .
 
     Attributes:
-        seed: of everything below, when it came from :meth:`from_seed`.
+        seed: of everything below, when made by :meth:`from_seed`.
         stature: height [m].
         upper_arm: shoulder to elbow [m].
         forearm: elbow to wrist [m].
         hand: wrist to finger tip [m].
         position: of the point on the floor between the feet, x and z in the sensor's frame, shape (2,) [m].
-        swivel: psi of an arm at rest: how far the elbow is carried outwards [rad].
-        lift: how much psi grows for each metre that the hand is above the shoulder's height [rad/m].
-        tremor: waves of the hand's tremor, amplitude [m], frequency [rad/s] and phase for each wave and axis,
-            shape (3, n, 3).
-        sway: amplitude [m], frequency [rad/s] and phase of the body's sway along x and z, shape (3, 2).
+        swivel: psi, the angle of the elbow outwards from straight down, while the hand is low [rad].
+        lift: increase of psi with the height of the hand [rad/m].
+        tremor: amplitude [m], frequency [rad/s] and phase [rad] of the hand's tremor, for each of n waves and each
+            axis, shape (3, n, 3).
+        sway: amplitude [m], frequency [rad/s] and phase [rad] of the body's sway along x and z, shape (3, 2).
     """
 
     seed: int
@@ -76,7 +81,7 @@ class Person:
 
     @classmethod
     def from_seed(cls, seed: int) -> Person:
-        """Make up the person number ``seed``; limbs vary by up to 15 percent about those of the stature."""
+        """Return synthetic person number ``seed``; limbs deviate by up to 15 percent from those of the stature."""
         rng = np.random.default_rng([30310, seed])
         stature = float(np.clip(rng.normal(1.72, 0.09), 1.50, 1.95))
         proportion = np.clip(rng.normal(1.0, 0.05, 3), 0.85, 1.15)
@@ -105,11 +110,11 @@ class Person:
 
     @property
     def reach(self) -> float:
-        """How far from the shoulder the wrist gets [m]."""
+        """Largest distance from shoulder to wrist [m]."""
         return STRETCHED * (self.upper_arm + self.forearm)
 
     def shoulder(self, side: str = "right", time: float = 0.0) -> Array:
-        """Return where a shoulder is, with the body's sway, shape (3,) [m].
+        """Return the position of a shoulder, including the body's sway, shape (3,) [m].
 
         Raises:
             UnknownNameError: when ``side`` is neither left nor right.
@@ -128,20 +133,21 @@ class Person:
         closed: bool = False,
         side: str = "right",
     ) -> Skeleton:
-        """Return the truth: where every joint is when the hand is held at ``wrist``; the other arm hangs.
+        """Return the true positions of all joints while the wrist is held at ``wrist``; the other arm hangs down.
 
         Args:
             time: [s]; tremor and sway depend on it.
-            wrist: where the person wants the wrist, in the sensor's frame, shape (3,) [m]; out of reach it is
-                on the way there.
-            swivel: psi [rad]; None: as this person carries the elbow.
+            wrist: desired position of the wrist in the sensor's frame, shape (3,) [m]; when it is out of reach, the
+                arm stretches towards it.
+            swivel: psi [rad]; None: this person's habit, :attr:`swivel` and :attr:`lift`.
             hand: rotation of the hand in the sensor's frame, shape (3, 3), its x along the hand, its y towards the
                 thumb; None: in line with the forearm, the thumb up as far as that goes.
             closed: whether the hand is a fist.
             side: of the arm that moves.
 
         Raises:
-            InputError: when the wrist is not three finite numbers, the swivel is none, or the hand no rotation.
+            InputError: when the wrist is not three finite numbers, the swivel is not finite, or the hand is not a
+                rotation.
             UnknownNameError: when ``side`` is neither left nor right.
         """
         wanted = np.asarray(wrist, dtype=float)
@@ -162,15 +168,15 @@ class Person:
         return Skeleton(time, points, hand_states=(states["left"], states["right"]))
 
     def elbow(self, shoulder: Array, wrist: Array, swivel: float, side: str = "right") -> tuple[Array, Array]:
-        """Return elbow and wrist (3,) [m]: the wrist brought within reach, the elbow on its circle at ``swivel``."""
-        way = wrist - shoulder
-        distance = float(np.linalg.norm(way))
-        along = way / distance if distance > 1e-6 else np.array([0.0, 0.0, -1.0])
+        """Return elbow and wrist (3,) [m]: the wrist moved into reach, the elbow on its circle at ``swivel`` [rad]."""
+        to_wrist = wrist - shoulder
+        distance = float(np.linalg.norm(to_wrist))
+        along = to_wrist / distance if distance > 1e-6 else np.array([0.0, 0.0, -1.0])
         nearest = abs(self.upper_arm - self.forearm) + 0.03
         r = float(np.clip(distance, nearest, self.reach))
         a = (self.upper_arm**2 + r * r - self.forearm**2) / (2.0 * r)
         h = math.sqrt(max(self.upper_arm**2 - a * a, 0.0))
-        down = _turned(np.array([0.0, -1.0, 0.0]), along)
+        down = _rotated(np.array([0.0, -1.0, 0.0]), along)
         out = _cross(down, along) if side == "right" else _cross(along, down)
         return shoulder + a * along + h * (math.cos(swivel) * down + math.sin(swivel) * out), shoulder + r * along
 
@@ -203,10 +209,10 @@ class Person:
 
 @lru_cache(maxsize=64)
 def _standing(stature: float) -> Array:
-    """Return an upright body without arms above the floor's point between its feet, shape (25, 3) [m]."""
+    """Return an upright body without arms, relative to the point on the floor between its feet, shape (25, 3) [m]."""
     points = np.zeros((len(JOINTS), 3))
-    for name, share in _HEIGHTS.items():
-        y = share * stature - SENSOR_HEIGHT
+    for name, height in _HEIGHTS.items():
+        y = height * stature - SENSOR_HEIGHT
         if name in JOINT:
             points[JOINT[name]] = [0.0, y, 0.0]
             continue
@@ -218,7 +224,7 @@ def _standing(stature: float) -> Array:
 
 
 def _outwards(side: str) -> float:
-    """Return the sign of x on which a side of a person who faces the sensor is."""
+    """Return the sign of x on the given side of a person who faces the sensor."""
     if side not in SIDES:
         raise UnknownNameError.among("side", side, SIDES)
     return 1.0 if side == "right" else -1.0
@@ -233,24 +239,23 @@ def _is_rotation(matrix: Array) -> bool:
 def _hand_along(forearm: Array) -> Array:
     """Return the rotation of a hand in line with the forearm; its thumb is up when the forearm points forward."""
     x = forearm / np.linalg.norm(forearm)
-    y = _turned(np.array([0.0, 1.0, 0.0]), x)
+    y = _rotated(np.array([0.0, 1.0, 0.0]), x)
     return np.array([x, y, _cross(x, y)]).T
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return the cross product of two vectors (3,); numpy's own is made for many of them."""
+    """Return the cross product of two vectors (3,); numpy's is slow for a single pair."""
     (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
     return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
-def _turned(vector: Array, way: Array) -> Array:
-    """Return a vector across the person's forward turned by the smallest rotation that turns forward into ``way``.
+def _rotated(vector: Array, direction: Array) -> Array:
+    """Return a vector, perpendicular to forward, after the smallest rotation from forward to ``direction``.
 
-    So what is up or down beside an arm that points forward goes along without a jump wherever the arm points, but
-    straight back.
+    So up and down beside an arm that points forward change without a jump as the arm moves, except straight backwards.
     """
-    both = way + _FORWARD
+    both = direction + _FORWARD
     square = float(both @ both)
-    turned = vector - (2.0 * float(way @ vector) / square) * both if square > 1e-12 else -vector
-    turned = turned - float(way @ turned) * way
-    return np.asarray(turned / np.sqrt(turned @ turned))
+    rotated = vector - (2.0 * float(direction @ vector) / square) * both if square > 1e-12 else -vector
+    rotated = rotated - float(direction @ rotated) * direction
+    return np.asarray(rotated / np.sqrt(rotated @ rotated))

@@ -1,37 +1,53 @@
-"""SkeletonRecording: skeletons that were recorded, to look at, cut and replay; read_recording reads them."""
+"""SkeletonRecording: recorded skeletons, to inspect, cut, slow down and replay; and how they are written to a file."""
 
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from typing import Final, Self
 
 import numpy as np
 
-from imitarm.capture import kinect_csv, mocap_tsv, native
-from imitarm.capture.finding import Finding
-from imitarm.capture.recorder import SkeletonRecorder
-from imitarm.capture.skeleton import Skeleton, SkeletonSource
+from imitarm.capture.formats import (
+    TICK,
+    UNFINISHED,
+    is_native,
+    native_header,
+    native_line,
+    read_kinect_table,
+    read_native,
+)
+from imitarm.capture.issue import RecordingIssue
+from imitarm.capture.motion_capture import is_motion_capture, read_motion_capture
+from imitarm.capture.skeleton import Skeleton, SkeletonSource, Tracking
 from imitarm.errors import InputError
-from imitarm.files.part_file import PART
+from imitarm.files.part_file import PART, PartFile
 from imitarm.files.table import read_bytes
+
+SLOWEST: Final = 0.05
+_GAP: Final = 0.25  # [s] a longer gap in a recording is not filled with frames
 
 
 class SkeletonRecording(SkeletonSource):
     """Skeletons in the order in which they were recorded; as a source it replays them once.
 
-    Nothing is judged and nothing is changed: times may run backwards, several persons may be in it. What is wrong is
-    said by :func:`~imitarm.capture.checks.check`.
+    Nothing is checked and nothing is changed: times may run backwards, and there may be several persons.
+    :func:`~imitarm.capture.checks.check` says what is wrong.
 
     Args:
         skeletons: in the order they came.
         name: for messages, for example the file's name.
-        realtime: replay at the pace at which they were recorded; else as fast as they are asked for.
-        findings: what was found while reading.
+        realtime: replay at the recorded speed; else as fast as skeletons are asked for.
+        issues: found while reading.
+        time_unit: unit of the file's time stamps [s], for messages about times that are not plausible.
 
     Attributes:
         skeletons: all of them.
-        findings: what was found while reading.
+        issues: found while reading.
+        time_unit: as given.
     """
 
     def __init__(
@@ -40,10 +56,12 @@ class SkeletonRecording(SkeletonSource):
         *,
         name: str = "recording",
         realtime: bool = False,
-        findings: Iterable[Finding] = (),
+        issues: Iterable[RecordingIssue] = (),
+        time_unit: float = 1.0,
     ) -> None:
         self.skeletons = tuple(skeletons)
-        self.findings = tuple(findings)
+        self.issues = tuple(issues)
+        self.time_unit = time_unit
         self.name = name
         self._realtime = realtime
         self.rewind()
@@ -53,25 +71,25 @@ class SkeletonRecording(SkeletonSource):
 
     @property
     def duration(self) -> float:
-        """From the earliest to the latest frame [s]."""
+        """Time from the earliest to the latest frame [s]."""
         times = [skeleton.time for skeleton in self.skeletons]
         return max(times) - min(times) if times else 0.0
 
     @property
     def persons(self) -> tuple[int, ...]:
-        """Who is in it, in order of appearance."""
+        """Numbers of the persons in it, in order of appearance."""
         return tuple(dict.fromkeys(skeleton.person for skeleton in self.skeletons))
 
     @property
     def rate(self) -> float:
-        """Frames a second, from the median time between frames [Hz]; 0 when there are fewer than two."""
+        """Frames per second, from the median time between frames [Hz]; 0 when there are fewer than two."""
         steps = np.diff(np.unique([skeleton.time for skeleton in self.skeletons]))
         return float(1.0 / np.median(steps)) if len(steps) else 0.0
 
     # --- parts of it
 
     def person(self, number: int) -> SkeletonRecording:
-        """Return what concerns one person.
+        """Return the skeletons of one person.
 
         Raises:
             InputError: when that person is not in it; the message says who is.
@@ -80,10 +98,10 @@ class SkeletonRecording(SkeletonSource):
         if not kept:
             who = ", ".join(str(person) for person in self.persons) or "nobody"
             raise InputError(f"{self.name}: person {number} is not in it; there is: {who}")
-        return self._with(kept)
+        return self.with_skeletons(kept)
 
     def trim(self, start: float = 0.0, end: float | None = None) -> SkeletonRecording:
-        """Return what was recorded between two moments; times stay as they are.
+        """Return what was recorded between two times; time stamps stay as they are.
 
         Args:
             start: since the first frame [s].
@@ -99,23 +117,26 @@ class SkeletonRecording(SkeletonSource):
             raise InputError(
                 f"{self.name}: no frame between {start:g} and {last:g} s; it goes from 0 to {self.duration:.2f} s"
             )
-        return self._with(kept)
+        return self.with_skeletons(kept)
 
-    def _with(self, skeletons: Iterable[Skeleton]) -> SkeletonRecording:
-        return SkeletonRecording(skeletons, name=self.name, realtime=self._realtime, findings=self.findings)
+    def with_skeletons(self, skeletons: Iterable[Skeleton]) -> SkeletonRecording:
+        """Return the same recording with other skeletons in it."""
+        return SkeletonRecording(
+            skeletons, name=self.name, realtime=self._realtime, issues=self.issues, time_unit=self.time_unit
+        )
 
     def save(self, path: str | Path, *, replace: bool = True) -> None:
-        """Write imitarm's own format, from which every skeleton is read back to the last bit.
+        """Write imitarm's own format, from which every skeleton is read back bit for bit.
 
         Args:
-            path: where to; written aside and renamed.
+            path: of the file; it is written under another name and renamed when it is whole.
             replace: an existing file may be replaced.
 
         Raises:
             InputError: when there is nothing to write, or it can't be written.
         """
         if not self.skeletons:
-            raise InputError(f"{path}: not written: {self.name} holds no skeletons; was a person in the picture?")
+            raise InputError(f"{path}: not written: {self.name} holds no skeletons; was a person in view?")
         with SkeletonRecorder(path, source=self.name, replace=replace) as recorder:
             for skeleton in self.skeletons:
                 recorder.write(skeleton)
@@ -138,7 +159,7 @@ class SkeletonRecording(SkeletonSource):
         return self._next >= len(self.skeletons)
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton; None when it is over, or in real time not due within ``timeout`` seconds."""
+        """Return the next skeleton; None at the end, or when in real time it is not due within ``timeout`` seconds."""
         if self.over:
             return None
         skeleton = self.skeletons[self._next]
@@ -154,15 +175,16 @@ class SkeletonRecording(SkeletonSource):
 
 
 def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecording:
-    """Read a recording: imitarm's own format, a table of the Kinect SDK, or motion capture; the content tells which.
+    """Read a recording: imitarm's own format, a Kinect SDK table, or motion capture; the content decides which.
 
     Args:
         path: the file; also the ``.part`` of a recorder that was killed.
-        realtime: replay at the pace at which it was recorded.
+        realtime: replay at the recorded speed.
 
     Raises:
         InputError: when there is no such file.
-        FileFormatError: when it is no recording of skeletons or was cut off; the message names file, line and remedy.
+        FileFormatError: when it is not a recording of skeletons or was cut off; the message names file, line and
+            remedy.
     """
     path = Path(path)
     part = path.with_name(path.name + PART)
@@ -170,9 +192,107 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
         raise InputError(f"{path}: is not there, but {part} is, left by a recording that was not closed; read that one")
     content = read_bytes(path)
     head = content[:65536]
-    if mocap_tsv.recognises(head):
-        skeletons, findings, _ = mocap_tsv.read(str(path), content)
+    unit = 1.0
+    if is_motion_capture(head):
+        skeletons, issues = read_motion_capture(str(path))
+    elif is_native(head):
+        skeletons, issues = read_native(str(path), content)
     else:
-        reader = native if native.recognises(head) else kinect_csv
-        skeletons, findings, _ = reader.read(str(path), content)
-    return SkeletonRecording(skeletons, name=path.name, realtime=realtime, findings=findings)
+        skeletons, issues = read_kinect_table(str(path), content)
+        unit = TICK
+    return SkeletonRecording(skeletons, name=path.name, realtime=realtime, issues=issues, time_unit=unit)
+
+
+class SkeletonRecorder:
+    """Writes skeletons to ``PATH.part``, one whole line each, and renames it to ``PATH`` when it is closed.
+
+    Each line is handed to the operating system before :meth:`write` returns: a program that is killed loses at most
+    the frame it was writing, and :func:`read_recording` reads ``PATH.part``. An older file ``PATH`` stays whole until
+    the new one is.
+
+    Args:
+        path: of the file.
+        source: where the skeletons are from, for whoever reads the file.
+        replace: an existing file may be replaced.
+
+    Attributes:
+        path: of the file.
+        n_frames: written so far.
+
+    Raises:
+        InputError: when the file exists and may not be replaced, another recorder has left or is writing
+            ``PATH.part``, or it can't be written.
+    """
+
+    def __init__(self, path: str | Path, *, source: str = "", replace: bool = False) -> None:
+        self.path, self.n_frames = Path(path), 0
+        self._source = source
+        self._file = PartFile(path, native_header(source, UNFINISHED), replace=replace)
+
+    def write(self, skeleton: Skeleton) -> None:
+        """Add a skeleton.
+
+        Raises:
+            InputError: when the recorder is closed, or the disk is full.
+        """
+        self._file.write(native_line(skeleton))
+        self.n_frames += 1
+
+    def close(self) -> None:
+        """Write the number of frames into the header and rename the file; without any frame there is no file.
+
+        A second call does nothing.
+
+        Raises:
+            InputError: when that is not possible; what was written stays in ``PATH.part``.
+        """
+        self._file.finish(self._take, begin=native_header(self._source, str(self.n_frames)))
+
+    def _take(self, part: Path) -> bool:
+        if self.n_frames:
+            part.replace(self.path)
+        return self.n_frames > 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
+    """Return a recording at a fraction of its speed, for a robot whose joints are slower than a person's.
+
+    Frames are inserted, so that the frame rate stays about the same: joints move straight between two frames, and a
+    joint that is lost in either keeps its earlier position. Gaps are not filled, and grow.
+
+    Args:
+        skeletons: in the order of their times.
+        pace: fraction of the recorded speed, 0.05 to 1.
+
+    Raises:
+        InputError: when the pace is out of range.
+    """
+    if not SLOWEST <= pace <= 1.0:
+        raise InputError(f"pace must be between {SLOWEST:g} and 1, got {pace!r}: a recording can only be slowed")
+    if pace == 1.0 or not skeletons:
+        return list(skeletons)
+    start, parts = skeletons[0].time, int(np.ceil(1.0 / pace))
+    slow = [replace(skeleton, time=start + (skeleton.time - start) / pace) for skeleton in skeletons]
+    done: list[Skeleton] = []
+    for before, after in pairwise(slow):
+        done.append(before)
+        if after.time - before.time <= _GAP / pace:
+            done += [_between(before, after, k / parts) for k in range(1, parts)]
+    return [*done, slow[-1]]
+
+
+def _between(before: Skeleton, after: Skeleton, fraction: float) -> Skeleton:
+    """Return the person between two frames, at a fraction of the time from one to the other."""
+    tracking = np.minimum(before.tracking, after.tracking)
+    lost = tracking == Tracking.LOST
+    positions = before.positions + fraction * (after.positions - before.positions)
+    positions[lost], tracking[lost] = before.positions[lost], before.tracking[lost]
+    return Skeleton(
+        before.time + fraction * (after.time - before.time), positions, tracking, before.hand_states, before.person
+    )

@@ -1,4 +1,4 @@
-"""Skeleton: a person as a camera sees one, at one instant; SkeletonSource: where skeletons come from."""
+"""Skeleton: a person at one instant, as a camera reports them; SkeletonSource: where skeletons come from."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ JOINT = {name: index for index, name in enumerate(JOINTS)}
 """Index of each joint."""
 
 SIDES = ("left", "right")
-FARTHEST = 20.0  # [m] no skeleton camera sees as far: a joint beyond it was not measured
+FARTHEST = 20.0  # [m] beyond the range of any skeleton camera: a joint farther away was not measured
 _ARM_PARTS = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
 _ARM_INDEX = {side: np.array([JOINT[f"{part}_{side}"] for part in _ARM_PARTS]) for side in SIDES}
 
 
 class Tracking(IntEnum):
-    """How a camera knows where a joint is; the numbers are those of the Kinect SDK."""
+    """Whether a camera sees a joint, infers its position, or has lost it; the numbers are those of the Kinect SDK."""
 
     LOST = 0
     INFERRED = 1
@@ -62,7 +62,7 @@ class Tracking(IntEnum):
 
 
 class HandState(IntEnum):
-    """What a hand does; the numbers are those of the Kinect SDK."""
+    """State of a hand; the numbers are those of the Kinect SDK."""
 
     UNKNOWN = 0
     NOT_TRACKED = 1
@@ -72,7 +72,7 @@ class HandState(IntEnum):
 
 
 CONFIDENCE = np.array([0.0, 0.2, 1.0])
-"""How far a position is believed, by its :class:`Tracking` (METHODS A.6)."""
+"""Weight of a position in estimates, by its :class:`Tracking`; docs/retargeting.md has the estimates."""
 CONFIDENCE.setflags(write=False)
 
 
@@ -84,7 +84,7 @@ class Arm:
         time: [s].
         points: shoulder, elbow, wrist, hand, hand tip, thumb, shape (6, 3) [m]; nan where lost.
         confidence: of each point, 0 (lost) to 1 (tracked), shape (6,).
-        hand_state: open, closed, or not known.
+        hand_state: open, closed, or unknown.
     """
 
     time: float
@@ -115,23 +115,23 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A person as a camera sees one at one instant.
+    """A person at one instant, as a camera reports them.
 
-    The frame is that of the Kinect v2: the origin in the sensor, x to the sensor's left, y up, z away from the
-    sensor, right-handed. A person who faces the sensor has the right hand at larger x than the left one.
+    The coordinate frame is that of the Kinect v2: origin in the sensor, x to the sensor's left, y up, z away from the
+    sensor, right-handed. The right hand of a person who faces the sensor has a larger x than the left one.
 
-    A position that can't have been measured (not finite, or farther than 20 m) is taken as lost, and every lost
-    position is nan, so that it can't be used by mistake.
+    A position that can't have been measured (not finite, or farther than 20 m) is taken as lost. Every lost position
+    is nan, so that it can't be used by mistake.
 
     Attributes:
         time: of the exposure, on the source's clock [s].
         positions: of the joints :data:`JOINTS`, shape (25, 3) [m]; nan where lost.
         tracking: :class:`Tracking` of each joint, shape (25,).
         hand_states: of the left and the right hand.
-        person: which person this is, as the source counts them.
+        person: number of the person, given by the source.
 
     Raises:
-        InputError: when a shape is wrong, the time is not finite, or a state is not one that exists.
+        InputError: when a shape is wrong, the time is not finite, or a state does not exist.
     """
 
     time: float
@@ -190,14 +190,14 @@ class Skeleton:
         index = _ARM_INDEX[side]
         return Arm(
             self.time,
-            self.positions.take(index, axis=0),  # a third of the time that [index] takes
+            self.positions.take(index, axis=0),  # three times as fast as [index]
             CONFIDENCE.take(self.tracking.take(index)),
             self.hand_states[SIDES.index(side)],
         )
 
 
 class SkeletonSource(ABC):
-    """Where skeletons come from: a recording, a camera, a stream, a made-up person.
+    """Where skeletons come from: a recording, a camera, a stream, a synthetic person.
 
     Iterating gives skeletons in the order of their times until the source is over::
 
@@ -220,8 +220,8 @@ class SkeletonSource(ABC):
     def over(self) -> bool:
         """Whether no more skeletons will come."""
 
-    def close(self) -> None:  # noqa: B027 (a source without anything to let go of needs none)
-        """Let go of files, sockets and devices; a second call does nothing."""
+    def close(self) -> None:  # noqa: B027 (a source without anything to release needs none)
+        """Release files, sockets and devices; a second call does nothing."""
 
     def __iter__(self) -> Iterator[Skeleton]:
         while not self.over:

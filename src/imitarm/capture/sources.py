@@ -7,9 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-from imitarm.capture.people import PersonFilter
+from imitarm.capture.filters import PersonFilter, SwapGuard
 from imitarm.capture.recording import read_recording
-from imitarm.capture.sides import SwapGuard
 from imitarm.capture.skeleton import SkeletonSource
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.files.part_file import PART

@@ -1,4 +1,4 @@
-"""Skeletons over UDP: SkeletonSender gives away what a source sees, UdpSource is the source at the other end."""
+"""Skeletons over UDP: SkeletonSender sends what a source sees, UdpSource receives it."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from imitarm.transmission.gate import Gate
 from imitarm.transmission.messages import SkeletonFrame
 from imitarm.transmission.sockets import LOOPBACK, Address, connected, listening, try_to_send, wait_for, waiting
 
-_LONGEST_WAIT = 60_000_000_000  # [ns] what a datagram can say
+_LONGEST_WAIT = 60_000_000_000  # [ns] the longest that a datagram can state
 
 
 class SkeletonSender:
-    """Sends skeletons to one address, each in a datagram of its own; nothing is waited for and nothing sent twice.
+    """Sends skeletons to one address, one datagram each, without waiting and without repetition.
 
-    A lost skeleton is lost: the next one is a thirtieth of a second away, and newer.
+    A lost skeleton is not sent again: the next one follows in a thirtieth of a second, and is newer.
 
     Args:
         address: host and port of the receiver.
-        clock_ns: the time to stamp with [ns].
+        clock_ns: clock for the time stamps [ns].
 
     Attributes:
-        sent: how many went out.
-        failed: how many did not, because nobody listens or the system could not take them.
+        sent: number of skeletons sent.
+        failed: number of skeletons not sent, because nobody listens or the system could not take them.
 
     Raises:
         InputError: when there is no such host.
@@ -41,11 +41,11 @@ class SkeletonSender:
         self._socket = connected(address)
 
     def send(self, skeleton: Skeleton, exposed_ns: int | None = None) -> bool:
-        """Send a skeleton; return whether it went out.
+        """Send a skeleton; return whether it was sent.
 
         Args:
             skeleton: to send.
-            exposed_ns: when the camera saw it, on the sender's clock [ns]; None: just now.
+            exposed_ns: time of exposure, on the sender's clock [ns]; None: now.
         """
         now = self._clock_ns()
         waited = 0 if exposed_ns is None else min(max(now - exposed_ns, 0), _LONGEST_WAIT)
@@ -55,7 +55,7 @@ class SkeletonSender:
         return gone
 
     def close(self) -> None:
-        """Let go of the socket; a second call does nothing."""
+        """Close the socket; a second call does nothing."""
         self._socket.close()
 
     def __enter__(self) -> Self:
@@ -66,11 +66,11 @@ class SkeletonSender:
 
 
 def frame_of(skeleton: Skeleton, waited_ns: int = 0) -> SkeletonFrame:
-    """Return a skeleton as it is sent: what is lost is 0, since nothing on the wire may be nan.
+    """Return a skeleton as it is sent: lost positions are 0, because a datagram must not hold nan.
 
     Args:
         skeleton: to send.
-        waited_ns: between exposure and sending [ns].
+        waited_ns: time between exposure and sending [ns].
     """
     seen = skeleton.tracking != Tracking.LOST
     positions = np.where(seen[:, None], skeleton.positions, 0.0)
@@ -79,12 +79,12 @@ def frame_of(skeleton: Skeleton, waited_ns: int = 0) -> SkeletonFrame:
 
 
 class Arrival(NamedTuple):
-    """How the skeleton that was read last has come.
+    """How the last skeleton arrived.
 
     Attributes:
-        waited: between exposure and sending [s].
-        queued: on the way [s]; from another machine, beyond the quickest there was.
-        received_ns: when it was received [ns].
+        waited: time between exposure and sending [s].
+        queued: time between sending and receiving [s]; from another machine, beyond the shortest one so far.
+        received_ns: time of receiving [ns].
     """
 
     waited: float
@@ -93,20 +93,20 @@ class Arrival(NamedTuple):
 
 
 class UdpSource(SkeletonSource):
-    """Skeletons that a :class:`SkeletonSender` sends, live.
+    """Skeletons from a :class:`SkeletonSender`, live.
 
-    What is late, damaged, foreign or hostile is dropped and counted by a
-    :class:`~imitarm.transmission.gate.Gate`. A sender that is killed and started again goes on after half a second of
-    silence; its times are moved so that they go on, too, with the gap in them, and every retargeter takes hold anew.
+    Datagrams that are late, damaged, foreign or hostile are dropped and counted by a
+    :class:`~imitarm.transmission.gate.Gate`. A sender that is killed and started again is accepted after half a second
+    of silence; its times are shifted so that they continue after the gap, and every retargeter engages anew.
 
     Args:
-        port: to listen at; 0: any that is free.
-        host: address of this machine to listen at; the usual one hears this machine only.
-        clock_ns: the time of receiving [ns].
+        port: to listen on; 0: any free one.
+        host: address of this machine to listen on; the default hears this machine only.
+        clock_ns: clock for the time of receiving [ns].
 
     Attributes:
-        gate: what it has let in and dropped.
-        arrival: how the skeleton that was read last has come; None before.
+        gate: decides which datagrams are used, and counts the dropped ones.
+        arrival: how the last skeleton arrived; None before the first.
 
     Raises:
         InputError: when the port is taken, or the address is not one of this machine's.
@@ -125,7 +125,7 @@ class UdpSource(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether it was closed: a stream has no end of its own."""
+        """Whether it was closed: a stream does not end by itself."""
         return self._closed
 
     def close(self) -> None:
@@ -134,7 +134,7 @@ class UdpSource(SkeletonSource):
         self._socket.close()
 
     def flush(self) -> None:
-        """Forget what has come so far: who has been busy elsewhere since this was opened begins with what comes now."""
+        """Discard what has arrived so far, so that the next skeleton read is a new one."""
         for _ in waiting(self._socket):
             pass
 
@@ -146,22 +146,22 @@ class UdpSource(SkeletonSource):
                 now = self._clock_ns()
                 came = self.gate.open(data, now, SkeletonFrame)
                 if came is not None:
-                    here = address[0].startswith("127.")  # one clock for both sides
-                    way = 1e-9 * (now - came[0].time_ns) if here else self.gate.age
-                    return self._skeleton(came[1], now, way)
+                    here = address[0].startswith("127.")  # sender and receiver have one clock
+                    queued = 1e-9 * (now - came[0].time_ns) if here else self.gate.age
+                    return self._skeleton(came[1], now, queued)
             left = until - clock.monotonic()
             if left <= 0.0:
                 break
             wait_for(self._socket, left)
         return None
 
-    def _skeleton(self, frame: SkeletonFrame, now: int, way: float) -> Skeleton:
-        """Return what was sent, at a time that goes on from one session to the next."""
+    def _skeleton(self, frame: SkeletonFrame, now: int, queued: float) -> Skeleton:
+        """Return the skeleton that was sent, at a time that continues from one session of the sender to the next."""
         if self.gate.sessions != self._sessions:
             self._sessions = self.gate.sessions
             silent = 0.0 if self.arrival is None else 1e-9 * (now - self.arrival.received_ns)
             self._shift = self._time + silent - frame.time
-        self.arrival = Arrival(1e-9 * frame.waited_ns, way, now)
+        self.arrival = Arrival(1e-9 * frame.waited_ns, queued, now)
         self._time = frame.time + self._shift
         left, right = frame.hands
         return Skeleton(self._time, frame.positions, frame.tracking, (HandState(left), HandState(right)), frame.person)

@@ -1,4 +1,4 @@
-"""SyntheticSource: skeletons of a made-up person, as a made-up camera sees them; seeded."""
+"""SyntheticSource: skeletons of a synthetic person, as a simulated camera sees them; seeded."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Callable
 from functools import partial
 
 from imitarm.capture.camera_model import SkeletonCamera
-from imitarm.capture.drawing import DRAWINGS, drawing
-from imitarm.capture.motions import REACHES, Truth, reaching
+from imitarm.capture.motions import DRAWINGS, REACHES, Truth, drawing, reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
 from imitarm.errors import InputError, UnknownNameError
@@ -17,23 +16,23 @@ MOTIONS: dict[str, Callable[..., Truth]] = {
     **{kind: partial(reaching, kind=kind) for kind in REACHES},
     **{kind: partial(drawing, kind=kind) for kind in DRAWINGS},
 }
-"""What a made-up person can be asked to do, by name: each takes a person, a seed and ``duration`` [s]."""
+"""Motions of a synthetic person, by name: each takes a person, a seed and ``duration`` [s]."""
 
 
 class SyntheticSource(SkeletonSource):
-    """A made-up person before a made-up camera; the same seeds give the same skeletons.
+    """A synthetic person in front of a simulated camera; the same seeds give the same skeletons.
 
-    What is seen can be compared with what is true::
+    What the camera sees can be compared with the truth::
 
         source = SyntheticSource.from_seed(3, kind="edge")
         for seen in source:
             error = seen.positions - source.truth(seen.time).positions
 
     Args:
-        truth: where every joint truly is at each time.
-        camera: what is made of it.
+        truth: true positions of all joints, as a function of time.
+        camera: that sees them.
         duration: [s].
-        realtime: give each skeleton when its time has come, as a camera does; else as fast as it is asked.
+        realtime: give each skeleton when it is due, as a camera does; else as fast as it is asked for.
         name: for messages.
 
     Attributes:
@@ -63,13 +62,13 @@ class SyntheticSource(SkeletonSource):
     def from_seed(
         cls, seed: int, *, duration: float = 12.0, kind: str = "inside", realtime: bool = False
     ) -> SyntheticSource:
-        """Return person number ``seed`` in motion before camera number ``seed``, whose noise is 1 to 2 cm.
+        """Return person number ``seed`` in motion in front of camera number ``seed``, whose noise is 1 to 2 cm.
 
         Args:
             seed: of person, motion and camera.
-            duration: [s]; the first second is still.
+            duration: [s]; the hand is still during the first second.
             kind: of motion, one of :data:`MOTIONS`.
-            realtime: give each skeleton when its time has come.
+            realtime: give each skeleton when it is due.
 
         Raises:
             UnknownNameError: when there is no such motion.
@@ -86,7 +85,7 @@ class SyntheticSource(SkeletonSource):
         return self._next > self._duration
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton; None when the camera lost this frame, or it is later than ``timeout`` from now."""
+        """Return the next skeleton; None when the camera lost this frame or none is due within ``timeout`` seconds."""
         if self.over:
             return None
         if self._realtime:

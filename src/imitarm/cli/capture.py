@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from imitarm.capture.checks import check, repaired
-from imitarm.capture.finding import Finding
-from imitarm.capture.people import PersonFilter
-from imitarm.capture.recorder import SkeletonRecorder
-from imitarm.capture.recording import SkeletonRecording
+from imitarm.capture.filters import PersonFilter
+from imitarm.capture.issue import RecordingIssue
+from imitarm.capture.recording import SkeletonRecorder, SkeletonRecording
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
 from imitarm.capture.sources import live, open_source
 from imitarm.capture.stream import SkeletonSender
@@ -94,8 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise TaskFailedError(
             f"{arguments.source}: nobody was seen, nothing is written; stand 1.5 to 3 m before the sensor"
         )
-    found = recorded.findings if recorded is not None else ()
-    recording = _finished(SkeletonRecording(taken, name=source.name, findings=found), arguments)
+    found = recorded.issues if recorded is not None else ()
+    recording = _finished(SkeletonRecording(taken, name=source.name, issues=found), arguments)
     findings = check(recording, arguments.side)
     _show(recording, arguments.side)
     show_findings(findings)
@@ -160,5 +159,5 @@ def _show(recording: SkeletonRecording, side: str) -> None:
     )
 
 
-def _has_error(findings: list[Finding]) -> bool:
+def _has_error(findings: list[RecordingIssue]) -> bool:
     return any(finding.severity == "error" for finding in findings)

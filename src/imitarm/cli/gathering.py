@@ -6,7 +6,7 @@ import argparse
 import time as clock
 from collections.abc import Callable, Sequence
 
-from imitarm.capture.finding import SEVERITIES, Finding
+from imitarm.capture.issue import SEVERITIES, RecordingIssue
 from imitarm.capture.skeleton import SIDES, Skeleton, SkeletonSource
 from imitarm.capture.sources import WORDS
 from imitarm.cli.screen import progress_bar, remark, say, show_table
@@ -83,7 +83,7 @@ def gather(
     return taken, stopped
 
 
-def show_findings(findings: Sequence[Finding]) -> None:
+def show_findings(findings: Sequence[RecordingIssue]) -> None:
     """Print the findings as a table, and how many there are of each kind."""
     if findings:
         show_table(

@@ -6,9 +6,8 @@ import argparse
 
 from imitarm.capture.checks import check, repaired
 from imitarm.capture.motions import Truth
-from imitarm.capture.recording import SkeletonRecording
+from imitarm.capture.recording import SkeletonRecording, slowed
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
-from imitarm.capture.slowing import slowed
 from imitarm.capture.sources import followed, live, open_source
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.cli.gathering import gather
@@ -74,7 +73,7 @@ def _mended(recording: SkeletonRecording, person: int | None) -> tuple[SkeletonR
     """Return a recording of one person, mended; a note says what was."""
     one = recording if person is None else recording.person(person)
     mended, notes = repaired(one)
-    return mended, [*(f"repaired: {note}" for note in notes), *(str(finding) for finding in recording.findings)]
+    return mended, [*(f"repaired: {note}" for note in notes), *(str(finding) for finding in recording.issues)]
 
 
 def _duration(source: SkeletonSource) -> float | None:

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.capture.motions import Truth
+from imitarm.capture.recording import slowed
 from imitarm.capture.skeleton import SIDES, Skeleton
-from imitarm.capture.slowing import slowed
 from imitarm.cli.driven import with_driven
 from imitarm.cli.following import FAR, MOSTLY, Following, remedy
 from imitarm.cli.gathering import source_help

@@ -5,17 +5,17 @@ import pytest
 
 from imitarm.capture.mediapipe_environment import VARIABLE
 from imitarm.capture.recording import SkeletonRecording
-from imitarm.capture.skeleton import JOINT, Tracking
-from imitarm.capture.video_figures import (
+from imitarm.capture.sensor_quality import (
     agreement,
     arm_raised,
     bone,
     elbow_bent,
     guarded,
     main,
-    tracked_share,
+    tracked_fraction,
     wrist_difference,
 )
+from imitarm.capture.skeleton import JOINT, Tracking
 from imitarm.kinematics.pose import quaternion_to_matrix
 from mediapipe_samples import SIZE, line, player, seen, standing
 from recording_samples import changed, exchanged, skeletons
@@ -52,7 +52,7 @@ def test_what_is_not_tracked_does_not_count():
         tracking[JOINT["wrist_right"]] = Tracking.INFERRED
         frames[i] = changed(frames[i], tracking=tracking)
     recording = SkeletonRecording(frames)
-    assert tracked_share(recording, "right") == pytest.approx(1 / 6) and tracked_share(recording, "left") == 1.0
+    assert tracked_fraction(recording, "right") == pytest.approx(1 / 6) and tracked_fraction(recording, "left") == 1.0
     assert len(arm_raised(recording, "right")) == 10
     alike, n = agreement(arm_raised(recording, "right"), arm_raised(recording, "left"))
     assert np.isnan(alike) and n == 10
@@ -78,6 +78,6 @@ def test_the_command_prints_every_view_and_every_pair(tmp_path, monkeypatch, cap
     films = [tmp_path / "a.mp4", tmp_path / "b.mp4"]
     assert main([str(film) for film in films]) == 0
     shown = capsys.readouterr().out.splitlines()
-    assert shown[0].startswith("video:a.mp4: 40 pictures, 40 with a person") and "left arm tracked in 100 %" in shown[1]
+    assert shown[0].startswith("video:a.mp4: 40 images, 40 with a person") and "left arm tracked in 100 %" in shown[1]
     assert shown[-1].startswith("video:a.mp4 and video:b.mp4: left raised 1.00 (40)")
     assert main([]) == 2 and "name one or more" in capsys.readouterr().err

@@ -15,9 +15,9 @@ import pytest
 from imitarm.capture.mediapipe import MediaPipeSource
 from imitarm.capture.mediapipe_environment import find_python
 from imitarm.capture.recording import SkeletonRecording, read_recording
+from imitarm.capture.sensor_quality import agreement, arm_raised, bone, elbow_bent, guarded, tracked_fraction
 from imitarm.capture.skeleton import SIDES
 from imitarm.capture.sources import open_source
-from imitarm.capture.video_figures import agreement, arm_raised, bone, elbow_bent, guarded, tracked_share
 from imitarm.cli import main
 from imitarm.errors import InputError
 from mediapipe_samples import VIDEOS
@@ -70,8 +70,8 @@ def test_a_real_person_is_seen_in_nearly_every_picture_at_the_videos_times(view)
     steps = np.diff(times(recording)) * 60.0  # 60 pictures a second
     assert steps.min() > 0.99 and np.allclose(steps, np.round(steps), atol=1e-3)
     assert recording.persons == (0,)
-    assert tracked_share(recording, "left") > 0.9
-    assert tracked_share(recording, "right") > (0.3 if view == 3 else 0.9)
+    assert tracked_fraction(recording, "left") > 0.9
+    assert tracked_fraction(recording, "right") > (0.3 if view == 3 else 0.9)
 
 
 @pytest.mark.slow
@@ -130,7 +130,7 @@ def test_files_that_are_no_video_and_cameras_that_are_not_there(tmp_path):
     film = tmp_path / "film.mp4"
     for content in (b"", b"no film at all", (VIDEOS / "cam01.mp4").read_bytes()[:100_000]):
         film.write_bytes(content)
-        with pytest.raises(InputError, match=r"film\.mp4: is no video that can be read"):
+        with pytest.raises(InputError, match=r"film\.mp4: is not a video that can be read"):
             MediaPipeSource(film)
     with pytest.raises(InputError, match="webcam:63: there is no camera number 63"):
         open_source("webcam:63")

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from imitarm.capture.recording import slowed
 from imitarm.capture.skeleton import JOINT, Skeleton, Tracking
-from imitarm.capture.slowing import slowed
 from imitarm.errors import InputError
 from recording_samples import same, skeletons
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from imitarm.capture.camera_model import SkeletonCamera
+from imitarm.capture.filters import MEMORY, SideMemory, SwapGuard, unswapped
 from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
 from imitarm.capture.recording import read_recording
-from imitarm.capture.sides import MEMORY, SideMemory, SwapGuard, unswapped
 from imitarm.capture.skeleton import JOINT, Skeleton, Tracking
 from imitarm.capture.synthetic import SyntheticSource
 from recording_samples import Listed, changed, exchanged, same, skeletons

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from imitarm.capture.drawing import DRAWINGS, drawing
+from imitarm.capture.motions import DRAWINGS, drawing
 from imitarm.capture.person import Person
 from imitarm.errors import InputError, UnknownNameError
 

@@ -9,15 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from imitarm.capture.recorder import SkeletonRecorder
-from imitarm.capture.recording import read_recording
+from imitarm.capture.recording import SkeletonRecorder, read_recording
 from imitarm.errors import FileFormatError, InputError
 from recording_samples import same, skeletons
 
 _WRITER = """
 import sys
 from recording_samples import skeletons
-from imitarm.capture.recorder import SkeletonRecorder
+from imitarm.capture.recording import SkeletonRecorder
 recorder = SkeletonRecorder(sys.argv[1], source="to be killed")
 frames = skeletons(50)
 i = 0
@@ -66,7 +65,7 @@ def test_a_killed_recorder_loses_no_whole_frame(tmp_path):
     assert len(recording) >= written >= 40
     frames = skeletons(50)
     assert all(same(one, frames[i % 50]) for i, one in enumerate(recording.skeletons))
-    assert [finding.code for finding in recording.findings] == ["not-closed"]
+    assert [finding.code for finding in recording.issues] == ["not-closed"]
 
 
 def test_a_torn_last_line_is_left_out_and_said_wherever_it_was_torn(tmp_path):
@@ -78,7 +77,7 @@ def test_a_torn_last_line_is_left_out_and_said_wherever_it_was_torn(tmp_path):
         part.write_bytes(content[:n])
         recording = read_recording(part)
         assert len(recording) == 2
-        assert "2 whole frames were read and the frame that was being written is lost" in recording.findings[0].message
+        assert "2 whole frames were read and the frame that was being written is lost" in recording.issues[0].message
     part.write_bytes(content[: content.index(b"\nt,") + 40])
     with pytest.raises(FileFormatError, match=r"a\.csv\.part"):
         read_recording(part)
@@ -88,7 +87,7 @@ def test_a_torn_last_line_is_left_out_and_said_wherever_it_was_torn(tmp_path):
 def test_what_was_not_closed_can_be_saved_under_another_name(tmp_path):
     recorder = recorded(tmp_path / "a.csv", 4)
     read_recording(tmp_path / "a.csv.part").save(tmp_path / "b.csv")
-    assert read_recording(tmp_path / "b.csv").findings == ()
+    assert read_recording(tmp_path / "b.csv").issues == ()
     recorder.close()
 
 

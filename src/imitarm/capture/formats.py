@@ -1,4 +1,4 @@
-"""imitarm's own file of skeletons: text that says what it holds, one skeleton a line."""
+"""Files of skeletons as text tables: imitarm's own format, and the table that programs on the Kinect SDK write."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.capture.finding import Finding
-from imitarm.capture.skeleton import FARTHEST, JOINTS, HandState, Skeleton
+from imitarm.capture.issue import RecordingIssue, length_unit_that_fits, time_unit_that_fits
+from imitarm.capture.skeleton import FARTHEST, JOINT, JOINTS, HandState, Skeleton
 from imitarm.errors import FileFormatError
 from imitarm.files.table import Table, parse_table
 
@@ -25,19 +25,29 @@ NAMES = (
     *(f"{joint}_{part}" for joint in JOINTS for part in ("x", "y", "z", "tracking")),
 )
 UNFINISHED = "not closed"
-"""What the header says of the number of frames while they are still being written."""
+"""What the header gives as the number of frames while they are still being written."""
 
+TICK = 1e-7  # [s] time unit of the Kinect SDK
+_KINECT_COLUMNS = 1 + 4 * len(JOINTS)
+_FASTEST_RATE = 1000.0  # [Hz] a table with more frames a second has its times in another unit for certain
 _MARK = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s*[#%][^\n]*\n)*?\s*[#%]\s*format:\s*" + FORMAT.encode() + rb"\b")
 _WHOLE = re.compile(rb"-?\d{1,20}")
-_N = len(JOINTS)
+_LIMBS = [
+    (JOINT[f"{a}_{side}"], JOINT[f"{b}_{side}"])
+    for side in ("left", "right")
+    for a, b in (("shoulder", "elbow"), ("elbow", "wrist"))
+]
 
 
-def recognises(head: bytes) -> bool:
-    """Tell by the remark ``# format: imitarm-skeletons``."""
+# --- imitarm's own format
+
+
+def is_native(head: bytes) -> bool:
+    """Return whether a file begins as imitarm's own format does: with the remark ``# format: imitarm-skeletons``."""
     return _MARK.match(head.replace(b"\r\n", b"\n").replace(b"\r", b"\n")) is not None
 
 
-def header(source: str, frames: str) -> str:
+def native_header(source: str, frames: str) -> str:
     """Return the lines before the first skeleton.
 
     Args:
@@ -58,8 +68,8 @@ def header(source: str, frames: str) -> str:
     return "\n".join([*lines, ",".join(NAMES), ""])
 
 
-def line_of(skeleton: Skeleton) -> str:
-    """Return a skeleton as one line, which gives it back to the last bit."""
+def native_line(skeleton: Skeleton) -> str:
+    """Return a skeleton as one line of text, from which it is read back bit for bit."""
     left, right = skeleton.hand_states
     fields = [repr(skeleton.time), str(skeleton.person), str(int(left)), str(int(right))]
     for (x, y, z), tracking in zip(skeleton.positions.tolist(), skeleton.tracking.tolist(), strict=True):
@@ -67,24 +77,24 @@ def line_of(skeleton: Skeleton) -> str:
     return ",".join(fields) + "\n"
 
 
-def read(path: str, content: bytes) -> tuple[list[Skeleton], list[Finding], str]:
-    """Read the content of such a file.
+def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
+    """Read imitarm's own format.
 
     A recording that was not closed, because its writer was killed or is still at work, is read up to its last whole
-    line, and what was lost is said.
+    line, and an issue says what was lost.
 
     Args:
         path: for messages.
         content: of the file.
 
     Returns:
-        the skeletons, what is worth knowing about the file, and where the skeletons were from.
+        the skeletons, and what is worth knowing about the file.
 
     Raises:
-        FileFormatError: when the file was cut off after it was closed, is of another version, or holds what is no
+        FileFormatError: when the file was cut off after it was closed, has another version, or a line is not a
             skeleton; the message names file and line.
     """
-    unfinished = _unfinished(content)
+    unfinished = _is_unfinished(content)
     torn = unfinished and not content.endswith(b"\n")
     if torn:
         content = content[: content.rfind(b"\n") + 1]
@@ -103,18 +113,20 @@ def read(path: str, content: bytes) -> tuple[list[Skeleton], list[Finding], str]
             f"{path}, line {int(table.lines[-1])}: ends after {n} frames where {announced} are announced: the file was "
             "cut off; copy it again, or write the number there is after '# frames:'"
         )
-    findings = []
+    issues = []
     if unfinished:
         lost = " and the frame that was being written is lost" if torn else ""
         message = f"was not closed: its writer was stopped or is still at work; {n} whole frames were read{lost}"
-        findings.append(Finding("note", "not-closed", message, n - 1, remedy="save it under another name to keep it"))
+        issues.append(
+            RecordingIssue("note", "not-closed", message, n - 1, remedy="save it under another name to keep it")
+        )
     persons = _persons(table, content)
-    joints = table.values[:, 4:].reshape(n, _N, 4)
-    skeletons, far = assembled(table, table.values[:, 0], joints, table.values[:, 2:4], persons)
-    return skeletons, findings + far, table.remarks.get("source", "")
+    joints = table.values[:, 4:].reshape(n, len(JOINTS), 4)
+    skeletons, far = _skeletons(table, table.values[:, 0], joints, table.values[:, 2:4], persons)
+    return skeletons, issues + far
 
 
-def _unfinished(content: bytes) -> bool:
+def _is_unfinished(content: bytes) -> bool:
     head = content[:4096].replace(b"\r\n", b"\n")
     return re.search(rb"^#\s*frames:\s*" + UNFINISHED.encode() + rb"\s*$", head, re.MULTILINE) is not None
 
@@ -127,44 +139,88 @@ def _persons(table: Table, content: bytes) -> list[int]:
     return [int(field) for field in fields]
 
 
-def assembled(
+# --- the table of the Kinect SDK
+
+
+def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
+    """Read a table of 101 columns: time in units of 100 ns, then x, y, z [m] and state of 25 joints in SDK order.
+
+    Time counts from the first frame. Such a file holds neither person numbers nor hand states. A comma at the end of
+    a line is accepted.
+
+    Args:
+        path: for messages.
+        content: of the file.
+
+    Returns:
+        the skeletons, and what is worth knowing about the file.
+
+    Raises:
+        FileFormatError: when the file is another table, was cut off, or a field is not a number; the message names
+            file and line.
+    """
+    table = parse_table(path, content)
+    n, columns = table.values.shape
+    if columns != _KINECT_COLUMNS:
+        raise FileFormatError(
+            f"{path}, line {int(table.lines[0])}: {columns} columns; a recording of skeletons is imitarm's own, which "
+            f"begins with '# format: imitarm-skeletons', or a Kinect SDK table of {_KINECT_COLUMNS} columns (time, "
+            "then x, y, z and state of 25 joints); export it as one of these"
+        )
+    times = (table.values[:, 0] - table.values[0, 0]) * TICK
+    skeletons, issues = _skeletons(table, times, table.values[:, 1:].reshape(n, len(JOINTS), 4))
+    period = abs(float(times[-1])) / max(n - 1, 1)
+    if n > 1 and period < 1.0 / _FASTEST_RATE:
+        fit = time_unit_that_fits(1.0 / period, TICK) if period > 0.0 else None
+        unit = "" if fit is None else f"they fit in {fit[0]}: multiply them by {fit[1]:.10g}; or "
+        raise FileFormatError(
+            f"{path}: {n} frames within {abs(float(times[-1])):.3g} s; its times are not in units of 100 ns as the "
+            f"Kinect SDK writes them; {unit}multiply seconds by 10 000 000"
+        )
+    return skeletons, issues
+
+
+# --- what both have in common
+
+
+def _skeletons(
     table: Table, times: Array, joints: Array, hands: Array | None = None, persons: Sequence[int] | None = None
-) -> tuple[list[Skeleton], list[Finding]]:
-    """Build skeletons from columns, whatever the format they are from.
+) -> tuple[list[Skeleton], list[RecordingIssue]]:
+    """Build skeletons from columns.
 
     Args:
         table: what was read, for messages.
         times: shape (n,) [s].
         joints: x, y, z [m] and tracking state of each joint, shape (n, 25, 4).
         hands: state of the left and of the right hand, shape (n, 2); None: not in the file.
-        persons: who each is; None: not in the file.
+        persons: number of each person; None: not in the file.
 
     Raises:
-        FileFormatError: when a time is not finite, or a state is none; the message names file and line.
+        FileFormatError: when a time is not finite, or a state does not exist; the message names file and line.
     """
     states = np.zeros((len(times), 2)) if hands is None else hands
     _refuse(table, ~np.isfinite(times), "the time is not a finite number")
     _refuse(table, ~np.isin(joints[..., 3], (0, 1, 2)).all(axis=1), "a tracking state is not 0, 1 or 2")
     _refuse(table, ~np.isin(states, range(len(HandState))).all(axis=1), "a hand's state is not one of 0 to 4")
-    with np.errstate(invalid="ignore"):
-        far = (joints[..., 3] > 0) & ~(np.abs(joints[..., :3]) <= FARTHEST).all(axis=2)
     skeletons = [
         Skeleton(time, frame[:, :3], frame[:, 3].astype(np.int8), (HandState(int(left)), HandState(int(right))), person)
         for time, frame, (left, right), person in zip(
             times.tolist(), joints, states, [0] * len(times) if persons is None else persons, strict=True
         )
     ]
-    return skeletons, _far(table, times, far)
+    return skeletons, _far_joints(table, times, joints)
 
 
 def _refuse(table: Table, bad: NDArray[np.bool_] | np.bool_, what: str) -> None:
     if np.any(bad):
         line = int(table.lines[np.argmax(bad)])
-        raise FileFormatError(f"{table.path}, line {line}: {what}; mend or remove that line")
+        raise FileFormatError(f"{table.path}, line {line}: {what}; correct or remove that line")
 
 
-def _far(table: Table, times: Array, far: NDArray[np.bool_]) -> list[Finding]:
-    """Return what to say about joints that can't have been measured."""
+def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssue]:
+    """Return an issue about joints that can't have been measured, with the unit of length that fits, if any."""
+    with np.errstate(invalid="ignore"):
+        far = (joints[..., 3] > 0) & ~(np.abs(joints[..., :3]) <= FARTHEST).all(axis=2)
     if not far.any():
         return []
     frame = int(np.argmax(far.any(axis=1)))
@@ -173,4 +229,12 @@ def _far(table: Table, times: Array, far: NDArray[np.bool_]) -> list[Finding]:
         f"{FARTHEST:.0f} m, first {JOINTS[int(np.argmax(far[frame]))]} in line {int(table.lines[frame])}; "
         "they are taken as lost"
     )
-    return [Finding("warning", "far-joint", message, frame, float(times[frame] - times[0]), "check units and sensor")]
+    remedy = "check units and sensor"
+    if far.mean() > 0.5:
+        with np.errstate(invalid="ignore", over="ignore"):
+            lengths = [np.linalg.norm(joints[:, a, :3] - joints[:, b, :3], axis=1) for a, b in _LIMBS]
+        finite = np.concatenate(lengths)[np.isfinite(np.concatenate(lengths))]
+        unit = length_unit_that_fits(float(np.median(finite))) if len(finite) else None
+        if unit is not None:
+            remedy = f"positions must be in metres; these fit in {unit}: convert them"
+    return [RecordingIssue("warning", "far-joint", message, frame, float(times[frame] - times[0]), remedy)]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.capture.people import PATIENCE, PersonFilter
+from imitarm.capture.filters import PATIENCE, PersonFilter
 from imitarm.capture.recording import SkeletonRecording
 from imitarm.capture.skeleton import JOINTS, Skeleton, Tracking
 from imitarm.errors import InputError

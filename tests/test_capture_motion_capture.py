@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imitarm.capture import mocap_tsv
-from imitarm.capture.motions import MotionCapture
+from imitarm.capture.motion_capture import MotionCapture, is_motion_capture
 from imitarm.capture.recording import read_recording
 from imitarm.capture.skeleton import JOINT, JOINTS, Tracking
 from imitarm.capture.sources import open_source
@@ -49,12 +48,12 @@ def test_the_rest_of_the_body_is_given_as_inferred(tmp_path):
     assert (tracking == Tracking.TRACKED).sum() == 6
     assert (tracking == Tracking.INFERRED).sum() == len(JOINTS) - 6
     assert recording.skeletons[0].positions[JOINT["head"], 1] > recording.skeletons[0].positions[JOINT["foot_left"], 1]
-    assert [finding.code for finding in recording.findings] == ["arm-only"]
+    assert [finding.code for finding in recording.issues] == ["arm-only"]
 
 
 def test_what_is_none_is_left_to_the_other_readers_and_damage_is_told(tmp_path):
-    assert not mocap_tsv.recognises(b"# format: imitarm-skeletons\n")
-    assert not mocap_tsv.recognises(b"1,2,3\nMARKER_NAMES\t")
+    assert not is_motion_capture(b"# format: imitarm-skeletons\n")
+    assert not is_motion_capture(b"1,2,3\nMARKER_NAMES\t")
     with pytest.raises(FileFormatError, match="marker 'thumb_middle' is missing"):
         read_recording(export(tmp_path / "few.tsv", markers=MARKERS[:-1]))
     whole = export(tmp_path / "whole.tsv").read_bytes()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from imitarm.capture.line_process import LONGEST, LineProcess
+from imitarm.capture.mediapipe_environment import LONGEST, LineProcess
 from mediapipe_samples import alive
 
 STUBBORN = "import signal, sys, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); "
@@ -94,7 +94,7 @@ def test_it_does_not_outlive_the_last_reference():
 def test_it_does_not_outlive_a_program_that_is_killed():
     program = (
         "import sys, time\n"
-        "from imitarm.capture.line_process import LineProcess\n"
+        "from imitarm.capture.mediapipe_environment import LineProcess\n"
         "child = LineProcess([sys.executable, '-c', 'import sys; print(1, flush=True); sys.stdin.read()'])\n"
         "child.line(30.0)\n"
         "print(child.pid, flush=True)\n"

@@ -4,9 +4,9 @@ import pytest
 from imitarm import InputError
 from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.motions import reaching
-from imitarm.capture.noise import measure_noise
 from imitarm.capture.person import Person
 from imitarm.capture.recording import read_recording
+from imitarm.capture.sensor_quality import measure_noise
 from imitarm.capture.skeleton import JOINT, JOINTS, Skeleton
 from imitarm.capture.synthetic import SyntheticSource
 

@@ -1,0 +1,274 @@
+"""Sources that filter another source: one person of several, with left and right kept apart."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.capture.skeleton import JOINT, JOINTS, SIDES, Skeleton, SkeletonSource, Tracking
+from imitarm.errors import InputError
+
+Array = NDArray[np.float64]
+
+PATIENCE = 2.0  # [s] the followed person may be out of view for so long
+_FASTEST = 2.5  # [m/s] speed of a torso; a faster one is another person with the same number
+_SLACK = 0.3  # [m] measurement error of its position
+_TORSO = np.array([JOINT[name] for name in ("spine_shoulder", "spine_mid", "neck")])
+
+
+class PersonFilter(SkeletonSource):
+    """One person of all whom a source sees.
+
+    The first person seen is followed until they have been out of view for more than ``patience`` on the source's
+    clock; everybody else is ignored. Only then is another person followed: after so long a gap every retargeter has
+    stopped and engages anew. A source that sees only one person may give the next one the same number; so a person who
+    appears farther away than anyone can have walked is ignored, too.
+
+    Args:
+        source: what sees people.
+        person: follow only this person, by the source's number; None: the first who is seen.
+        patience: [s].
+
+    Attributes:
+        followed: number of the followed person; None: nobody yet.
+        passed_over: number of skeletons of other persons so far.
+
+    Raises:
+        InputError: when the patience is negative.
+    """
+
+    def __init__(self, source: SkeletonSource, *, person: int | None = None, patience: float = PATIENCE) -> None:
+        if not patience >= 0.0:
+            raise InputError(f"PersonFilter: patience must be at least 0 s, got {patience!r}")
+        self.name = source.name
+        self.followed: int | None = None
+        self.passed_over = 0
+        self._source, self._only, self._patience = source, person, patience
+        self._seen = -math.inf
+        self._place: tuple[float, Array] | None = None  # time and place of the torso when last seen
+        self._stranger: Array | None = None  # place of another person who has the same number
+
+    @property
+    def over(self) -> bool:
+        """Whether the source is over."""
+        return self._source.over
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
+
+    def read(self, timeout: float = 1.0) -> Skeleton | None:
+        """Return the next skeleton of the followed person; None when none came within ``timeout`` seconds."""
+        until = clock.monotonic() + timeout
+        while not self._source.over:
+            skeleton = self._source.read(max(until - clock.monotonic(), 0.0))
+            if skeleton is not None and self._is_followed(skeleton):
+                return skeleton
+            if clock.monotonic() >= until:
+                break
+        return None
+
+    def _is_followed(self, skeleton: Skeleton) -> bool:
+        """Return whether a skeleton is that of the followed person, and remember where that person is."""
+        if self._only is not None and skeleton.person != self._only:
+            self.passed_over += 1
+            return False
+        gone = skeleton.time - self._seen
+        torso = _torso(skeleton)
+        near = abs(gone) <= self._patience  # a clock that was set back is a gap too
+        if self.followed is not None and near:
+            same = skeleton.person == self.followed and self._can_be_there(skeleton.time, torso)
+            if not same:
+                self.passed_over += 1
+                return False
+        elif torso is None:  # a hand alone is not enough to begin with
+            return False
+        else:
+            self._place = self._stranger = None
+        self.followed = skeleton.person
+        self._seen = max(self._seen, skeleton.time) if near else skeleton.time
+        if torso is not None:
+            self._place = (skeleton.time, torso)
+        return True
+
+    def _can_be_there(self, time: float, torso: Array | None) -> bool:
+        """Return whether the followed person can have walked there, and no other person was seen closer to there."""
+        if torso is None or self._place is None:
+            return self._stranger is None
+        before, place = self._place
+        moved = _distance(torso, place)
+        near = moved <= _SLACK + _FASTEST * abs(time - before)
+        if near and (self._stranger is None or moved < _distance(torso, self._stranger)):
+            self._stranger = None
+            return True
+        self._stranger = torso
+        return False
+
+
+def _distance(a: Array, b: Array) -> float:
+    difference = a - b
+    return math.sqrt(float(difference @ difference))
+
+
+def _torso(skeleton: Skeleton) -> Array | None:
+    """Return the place of a person: the first joint of the torso that is seen, else the middle of the shoulders."""
+    for point in skeleton.positions[_TORSO]:
+        if point[0] == point[0]:  # not nan
+            return np.asarray(point)
+    middle = 0.5 * (skeleton.joint("shoulder_left") + skeleton.joint("shoulder_right"))
+    if middle[0] == middle[0]:
+        return np.asarray(middle)
+    return None
+
+
+MEMORY = 0.5  # [s] older positions of a joint are not used
+_TRUNK_SPEED, _ARM_SPEED = 0.5, 4.0  # [m/s] joints that appear to move faster have exchanged sides
+_LEAST = 0.15  # [m] sides closer than half of this can't be told apart by their motion
+
+_PAIRED = tuple(name.removesuffix("_left") for name in JOINTS if name.endswith("_left"))
+
+
+def _pairs(parts: tuple[str, ...]) -> NDArray[np.int64]:
+    return np.array([[JOINT[f"{part}_{side}"] for part in parts] for side in SIDES])
+
+
+_BODY = _pairs(_PAIRED)
+_TRUNK = _pairs(("shoulder", "hip"))
+_ARMS = (  # joints that are exchanged together, and joints that decide it
+    (_pairs(("elbow", "wrist", "hand", "hand_tip", "thumb")), _pairs(("elbow", "wrist"))),
+    (_pairs(("wrist", "hand", "hand_tip", "thumb")), _pairs(("wrist",))),
+)
+
+_DECIDING = _pairs(("shoulder", "hip", "elbow", "wrist"))
+
+
+def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
+    r"""Return the skeleton with its sides as they were in the frame before.
+
+    Let :math:`l, r` be the positions of a left and a right joint and :math:`l', r'` those in the frame before, a time t
+    earlier. Sides are exchanged back when that shortens the motion since the frame before by more than limbs can move:
+
+    .. math:: \sum_j |l_j - l'_j| + |r_j - r'_j| > \sum_j |l_j - r'_j| + |r_j - l'_j| + n\,\max(0.15, v t)
+
+    summed over n pairs of joints that are seen in both frames. Shoulders and hips (v = 0.5 m/s) decide about the whole
+    body; then hands, with or without elbows (v = 4 m/s), decide about arms that were exchanged while the body was not.
+    Hands that meet are too close to each other to fulfil the inequality and stay as they are. When one joint of a pair
+    is lost, the other one decides.
+
+    Args:
+        skeleton: as the camera reports it.
+        before: the frame before, with its sides right.
+
+    Returns:
+        the same skeleton when nothing was exchanged.
+    """
+    return _kept(skeleton, before.positions, abs(skeleton.time - before.time))
+
+
+def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
+    """Return the skeleton with its sides as they were at ``before``, positions (25, 3) [m], a ``period`` [s] ago."""
+    if not (_gain(skeleton.positions, before, _DECIDING, _LEAST) > 0.0).any():  # nearly always
+        return skeleton
+    order = np.arange(len(JOINTS))
+    trunk = np.nansum(_gain(skeleton.positions, before, _TRUNK, max(_LEAST, _TRUNK_SPEED * period)))
+    hands = body = bool(trunk > 0.0)
+    if body:
+        order[_BODY.ravel()] = _BODY[::-1].ravel()
+    for arms, deciding in _ARMS:
+        gain = _gain(skeleton.positions[order], before, deciding, max(_LEAST, _ARM_SPEED * period))
+        known = np.isfinite(gain)
+        if known.any(axis=0).all() and (np.where(known, gain, 0.0).sum(axis=0) > 0.0).all():
+            order[arms.ravel()] = order[arms[::-1].ravel()]
+            hands = not hands
+            break
+    if (order == np.arange(len(JOINTS))).all():
+        return skeleton
+    left, right = skeleton.hand_states
+    states = (right, left) if hands else (left, right)
+    return Skeleton(skeleton.time, skeleton.positions[order], skeleton.tracking[order], states, skeleton.person)
+
+
+def _gain(now: Array, before: Array, pairs: NDArray[np.int64], margin: float) -> Array:
+    """Return how much closer joints are to where the other side was than to where they were, less ``margin`` / 2.
+
+    Args:
+        now: positions (25, 3) [m].
+        before: likewise.
+        pairs: joints of the left and the right side, shape (2, n).
+        margin: for each pair [m].
+
+    Returns:
+        shape (2, n) [m]; nan where a joint is lost, or one of its pair was.
+    """
+    there, here = before[pairs], now[pairs]
+    straight, crossed = here - there, here - there[::-1]
+    straight *= straight
+    crossed *= crossed
+    return np.sqrt(straight.sum(axis=2)) - np.sqrt(crossed.sum(axis=2)) - 0.5 * margin
+
+
+class SideMemory:
+    """Keeps the sides of one person apart, frame by frame.
+
+    Attributes:
+        swaps: frames in which sides were exchanged back.
+    """
+
+    def __init__(self) -> None:
+        self.swaps = 0
+        self._time = -np.inf
+        self._positions = np.full((len(JOINTS), 3), np.nan)  # last position of each joint, for MEMORY seconds
+        self._seen = np.full(len(JOINTS), -np.inf)
+
+    def update(self, skeleton: Skeleton) -> Skeleton:
+        """Return the next skeleton with its sides right."""
+        right = skeleton
+        period = abs(skeleton.time - self._time)
+        if period <= MEMORY:
+            right = _kept(skeleton, self._positions, period)
+            self.swaps += right is not skeleton
+        seen = right.tracking > Tracking.LOST
+        self._positions[seen], self._seen[seen] = right.positions[seen], right.time
+        self._positions[np.abs(right.time - self._seen) > MEMORY] = np.nan
+        self._time = right.time
+        return right
+
+
+class SwapGuard(SkeletonSource):
+    """A source with left and right kept apart, for each person; see :func:`unswapped`.
+
+    Only motion decides: the sides of the first frame are taken as right. After half a second without frames it starts
+    anew; by then every retargeter has stopped.
+
+    Args:
+        source: a source that may exchange left and right.
+    """
+
+    def __init__(self, source: SkeletonSource) -> None:
+        self.name = source.name
+        self._source = source
+        self._memory: dict[int, SideMemory] = {}
+
+    @property
+    def swaps(self) -> int:
+        """Frames in which sides were exchanged back."""
+        return sum(memory.swaps for memory in self._memory.values())
+
+    @property
+    def over(self) -> bool:
+        """Whether the source is over."""
+        return self._source.over
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
+
+    def read(self, timeout: float = 1.0) -> Skeleton | None:
+        """Return the next skeleton with its sides right; None when none came within ``timeout`` seconds."""
+        skeleton = self._source.read(timeout)
+        if skeleton is None:
+            return None
+        return self._memory.setdefault(skeleton.person, SideMemory()).update(skeleton)
