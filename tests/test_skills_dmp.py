@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_exp, quaternion_log, quaternion_multiply
-from imitarm.skills import DMP, Gains
+from imitarm.skills import DMP, DMPState, Gains
+from imitarm.skills.dynamical_systems import MovingTarget
+from imitarm.skills.quaternion_dmp import RotationState
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -280,7 +282,7 @@ def test_rotation_is_learnt_with_the_position() -> None:
 
 def test_a_quaternion_must_come_in_a_pose() -> None:
     dmp = DMP().fit(minimum_jerk())
-    with pytest.raises(InputError, match="goal must be a Pose or 3"):
+    with pytest.raises(InputError, match=r"goal .a Pose or a position. must be 3 numbers"):
         dmp.generate(goal=[0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
     np.testing.assert_allclose(dmp.generate(goal=Pose(NET, WXYZ)).positions[-1], NET, atol=1e-6)
 
@@ -327,7 +329,31 @@ def test_from_weights_gives_the_same_motion_and_refuses_nonsense(dmp: DMP) -> No
     }
     again = DMP.from_weights(dmp.weights_, dmp.progress_weights_, **arguments)
     np.testing.assert_array_equal(again.generate(goal=[0, 0, 0]).positions, dmp.generate(goal=[0, 0, 0]).positions)
-    with pytest.raises(InputError, match="shapes"):
+    with pytest.raises(InputError, match=r"weights must be an array of shape \(n, 3\)"):
         DMP.from_weights(dmp.weights_[:, :2], dmp.progress_weights_, **arguments)
     with pytest.raises(InputError, match="duration"):
         DMP.from_weights(dmp.weights_, dmp.progress_weights_, **{**arguments, "duration": -1.0})
+
+
+TARGET = MovingTarget(np.zeros(3), np.ones(3), 4.0, "progress", np.zeros((5, 3)))
+MOTION = np.array([[1.0, 2.0, 3.0], [4.0, 0.0, -4.0]])
+
+
+def test_it_answers_in_metres_and_seconds() -> None:
+    state = DMPState(MOTION, 0.5, TARGET)
+    np.testing.assert_array_equal(state.position, [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(state.velocity, [1.0, 0.0, -1.0])
+    assert state.time == 2.0
+    assert state.phase == pytest.approx(0.1)
+    assert state.quaternion is None
+
+
+def test_the_phase_falls_from_one_to_a_hundredth() -> None:
+    assert DMPState(MOTION, 0.0, TARGET).phase == 1.0
+    assert DMPState(MOTION, 1.0, TARGET).phase == pytest.approx(0.01)
+
+
+def test_the_rotation_is_that_of_its_state() -> None:
+    q = np.array([1.0, 0.0, 0.0, 0.0])
+    rotation = RotationState(q, np.zeros((2, 3)), 0.5, np.zeros(3), np.zeros(3))
+    assert DMPState(MOTION, 0.5, TARGET, rotation).quaternion is q

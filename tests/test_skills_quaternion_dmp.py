@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_exp, quaternion_log, quaternion_multiply
 from imitarm.skills import QuaternionDMP
-from imitarm.skills.spring import GAINS
+from imitarm.skills.dynamical_systems import GAINS
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -117,7 +117,7 @@ def test_uneven_stamps_and_epoch_times() -> None:
 def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="no quaternions"):
         QuaternionDMP().fit(Trajectory([0.0, 1.0], np.zeros((2, 3))))
-    with pytest.raises(InputError, match="row 2 is turned by 120 degrees"):
+    with pytest.raises(InputError, match="row 2 is rotated by 120 degrees"):
         q = quaternion_exp(np.deg2rad([0.0, 10.0, 130.0, 140.0, 150.0])[:, None] * AXIS)
         QuaternionDMP().fit(Trajectory(np.arange(5.0), np.zeros((5, 3)), q))
     with pytest.raises(InputError, match="not fitted"):

@@ -96,9 +96,9 @@ def test_rotation_goes_round_with_the_position() -> None:
 
 def test_bad_input_is_named(dmp: RhythmicDMP) -> None:
     t = np.linspace(0.0, 2.0, 201)
-    with pytest.raises(InputError, match=r"after 1\.3 s the motion is"):
+    with pytest.raises(InputError, match=r"after a period of 1\.3 s the motion is"):
         RhythmicDMP().fit(Trajectory(t, wiping(t)), period=1.3)
-    with pytest.raises(InputError, match="period must be above 0"):
+    with pytest.raises(InputError, match="period must be a finite number above 0"):
         RhythmicDMP().fit(Trajectory(t, wiping(t)), period=5.0)
     with pytest.raises(InputError, match="120 degrees"):
         q = quaternion_exp(np.deg2rad(170.0) * np.sin(np.pi * t)[:, None] * np.array([0.0, 0.0, 1.0]))

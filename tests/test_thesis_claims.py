@@ -11,8 +11,7 @@ from imitarm.benchmark.avoidance import learn
 from imitarm.policies import adapt
 from imitarm.scene import Scene, Sphere
 from imitarm.skills import DMP
-from imitarm.skills.phase_basis import DECAY
-from imitarm.skills.spring import GAINS
+from imitarm.skills.dynamical_systems import DECAY, GAINS
 from imitarm.trajectory import Trajectory
 
 # Table 4.1, tasks T1 to T8 in rows. Its unit is not stated.

@@ -1,67 +1,123 @@
-"""Dynamic movement primitive: a spring and damper to the goal, shaped by a learnt force."""
+"""Dynamic movement primitive: a spring and damper that reaches the goal along a learned path."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose
-from imitarm.skills.course import ADJUSTMENTS, Adjustment, Course, rotodilatation
-from imitarm.skills.dmp_fit import imitate, progress_at
-from imitarm.skills.dmp_state import DMPState
-from imitarm.skills.phase_basis import DECAY, phase_basis
-from imitarm.skills.quaternion_dmp import QuaternionDMP
-from imitarm.skills.spring import Gains, gains_named, propagator, roll_out
+from imitarm.skills.dmp_fit import fit_weights, progress_at
+from imitarm.skills.dynamical_systems import (
+    ADJUSTMENTS,
+    DECAY,
+    Adjustment,
+    Gains,
+    MovingTarget,
+    phase_basis,
+    propagator,
+    roll_out,
+    rotodilatation,
+)
+from imitarm.skills.quaternion_dmp import QuaternionDMP, RotationState
 from imitarm.trajectory import Trajectory
+from imitarm.validation import finite_array, finite_number, finite_vector, flag, instance, whole_number
 
 Array = NDArray[np.float64]
-
 Coupling = Callable[[Array, Array], ArrayLike]
+
+MOST_STEPS = 10_000_000  # of a generated motion
+_SHORTEST_STEP, _LONGEST_STEP = 1e-100, 100.0  # in durations: the spring's numbers stay finite, and the time to compute
+
+
+class DMPState(NamedTuple):
+    """State of a primitive on its way. Made by ``DMP.begin``, advanced by ``DMP.step``.
+
+    Attributes:
+        motion: [x; T x'] with T the duration, shape (2, 3) [m].
+        fraction: of the duration that is over on the primitive's own clock; the phase is ``exp(-alpha fraction)``.
+        target: the motion that was asked for: its start, goal and duration.
+        rotation: state of the rotation; None when none was learned.
+        steps: length of the steps so far, as a fraction of the duration, and their number; None when they differed.
+    """
+
+    motion: Array
+    fraction: float
+    target: MovingTarget
+    rotation: RotationState | None = None
+    steps: tuple[float, int] | None = None
+
+    @property
+    def position(self) -> Array:
+        """Position (3,) [m]."""
+        return self.motion[0]
+
+    @property
+    def velocity(self) -> Array:
+        """Velocity (3,) [m/s]."""
+        return self.motion[1] / self.target.duration
+
+    @property
+    def phase(self) -> float:
+        """Phase s, from 1 at the start to 0.01 at the end and on towards 0."""
+        return float(np.exp(-DECAY * self.fraction))
+
+    @property
+    def time(self) -> float:
+        """Time of the primitive's own clock [s]; it is behind the wall clock when the robot lagged."""
+        return self.fraction * self.target.duration
+
+    @property
+    def quaternion(self) -> Array | None:
+        """Rotation wxyz (4,), or None when none was learned."""
+        return None if self.rotation is None else self.rotation.quaternion
 
 
 class DMP:
-    r"""Dynamic movement primitive in the form of Hoffmann and Pastor (METHODS C; replaces thesis Eqs 2.8 to 2.12).
+    r"""Dynamic movement primitive in the form of Hoffmann et al. (2009) and Pastor et al. (2009).
 
     .. math::
         \tau \dot v &= K (g - x) - D v - K (g - x_0) s + K f(s), \quad \tau \dot x = v, \quad \tau \dot s = -\alpha s
 
         f(s) &= \frac{\sum_i w_i \psi_i(s) s}{\sum_i \psi_i(s)}, \quad \psi_i(s) = \exp(-h_i (s - c_i)^2)
 
-    tau is the duration, so K and D have no unit; ``"critical"`` gains have D = 2 sqrt(K), the ``"thesis"`` gains
-    K = 139.26, D = 28 a damping ratio of 1.186. The same in other words: the spring pulls to a moving target
+    It replaces thesis Eqs 2.8 to 2.12, whose force is scaled by g - x_0 and fails for an axis that does not move. tau
+    is the duration, so K and D have no unit: ``"critical"`` gains have D = 2 sqrt(K); the ``"thesis"`` gains
+    K = 139.26, D = 28 have a damping ratio of 1.186. Written differently, the spring follows a moving target
     ``y(s) = g - (g - x_0) s + f(s)`` that ends at the goal.
 
-    **Fitting** (:func:`~imitarm.skills.dmp_fit.imitate`) is ridge regression on the positions themselves: no noise is
-    differentiated, any time stamps will do, and the motion arrives at the goal exactly when the duration is over.
+    **Fitting** (:func:`~imitarm.skills.dmp_fit.fit_weights`) is ridge regression on the positions: nothing measured is
+    differentiated, samples may lie at any times, and the motion is at the goal when the duration is over.
 
-    **Other ends.** With ``p`` the share of the path that is done (itself a primitive from 0 to 1 with weights w_p),
+    **Another start or goal.** With ``p`` the fraction of the path that is done (a primitive from 0 to 1 with weights
+    w_p), ``adjustment`` selects the weights:
 
-    * ``"progress"``: w + (change of g - x_0) w_p, so the change enters as the path is travelled: nothing moves when
-      the demonstration did not, half the distance never goes backwards, a still axis is no special case;
-    * ``"hoffmann"``: w as learnt, the printed form: the change enters as fast as the spring allows;
-    * ``"rotodilatation"``: w turned and stretched like g - x_0 was (Ginesi et al. 2019), for a shape that scales.
+    * ``"progress"``: w + (change of g - x_0) w_p. The change enters as the path is travelled: while the demonstration
+      rests, nothing moves; half the distance never goes backwards; an axis without motion is no special case.
+    * ``"hoffmann"``: w as learned, the published form. The change enters as fast as the spring allows.
+    * ``"rotodilatation"``: w rotated and stretched as g - x_0 is (Ginesi et al. 2019), for a shape that scales.
 
-    **Integration.** Steps are exact for a target that is a parabola within the step (:mod:`imitarm.skills.spring`), so
-    ``step`` and ``generate`` agree, and a motion does not depend on the step chosen nor lead its demonstration.
+    **Integration.** A step is exact for a target that is a parabola within each 1/200 of the duration, so ``step`` and
+    ``generate`` agree, and neither the path nor its end depends on the step length.
 
     Args:
-        gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.spring.Gains`.
+        gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
         n_basis: number N of basis functions.
-        regularisation: ridge, relative to the mean square response of a basis function.
+        regularisation: of the ridge regression, relative to the mean square response of a basis function.
 
     Attributes:
         gains_: stiffness and damping.
         weights_: w, shape (N, 3) [m].
         progress_weights_: w_p, shape (N,).
-        start_: learnt start x_0, shape (3,) [m].
-        goal_: learnt goal g, shape (3,) [m].
-        start_velocity_: learnt, shape (3,) [m/s].
-        duration_: learnt [s].
-        path_length_: of the learnt motion [m].
+        start_: learned start x_0, shape (3,) [m].
+        goal_: learned goal g, shape (3,) [m].
+        start_velocity_: learned, shape (3,) [m/s].
+        duration_: learned [s].
+        path_length_: of the learned motion [m].
         orientation_: primitive of the rotation; None when the demonstration had no quaternions.
 
     Raises:
@@ -79,15 +135,9 @@ class DMP:
     orientation_: QuaternionDMP | None
 
     def __init__(self, gains: str | Gains = "critical", *, n_basis: int = 40, regularisation: float = 1e-7) -> None:
-        self.gains_ = gains_named(gains) if isinstance(gains, str) else Gains(*gains)
-        if not (self.gains_.stiffness > 0.0 and self.gains_.damping > 0.0):
-            raise InputError(f"DMP: stiffness and damping must be above 0, got {self.gains_}")
-        if not isinstance(n_basis, int | np.integer) or n_basis < 2:
-            raise InputError(f"DMP: n_basis must be a whole number of at least 2, got {n_basis!r}")
-        if not regularisation > 0.0:
-            raise InputError(f"DMP: regularisation must be above 0, got {regularisation!r}")
-        self.n_basis = int(n_basis)
-        self.regularisation = regularisation
+        self.gains_ = Gains.of(gains, "DMP")
+        self.n_basis = whole_number(n_basis, "DMP: n_basis", at_least=2, at_most=2000)
+        self.regularisation = finite_number(regularisation, "DMP: regularisation", above=0.0)
 
     def fit(self, trajectory: Trajectory, *, exact_ends: bool = False) -> Self:
         """Learn from one trajectory; its times may start anywhere.
@@ -101,15 +151,17 @@ class DMP:
         Raises:
             InputError: when it has fewer than 3 samples.
         """
+        instance(trajectory, Trajectory, "DMP.fit: trajectory")
+        flag(exact_ends, "DMP.fit: exact_ends")
         if len(trajectory) < 3:
             raise InputError(f"DMP.fit: needs at least 3 samples, got {len(trajectory)}")
-        share = (trajectory.times - trajectory.times[0]) / trajectory.duration
-        learnt = imitate(
-            share, trajectory.positions, self.gains_, self.n_basis, self.regularisation, exact_ends=exact_ends
+        fraction = (trajectory.times - trajectory.times[0]) / trajectory.duration
+        learned = fit_weights(
+            fraction, trajectory.positions, self.gains_, self.n_basis, self.regularisation, exact_ends=exact_ends
         )
-        self.weights_, self.progress_weights_ = learnt.weights, learnt.progress_weights
-        self.start_, self.goal_, self.duration_ = learnt.start, learnt.goal, trajectory.duration
-        self.start_velocity_, self.path_length_ = learnt.start_rate / self.duration_, learnt.path_length
+        self.weights_, self.progress_weights_ = learned.weights, learned.progress_weights
+        self.start_, self.goal_, self.duration_ = learned.start, learned.goal, trajectory.duration
+        self.start_velocity_, self.path_length_ = learned.start_rate / self.duration_, learned.path_length
         self.orientation_ = None
         if trajectory.quaternions is not None:
             self.orientation_ = QuaternionDMP(self.gains_).fit(trajectory, exact_ends=exact_ends)
@@ -129,21 +181,24 @@ class DMP:
         path_length: float,
         orientation: QuaternionDMP | None = None,
     ) -> DMP:
-        """Build from weights that were learnt before; the arguments are the attributes of the class.
+        """Build from weights that were learned before; the arguments are the attributes of the class.
 
         Raises:
-            InputError: when shapes disagree, a number is not finite, or duration or gains are not above 0.
+            InputError: when shapes disagree, a number is not finite, or the duration or a gain is not above 0.
         """
-        w, p = np.array(weights, dtype=float), np.array(progress_weights, dtype=float)
-        if w.ndim != 2 or w.shape[1] != 3 or p.shape != (len(w),) or not np.all(np.isfinite(w)):
-            raise InputError(f"DMP.from_weights: shapes (N, 3) and (N,) of numbers needed, got {w.shape} and {p.shape}")
-        if not (np.all(np.isfinite(p)) and np.isfinite(duration) and duration > 0.0 and path_length >= 0.0):
-            raise InputError(f"DMP.from_weights: duration must be above 0 s and all finite, got {duration!r}")
+        what = "DMP.from_weights:"
+        w = finite_array(weights, (None, 3), f"{what} weights", "m").copy()
         dmp = cls(gains, n_basis=len(w))
-        dmp.weights_, dmp.progress_weights_, dmp.orientation_ = w, p, orientation
-        dmp.start_, dmp.goal_ = _position(start, w[0], "start"), _position(goal, w[0], "goal")
-        dmp.start_velocity_ = _position(start_velocity, w[0], "start_velocity")
-        dmp.duration_, dmp.path_length_ = float(duration), float(path_length)
+        dmp.weights_ = w
+        dmp.progress_weights_ = finite_vector(progress_weights, len(w), f"{what} progress_weights").copy()
+        dmp.start_ = finite_vector(start, 3, f"{what} start", "m").copy()
+        dmp.goal_ = finite_vector(goal, 3, f"{what} goal", "m").copy()
+        dmp.start_velocity_ = finite_vector(start_velocity, 3, f"{what} start_velocity", "m/s").copy()
+        dmp.duration_ = finite_number(duration, f"{what} duration", "s", above=0.0)
+        dmp.path_length_ = finite_number(path_length, f"{what} path_length", "m", at_least=0.0)
+        if orientation is not None:
+            instance(orientation, QuaternionDMP, f"{what} orientation")
+        dmp.orientation_ = orientation
         return dmp
 
     @property
@@ -156,19 +211,28 @@ class DMP:
         """Widths h_i of the basis functions, shape (N,)."""
         return phase_basis(self.n_basis).widths
 
+    def _check_fitted(self) -> None:
+        if not hasattr(self, "weights_"):
+            raise InputError("DMP: not fitted yet; call fit first")
+
     def progress(self, times: ArrayLike) -> Array:
-        """Return p, the fraction of the learned path that is done at ``times`` (n,) [s] of the learned duration."""
-        t = np.atleast_1d(np.asarray(times, dtype=float))
+        """Return p, the fraction of the learned path that is done at ``times`` (n,) [s] of the learned duration.
+
+        Raises:
+            InputError: when not fitted, or the times are not finite numbers.
+        """
+        self._check_fitted()
+        t = finite_array(np.atleast_1d(times), (None,), "DMP.progress: times", "s")
         return progress_at(t / self.duration_, self.progress_weights_, self.gains_)
 
-    def _course(self, start: Array, goal: Array, duration: float, adjustment: Adjustment) -> Course:
-        learnt, asked = self.goal_ - self.start_, goal - start
+    def _target(self, start: Array, goal: Array, duration: float, adjustment: Adjustment) -> MovingTarget:
+        learned, asked = self.goal_ - self.start_, goal - start
         weights = self.weights_
         if adjustment == "progress":
-            weights = weights + self.progress_weights_[:, None] * (asked - learnt)
+            weights = weights + self.progress_weights_[:, None] * (asked - learned)
         elif adjustment == "rotodilatation":
-            weights = weights @ rotodilatation(learnt, asked, self.path_length_).T
-        return Course(start, goal, duration, adjustment, weights - asked)
+            weights = weights @ rotodilatation(learned, asked, self.path_length_).T
+        return MovingTarget(start, goal, duration, adjustment, weights - asked)
 
     def begin(
         self,
@@ -182,33 +246,30 @@ class DMP:
         """Return the state at the start of a motion.
 
         Args:
-            start: a Pose, or a position (3,) [m] with the learnt rotation; None: as learnt.
+            start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
             goal: likewise.
-            duration: [s]; None: as learnt.
-            start_velocity: (3,) [m/s]; None: as learnt, sped up or slowed down with the duration.
-            adjustment: how the motion gives way to other ends, see the class.
+            duration: [s]; None: as learned.
+            start_velocity: (3,) [m/s]; None: as learned, scaled with the duration.
+            adjustment: how the motion is changed for another start and goal, see the class.
 
         Raises:
             InputError: when not fitted, a shape is wrong, or the duration is not above 0.
             UnknownNameError: when ``adjustment`` is none of the three.
         """
-        if not hasattr(self, "weights_"):
-            raise InputError("DMP: not fitted yet; call fit first")
+        self._check_fitted()
         if adjustment not in ADJUSTMENTS:
             raise UnknownNameError.among("adjustment", adjustment, ADJUSTMENTS)
-        T = self.duration_ if duration is None else float(duration)
-        if not (np.isfinite(T) and T > 0.0):
-            raise InputError(f"DMP: duration must be above 0 s, got {duration!r}")
+        T = self.duration_ if duration is None else finite_number(duration, "DMP: duration", "s", above=0.0)
         x0 = _position(start, self.start_, "start")
-        course = self._course(x0, _position(goal, self.goal_, "goal"), T, adjustment)
+        target = self._target(x0, _position(goal, self.goal_, "goal"), T, adjustment)
         rate = self.start_velocity_ * self.duration_
         if start_velocity is not None:
-            rate = _position(start_velocity, rate, "start_velocity") * T
-        turn = None
+            rate = finite_vector(start_velocity, 3, "DMP: start_velocity", "m/s") * T
+        rotation = None
         if self.orientation_ is not None:
             ends = [end.quaternion if isinstance(end, Pose) else None for end in (start, goal)]
-            turn = self.orientation_.begin(*ends)
-        return DMPState(np.stack([x0, rate]), 0.0, course, turn)
+            rotation = self.orientation_.begin(*ends)
+        return DMPState(np.stack([x0, rate]), 0.0, target, rotation)
 
     def step(
         self,
@@ -224,47 +285,59 @@ class DMP:
 
         Args:
             state: from :meth:`begin` or the last step.
-            dt: [s].
+            dt: [s], above 0.
             goal: another goal position (3,) [m] from now on, for a goal that moves.
-            coupling: from position (3,) [m] and velocity (3,) [m/s] to an acceleration (3,) [m/s^2] that is added
-                during this step, for example away from an obstacle; with (6,) the last three turn [rad/s^2].
-            measured: where the robot really is (3,) [m]: the clock slows down by ``1 / (1 + |lag| / patience)``
-                (phase stopping), so that the primitive waits instead of running ahead.
-            patience: the lag [m] that halves the pace.
+            coupling: function from position (3,) [m] and velocity (3,) [m/s] to an acceleration (3,) [m/s^2] that is
+                added during this step, for example away from an obstacle. With (6,) the last three are an angular
+                acceleration [rad/s^2].
+            measured: measured position of the robot (3,) [m]. The primitive's clock slows down by
+                ``1 / (1 + |lag| / patience)`` (phase stopping), so that the primitive waits for a robot that lags.
+            patience: the lag that halves the speed [m].
+
+        Raises:
+            InputError: when an argument is not finite or of a wrong shape, ``dt`` is not above 0 or above
+                100 durations, or ``patience`` is not above 0.
         """
-        course, rhythm = state.course, state.rhythm
-        if goal is not None and not np.array_equal(goal, course.goal):
-            course = self._course(
-                course.start, _position(goal, course.goal, "goal"), course.duration, course.adjustment
-            )
-            rhythm = None
-        h = dt / course.duration
+        if not isinstance(state, DMPState) or not hasattr(self, "weights_"):
+            self._check_fitted()
+            raise InputError(f"DMP.step: state must be a DMPState from begin or step, got {state!r:.80}")
+        if not math.isfinite(sum(state.motion.ravel().tolist())):
+            raise InputError("DMP.step: state must hold finite numbers; begin again from a valid state")
+        target, steps = state.target, state.steps
+        if goal is not None:
+            goal = finite_vector(goal, 3, "DMP.step: goal", "m")
+            if not np.array_equal(goal, target.goal):
+                target = self._target(target.start, goal.copy(), target.duration, target.adjustment)
+                steps = None
+        T = target.duration
+        h = finite_number(dt, "DMP.step: dt", "s", above=0.0, at_most=_LONGEST_STEP * T) / T
         if measured is not None:
-            h /= 1.0 + float(np.linalg.norm(np.asarray(measured) - state.motion[0])) / patience
+            lag = finite_vector(measured, 3, "DMP.step: measured", "m") - state.motion[0]
+            h /= 1.0 + float(np.linalg.norm(lag)) / finite_number(patience, "DMP.step: patience", "m", above=0.0)
+        h = max(h, _SHORTEST_STEP)
         done = 0
-        if rhythm is not None:
-            done = rhythm[1] if rhythm[0] == h else -1
-        elif state.share > 0.0:
+        if steps is not None:
+            done = steps[1] if steps[0] == h else -1
+        elif state.fraction > 0.0:
             done = -1
-        plan = course.plan(self.gains_, h) if done >= 0 else None
+        plan = target.plan(self.gains_, h) if done >= 0 else None
         if plan is not None and done < len(plan.pushes):
             motion = plan.transition.dot(state.motion) + plan.pushes[done]  # dot: @ is slower on small arrays
         else:
             one = propagator(self.gains_, h)
-            y = course.target(np.exp(-DECAY * (state.share + one.instants)))
+            y = target.at(np.exp(-DECAY * (state.fraction + one.instants)))
             motion = one.transition.dot(state.motion) + one.drive.dot(y)
-        turning = None
+        angular = None
         if coupling is not None:
-            T = course.duration
-            acceleration = np.asarray(coupling(state.motion[0], state.motion[1] / T), dtype=float) * (T * T)
+            acceleration = _acceleration(coupling(state.motion[0], state.motion[1] / T)) * (T * T)
             motion += propagator(self.gains_, h).push[:, None] * acceleration[:3]
-            turning = acceleration[3:] if len(acceleration) == 6 else None
-        turn = state.turn
-        if turn is not None and self.orientation_ is not None:
-            turn = self.orientation_.step(turn, h, turning)
+            angular = acceleration[3:] if len(acceleration) == 6 else None
+        rotation = state.rotation
+        if rotation is not None and self.orientation_ is not None:
+            rotation = self.orientation_.step(rotation, h, angular)
         if done < 0:
-            return DMPState(motion, state.share + h, course, turn, None)
-        return DMPState(motion, (done + 1) * h, course, turn, (h, done + 1))
+            return DMPState(motion, state.fraction + h, target, rotation, None)
+        return DMPState(motion, (done + 1) * h, target, rotation, (h, done + 1))
 
     def generate(
         self,
@@ -295,31 +368,50 @@ class DMP:
             InputError: as :meth:`begin`, and when ``dt`` is not above 0 or longer than twice the duration.
         """
         state = self.begin(start, goal, duration, start_velocity=start_velocity, adjustment=adjustment)
-        T = state.course.duration
-        n = round(T / dt) if np.isfinite(dt) and dt > 0.0 else 0
-        if n < 1:
-            raise InputError(f"DMP.generate: dt must be above 0 and not above the duration {T:g} s, got {dt!r}")
+        T = state.target.duration
+        n = number_of_steps(T, dt, "DMP.generate")
         times = np.linspace(0.0, T, n + 1)
         if coupling is not None:
             states = [state]
             for _ in range(n):
                 states.append(self.step(states[-1], T / n, coupling=coupling))
-            quaternions = None if state.turn is None else np.stack([s.turn.quaternion for s in states if s.turn])
+            quaternions = None
+            if state.rotation is not None:
+                quaternions = np.stack([s.rotation.quaternion for s in states if s.rotation is not None])
             return Trajectory(times, np.stack([s.position for s in states]), quaternions)
         one = propagator(self.gains_, 1.0 / n)
-        positions = roll_out(one, state.motion, state.course.target_on_grid(n * one.n_parts))[0]
-        if self.orientation_ is None or state.turn is None:
+        positions = roll_out(one, state.motion, state.target.on_grid(n * one.n_parts))[0]
+        if self.orientation_ is None or state.rotation is None:
             return Trajectory(times, positions)
-        return Trajectory(times, positions, self.orientation_.target(state.turn, times / T))
+        return Trajectory(times, positions, self.orientation_.target(state.rotation, times / T))
+
+
+def number_of_steps(duration: float, dt: float, what: str) -> int:
+    """Return ``round(duration / dt)``, at least 1.
+
+    Raises:
+        InputError: when ``dt`` [s] is not above 0, or gives no step or more than 10 million.
+    """
+    steps = duration / finite_number(dt, f"{what}: dt", "s", above=0.0)
+    if not 0.5 <= steps <= MOST_STEPS:
+        raise InputError(
+            f"{what}: dt must be at most the duration {duration:g} s and give at most {MOST_STEPS:,} steps, "
+            f"got {dt!r} s"
+        )
+    return max(1, round(steps))
 
 
 def _position(value: Pose | ArrayLike | None, default: Array, what: str) -> Array:
-    """Return a position of its own, (3,)."""
+    """Return a position that shares no memory with ``value``, shape (3,)."""
     if value is None:
         return default.copy()
     if isinstance(value, Pose):
         return value.position
-    position = np.array(value, dtype=float)
-    if position.shape != (3,) or not np.all(np.isfinite(position)):
-        raise InputError(f"DMP: {what} must be a Pose or 3 finite numbers, got {value!r}")
-    return position
+    return finite_vector(value, 3, f"DMP: {what} (a Pose or a position)", "m").copy()
+
+
+def _acceleration(value: ArrayLike) -> Array:
+    acceleration = finite_array(value, (None,), "DMP: acceleration that coupling returns", "m/s^2, rad/s^2")
+    if len(acceleration) not in (3, 6):
+        raise InputError(f"DMP: coupling must return 3 or 6 numbers, got {len(acceleration)}")
+    return acceleration

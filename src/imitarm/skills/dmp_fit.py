@@ -1,4 +1,4 @@
-"""Learning the weights of a movement primitive."""
+"""The weights of a movement primitive, from one path."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from imitarm.skills.phase_basis import on_grid, phase_basis
-from imitarm.skills.spring import Gains, propagator, roll_out
+from imitarm.skills.dynamical_systems import Gains, basis_on_grid, phase_basis, propagator, roll_out
 
 Array = NDArray[np.float64]
 
@@ -19,8 +18,8 @@ _FINE = 512  # steps of the grid on which responses are computed
 _NOISE = 1e-4  # [m] the repeatability of industrial arms
 
 
-class Imitation(NamedTuple):
-    """What was learnt from one path.
+class FittedWeights(NamedTuple):
+    """A primitive's parameters, fitted to one path.
 
     Attributes:
         start: x_0, shape (3,) [m].
@@ -41,7 +40,7 @@ class Imitation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Responses:
-    """What the spring answers on the fine grid to a start of 1, a rate of 1, a goal of 1, and each basis function."""
+    """Responses of the spring on the fine grid: to a start of 1, a rate of 1, a goal of 1, and each basis function."""
 
     values: Array  # (_FINE + 1, 3 + N)
     rates: Array
@@ -50,7 +49,7 @@ class _Responses:
 
 @lru_cache(maxsize=8)
 def _responses(gains: Gains, n_basis: int) -> _Responses:
-    basis = on_grid(n_basis, _FINE)[1]
+    basis = basis_on_grid(n_basis, _FINE)[1]
     nothing = np.zeros(len(basis))
     inputs = np.column_stack([nothing, nothing, np.ones_like(nothing), basis])
     start = np.zeros((2, inputs.shape[1]))
@@ -59,37 +58,38 @@ def _responses(gains: Gains, n_basis: int) -> _Responses:
     return _Responses(z[0], z[1], CubicHermiteSpline(np.linspace(0.0, 1.0, _FINE + 1), z[0], z[1]))
 
 
-def imitate(
-    share: Array, x: Array, gains: Gains, n_basis: int, regularisation: float, *, exact_ends: bool = False
-) -> Imitation:
-    r"""Learn a path.
+def fit_weights(
+    fraction: Array, x: Array, gains: Gains, n_basis: int, regularisation: float, *, exact_ends: bool = False
+) -> FittedWeights:
+    r"""Return the weights with which the primitive reproduces a path.
 
     The motion is linear in the drives ``d_i = w_i - (g - x_0)``: with R the spring's responses to a start, a rate, a
-    goal and each basis function, ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. This is METHODS C's
-    ridge regression on the force, ``tau v' + D v`` and so on, with both sides filtered by the spring itself, which
-    turns accelerations that nobody measured into positions that were. So no noise is differentiated, time stamps may
-    lie anywhere, and what is minimised is the error of the reproduction in metres.
+    goal and each basis function, ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression
+    compares forces, ``tau v' + D v`` and so on, and needs measured accelerations. Here both sides are filtered by the
+    spring itself, which turns forces into positions. So noise is not differentiated, samples may lie at any times, and
+    the regression minimises the error of the reproduction in metres.
 
-    The motion passes exactly through its start and its goal. They are the first and the last sample, or, where noise
-    has put one of these more than 0.1 mm beside the path that fits all samples, that path's end: forced through a noisy
-    sample, it would jerk there. The last drive stays 0, so that the target is the goal when the duration is over. (Left
-    to the regression it is hardly determined, and pulls the tool off the goal by decimetres after the end.)
+    The motion passes exactly through its start and its goal. These are the first and the last sample. Where noise has
+    put one of them more than 0.1 mm beside the path that fits all samples, it is that path's end instead, unless
+    ``exact_ends``: forced through a noisy sample, the motion would jerk there. The last drive is 0, so that the target
+    is the goal when the duration is over. (The regression hardly determines it; left free, it can pull the tool
+    decimetres off the goal after the end.)
 
     Args:
-        share: of the duration, 0 to 1, shape (n,).
+        fraction: of the duration, from 0 to 1, shape (n,).
         x: positions, shape (n, 3) [m].
         gains: of the spring.
         n_basis: number N of basis functions.
-        regularisation: ridge, relative to the mean square response.
+        regularisation: of the ridge regression, relative to the mean square response.
         exact_ends: take the first and the last sample as they are, without smoothing.
     """
     responses = _responses(gains, n_basis)
-    R = responses.spline(share)
-    rate = start_rate(share, x)
+    R = responses.spline(fraction)
+    rate = start_rate(fraction, x)
     ends = np.stack([x[0], rate, x[-1]])
     if not exact_ends:
         beside = _beside(R, x - R[:, :3] @ ends, n_basis, regularisation)
-        if start_rate(1.0 - share[::-1], x[::-1]).any():  # cut off under way: the last sample is as good as any
+        if start_rate(1.0 - fraction[::-1], x[::-1]).any():  # it ends in motion: the last sample is as good as any
             beside[2] = 0.0
         ends += np.where(np.linalg.norm(beside, axis=1, keepdims=True) > _NOISE, beside, 0.0)
     base = R[:, :3] @ ends
@@ -101,23 +101,23 @@ def imitate(
         responses.values[:, 3:], (progress - base_progress)[:, None], force, regularisation, 1.0 - base_progress[-1:]
     )
     weights = drives + (ends[2] - ends[0])
-    return Imitation(ends[0], ends[2], weights, progress_drives[:, 0] + 1.0, rate, path_length)
+    return FittedWeights(ends[0], ends[2], weights, progress_drives[:, 0] + 1.0, rate, path_length)
 
 
-def progress_at(share: Array, progress_weights: Array, gains: Gains) -> Array:
-    """Return the fraction of the path that is done at ``share`` (n,) of the duration: 0 at the start, 1 at the end."""
-    R = _responses(gains, len(progress_weights)).spline(np.clip(share, 0.0, 1.0))
+def progress_at(fraction: Array, progress_weights: Array, gains: Gains) -> Array:
+    """Return the fraction of the path, from 0 to 1, that is done at ``fraction`` (n,) of the duration."""
+    R = _responses(gains, len(progress_weights)).spline(np.clip(fraction, 0.0, 1.0))
     return np.asarray(R[:, 2] + R[:, 3:] @ (progress_weights - 1.0))
 
 
 def _without_last(R: Array, y: Array, force: Array, regularisation: float, end: Array) -> Array:
-    """As :func:`_ridge`, with the last drive 0."""
+    """Return the solution of :func:`_ridge` whose last drive is 0."""
     drives = _ridge(R[:, :-1], y, force[:-1], regularisation, end)
     return np.concatenate([drives, np.zeros((1, y.shape[1]))])
 
 
 def _beside(R: Array, y: Array, n_basis: int, regularisation: float) -> Array:
-    """Return how far beside the first and the last sample the best path passes, rows (start, 0, goal)."""
+    """Return how far the best path passes from the first and from the last sample, rows (start, 0, goal) [m]."""
     columns = np.concatenate([R[:, :1], R[:, 3:-1]], axis=1)
     solution = _ridge(columns, y, np.append(1.0, phase_basis(n_basis).centers[:-1]), regularisation)
     start, goal = columns[[0, -1]] @ solution - y[[0, -1]]
@@ -125,7 +125,7 @@ def _beside(R: Array, y: Array, n_basis: int, regularisation: float) -> Array:
 
 
 def _ridge(R: Array, y: Array, force: Array, regularisation: float, end: Array | None = None) -> Array:
-    """Return ``d`` with ``R d = y``, by ridge regression on ``force d``, and exactly ``R[-1] d = end`` if given."""
+    """Return the ridge regression of ``R d = y``, penalising ``force d``; with ``end``, ``R[-1] d = end`` exactly."""
     n = R.shape[1]
     S = R / force
     kkt = np.zeros((n + 1, n + 1))
@@ -140,7 +140,10 @@ def _ridge(R: Array, y: Array, force: Array, regularisation: float, end: Array |
 
 
 def _progress(rate: Array) -> tuple[Array, float]:
-    """Return the share of the path that is done on the fine grid, and its length; minimum jerk if it has none."""
+    """Return the fraction of the path that is done, on the fine grid, and its length [m].
+
+    A motion without length gets a minimum-jerk profile.
+    """
     speed = np.linalg.norm(rate, axis=1)
     done = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))]) / _FINE
     length = float(done[-1])
@@ -150,16 +153,16 @@ def _progress(rate: Array) -> tuple[Array, float]:
     return u**3 * (10.0 + u * (6.0 * u - 15.0)), length
 
 
-def start_rate(share: Array, x: Array) -> Array:
-    """Return how fast the motion is under way at its first sample, shape (3,), in m a duration.
+def start_rate(fraction: Array, x: Array) -> Array:
+    """Return the velocity at the first sample, in m per duration, shape (3,).
 
-    The slope of a parabola through the first twentieth. It counts only when it stands out of the noise and is more than
-    a tenth of the mean speed: a motion that begins at rest begins exactly at rest.
+    It is the slope of a parabola through the first twentieth of the motion. It is 0 unless it exceeds three standard
+    errors and a tenth of the mean speed: a motion that begins at rest begins exactly at rest.
     """
-    n = max(6, int(np.searchsorted(share, 0.05, side="right")))
-    if len(share) < n:
+    n = max(6, int(np.searchsorted(fraction, 0.05, side="right")))
+    if len(fraction) < n:
         return np.zeros(3)
-    table = share[:n, None] ** np.arange(3)
+    table = fraction[:n, None] ** np.arange(3)
     solution, *_ = np.linalg.lstsq(table, x[:n], rcond=None)
     variance = np.sum((x[:n] - table @ solution) ** 2, axis=0) / (n - 3)
     error = np.sqrt(variance.sum() * np.linalg.inv(table.T @ table)[1, 1])

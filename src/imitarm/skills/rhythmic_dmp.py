@@ -1,4 +1,4 @@
-"""Rhythmic movement primitive: a spring and damper about a centre, driven round and round by a learnt force."""
+"""Rhythmic movement primitive: a spring and damper about a centre, driven by a learned periodic force."""
 
 from __future__ import annotations
 
@@ -11,29 +11,31 @@ from scipy.interpolate import CubicSpline
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
+from imitarm.skills.dmp import number_of_steps
+from imitarm.skills.dynamical_systems import Gains, propagator, roll_out
 from imitarm.skills.rotation_reference import RotationReference
-from imitarm.skills.spring import Gains, gains_named, propagator, roll_out
 from imitarm.trajectory import Trajectory
+from imitarm.validation import finite_number, finite_vector, instance, whole_number
 
 Array = NDArray[np.float64]
 
 _GRID = 512  # points of one period
-_CLOSES = 0.1  # a period whose ends are further apart than this share of its extent is none
+_CLOSES = 0.1  # of the extent: a motion that ends a period further than this from where it began is not periodic
 
 
-class RhythmState(NamedTuple):
-    """Where a rhythmic primitive is.
+class RhythmicDMPState(NamedTuple):
+    """State of a rhythmic primitive on its way. Made by ``RhythmicDMP.begin``, advanced by ``RhythmicDMP.step``.
 
     Attributes:
-        motion: [x; P x'], shape (2, D): position [m], and the rotation vector [rad] where rotation was learnt.
-        turns: periods since the start, phi / (2 pi).
+        motion: [x; P x'], shape (2, D): position [m], and the rotation vector [rad] where rotation was learned.
+        periods: number of periods since the start, phi / (2 pi).
         center: g, shape (D,).
-        amplitude: r, a factor of the learnt motion.
+        amplitude: r, a factor on the learned motion.
         period: P [s].
     """
 
     motion: Array
-    turns: float
+    periods: float
     center: Array
     amplitude: float
     period: float
@@ -58,21 +60,21 @@ class RhythmicDMP:
         f(\phi) = \frac{\sum_i w_i \psi_i(\phi)}{\sum_i \psi_i(\phi)}, \quad
         \psi_i(\phi) = \exp(h (\cos(\phi - c_i) - 1))
 
-    tau is the period, g the centre of the motion, r its amplitude. The weights come from ridge regression on the
-    positions: the steady answer to each basis function is known exactly, its Fourier coefficient at the k-th harmonic
-    times ``K / (K - (2 pi k)^2 + 2 pi k D i)``. Rotations are vectors about their mean rotation; they must stay within
-    120 degrees of it.
+    tau is the period, g the centre of the motion, r its amplitude (the rhythmic form of Ijspeert et al. 2013). The
+    weights come from ridge regression on the positions. The periodic response to each basis function is known exactly:
+    its Fourier coefficient at the k-th harmonic is multiplied by ``K / (K - (2 pi k)^2 + 2 pi k D i)``. Rotations are
+    rotation vectors from their mean rotation; they must stay within 120 degrees of it.
 
     Args:
-        gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.spring.Gains`.
-        n_basis: number N of basis functions round the circle.
-        regularisation: ridge, relative to the mean square response of a basis function.
+        gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
+        n_basis: number N of basis functions in one period.
+        regularisation: of the ridge regression, relative to the mean square response of a basis function.
 
     Attributes:
         gains_: stiffness and damping.
         weights_: shape (N, D), D = 3, or 6 with rotation.
         center_: g, shape (D,).
-        period_: learnt [s].
+        period_: learned [s].
         reference_: mean rotation; None when the demonstration had no quaternions.
 
     Raises:
@@ -86,29 +88,25 @@ class RhythmicDMP:
     reference_: RotationReference | None
 
     def __init__(self, gains: str | Gains = "critical", *, n_basis: int = 30, regularisation: float = 1e-7) -> None:
-        self.gains_ = gains_named(gains) if isinstance(gains, str) else Gains(*gains)
-        if n_basis < 3:
-            raise InputError(f"RhythmicDMP: n_basis must be at least 3, got {n_basis!r}")
-        if not regularisation > 0.0:
-            raise InputError(f"RhythmicDMP: regularisation must be above 0, got {regularisation!r}")
-        self.n_basis = n_basis
-        self.regularisation = regularisation
+        self.gains_ = Gains.of(gains, "RhythmicDMP")
+        self.n_basis = whole_number(n_basis, "RhythmicDMP: n_basis", at_least=3, at_most=2000)
+        self.regularisation = finite_number(regularisation, "RhythmicDMP: regularisation", above=0.0)
 
-    def _basis(self, turns: Array) -> Array:
-        """Return psi_i / sum psi at ``turns`` (n,), shape (n, N)."""
-        angle = 2.0 * np.pi * (turns[:, None] - np.arange(self.n_basis) / self.n_basis)
+    def _basis(self, periods: Array) -> Array:
+        """Return psi_i / sum psi after ``periods`` (n,), shape (n, N)."""
+        angle = 2.0 * np.pi * (periods[:, None] - np.arange(self.n_basis) / self.n_basis)
         psi = np.exp(0.1 * self.n_basis**2 * (np.cos(angle) - 1.0))
         return np.asarray(psi / psi.sum(axis=1, keepdims=True))
 
     def _responses(self) -> tuple[CubicSpline, Array]:
-        """Return the steady answer of the spring to each basis function over a period, and its rate at the start."""
+        """Return the periodic response to each basis function over a period, and its rate of change at phase 0."""
         K, D = self.gains_
         omega = 2.0 * np.pi * np.arange(_GRID // 2 + 1)
         spectrum = np.fft.rfft(self._basis(np.arange(_GRID) / _GRID), axis=0)
         spectrum *= (K / (K - omega**2 + 1j * omega * D))[:, None]
-        answers = np.fft.irfft(spectrum, _GRID, axis=0)
+        responses = np.fft.irfft(spectrum, _GRID, axis=0)
         rates = np.fft.irfft(1j * omega[:, None] * spectrum, _GRID, axis=0)
-        closed = np.concatenate([answers, answers[:1]])
+        closed = np.concatenate([responses, responses[:1]])
         return CubicSpline(np.linspace(0.0, 1.0, _GRID + 1), closed, bc_type="periodic"), rates[0]
 
     def fit(self, trajectory: Trajectory, period: float | None = None) -> Self:
@@ -119,30 +117,29 @@ class RhythmicDMP:
             period: [s]; None: the trajectory is exactly one period.
 
         Raises:
-            InputError: when the period is not above 0 or longer than the trajectory, when the motion does not come
-                back to where it was, or turns too far.
+            InputError: when the period is not above 0 or is longer than the trajectory, when the motion does not return
+                to where it was a period before, or when it rotates too far.
         """
+        instance(trajectory, Trajectory, "RhythmicDMP.fit: trajectory")
         t = trajectory.times - trajectory.times[0]
-        P = trajectory.duration if period is None else float(period)
-        if not (np.isfinite(P) and 0.0 < P <= trajectory.duration * (1.0 + 1e-9)):
-            raise InputError(
-                f"RhythmicDMP.fit: period must be above 0 and at most the recorded {trajectory.duration:g} s, got {P!r}"
-            )
+        P = trajectory.duration
+        if period is not None:
+            P = finite_number(period, "RhythmicDMP.fit: period", "s", above=0.0, at_most=P * (1.0 + 1e-9))
         later, _ = trajectory.at(np.minimum(trajectory.times + P, trajectory.times[-1]))
         overlap = t <= trajectory.duration - P + 1e-9 * P
         gap = float(np.linalg.norm((later - trajectory.positions)[overlap], axis=1).max())
         extent = float(np.linalg.norm(np.ptp(trajectory.positions, axis=0)))
         if gap > _CLOSES * extent:
             raise InputError(
-                f"RhythmicDMP.fit: after {P:g} s the motion is {1e3 * gap:.0f} mm from where it was, of "
-                f"{1e3 * extent:.0f} mm extent; give the right period, or record whole periods"
+                f"RhythmicDMP.fit: after a period of {P:g} s the motion is up to {1e3 * gap:.0f} mm from where it was "
+                f"(its extent is {1e3 * extent:.0f} mm); give the right period, or record whole periods"
             )
         columns = trajectory.positions
         self.reference_ = None
         if trajectory.quaternions is not None:
             self.reference_ = RotationReference.among([(t, trajectory.quaternions)])
             if len(self.reference_.times) > 1:
-                raise InputError("RhythmicDMP.fit: the motion turns more than 120 degrees from its mean rotation")
+                raise InputError("RhythmicDMP.fit: the motion rotates more than 120 degrees from its mean rotation")
             columns = np.column_stack([columns, self.reference_.to_vectors(t, trajectory.quaternions)])
         self.period_ = P
         spline, self._rate_at_start = self._responses()
@@ -151,7 +148,7 @@ class RhythmicDMP:
         normal = R.T @ R / len(R)
         normal[np.diag_indices(self.n_basis)] += self.regularisation * np.trace(normal) / self.n_basis
         weights = np.linalg.solve(normal, R.T @ (columns - self.center_) / len(R))
-        self.center_ += weights.mean(axis=0)  # the mean over whole periods, whatever part of one was recorded twice
+        self.center_ += weights.mean(axis=0)  # the mean over one period, also when part of a period was recorded twice
         self.weights_ = weights - weights.mean(axis=0)
         self._value_at_start = spline(0.0)
         return self
@@ -163,61 +160,80 @@ class RhythmicDMP:
         center: ArrayLike | None = None,
         amplitude: float = 1.0,
         period: float | None = None,
-    ) -> RhythmState:
+    ) -> RhythmicDMPState:
         """Return the state at phase 0.
 
         Args:
-            start: where the tool is, at rest; it swings in from there. None: already in the rhythm.
-            center: another centre of the positions (3,) [m]; None: as learnt.
-            amplitude: factor of the learnt motion.
-            period: [s]; None: as learnt.
+            start: where the tool is, at rest; the motion approaches the rhythm from there. None: the motion begins in
+                the rhythm.
+            center: another centre of the positions (3,) [m]; None: as learned.
+            amplitude: factor on the learned motion.
+            period: [s]; None: as learned.
 
         Raises:
             InputError: when not fitted, or an argument is out of range.
         """
         if not hasattr(self, "weights_"):
             raise InputError("RhythmicDMP: not fitted yet; call fit first")
-        P = self.period_ if period is None else float(period)
-        if not (np.isfinite(P) and P > 0.0 and np.isfinite(amplitude)):
-            raise InputError(
-                f"RhythmicDMP: period must be above 0 s and amplitude finite, got {period!r}, {amplitude!r}"
-            )
+        P = self.period_ if period is None else finite_number(period, "RhythmicDMP: period", "s", above=0.0)
+        r = finite_number(amplitude, "RhythmicDMP: amplitude")
         g = self.center_.copy()
         if center is not None:
-            g[:3] = Pose(np.asarray(center), np.array([1.0, 0.0, 0.0, 0.0])).position
-        swing = np.stack([self._value_at_start, self._rate_at_start]) @ self.weights_ * amplitude
+            g[:3] = finite_vector(center, 3, "RhythmicDMP: center", "m")
+        swing = np.stack([self._value_at_start, self._rate_at_start]) @ self.weights_ * r
         motion = np.stack([g + swing[0], swing[1]])
         if start is not None:
+            instance(start, Pose, "RhythmicDMP: start")
             motion[1] = 0.0
             motion[0, :3] = start.position
             if self.reference_ is not None:
                 motion[0, 3:] = self.reference_.to_vectors(np.zeros(1), start.quaternion[None])[0]
-        return RhythmState(motion, 0.0, g, float(amplitude), P)
+        return RhythmicDMPState(motion, 0.0, g, r, P)
 
-    def _target(self, state: RhythmState, turns: Array) -> Array:
-        return np.asarray(state.center + state.amplitude * (self._basis(turns) @ self.weights_))
+    def _check(self, state: RhythmicDMPState) -> None:
+        if not hasattr(self, "weights_"):
+            raise InputError("RhythmicDMP: not fitted yet; call fit first")
+        instance(state, RhythmicDMPState, "RhythmicDMP: state")
+        for name in ("motion", "periods", "center", "amplitude"):
+            if not np.all(np.isfinite(getattr(state, name))):
+                raise InputError(f"RhythmicDMP: {name} of the state must be finite")
+        finite_number(state.period, "RhythmicDMP: period of the state", "s", above=0.0)
+
+    def _target(self, state: RhythmicDMPState, periods: Array) -> Array:
+        return np.asarray(state.center + state.amplitude * (self._basis(periods) @ self.weights_))
 
     def step(
-        self, state: RhythmState, dt: float, *, coupling: Callable[[Array, Array], ArrayLike] | None = None
-    ) -> RhythmState:
+        self, state: RhythmicDMPState, dt: float, *, coupling: Callable[[Array, Array], ArrayLike] | None = None
+    ) -> RhythmicDMPState:
         """Return the state ``dt`` seconds later.
 
         Args:
             state: from :meth:`begin` or the last step; replace ``amplitude``, ``center`` or ``period`` in it to change
                 the rhythm on the way.
-            dt: [s].
-            coupling: from position and velocity to an acceleration (3,) [m/s^2] that is added during this step.
-        """
-        h = dt / state.period
-        one = propagator(self.gains_, h)
-        motion = one.transition @ state.motion + one.drive @ self._target(state, state.turns + one.instants)
-        if coupling is not None:
-            acceleration = np.asarray(coupling(state.position, state.velocity), dtype=float) * state.period**2
-            motion[:, :3] += one.push[:, None] * acceleration
-        return state._replace(motion=motion, turns=state.turns + h)
+            dt: [s], above 0.
+            coupling: function from position and velocity to an acceleration (3,) [m/s^2] that is added during this
+                step.
 
-    def quaternion(self, state: RhythmState) -> Array | None:
-        """Return the rotation wxyz (4,), or None when none was learnt."""
+        Raises:
+            InputError: when not fitted, or an argument is not finite or of a wrong shape.
+        """
+        self._check(state)
+        h = finite_number(dt, "RhythmicDMP.step: dt", "s", above=0.0, at_most=100.0 * state.period) / state.period
+        h = max(h, 1e-100)
+        one = propagator(self.gains_, h)
+        motion = one.transition @ state.motion + one.drive @ self._target(state, state.periods + one.instants)
+        if coupling is not None:
+            added = finite_vector(coupling(state.position, state.velocity), 3, "RhythmicDMP: acceleration of coupling")
+            motion[:, :3] += one.push[:, None] * added * state.period**2
+        return state._replace(motion=motion, periods=state.periods + h)
+
+    def quaternion(self, state: RhythmicDMPState) -> Array | None:
+        """Return the rotation wxyz (4,), or None when none was learned.
+
+        Raises:
+            InputError: when not fitted, or ``state`` is not valid.
+        """
+        self._check(state)
         if self.reference_ is None:
             return None
         return self.reference_.to_quaternions(np.zeros(1), state.motion[:1, 3:])[0]
@@ -246,10 +262,10 @@ class RhythmicDMP:
             InputError: as :meth:`begin`, and when ``duration`` or ``dt`` is out of range.
         """
         state = self.begin(start, center=center, amplitude=amplitude, period=period)
-        T = state.period if duration is None else float(duration)
-        n = round(T / dt) if np.isfinite(T) and np.isfinite(dt) and dt > 0.0 else 0
-        if n < 1:
-            raise InputError(f"RhythmicDMP.generate: dt must be above 0 and not above the duration {T:g} s, got {dt!r}")
+        T = state.period
+        if duration is not None:
+            T = finite_number(duration, "RhythmicDMP.generate: duration", "s", above=0.0)
+        n = number_of_steps(T, dt, "RhythmicDMP.generate")
         h = T / n / state.period
         one = propagator(self.gains_, h)
         target = self._target(state, np.linspace(0.0, n * h, 2 * n * one.n_parts + 1))

@@ -12,13 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 import imitarm
 from imitarm.errors import FileFormatError, InputError
 from imitarm.kinematics.pose import Pose
-from imitarm.skills.course import Adjustment
 from imitarm.skills.dmp import DMP
+from imitarm.skills.dynamical_systems import Adjustment, Gains
 from imitarm.skills.gmr import GMR
 from imitarm.skills.quaternion_dmp import with_other_ends
 from imitarm.skills.skill_content import dmp_content, gmr_content, read_dmp, read_gmr
 from imitarm.skills.skill_file import read_skill, write_skill
-from imitarm.skills.spring import Gains
 from imitarm.trajectory import Demonstration, Trajectory
 
 Array = NDArray[np.float64]
@@ -36,7 +35,7 @@ class Skill:
 
     Args:
         n_components: number of Gaussians, or ``"auto"`` (see GMR).
-        gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.spring.Gains` (see DMP).
+        gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains` (see DMP).
         n_basis: number of basis functions of the primitive.
         random_state: seed of everything random in learning.
 
@@ -151,12 +150,12 @@ class Skill:
         state = self._fitted().begin(start, goal)
         t = np.asarray(times, dtype=float)
         positions, quaternions = self.gmr_.nominal(t)
-        moved = np.stack([state.course.start - self.dmp_.start_, state.course.goal - self.dmp_.goal_])
+        moved = np.stack([state.target.start - self.dmp_.start_, state.target.goal - self.dmp_.goal_])
         if moved.any():
             p = self.dmp_.progress(t)
             positions = positions + np.stack([1.0 - p, p], axis=1) @ moved
-        if quaternions is not None and state.turn is not None:
-            changes = state.turn.start_change, state.turn.goal_change
+        if quaternions is not None and state.rotation is not None:
+            changes = state.rotation.start_change, state.rotation.goal_change
             quaternions = with_other_ends(quaternions, t / self.duration_, *changes)
         return Trajectory(t, positions, quaternions)
 

@@ -8,12 +8,12 @@ import numpy as np
 
 from imitarm.errors import FileFormatError
 from imitarm.skills.dmp import DMP
+from imitarm.skills.dynamical_systems import Gains
 from imitarm.skills.gmr import GMR
 from imitarm.skills.quaternion_dmp import QuaternionDMP
 from imitarm.skills.rotation_reference import RotationReference
 from imitarm.skills.selection import Candidate
 from imitarm.skills.skill_file import Fields
-from imitarm.skills.spring import Gains
 
 
 def gmr_content(gmr: GMR) -> dict[str, Any]:
