@@ -1,68 +1,40 @@
-"""Proof that a path keeps its distance: a lower bound on every straight segment, from convexity.
+"""Proof that a path keeps its clearance: a lower bound of the distance on every straight segment, from convexity.
 
-The signed distance to a convex obstacle is a convex function, so a tangent plane at any point under-estimates it
-everywhere. Two samples and their tangents therefore bound the distance on the whole segment between them: what is
-certified is the polyline itself, not a set of samples. Where that bound falls short, points of the segment are looked
-at until either the bound reaches what is asked, or one of them is truly nearer.
+The signed distance to a convex obstacle is a convex function, so its tangent plane at any point is a lower bound
+everywhere. The tangents at two samples therefore bound the distance on the whole segment between them: the polyline
+itself is certified, not a set of samples. Where that bound is too low, the distance is measured at further points of
+the segment, until either the bound reaches the required clearance or one of the points is closer than that.
+
+An obstacle that moves at a constant velocity ``v`` stands still in coordinates that move with it. Subtracting
+``t v`` from the path makes the same proof exact for it, as long as the path is executed on time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.kinematics.pose import rotate
 from imitarm.scene.obstacle import Obstacle
+from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_LOOKS = 12  # points looked at on a segment whose bound falls short; the bracket then is far below a micrometre
+_MAX_PROBES = 12  # points measured on a segment whose bound is too low; the bracket is then far below a micrometre
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
-    """One sphere of the tool and one obstacle that it must stay clear of.
-
-    Attributes:
-        obstacle: what is in the way.
-        index: of the obstacle in its scene.
-        radius: of the sphere [m].
-        offset: from the tool's tip to the sphere's centre at each sample of a path, in the base frame, shape (n, 3)
-            [m]; None for a sphere about the tip itself.
-        bow: how far the centre strays from a straight line between two samples while the tool turns, (n - 1,) [m].
-    """
-
-    obstacle: Obstacle
-    index: int
-    radius: float
-    offset: Array | None
-    bow: Array | float
-
-    def centres(self, positions: Array, samples: Index | slice = slice(None)) -> Array:
-        """Return the sphere's centres (..., m, 3) for tip positions (..., m, 3) at some ``samples`` of the path."""
-        return positions if self.offset is None else positions + self.offset[samples]
-
-    def distance(self, positions: Array, samples: Index | slice = slice(None)) -> Array:
-        """Return the distance (..., m) [m] from the sphere's surface to the obstacle."""
-        return self.obstacle.signed_distance(self.centres(positions, samples)) - self.radius
-
-    def distance_and_normal(self, centres: Array) -> tuple[Array, Array]:
-        """Return the distance (...) [m] from the sphere's surface to the obstacle, and its gradient (..., 3)."""
-        distance, normal = self.obstacle.distance_and_gradient(centres)
-        return distance - self.radius, normal
-
-
-@dataclass(frozen=True, eq=False)
-class Dips:
-    """Points between two samples, at which a path is nearer to an obstacle than asked although both samples are not.
+class ClosePoints:
+    """Points between two samples that are closer to an obstacle than required, although both samples are not.
 
     Attributes:
         pair: which sphere and obstacle, shape (m,).
         segment: index of the sample before the point, shape (m,).
-        fraction: where between that sample and the next, in [0, 1], shape (m,).
+        fraction: position of the point between that sample (0) and the next (1), shape (m,).
     """
 
     pair: Index
@@ -70,145 +42,248 @@ class Dips:
     fraction: Array
 
     @classmethod
-    def none(cls) -> Dips:
-        """Return no dips."""
+    def none(cls) -> ClosePoints:
+        """Return an empty set."""
         return cls(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp), np.empty(0))
 
-    def and_also(self, others: Dips) -> Dips:
-        """Return these dips and others."""
-        pair, segment = np.append(self.pair, others.pair), np.append(self.segment, others.segment)
-        return Dips(pair, segment, np.append(self.fraction, others.fraction))
+    def __len__(self) -> int:
+        return len(self.pair)
+
+    def __add__(self, other: ClosePoints) -> ClosePoints:
+        pair, segment = np.append(self.pair, other.pair), np.append(self.segment, other.segment)
+        return ClosePoints(pair, segment, np.append(self.fraction, other.fraction))
 
 
 @dataclass(frozen=True, eq=False)
-class Detour:
-    """A displaced path and what is proven of it.
+class ToolAmongObstacles:
+    """The spheres that contain the tool, and the obstacles that each of them must stay clear of.
+
+    Every sphere with every obstacle is a *pair*; pair ``i`` is obstacle ``i // n_spheres`` with sphere
+    ``i % n_spheres``. The rotation of the tool is that of the nominal path, so the centre of a sphere is the position of
+    the tip plus a known offset at each sample.
 
     Attributes:
-        displacement: of each component's mean, shape (n_components, 3) [m].
-        positions: the path of the tool's tip, shape (n, 3) [m].
-        bounds: proven lower bound of the clearance of each pair over the whole path, shape (n_pairs,) [m].
-        nearest: smallest clearance of each pair at the samples, shape (n_pairs,) [m].
-        feasible: whether every bound reaches the asked clearance and the path does not stray.
-        expanded: how many choices of a side were made.
-        strays: whether the path leads absurdly far away or jumps, as it does where a point that must not move is near.
-        dips: where it is too near between two samples that are not.
+        obstacles: convex obstacles.
+        radii: of the spheres, shape (n_spheres,) [m].
+        offsets: for each obstacle, from the tip to the centres of the spheres at each sample, less the motion of the
+            obstacle until then, in the base frame, shape (n_spheres, n, 3) [m]; None when all of them are zero.
+        bows: how far a centre leaves the straight line between two samples while the tool rotates, shape
+            (n_spheres, n - 1) [m].
     """
 
-    displacement: Array
+    obstacles: tuple[Obstacle, ...]
+    radii: Array
+    offsets: tuple[Array | None, ...]
+    bows: Array
+
+    @classmethod
+    def along(cls, nominal: Trajectory, spheres: Array, obstacles: Sequence[Obstacle]) -> ToolAmongObstacles:
+        """Place the spheres and the obstacles along a path.
+
+        Args:
+            nominal: times and rotations of the tool, n samples.
+            spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
+            obstacles: where they are at time 0; one with a velocity moves from there.
+        """
+        q, n = nominal.quaternions, len(nominal)
+        bows = np.zeros((len(spheres), n - 1))
+        centres: Array | None = None
+        if q is not None and spheres[:, :3].any():
+            half_angle = np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=1)), 0.0, 1.0))
+            centres = np.stack([rotate(q, sphere[:3]) for sphere in spheres])
+            # Exact for a rotation at constant rate: the sagitta of the arc about the tip.
+            bows = np.linalg.norm(spheres[:, :3], axis=1)[:, None] * (1.0 - np.cos(half_angle))
+        offsets: list[Array | None] = []
+        for obstacle in obstacles:
+            if not obstacle.velocity.any():
+                offsets.append(centres)
+                continue
+            travelled = nominal.times[:, None] * obstacle.velocity
+            moved = np.zeros((len(spheres), n, 3)) if centres is None else centres
+            offsets.append(moved - travelled)
+        return cls(tuple(obstacles), np.ascontiguousarray(spheres[:, 3]), tuple(offsets), bows)
+
+    @property
+    def n_spheres(self) -> int:
+        """Number of spheres."""
+        return len(self.radii)
+
+    @property
+    def n_pairs(self) -> int:
+        """Number of pairs of a sphere and an obstacle."""
+        return len(self.radii) * len(self.obstacles)
+
+    def centres(self, pair: int, positions: Array, samples: Index | slice = slice(None)) -> Array:
+        """Return the centre of a pair's sphere, relative to where its obstacle is at that time.
+
+        Args:
+            pair: index of the pair.
+            positions: of the tip, shape (..., m, 3) [m].
+            samples: the m samples of the path to which the positions belong.
+
+        Returns:
+            Shape (..., m, 3) [m].
+        """
+        obstacle, sphere = divmod(pair, self.n_spheres)
+        offset = self.offsets[obstacle]
+        return positions if offset is None else positions + offset[sphere, samples]
+
+    def distance_and_normal(self, pair: int, centres: Array) -> tuple[Array, Array]:
+        """Return the distance (...) [m] from a sphere's surface to the obstacle, and its gradient (..., 3)."""
+        obstacle, sphere = divmod(pair, self.n_spheres)
+        distance, normal = self.obstacles[obstacle].distance_and_gradient(centres)
+        return distance - self.radii[sphere], normal
+
+    def distances(self, positions: Array, samples: Index | slice = slice(None)) -> Array:
+        """Return the distance of every pair.
+
+        Args:
+            positions: of the tip, shape (..., m, 3) [m].
+            samples: the m samples of the path to which the positions belong.
+
+        Returns:
+            From the spheres' surfaces to the obstacles, shape (n_pairs, ..., m) [m].
+        """
+        answer = np.empty((self.n_pairs, *positions.shape[:-1]))
+        for o, obstacle in enumerate(self.obstacles):
+            rows = answer[o * self.n_spheres : (o + 1) * self.n_spheres]
+            offset = self.offsets[o]
+            for s in range(self.n_spheres) if offset is not None else range(1):
+                centres = positions if offset is None else positions + offset[s, samples]
+                rows[s if offset is not None else slice(None)] = obstacle.signed_distance(centres)
+            rows -= self.radii.reshape((-1, *[1] * (positions.ndim - 1)))
+        return answer
+
+    def clearance_of(self, positions: Array) -> PathClearance:
+        """Return the distances and normals of every pair along a path of the tip (n, 3)."""
+        n, k = len(positions), self.n_spheres
+        distance, normal = np.empty((self.n_pairs, n)), np.empty((self.n_pairs, n, 3))
+        for o, obstacle in enumerate(self.obstacles):
+            rows, offset = slice(o * k, (o + 1) * k), self.offsets[o]
+            d, normal[rows] = obstacle.distance_and_gradient(positions if offset is None else positions + offset)
+            distance[rows] = d - self.radii[:, None]
+        return PathClearance(self, positions, distance, normal)
+
+
+@dataclass(frozen=True, eq=False)
+class PathClearance:
+    """Distances from the tool to the obstacles along one path of the tip, and what follows from them.
+
+    Attributes:
+        tool: the spheres and the obstacles.
+        positions: of the tip, shape (n, 3) [m].
+        distance: of each pair at each sample, shape (n_pairs, n) [m].
+        normal: gradients of these distances, shape (n_pairs, n, 3).
+    """
+
+    tool: ToolAmongObstacles
     positions: Array
-    bounds: Array
-    nearest: Array
-    feasible: bool
-    expanded: int
-    strays: bool = False
-    dips: Dips = field(default_factory=Dips.none)
+    distance: Array
+    normal: Array
 
+    @property
+    def lowest(self) -> float:
+        """The smallest distance at a sample [m]; inf without obstacles."""
+        return float(self.distance.min(initial=np.inf))
 
-def judged(
-    pairs: Sequence[Pair],
-    displacement: Array,
-    positions: Array,
-    distance: Array,
-    normal: Array,
-    clearance: float,
-    expanded: int = 0,
-) -> Detour:
-    """Judge a path by its distances (n_pairs, n) and normals (n_pairs, n, 3) against the asked clearance [m]."""
-    bounds = segment_bounds(pairs, distance, normal, positions)
-    dips = Dips.none()
-    if bounds.min() < clearance:
-        bounds, dips = looked_at_again(pairs, bounds, distance, normal, positions, clearance)
-    feasible, bounds = bool(bounds.min() >= clearance), bounds.min(axis=1)
-    return Detour(displacement, positions, bounds, distance.min(axis=1), feasible, expanded, dips=dips)
+    def segment_bounds(self) -> Array:
+        """Bound the distance from below on each segment of the path.
 
+        For a convex function ``f`` on a segment of length L, with slope a at its start and b at its end,
+        ``f(s) >= max(f0 + a s, f1 - b (L - s))``. The minimum of the right side over s is at an end or where the two
+        lines cross. The tip moves straight between two samples. A sphere beside it leaves the straight line by at most
+        ``|offset| (1 - cos(angle / 2))`` while the tool rotates by ``angle``; this is subtracted.
 
-def distances(pairs: Sequence[Pair], positions: Array) -> tuple[Array, Array]:
-    """Return clearances (n_pairs, n) [m] and unit normals (n_pairs, n, 3) of a path (n, 3)."""
-    answers = [pair.distance_and_normal(pair.centres(positions)) for pair in pairs]
-    return np.stack([d for d, _ in answers]), np.stack([n for _, n in answers])
+        Returns:
+            Shape (n_pairs, n - 1) [m].
+        """
+        tool, k = self.tool, self.tool.n_spheres
+        tip = (self.positions[1:] - self.positions[:-1])[None]
+        if all(offset is None for offset in tool.offsets):
+            step = tip
+        else:
+            step = np.empty((tool.n_pairs, *tip.shape[1:]))
+            for o, offset in enumerate(tool.offsets):
+                step[o * k : (o + 1) * k] = tip if offset is None else tip + np.diff(offset, axis=1)
+        a = (self.normal[:, :-1, None, :] @ step[..., None])[..., 0, 0]  # slopes over s in [0, 1] on each segment
+        b = (self.normal[:, 1:, None, :] @ step[..., None])[..., 0, 0]
+        low = crossing_of_tangents(self.distance[:, :-1], a, self.distance[:, 1:], b, 1.0)[0]
+        return low - (np.tile(tool.bows, (len(tool.obstacles), 1)) if tool.bows.any() else 0.0)
 
+    def certified(self, clearance: float) -> tuple[Array, ClosePoints]:
+        """Bound the distance on each segment, and look more closely where the bound is below a clearance.
 
-def segment_bounds(pairs: Sequence[Pair], distance: Array, normal: Array, positions: Array) -> Array:
-    """Bound the clearance of convex obstacles from below on each segment of a path.
+        Round a corner, two tangents cross at twice the depth of the chord or deeper. The distance is therefore measured
+        where they cross. If it is too small there, the path really is too close. If not, the tangent at that point
+        replaces one of the two, namely the one on whose side the distance falls towards the point. So the minimum stays
+        between two tangents that close in on it.
 
-    For a convex signed distance ``f`` the tangents at both ends of a segment of length L, with slopes a (start) and b
-    (end), under-estimate it, so on the segment ``f(s) >= max(f0 + a s, f1 - b (L - s))``; the minimum over s of the
-    right side is at an end or where the two lines cross. The tip moves straight between two samples; a sphere beside
-    it bows out by at most ``|offset| (1 - cos(turn / 2))``, which is taken off.
+        Args:
+            clearance: that the path must keep [m].
 
-    Args:
-        pairs: which spheres and obstacles.
-        distance: clearance at the samples, shape (n_pairs, n) [m].
-        normal: gradient at the samples, shape (n_pairs, n, 3).
-        positions: of the tip at the samples, shape (n, 3) [m].
+        Returns:
+            Lower bounds, shape (n_pairs, n - 1) [m], and the points that are closer than ``clearance``.
+        """
+        bounds, found = self.segment_bounds(), ClosePoints.none()
+        if bounds.min(initial=np.inf) >= clearance:
+            return bounds, found
+        low = (bounds < clearance) & (self.distance[:, :-1] >= clearance) & (self.distance[:, 1:] >= clearance)
+        for i in np.flatnonzero(low.any(axis=1)).tolist():
+            segments = np.flatnonzero(low[i])
+            bounds[i, segments], at = self._closer_look(i, segments, bounds[i, segments], clearance)
+            close = bounds[i, segments] < clearance
+            found = found + ClosePoints(np.full(int(close.sum()), i), segments[close], at[close])
+        return bounds, found
 
-    Returns:
-        Lower bounds, shape (n_pairs, n - 1) [m].
-    """
-    if all(pair.offset is None for pair in pairs):
-        step, bow = (positions[1:] - positions[:-1])[None], np.zeros(1)
-    else:
-        step = np.stack([np.diff(pair.centres(positions), axis=0) for pair in pairs])
-        bow = np.stack([np.broadcast_to(pair.bow, len(positions) - 1) for pair in pairs])
-    a = (normal[:, :-1, None, :] @ step[..., None])[..., 0, 0]  # the parameter s runs over [0, 1] on each segment
-    b = (normal[:, 1:, None, :] @ step[..., None])[..., 0, 0]
-    return _lowest(distance[:, :-1], a, distance[:, 1:], b, 1.0)[0] - bow
-
-
-def looked_at_again(
-    pairs: Sequence[Pair], bounds: Array, distance: Array, normal: Array, positions: Array, clearance: float
-) -> tuple[Array, Dips]:
-    """Look between samples where the bound falls short although both of them keep the clearance.
-
-    Two tangents round a corner cross at twice the depth of the chord, or deeper. The true distance where they cross
-    is either too small, then there is a dip; or its tangent takes the place of one of the two, on whose side the
-    distance then only falls towards it. So the lowest point stays between two tangents, which close in on it.
-
-    Args:
-        pairs: which spheres and obstacles.
-        bounds: of :func:`segment_bounds`, shape (n_pairs, n - 1) [m].
-        distance: clearance at the samples, shape (n_pairs, n) [m].
-        normal: gradient at the samples, shape (n_pairs, n, 3).
-        positions: of the tip at the samples, shape (n, 3) [m].
-        clearance: asked [m].
-
-    Returns:
-        Better lower bounds, shape (n_pairs, n - 1) [m], and the dips that remain.
-    """
-    bounds, dips = bounds.copy(), Dips.none()
-    short = (bounds < clearance) & (distance[:, :-1] >= clearance) & (distance[:, 1:] >= clearance)
-    for i in np.flatnonzero(short.any(axis=1)).tolist():
-        j = np.flatnonzero(short[i])
-        start = pairs[i].centres(positions[j], j)
-        step = pairs[i].centres(positions[j + 1], j + 1) - start
-        bow = np.broadcast_to(pairs[i].bow, len(positions) - 1)[j]
+    def _closer_look(self, pair: int, j: Index, bounds: Array, clearance: float) -> tuple[Array, Array]:
+        """Return better bounds (m,) of segments ``j`` (m,) of a pair, and the fraction where each is lowest (m,)."""
+        start = self.tool.centres(pair, self.positions[j], j)
+        step = self.tool.centres(pair, self.positions[j + 1], j + 1) - start
+        bow = self.tool.bows[pair % self.tool.n_spheres, j]
         left, right = np.zeros(len(j)), np.ones(len(j))
-        f0, f1 = distance[i, j], distance[i, j + 1]
-        a, b = np.einsum("sd,sd->s", normal[i, j], step), np.einsum("sd,sd->s", normal[i, j + 1], step)
-        low, at = _lowest(f0, a, f1, b, 1.0)
-        found = np.zeros(len(j), dtype=bool)
-        for _ in range(_LOOKS):
-            if np.all(found | (low - bow >= clearance)):
+        f0, f1 = self.distance[pair, j], self.distance[pair, j + 1]
+        a = np.einsum("sd,sd->s", self.normal[pair, j], step)
+        b = np.einsum("sd,sd->s", self.normal[pair, j + 1], step)
+        low, at = crossing_of_tangents(f0, a, f1, b, 1.0)
+        close = np.zeros(len(j), dtype=bool)
+        for _ in range(_MAX_PROBES):
+            if np.all(close | (low - bow >= clearance)):
                 break
-            f, n = pairs[i].distance_and_normal(start + at[:, None] * step)
+            f, n = self.tool.distance_and_normal(pair, start + at[:, None] * step)
             slope = np.einsum("sd,sd->s", n, step)
-            found |= f - bow < clearance
-            falls, rises = ~found & (slope <= 0.0), ~found & (slope > 0.0)
+            close |= f - bow < clearance
+            falls, rises = ~close & (slope <= 0.0), ~close & (slope > 0.0)
             left, f0, a = np.where(falls, (at, f, slope), (left, f0, a))
             right, f1, b = np.where(rises, (at, f, slope), (right, f1, b))
-            low, inside = _lowest(f0, a, f1, b, right - left)
-            at = np.where(found, at, left + inside)
-        bounds[i, j] = np.maximum(bounds[i, j], low - bow)
-        dip = bounds[i, j] < clearance
-        dips = dips.and_also(Dips(np.full(int(dip.sum()), i), j[dip], at[dip]))
-    return bounds, dips
+            low, inside = crossing_of_tangents(f0, a, f1, b, right - left)
+            at = np.where(close, at, left + inside)
+        return np.maximum(bounds, low - bow), at
+
+    def at(self, points: ClosePoints) -> tuple[Array, Array]:
+        """Return distance (m,) [m] and normal (m, 3) at points between two samples."""
+        distance, normal = np.empty(len(points)), np.empty((len(points), 3))
+        for i in np.unique(points.pair).tolist():
+            of = np.flatnonzero(points.pair == i)
+            j, s = points.segment[of], points.fraction[of, None]
+            start = self.tool.centres(i, self.positions[j], j)
+            step = self.tool.centres(i, self.positions[j + 1], j + 1) - start
+            d, normal[of] = self.tool.distance_and_normal(i, start + s * step)
+            distance[of] = d - self.tool.bows[i % self.tool.n_spheres, j]
+        return distance, normal
 
 
-def _lowest(f0: Array, a: Array, f1: Array, b: Array, length: Array | float) -> tuple[Array, Array]:
-    """Return the least value of ``max(f0 + a s, f1 - b (length - s))`` over s in [0, length], and where it is."""
-    dip = (a < 0.0) & (b > 0.0)
-    s = np.clip((f1 - f0 - b * length) / np.where(dip, a - b, -1.0), 0.0, length)
+def crossing_of_tangents(f0: Array, a: Array, f1: Array, b: Array, length: Array | float) -> tuple[Array, Array]:
+    """Return the least value of ``max(f0 + a s, f1 - b (length - s))`` over s in [0, length], and the s of it.
+
+    Args:
+        f0: values at the start, of any shape.
+        a: slopes at the start.
+        f1: values at the end.
+        b: slopes at the end.
+        length: of the interval.
+    """
+    inside = (a < 0.0) & (b > 0.0)
+    s = np.clip((f1 - f0 - b * length) / np.where(inside, a - b, -1.0), 0.0, length)
     low = np.where(a >= 0.0, f0, f1)  # rising from the start, or falling until the end
     crossing = np.maximum(f0 + a * s, f1 + b * (s - length))
-    return np.where(dip, crossing, low), np.where(dip, s, np.where(a >= 0.0, 0.0, length))
+    return np.where(inside, crossing, low), np.where(inside, s, np.where(a >= 0.0, 0.0, length))

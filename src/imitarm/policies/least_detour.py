@@ -1,37 +1,41 @@
-"""The least displacement of components that keeps the clearance, once it is known on which side to pass.
+"""The smallest displacement of components that keeps the clearance, once it is known on which side to pass.
 
 With one tangent plane for each sample and obstacle, "keep the clearance" is a set of linear inequalities in the
-displacements, and because the planes under-estimate the distance, each of their solutions truly keeps it (an inner
-convex approximation). Minimising ``sum_k Delta_k^T Y_k^-1 Delta_k`` under them and renewing the planes never leaves
-the feasible set and never gets worse.
+displacements. Because the planes under-estimate the distance, each solution truly keeps the clearance at the samples
+(an inner convex approximation). Minimising ``sum_k Delta_k^T Y_k^-1 Delta_k`` under them and renewing the planes never
+leaves the feasible set and never gets worse.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.policies.certificate import Detour, Dips, Pair, distances, judged
+from imitarm.policies.certificate import ClosePoints, PathClearance, ToolAmongObstacles
 from imitarm.policies.component_path import STILL, ComponentPath
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 NEGLIGIBLE_LEVER = 0.02  # a sample that components can hardly move has no row: it would take a huge displacement
-FARTHEST = 0.5  # [m] no sample is led farther than this from where it was learnt
-_LONGEST_STEP = 8.0  # times the longest step of the nominal path: a longer one is a jump
+MAX_DISPLACEMENT = 0.5  # [m] no sample is led farther than this from the nominal path
+MAX_STEP_RATIO = 8.0  # times the longest step of the nominal path: a longer one is a jump
+MAX_JERK_RATIO = 10.0  # times the largest jerk of the nominal path
 UNBOUNDED = 1e30  # daqp's infinity
 _INFLUENCE = 0.04  # [m] at first, obstacles farther from a sample than this get no row
-_STEPS = 2  # rounds of tangents; most of what there is to save, the first one saves
-_HOPELESS = 0.002  # [m] a sample that lacks this much is no dip between two of them
-_TRIES = 12  # a segment that still dips then is given up
-_BEYOND = 2e-5  # [m] asked beyond the clearance of a point between two samples
+_ROUNDS = 2  # of tangents before the certificate is computed; the first saves most of what there is to save
+_MAX_TRIES = 12  # a segment that is still too close then is given up
+_MAX_SAG = 2e-4  # [m] most that is kept beyond the clearance at samples for the segments between them
+_ROUNDING = 2e-6  # [m] quadratic programs keep their rows no better
 _SLACK_SCALE = 1e-4  # [m] missing the tangents by this costs as much as one demonstrated sigma
-_GAIN = 0.9  # stop when a step saves less than a tenth
+_GAIN = 0.9  # stop when a round saves less than a tenth
+_PROGRESS = 0.7  # a try that leaves more than this fraction of what was missing is no progress
+_SMOOTHNESS = 1e-3  # weight of the squared jerk of the displacement, in units of the largest nominal jerk
+_SMOOTHER = (1e-1, 1e1, 1e3)  # weights tried where the path would be too jerky
 _SOLVED = 1  # daqp's exit flag of an optimal solution
 
 
@@ -51,131 +55,272 @@ def least_norm(rows: Array, lower: Array, upper: Array) -> Array | None:
     return np.asarray(y) if flag == _SOLVED else None
 
 
+@dataclass(frozen=True, eq=False)
+class AllowedDirections:
+    """The directions in which components may move: all ``u`` with ``u . f <= 0`` for every forbidden direction ``f``.
+
+    Attributes:
+        forbidden: unit rows, shape (m, 3). A direction and its opposite forbid the axis.
+        axes: orthonormal basis of what is left without the forbidden axes, columns, shape (3, d).
+        one_sided: the other forbidden directions in that basis, unit rows, shape (m', d).
+    """
+
+    forbidden: Array
+    axes: Array
+    one_sided: Array
+
+    @classmethod
+    def without(cls, forbidden: Array) -> AllowedDirections:
+        """Leave out forbidden directions, given as unit rows (m, 3)."""
+        opposite = (forbidden @ forbidden.T).min(axis=1, initial=0.0) < -1.0 + 1e-12 if len(forbidden) else []
+        axes = _complement(forbidden[opposite])
+        rest = forbidden[np.logical_not(opposite)] @ axes if len(forbidden) else np.empty((0, axes.shape[1]))
+        length = np.linalg.norm(rest, axis=1)
+        return cls(forbidden, axes, rest[length > 1e-9] / length[length > 1e-9, None])
+
+    @property
+    def dimension(self) -> int:
+        """Number of dimensions in which components can move at all."""
+        return self.axes.shape[1]
+
+    def enforced(self, reduced: Array) -> Array:
+        """Return displacements (..., 3) for coordinates (..., d), with what rounding left in forbidden directions."""
+        for _ in range(100 if len(self.one_sided) else 0):  # taking out one part may bring back a little of another
+            for f in self.one_sided:
+                reduced = reduced - np.maximum(reduced @ f, 0.0)[..., None] * f
+            if (reduced @ self.one_sided.T).max() <= 1e-17:
+                break
+        return np.asarray(reduced @ self.axes.T)
+
+    def unit_directions(self, candidates: Array) -> Array:
+        """Return the allowed parts of directions (m, 3) as unit rows, without those of which little is left."""
+        allowed = self.enforced(candidates @ self.axes)
+        length = np.sqrt(np.einsum("md,md->m", allowed, allowed))
+        allowed = allowed[length > 0.25] / length[length > 0.25, None]
+        return np.unique(np.round(allowed, 9) + 0.0, axis=0) if len(self.forbidden) else allowed
+
+
+def _complement(axes: Array) -> Array:
+    """Return an orthonormal basis (3, d), as columns, of the directions that are square to all rows of ``axes``."""
+    if not len(axes):
+        return np.eye(3)
+    first = axes[0]
+    rest = axes - (axes @ first)[:, None] * first
+    far = int(np.argmax(np.einsum("md,md->m", rest, rest)))
+    length = float(np.linalg.norm(rest[far]))
+    if length < 1e-9:  # one axis: the columns of a Householder reflection that takes a coordinate axis to it
+        i = int(np.argmax(np.abs(first)))
+        v = first.copy()
+        v[i] += np.copysign(1.0, first[i])
+        return np.asarray(np.delete(np.eye(3) - np.outer(v, v) * (2.0 / (v @ v)), i, axis=1))
+    second = rest[far] / length
+    third = np.cross(first, second)
+    if np.abs(rest @ third).max() > 1e-9:
+        return np.empty((3, 0))
+    return third[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Detour:
+    """A displaced path and what is proven of it.
+
+    Attributes:
+        path: the path and the components that were moved.
+        displacement: of each component's mean, shape (n_components, 3) [m].
+        clearance: distances along the displaced path.
+        bounds: proven lower bound of the clearance of each pair over the whole path, shape (n_pairs,) [m].
+        feasible: whether every bound reaches the required clearance and the path is within the stated limits.
+        out_of_limits: whether the path leads farther away, or makes longer steps, than the stated limits.
+        close: where it is too close between two samples that are not.
+    """
+
+    path: ComponentPath
+    displacement: Array
+    clearance: PathClearance
+    bounds: Array
+    feasible: bool
+    out_of_limits: bool
+    close: ClosePoints
+
+    @property
+    def lowest(self) -> float:
+        """The smallest of all bounds [m]; inf without obstacles."""
+        return float(self.bounds.min(initial=np.inf))
+
+
 def _longest_step(positions: Array) -> float:
     step = positions[1:] - positions[:-1]
     return float(np.sqrt(np.einsum("nd,nd->n", step, step).max()))
 
 
 class LeastDetour:
-    """Shrinks detours of one path among one set of obstacles, for all spheres of the tool.
+    """Finds the least detours of one path among one set of obstacles, for all spheres of the tool.
 
     Attributes:
-        wanted: distance planned for at the samples: the clearance, and what a chord may sag between two of them [m].
+        target: distance that is planned for at the samples: the clearance, and a little for the segments between [m].
         movable: which samples some component can move, shape (n,).
     """
 
-    def __init__(self, path: ComponentPath, pairs: Sequence[Pair], clearance: float, forbidden: Array) -> None:
-        self.path, self.pairs, self.clearance, self.forbidden = path, pairs, clearance, forbidden
+    def __init__(
+        self,
+        path: ComponentPath,
+        tool: ToolAmongObstacles,
+        clearance: float,
+        allowed: AllowedDirections,
+        *,
+        exact: bool = False,
+    ) -> None:
+        self.path, self.tool, self.clearance, self.allowed = path, tool, clearance, allowed
         step = self._longest_step = _longest_step(path.nominal.positions)
-        # Round a corner of an obstacle the centre of a sphere passes on an arc of this radius; its chord sags by
-        # step^2 / 8 radius.
-        radius = clearance + min(pair.radius for pair in pairs)
-        self.wanted = clearance + 1e-4 + 1.5 * step**2 / (8.0 * max(radius, 1e-3))
-        self.movable = path.basis.max(axis=1) > NEGLIGIBLE_LEVER
+        # Round an edge, the centre of a sphere passes on an arc of this radius; its chord sags by step^2 / 8 radius.
+        # It only saves rounds: segments that are too close get rows of their own.
+        radius = clearance + float(tool.radii.min())
+        sag = 1.5 * step**2 / (8.0 * max(radius, 1e-3))
+        self.target = clearance + (_ROUNDING if exact else _ROUNDING + min(sag, _MAX_SAG))
+        self.exact = exact
+        self.movable = path.basis.max(axis=1) > (1e-3 if exact else NEGLIGIBLE_LEVER)
 
-    def judged(self, displacement: Array, positions: Array, distance: Array, normal: Array, expanded: int) -> Detour:
-        """Judge a path by its certificate, and by whether it is one that a robot could follow."""
-        detour = judged(self.pairs, displacement, positions, distance, normal, self.clearance, expanded)
-        away = self._away(positions)
-        far = bool(np.sqrt(np.einsum("nd,nd->n", away, away).max()) > FARTHEST)
-        if far or _longest_step(positions) > _LONGEST_STEP * self._longest_step:
-            return replace(detour, feasible=False, strays=True)
-        return detour
+    def evaluate(self, displacement: Array, clearance: PathClearance) -> Detour:
+        """Return what is proven of a displaced path, and whether it is within the stated limits."""
+        bounds, close = clearance.certified(self.clearance)
+        away = clearance.positions - self.path.nominal.positions
+        out = bool(np.sqrt(np.einsum("nd,nd->n", away, away).max()) > MAX_DISPLACEMENT) or (
+            _longest_step(clearance.positions) > MAX_STEP_RATIO * self._longest_step
+        )
+        proven = bounds.min(axis=1, initial=np.inf)
+        feasible = bool(proven.min(initial=np.inf) >= self.clearance) and not out
+        return Detour(self.path, displacement, clearance, proven, feasible, out, close)
 
-    def shrink(self, detour: Detour, distance: Array, normal: Array) -> Detour:
-        """Shrink a displacement to the least one that its tangents allow; where a segment dips, hold that point too.
+    def shrink(self, start: PathClearance, moved: Index | None = None, *, smoothness: float | None = None) -> Detour | None:
+        """Return the least detour that the tangents along a path allow, or the best attempt; None: no attempt.
 
-        To ask for more at the samples instead would not do: with longer steps round the corner the path can have them
-        farther out and yet cut it as before, and next to a pinned instant a little more takes a huge displacement.
+        Where a segment is too close although its samples are not, that point gets a row of its own. Requiring more at
+        the samples instead does not work: with longer steps round the edge the path can have them farther out and yet
+        cut the edge as before, and next to a fixed time a little more takes a huge displacement.
+
+        Args:
+            start: clearance along a path from which the tangents are taken; it need not be a sum of the components.
+            moved: indices of the components that may move; None: all.
+            smoothness: weight of the squared jerk; None: the usual one of this path.
         """
+        moved = np.arange(self.path.n_components) if moved is None else moved
+        scale = self._scale(moved, smoothness)
         best: Detour | None = None
-        moved = np.flatnonzero(detour.displacement.any(axis=1))
-        displacement, positions, held = detour.displacement, detour.positions, Dips.none()
-        for _ in range(_TRIES if len(moved) else 0):
-            cost = self._cost(displacement)
-            for _ in range(_STEPS):
-                step = self._step(moved, positions, distance, normal, held)
+        here, held = start, ClosePoints.none()
+        missing = np.inf
+        for _ in range(_MAX_TRIES if len(moved) and self.allowed.dimension else 0):
+            cost = np.inf
+            displacement: Array | None = None
+            for _ in range(_ROUNDS):
+                step = self._step(moved, scale, here, held)
                 if step is None:
                     break
-                displacement, positions, distance, normal = step
-                previous, cost = cost, self._cost(displacement)
+                displacement, here, previous, cost = *step[:2], cost, step[2]
                 if cost > _GAIN * previous:
                     break
-            trial = self.judged(displacement, positions, distance, normal, detour.expanded)
-            if best is None or trial.bounds.min() > best.bounds.min():
-                best = trial
-            if trial.feasible or trial.strays or distance.min() < self.clearance - _HOPELESS:
+            if displacement is None:
                 break
-            held = held.and_also(trial.dips)
-        return detour if best is None else best
+            detour = self.evaluate(displacement, here)
+            if best is None or (detour.feasible, not detour.out_of_limits, detour.lowest) > (
+                best.feasible,
+                not best.out_of_limits,
+                best.lowest,
+            ):
+                best = detour
+            if detour.feasible:
+                break
+            still = self.clearance - here.lowest
+            if still > 1e-5 and still > _PROGRESS * missing:
+                break
+            missing = min(missing, still) if still > 0.0 else missing
+            held = held + detour.close
+        return best
+
+    def smoothed(self, detour: Detour) -> tuple[Detour, float]:
+        """Return a feasible detour with a jerk within the limit, if there is one near it, and its jerk ratio."""
+        ratio = self.path.jerk_ratio(detour.clearance.positions)
+        best, limit = detour, max(MAX_JERK_RATIO, 1.0)
+        moved = np.flatnonzero(detour.displacement.any(axis=1)) if not self.exact else None
+        for weight in _SMOOTHER:
+            if ratio <= limit:
+                break
+            trial = self.shrink(best.clearance, moved, smoothness=weight)
+            if trial is None or not trial.feasible:
+                break
+            less = self.path.jerk_ratio(trial.clearance.positions)
+            if less < ratio:
+                best, ratio = trial, less
+        return best, ratio
+
+    def cost(self, displacement: Array) -> float:
+        """Return ``sum_k Delta_k^T Y_k^-1 Delta_k``."""
+        return float(np.einsum("kd,kde,ke->", displacement, self.path.precisions, displacement))
+
+    def _scale(self, moved: Index, smoothness: float | None) -> Array:
+        """Return the matrix G (m d, m d) with ``delta = G y``, so that the cost of ``delta`` is ``|y|^2``.
+
+        The cost is ``delta^T H delta`` with the demonstrated precisions on the diagonal blocks of H and, where the
+        path is divided or has to be smoother, the squared jerk of the displacement.
+        """
+        axes, m, d = self.allowed.axes, len(moved), self.allowed.dimension
+        blocks = axes.T @ self.path.precisions[moved] @ axes
+        weight = (_SMOOTHNESS if self.exact else 0.0) if smoothness is None else smoothness
+        h = np.zeros((m, d, m, d))
+        index = np.arange(m)
+        h[index, :, index, :] = blocks
+        if weight > 0.0:
+            jerk = self.path.basis_jerk[:, moved] / max(np.linalg.norm(self.path.nominal_jerk, axis=1).max(), 1e-9)
+            products = weight * (jerk.T @ jerk)
+            for axis in range(d):
+                h[:, axis, :, axis] += products
+        lower = np.linalg.cholesky(h.reshape(m * d, m * d))
+        return np.asarray(np.linalg.inv(lower).T)
 
     def _step(
-        self, moved: Index, positions: Array, distance: Array, normal: Array, held: Dips
-    ) -> tuple[Array, Array, Array, Array] | None:
-        """Return the displacement of least cost under the tangents, its path, distances and normals; None: no solution.
+        self, moved: Index, scale: Array, here: PathClearance, held: ClosePoints
+    ) -> tuple[Array, PathClearance, float] | None:
+        """Return the displacement of least cost under the tangents, its clearance and cost; None: no solution.
 
         At first only samples near an obstacle get a row. Where that lets another one in, all of them do.
         """
         answer = None
         for influence in (_INFLUENCE, np.inf):
-            displacement = self._least(moved, positions, distance, normal, held, influence)
-            if displacement is None:
+            solution = self._least(moved, scale, here, held, influence)
+            if solution is None:
                 return None
-            new = self.path.displaced(displacement)
-            answer = (displacement, new, *distances(self.pairs, new))
-            if answer[2].min() >= min(self.wanted, float(distance.min())) - STILL:
+            displacement, cost = solution
+            there = self.tool.clearance_of(self.path.displaced(displacement))
+            answer = (displacement, there, cost)
+            if there.lowest >= min(self.target, here.lowest) - STILL:
                 break
         return answer
 
-    def _away(self, positions: Array) -> Array:
-        return positions - self.path.nominal.positions
-
-    def _between(self, dips: Dips, positions: Array) -> tuple[Array, Array, Array, Array]:
-        """Return normals (m, 3), missing clearance (m,), basis (m, n_components) and distance from nominal (m, 3).
-
-        A point between two samples is a fixed mean of them, so it is as affine in the displacements as they are.
-        """
-        j, s = dips.segment, dips.fraction[:, None]
-        normal, missing = np.empty((len(j), 3)), np.empty(len(j))
-        for i in np.unique(dips.pair).tolist():
-            pair, of = self.pairs[i], np.flatnonzero(dips.pair == i)
-            start, end = pair.centres(positions[j[of]], j[of]), pair.centres(positions[j[of] + 1], j[of] + 1)
-            distance, normal[of] = pair.distance_and_normal(start + s[of] * (end - start))
-            bow = np.broadcast_to(pair.bow, len(positions) - 1)[j[of]]
-            missing[of] = self.clearance + _BEYOND - (distance - bow)
-        away, basis = self._away(positions), self.path.basis
-        return normal, missing, (1.0 - s) * basis[j] + s * basis[j + 1], (1.0 - s) * away[j] + s * away[j + 1]
-
-    def _cost(self, displacement: Array) -> float:
-        return float(np.einsum("kd,kde,ke->", displacement, self.path.precisions, displacement))
-
     def _least(
-        self, moved: Index, positions: Array, distance: Array, normal: Array, held: Dips, influence: float
-    ) -> Array | None:
-        """Minimise ``sum Delta_k^T Y_k^-1 Delta_k`` under the tangents at ``positions``; None: no solution.
+        self, moved: Index, scale: Array, here: PathClearance, held: ClosePoints, influence: float
+    ) -> tuple[Array, float] | None:
+        """Minimise the cost under the tangents along a path; None: no solution.
 
-        With the yields ``Y_k = L_k L_k^T`` and ``Delta_k = L_k y_k`` the cost is ``|y|^2``: a least-norm problem. Where
-        it has no solution, one more unknown lets all tangents be missed by the same, smallest length; from the path
-        that comes of it the renewed tangents may have one.
+        Where there is none, one more unknown lets all tangents be missed by the same, smallest length; from the path
+        that results, the renewed tangents may have one.
         """
-        o, j = np.nonzero((distance < self.wanted + influence) & self.movable)
-        at_samples = (normal[o, j], self.wanted - distance[o, j], self.path.basis[j], self._away(positions)[j])
-        n, missing, lever, away = at_samples
-        if len(held.pair):
-            between = self._between(held, positions)
-            n, missing, lever, away = map(np.concatenate, zip(at_samples, between, strict=True))
-        factors = self.path.factors[moved]
-        rows = lever[:, moved][:, :, None] * np.swapaxes(n @ factors, 0, 1)
-        lower = missing + np.einsum("rd,rd->r", n, away)
-        size = 3 * len(moved)
+        basis, away = self.path.basis, here.positions - self.path.nominal.positions
+        pair, j = np.nonzero((here.distance < self.target + influence) & self.movable)
+        n, missing = here.normal[pair, j], self.target - here.distance[pair, j]
+        lever, away_there = basis[j], away[j]
+        if len(held):
+            distance, normal = here.at(held)
+            k, s = held.segment, held.fraction[:, None]  # a point between two samples is as affine as they are
+            n, missing = np.concatenate([n, normal]), np.append(missing, self.clearance + 10 * _ROUNDING - distance)
+            lever = np.concatenate([lever, (1.0 - s) * basis[k] + s * basis[k + 1]])
+            away_there = np.concatenate([away_there, (1.0 - s) * away[k] + s * away[k + 1]])
+        size, d = scale.shape[1], self.allowed.dimension
+        rows = (lever[:, moved, None] * (n @ self.allowed.axes)[:, None, :]).reshape(-1, size)
+        lower = missing + np.einsum("rd,rd->r", n, away_there)
         n_tangents = len(rows)
-        if len(self.forbidden):
-            blocks = np.zeros((len(self.forbidden), len(moved), len(moved), 3))
-            index = np.arange(len(moved))
-            blocks[:, index, index] = np.swapaxes(self.forbidden @ factors, 0, 1)
-            rows = np.vstack([rows.reshape(-1, size), -blocks.reshape(-1, size)])
-            lower = np.concatenate([lower, np.zeros(len(self.forbidden) * len(moved))])
-        rows, upper = rows.reshape(-1, size), np.full(len(lower), UNBOUNDED)
+        if len(self.allowed.one_sided):
+            one_sided = np.kron(np.eye(len(moved)), -self.allowed.one_sided)
+            rows, lower = np.concatenate([rows, one_sided]), np.append(lower, np.zeros(len(one_sided)))
+        rows, upper = rows @ scale, np.full(len(lower), UNBOUNDED)
         y = least_norm(rows, lower, upper)
         if y is None:
             slack = np.where(np.arange(len(rows)) < n_tangents, _SLACK_SCALE, 0.0)[:, None]
@@ -184,8 +329,15 @@ class LeastDetour:
                 return None
             y = y[:-1]
         displacement = np.zeros((self.path.n_components, 3))
-        displacement[moved] = (factors @ y.reshape(-1, 3, 1))[..., 0]
-        for f in self.forbidden:  # the solver keeps them to its tolerance; here they hold exactly
-            displacement -= np.maximum(displacement @ f, 0.0)[:, None] * f
-        displacement[np.linalg.norm(displacement, axis=1) < STILL] = 0.0
-        return displacement
+        displacement[moved] = self.allowed.enforced((scale @ y).reshape(-1, d))
+        displacement[np.einsum("kd,kd->k", displacement, displacement) < STILL**2] = 0.0
+        return displacement, float(y @ y)
+
+
+def best_of(detours: Iterable[Detour | None]) -> Detour | None:
+    """Return the feasible detour, or the one that comes nearest to the clearance; None when there is none."""
+    found = [detour for detour in detours if detour is not None]
+    return max(found, key=lambda x: (x.feasible, not x.out_of_limits, x.lowest), default=None)
+
+
+__all__ = ["AllowedDirections", "Detour", "LeastDetour", "best_of", "least_norm", "replace"]
