@@ -76,7 +76,7 @@ def test_a_slow_robot_follows_the_same_path(skill_and_path):
 def test_begins_where_the_tool_is(skill_and_path):
     skill, _ = skill_and_path
     away = np.add(skill.start_.position, [0.0, 0.06, 0.05])
-    policy = ACFRA(skill)
+    policy = ACFRA(skill, tool_radius=0.0)
     track, last = fly(policy, Scene(), away)
     assert policy.finished(last)
     assert np.linalg.norm(np.diff(track, axis=0), axis=1).max() < 0.006  # no jump to the learnt start
@@ -92,7 +92,7 @@ def test_refuses_with_the_reason(skill_and_path):
 
 def test_step_before_reset_and_unknown_methods_are_errors(skill_and_path):
     skill, _ = skill_and_path
-    policy = ACFRA(skill)
+    policy = ACFRA(skill, tool_radius=0.0)
     observation = Observation(0.0, skill.start_, Scene())
     assert not policy.finished(observation)
     with pytest.raises(InputError, match="reset"):

@@ -9,7 +9,7 @@ from imitarm.benchmark.avoidance import learn
 from imitarm.benchmark.families import sparse_clutter
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose, quaternion_exp, rotate
-from imitarm.policies import HORIZONTAL_ONLY, METHODS, adapt
+from imitarm.policies import ADAPTERS, HORIZONTAL_ONLY, adapt
 from imitarm.policies.baselines.potential_components import FORCES, component_distances, push_components
 from imitarm.policies.component_path import ComponentPath, quintic_step
 from imitarm.scene import Box, Scene, Sphere
@@ -38,33 +38,43 @@ def turning():
 
 def test_unknown_method_lists_the_known_ones(spatial):
     with pytest.raises(UnknownNameError, match="certified, literal, mapf"):
-        adapt(spatial[0], Scene(), "magic")
+        adapt(spatial[0], Scene(), "magic", tool_radius=0.0)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tool_radius": -0.01}, "must be >= 0"),
-        ({"clearance": float("nan")}, "must be >= 0"),
-        ({"forbidden": [[0, 0, 0]]}, "none of them zero"),
-        ({"forbidden": [1.0, 2.0]}, "rows of 3"),
+        ({"tool_radius": -0.01}, "tool_radius must be a finite number of at least 0"),
+        ({"tool_radius": float("nan")}, "tool_radius must be a finite number"),
+        ({"tool_radius": "wide"}, "tool_radius must be a finite number"),
+        ({"clearance": float("nan")}, "clearance must be a finite number"),
+        ({"clearance": -0.01}, "clearance must be a finite number of at least 0"),
+        ({"forbidden": [[0, 0, 0]]}, "a direction is zero"),
+        ({"forbidden": [1.0, 2.0]}, r"shape \(n, 3\)"),
+        ({"forbidden": [[0, 0, np.inf]]}, "must be finite"),
+        ({"start": [0, 0, 0]}, "start must be a Pose"),
+        ({"n_samples": 100.0}, "whole number"),
+        ({"pinned": [np.nan]}, "pinned must be finite"),
+        ({"tool_radius": None}, "exactly one of tool_radius .* got none"),
+        ({"tool_radius": None, "arm": "sawyer"}, "arm must be a ArmModel"),
         ({"n_samples": 3}, "at least 10"),
         ({"pinned": [99.0]}, "outside the motion"),
-        ({"tool_radius": 0.1, "tool_spheres": [[0, 0, 0, 0.1]]}, "not both"),
-        ({"tool_spheres": [[0, 0, 0]]}, "rows x y z r"),
+        ({"tool_radius": 0.1, "tool_spheres": [[0, 0, 0, 0.1]]}, "exactly one of"),
+        ({"tool_spheres": [[0, 0, 0]]}, r"shape \(n, 4\)"),
         ({"tool_spheres": [[0, 0, 0, -1]]}, "r >= 0"),
-        ({"tool_spheres": [[0, 0, 0.1, 0.02]]}, "orientation, which was not learnt"),
+        ({"tool_spheres": [[0, 0, 0.1, 0.02]]}, "orientation, which was not learned"),
     ],
 )
 def test_bad_options_say_what_is_wrong(spatial, options, message):
     with pytest.raises(InputError, match=message):
-        adapt(spatial[0], Scene(), **options)
+        spheres = "tool_spheres" in options
+        adapt(spatial[0], Scene(), **({} if spheres else {"tool_radius": 0.0}) | options)
 
 
 def test_without_obstacles_nothing_changes(spatial):
-    adaptation = adapt(spatial[0], Scene())
+    adaptation = adapt(spatial[0], Scene(), tool_radius=0.0)
     assert adaptation.feasible and adaptation.reason == "" and adaptation.certified_clearance == np.inf
-    assert not adaptation.moved.any() and adaptation.unmoved_share == 1.0 and adaptation.rmse_to_nominal == 0.0
+    assert not adaptation.moved.any() and adaptation.unmoved_fraction == 1.0 and adaptation.rmse_to_nominal == 0.0
     np.testing.assert_array_equal(adaptation.trajectory.positions, adaptation.nominal.positions)
 
 
@@ -125,7 +135,7 @@ def test_one_sphere_at_the_tip_is_the_same_as_a_radius(spatial):
 def test_adaptation_is_deterministic(spatial):
     skill, path = spatial
     scene = sparse_clutter(8, path, n_obstacles=3, planar=False).scene
-    runs = [adapt(skill, scene, method, tool_radius=0.03).trajectory.positions for method in METHODS for _ in range(2)]
+    runs = [adapt(skill, scene, method, tool_radius=0.03).trajectory.positions for method in ADAPTERS for _ in range(2)]
     for a, b in zip(runs[::2], runs[1::2], strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -134,7 +144,7 @@ def test_what_is_said_is_what_was_measured(spatial):
     skill, path = spatial
     for seed in range(10):
         case = sparse_clutter(seed, path, n_obstacles=2, planar=False)
-        for method in METHODS:
+        for method in ADAPTERS:
             adaptation = adapt(skill, case.scene, method, tool_radius=0.03)
             at_samples = case.scene.clearance(adaptation.trajectory.positions).min() - 0.03
             assert adaptation.min_clearance == pytest.approx(at_samples, abs=1e-9)

@@ -23,7 +23,7 @@ from imitarm.benchmark.families import (
 )
 from imitarm.benchmark.tables import Table
 from imitarm.evaluation.intervals import wilson_interval
-from imitarm.policies.adaptation import METHODS, Adaptation, adapt
+from imitarm.policies.adaptation import ADAPTERS, Adaptation, adapt
 from imitarm.skills.gmm import DegenerateAxisWarning
 from imitarm.skills.skill import Skill
 
@@ -80,7 +80,7 @@ def judge(case: Case, adaptation: Adaptation) -> Outcome:
         collision_free=clearance > 0.0,
         clearance=clearance,
         rmse=adaptation.rmse_to_nominal,
-        unmoved=adaptation.unmoved_share,
+        unmoved=adaptation.unmoved_fraction,
         seconds=adaptation.compute_time,
     )
 
@@ -129,7 +129,7 @@ def _row(dimension: str, family: str, solvable: bool, method: str, outcomes: Seq
 def success_table(
     seeds: int,
     first: int = 2000,
-    methods: Sequence[str] = tuple(METHODS),
+    methods: Sequence[str] = tuple(ADAPTERS),
     on_done: Callable[[int, int], None] | None = None,
 ) -> Table:
     """Run every method over every family.
@@ -137,7 +137,7 @@ def success_table(
     Args:
         seeds: scenes in each family.
         first: first seed; 2000 and on are the test seeds.
-        methods: of :data:`imitarm.policies.adaptation.METHODS`.
+        methods: of :data:`imitarm.policies.adaptation.ADAPTERS`.
         on_done: is told how many rows are done, and of how many.
     """
     rows: list[tuple[str, ...]] = []

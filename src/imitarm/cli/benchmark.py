@@ -22,7 +22,7 @@ from imitarm.cli.outputs import check_outputs, same_place
 from imitarm.cli.screen import progress_bar, remark, say, show_table
 from imitarm.cli.trial import provenance
 from imitarm.errors import InputError
-from imitarm.policies.adaptation import METHODS as ADAPTATIONS
+from imitarm.policies.adaptation import ADAPTERS as ADAPTATIONS
 
 EPILOG = """\
 examples:

@@ -14,7 +14,7 @@ from imitarm.cli.screen import progress_bar, say
 from imitarm.cli.trial import learning_summary, provenance, show_results, try_scene
 from imitarm.demonstrations import compute_alignment, lint
 from imitarm.errors import InputError
-from imitarm.policies import ACFRA, HORIZONTAL_ONLY, METHODS
+from imitarm.policies import ACFRA, ADAPTERS, HORIZONTAL_ONLY
 from imitarm.skills import Skill
 from imitarm.tasks.sweep import DEMONSTRATIONS, SCENES, SweepTask
 from imitarm.trajectory import Demonstration
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes."""
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="FOLDER", help="default: demo")
     parser.add_argument("--seed", type=int, default=0, help="of where the crumbs lie; default: 0")
-    parser.add_argument("--method", choices=METHODS, default="certified", help="how to adapt; default: certified")
+    parser.add_argument("--method", choices=ADAPTERS, default="certified", help="how to adapt; default: certified")
     parser.add_argument("--force", action="store_true", help="replace files that are there")
 
 

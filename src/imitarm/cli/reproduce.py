@@ -16,7 +16,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_file import ARMS, TOOLS
 from imitarm.kinematics.ik import find_posture
 from imitarm.kinematics.pose import Pose
-from imitarm.policies import ACFRA, HORIZONTAL_ONLY, METHODS, NOT_DOWN
+from imitarm.policies import ACFRA, ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN
 from imitarm.robots import SimulatedRobot
 from imitarm.scene import Scene, load_scene
 from imitarm.skills import Skill
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tool", metavar="NAME", help=f"{', '.join(TOOLS)} or an MJCF file")
     parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles and goal (YAML); default: nothing")
     way = parser.add_argument_group("the way round")
-    way.add_argument("--method", choices=METHODS, default="certified", help="how to adapt; default: certified")
+    way.add_argument("--method", choices=ADAPTERS, default="certified", help="how to adapt; default: certified")
     way.add_argument("--clearance", type=float, default=20.0, metavar="MM", help="to every obstacle; default: 20 mm")
     way.add_argument("--tool-radius", type=float, metavar="MM", help="of a sphere; default: the tool's own shape")
     way.add_argument("--tool-only", action="store_true", help="do not keep the other links clear (to compare)")

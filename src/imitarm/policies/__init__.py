@@ -4,19 +4,20 @@
 """
 
 from imitarm.policies.acfra import ACFRA
-from imitarm.policies.adaptation import HORIZONTAL_ONLY, METHODS, NOT_DOWN, Adaptation, adapt
+from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, Adaptation, PathAdapter, adapt
 from imitarm.policies.policy import Observation, Policy
 
 POLICIES: dict[str, type[Policy]] = {"acfra": ACFRA}
 
 __all__ = [
     "ACFRA",
+    "ADAPTERS",
     "HORIZONTAL_ONLY",
-    "METHODS",
     "NOT_DOWN",
     "POLICIES",
     "Adaptation",
     "Observation",
+    "PathAdapter",
     "Policy",
     "adapt",
 ]

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.errors import InfeasibleError, InputError, UnknownNameError
+from imitarm.errors import InfeasibleError, InputError
 from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply
-from imitarm.policies.adaptation import METHODS, Adaptation, adapt
+from imitarm.policies.adaptation import ADAPTERS, Adaptation, adapt
 from imitarm.policies.policy import Observation, Policy
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class ACFRA(Policy):
         skill: Skill,
         *,
         method: str = "certified",
-        tool_radius: float = 0.0,
+        tool_radius: float | None = None,
         tool_spheres: ArrayLike | None = None,
         clearance: float = 0.02,
         forbidden: ArrayLike = (),
@@ -56,8 +56,7 @@ class ACFRA(Policy):
         arrival: float = 0.003,  # [m]
     ) -> None:
         super().__init__(skill)
-        if method not in METHODS:
-            raise UnknownNameError.among("method", method, METHODS)
+        self._refuses = ADAPTERS[method].refuses
         self._options = {
             "method": method,
             "tool_radius": tool_radius,
@@ -82,7 +81,7 @@ class ACFRA(Policy):
             away = away[:3]
         start = observation.tool_to_base if np.linalg.norm(away) > _SAME_PLACE else None
         self.adaptation = adapt(self.skill, observation.scene, start=start, **self._options)  # type: ignore[arg-type]
-        if not self.adaptation.feasible and self.adaptation.method == "certified":
+        if not self.adaptation.feasible and self._refuses:
             raise InfeasibleError(self.adaptation.reason)
         path = self.adaptation.trajectory
         self._velocity = np.gradient(path.positions, path.times, axis=0)

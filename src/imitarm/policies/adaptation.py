@@ -1,54 +1,122 @@
-"""Adapt a whole learnt path to a scene by moving only the components near an obstacle (thesis Chapter 4)."""
+"""Adapt a whole learned path to a scene by moving only the components near an obstacle (thesis Chapter 4)."""
 
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.errors import InputError, UnknownNameError
+from imitarm.errors import InputError
+from imitarm.html_table import html_table
+from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
-from imitarm.policies.baselines.potential_components import push_components
-from imitarm.policies.certificate import Detour, distances, judged
-from imitarm.policies.certified import find_detour
+from imitarm.policies.certificate import PathClearance, ToolAmongObstacles
 from imitarm.policies.component_path import STILL, ComponentPath
+from imitarm.policies.least_detour import (
+    MAX_DISPLACEMENT,
+    MAX_JERK_RATIO,
+    MAX_STEP_RATIO,
+    AllowedDirections,
+    Detour,
+    LeastDetour,
+)
+from imitarm.registry import Registry
 from imitarm.scene.scene import Scene
 from imitarm.trajectory import Trajectory
+from imitarm.validation import finite_array, finite_number, instance, text
 
 if TYPE_CHECKING:
     from imitarm.skills.skill import Skill
 
 Array = NDArray[np.float64]
 
-METHODS = ("certified", "mapf", "literal")
 HORIZONTAL_ONLY = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))  # stay in the plane of the table: 2-D avoidance
 NOT_DOWN = ((0.0, 0.0, -1.0),)  # never into the table
 
 
 @dataclass(frozen=True, eq=False)
+class AvoidanceProblem:
+    """What a method of adaptation has to solve.
+
+    Attributes:
+        path: the nominal path and its components.
+        nominal: clearance of the tool along it, to every obstacle.
+        clearance: required [m].
+        allowed: directions in which components may move.
+    """
+
+    path: ComponentPath
+    nominal: PathClearance
+    clearance: float
+    allowed: AllowedDirections
+
+    def evaluated(self, displacement: Array) -> Detour:
+        """Return what is proven of the path when the components move by ``displacement`` (n_components, 3) [m]."""
+        there = self.nominal.tool.clearance_of(self.path.displaced(displacement))
+        return LeastDetour(self.path, self.nominal.tool, self.clearance, self.allowed).evaluate(displacement, there)
+
+
+class PathAdapter(ABC):
+    """One method of adapting a path. A new one is one file, and one line in ``ADAPTERS`` or an entry point.
+
+    Attributes:
+        refuses: whether the method itself knows that it can't keep the clearance. ``ACFRA`` then refuses to move;
+            the paths of other methods are followed wherever they lead, so that they can be compared.
+    """
+
+    refuses: ClassVar[bool] = False
+
+    @abstractmethod
+    def detour(self, problem: AvoidanceProblem) -> Detour:
+        """Return a displaced path with what is proven of it; :meth:`AvoidanceProblem.evaluated` makes one."""
+
+
+ADAPTERS: Registry[PathAdapter] = Registry(
+    "adaptation method",
+    "imitarm.adapters",
+    {
+        "certified": "imitarm.policies.certified:CERTIFIED",
+        "mapf": "imitarm.policies.baselines.potential_components:MAPF",
+        "literal": "imitarm.policies.baselines.potential_components:LITERAL",
+    },
+)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Adaptation:
-    """What became of a skill's path in a scene.
+    """The path of a skill, adapted to a scene.
 
     Attributes:
         nominal: the path without obstacles.
-        trajectory: the adapted path, same times; where it is not ``feasible``, the best attempt, not to be executed.
+        trajectory: the adapted path, at the same times; where it is not ``feasible``, the best attempt, not to be
+            executed.
         displacement: of each component's mean, shape (n_components, 3) [m].
         moved: which components moved, shape (n_components,).
         means: centres of the components before they moved, shape (n_components, 3) [m].
         covariances: position covariances of the components, shape (n_components, 3, 3) [m^2].
         responsibilities: of each component for each sample, shape (n, n_components).
+        divided: whether the learned components were too wide for this scene, so that the arrays above are of more,
+            narrower ones.
         tolerance: covariance of the demonstrations along the path, shape (n, 3, 3) [m^2].
         min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without any.
-        certified_clearance: proven lower bound of it on the whole polyline through the samples [m].
+        certified_clearance: guaranteed lower bound of it on the whole polyline through the samples [m].
+        only_on_schedule: whether an obstacle moves. The guarantee then holds only while the motion is on time: the
+            tool is at ``trajectory`` at the time of each sample, counted from when the scene was seen. It ends with the
+            last sample.
+        validity: in words, what the guarantee assumes and what it does not cover.
         deviation: how many demonstrated sigmas the farthest mean moved (Mahalanobis).
-        feasible: whether ``certified_clearance`` reaches what was asked.
+        jerk_ratio: largest jerk of the adapted path, divided by the largest jerk of the nominal path.
+        jerk_reason: empty while ``jerk_ratio`` is at most 10, else why it is not.
+        feasible: whether ``certified_clearance`` reaches the required clearance, within the stated limits.
         reason: empty when feasible, else which obstacle is in the way and why it can't be avoided.
         method: which method was used.
         compute_time: of the whole adaptation [s].
+        joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned.
     """
 
     nominal: Trajectory
@@ -58,18 +126,24 @@ class Adaptation:
     means: Array
     covariances: Array
     responsibilities: Array
+    divided: bool
     tolerance: Array
     min_clearance: float
     certified_clearance: float
+    only_on_schedule: bool
+    validity: str
     deviation: float
+    jerk_ratio: float
+    jerk_reason: str
     feasible: bool
     reason: str
     method: str
     compute_time: float
+    joints: Array | None = None
 
     @property
-    def unmoved_share(self) -> float:
-        """Share of the components that stayed where they were learnt."""
+    def unmoved_fraction(self) -> float:
+        """Fraction of the components that stayed where they were learned."""
         return float(1.0 - np.mean(self.moved))
 
     @property
@@ -77,14 +151,40 @@ class Adaptation:
         """Root mean square distance between adapted and nominal path (thesis Eq 4.9 with its root) [m]."""
         return float(np.sqrt(np.mean(np.sum((self.trajectory.positions - self.nominal.positions) ** 2, axis=1))))
 
+    def __repr__(self) -> str:
+        if not self.feasible:
+            return f"Adaptation({self.method}, not feasible: {self.reason})"
+        clear = "no obstacles" if np.isinf(self.certified_clearance) else f"{1e3 * self.certified_clearance:.1f} mm"
+        return (
+            f"Adaptation({self.method}, feasible, certified clearance {clear}, {int(self.moved.sum())} of "
+            f"{len(self.moved)} components moved, {1e3 * self.compute_time:.1f} ms)"
+        )
+
+    def _repr_html_(self) -> str:
+        clear = "no obstacles" if np.isinf(self.certified_clearance) else f"{1e3 * self.certified_clearance:.2f} mm"
+        rows = {
+            "method": self.method,
+            "feasible": "yes" if self.feasible else f"no: {self.reason}",
+            "certified clearance": clear,
+            "valid": self.validity,
+            "components moved": f"{int(self.moved.sum())} of {len(self.moved)}",
+            "RMSE to the nominal path": f"{1e3 * self.rmse_to_nominal:.1f} mm",
+            "jerk": f"{self.jerk_ratio:.1f} times that of the nominal path",
+            "jerk above the limit": self.jerk_reason,
+            "joint path": "not planned" if self.joints is None else f"{self.joints.shape[1]} joints",
+            "compute time": f"{1e3 * self.compute_time:.1f} ms",
+        }
+        return html_table("Adaptation", rows)
+
 
 def adapt(
     skill: Skill,
     scene: Scene,
     method: str = "certified",
     *,
-    tool_radius: float = 0.0,
+    tool_radius: float | None = None,
     tool_spheres: ArrayLike | None = None,
+    arm: ArmModel | None = None,
     clearance: float = 0.02,
     forbidden: ArrayLike = (),
     pinned: Sequence[float] = (),
@@ -94,125 +194,177 @@ def adapt(
     """Adapt the whole path of a skill to the obstacles of a scene.
 
     ``certified`` moves the affected components by the least that keeps the clearance on the whole path, or refuses and
-    says why; ``mapf`` and ``literal`` are the thesis's potential fields (see ``potential_components``), which may fail.
-    Start, goal and ``pinned`` instants do not move.
+    says why. ``mapf`` and ``literal`` are the thesis's potential fields (see ``potential_components``), which may fail.
+    Start, goal and ``pinned`` times do not move. The tool must be given in exactly one of three ways.
+
+    Obstacles are where the scene says at time 0, and move on at their velocities: the motion begins at time 0.
 
     Args:
         skill: a fitted skill.
-        scene: goal (None: the learnt one) and obstacles.
-        method: ``"certified"``, ``"mapf"`` or ``"literal"``.
-        tool_radius: radius of a sphere about the tool's tip that holds the tool [m].
-        tool_spheres: instead of one radius, spheres that hold the tool: rows x y z r in the tool's frame, shape
-            (m, 4) [m], as ``ArmModel.tool_spheres`` gives them. They turn as the skill turns the tool.
-        clearance: asked distance from them to every obstacle [m].
+        scene: goal (None: the learned one) and obstacles.
+        method: a name in ``ADAPTERS``: ``"certified"``, ``"mapf"``, ``"literal"`` or one that was added.
+        tool_radius: the tool as one sphere of this radius about its tip [m]; 0 for a point.
+        tool_spheres: the tool as spheres that contain it: rows x y z r in the tool's frame, shape (m, 4) [m]. They
+            rotate as the skill rotates the tool.
+        arm: the tool as the spheres of this arm (``ArmModel.tool_spheres``). Its links are not planned for.
+        clearance: required distance from the tool to every obstacle [m].
         forbidden: directions in which nothing may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
-        pinned: instants [s] at which the path must not move, for example where the dirt lies.
-        start: where the motion begins; None: where it was learnt.
+        pinned: times [s] at which the path must not move, for example where the dirt lies.
+        start: where the motion begins; None: where it was learned.
         n_samples: samples along the path.
 
     Returns:
-        The adaptation; look at ``feasible`` before executing it.
+        The adaptation; check ``feasible`` before executing it.
 
     Raises:
         UnknownNameError: when there is no such method.
-        InputError: when a radius, a clearance or a direction can't be used.
+        InputError: when the tool is not given in exactly one way, or an argument is not valid.
     """
-    if method not in METHODS:
-        raise UnknownNameError.among("method", method, METHODS)
-    for name, length in (("tool_radius", tool_radius), ("clearance", clearance)):
-        if not 0.0 <= length < np.inf:
-            raise InputError(f"{name} must be >= 0 m, got {length:g}")
-    if tool_spheres is not None and tool_radius > 0.0:
-        raise InputError("give tool_radius or tool_spheres, not both")
-    spheres = ((0.0, 0.0, 0.0, tool_radius),) if tool_spheres is None else tool_spheres
-    axes = _unit_rows(forbidden)
     began = time.perf_counter()
-    path = ComponentPath.of_skill(
-        skill, spheres=spheres, n_samples=n_samples, start=start, goal=scene.goal, pinned=pinned
-    )
-    detour = _detour(path, scene, clearance, method, axes)
+    adapter = ADAPTERS[text(method, "method")]
+    instance(scene, Scene, "scene")
+    if start is not None:
+        instance(start, Pose, "start")
+    clearance = finite_number(clearance, "clearance", "m", at_least=0.0)
+    spheres = _spheres(skill, tool_radius, tool_spheres, arm)
+    allowed = AllowedDirections.without(_unit_rows(forbidden))
+    path = ComponentPath.of_skill(skill, n_samples=n_samples, start=start, goal=scene.goal, pinned=pinned)
+    tool = ToolAmongObstacles.along(path.nominal, spheres, scene.obstacles)
+    problem = AvoidanceProblem(path, tool.clearance_of(path.nominal.positions), clearance, allowed)
+    detour = _detour(problem, adapter)
+    jerk_ratio = 1.0
+    if detour.displacement.any():
+        jerk_ratio = path.jerk_ratio(detour.clearance.positions)
+        if jerk_ratio > MAX_JERK_RATIO and detour.feasible and adapter.refuses:
+            least = LeastDetour(detour.path, tool, clearance, allowed, exact=True)
+            detour, jerk_ratio = least.smoothed(detour)
+    used = detour.path
     return Adaptation(
         nominal=path.nominal,
-        trajectory=Trajectory(path.nominal.times, detour.positions, path.nominal.quaternions),
+        trajectory=Trajectory(path.nominal.times, detour.clearance.positions, path.nominal.quaternions),
         displacement=detour.displacement,
         moved=np.linalg.norm(detour.displacement, axis=1) > STILL,
-        means=path.means,
-        covariances=path.covariances,
-        responsibilities=path.responsibilities,
+        means=used.means,
+        covariances=used.covariances,
+        responsibilities=used.responsibilities,
+        divided=used is not path,
         tolerance=path.tolerance,
-        min_clearance=float(np.min(detour.nearest, initial=np.inf)),
-        certified_clearance=float(np.min(detour.bounds, initial=np.inf)),
-        deviation=path.deviation(detour.displacement),
+        min_clearance=detour.clearance.lowest,
+        certified_clearance=detour.lowest,
+        only_on_schedule=any(obstacle.velocity.any() for obstacle in scene.obstacles),
+        validity=_validity(scene, path.nominal.duration),
+        deviation=used.deviation(detour.displacement),
+        jerk_ratio=jerk_ratio,
+        jerk_reason=_jerk_reason(scene, detour, jerk_ratio, clearance),
         feasible=detour.feasible,
-        reason="" if detour.feasible else _reason(path, scene, detour, method, clearance, len(axes)),
+        reason="" if detour.feasible else _reason(scene, problem, detour, method, adapter),
         method=method,
         compute_time=time.perf_counter() - began,
     )
 
 
+def _spheres(skill: Skill, radius: float | None, spheres: ArrayLike | None, arm: ArmModel | None) -> Array:
+    """Return the tool as rows x y z r, shape (n, 4) [m]."""
+    ways = {"tool_radius": radius, "tool_spheres": spheres, "arm": arm}
+    given = [name for name, value in ways.items() if value is not None]
+    if len(given) != 1:
+        got = " and ".join(given) or "none"
+        raise InputError(f"adapt: give exactly one of tool_radius (0 for a point), tool_spheres or arm, got {got}")
+    if arm is not None:
+        rows = np.asarray(instance(arm, ArmModel, "arm").tool_spheres, dtype=float)
+        if not len(rows):
+            raise InputError(f"adapt: the arm {arm.name} has no tool; give tool_radius or tool_spheres")
+    elif radius is not None:
+        rows = np.array([[0.0, 0.0, 0.0, finite_number(radius, "tool_radius", "m", at_least=0.0)]])
+    else:
+        rows = finite_array(spheres, (None, 4), "tool_spheres (rows x y z r)", "m")
+        if not len(rows) or rows[:, 3].min() < 0.0:
+            raise InputError("tool_spheres: give at least one row x y z r with r >= 0 m")
+    if not skill.gmr_.has_orientation_ and rows[:, :3].any():
+        raise InputError(
+            "tool spheres beside the tip need the tool's orientation, which was not learned: "
+            "record quaternions, or give tool_radius"
+        )
+    return rows
+
+
 def _unit_rows(directions: ArrayLike) -> Array:
-    rows = np.asarray(directions, dtype=float)
-    rows = rows.reshape(-1, 3) if rows.size % 3 == 0 else np.full((1, 3), np.nan)
+    rows = finite_array(directions, (None,) if np.size(directions) == 0 else (None, 3), "forbidden (rows x y z)")
+    rows = rows.reshape(-1, 3)
     length = np.linalg.norm(rows, axis=1, keepdims=True)
-    if not np.all(np.isfinite(length)) or np.any(length == 0.0):
-        raise InputError("forbidden: give directions as rows of 3 finite numbers, none of them zero")
+    if np.any(length == 0.0) or not np.isfinite(length).all():
+        raise InputError("forbidden: a direction is zero or too long; give rows of 3 numbers such as (0, 0, 1)")
     return np.asarray(rows / length)
 
 
-def _detour(path: ComponentPath, scene: Scene, clearance: float, method: str, axes: Array) -> Detour:
-    """Return the detour of the method; nothing is searched when nothing is in the way or a pinned point is covered."""
+def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
+    """Return the detour of the method; nothing is searched when nothing is in the way or a fixed point is covered."""
+    path, clearance, lowest = problem.path, problem.clearance, problem.nominal.lowest
     still = np.zeros((path.n_components, 3))
-    if not scene.obstacles:
-        return Detour(still, path.nominal.positions, np.empty(0), np.empty(0), True, 0)
-    pairs = path.pairs(scene.obstacles)
-    positions = path.nominal.positions
-    distance, normal = distances(pairs, positions)
-    covered = bool(distance[:, _pins(path)].min() < clearance)
-    if covered or distance.min() >= clearance:  # else a sample already tells that it has to move
-        unmoved = judged(pairs, still, positions, distance, normal, clearance)
-        if unmoved.feasible or (covered and method == "certified"):
+    covered = bool(problem.nominal.distance[:, path.fixed].min(initial=np.inf) < clearance)
+    if covered or lowest >= clearance:  # otherwise a sample already shows that the path has to move
+        least = LeastDetour(path, problem.nominal.tool, clearance, problem.allowed)
+        unmoved = least.evaluate(still, problem.nominal)
+        if unmoved.feasible or (covered and adapter.refuses):
             return unmoved
-    if method == "certified":
-        return find_detour(path, pairs, clearance, distance, normal, forbidden=axes)
-    reach = float(np.max(np.linalg.norm(path.spheres[:, :3], axis=1) + path.spheres[:, 3]))
-    pushed = push_components(path, scene.obstacles, reach + clearance, method=method, forbidden=axes)
-    positions = path.displaced(pushed)
-    return judged(pairs, pushed, positions, *distances(pairs, positions), clearance)
+    return adapter.detour(problem)
 
 
-def _pins(path: ComponentPath) -> NDArray[np.intp]:
-    """Return the indices of the samples that no displacement can move."""
-    return np.flatnonzero(path.basis.max(axis=1) == 0.0)
+def _validity(scene: Scene, duration: float) -> str:
+    moving = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.velocity.any()]
+    covers = "the tool on the planned path; not the links of the arm, not tracking errors"
+    if not moving:
+        return f"while the obstacles stand still, for {covers}"
+    return (
+        f"only from 0 to {duration:.2f} s, while the motion is on time and {' and '.join(moving)} "
+        f"{'keeps' if len(moving) == 1 else 'keep'} the given velocity, for {covers}; not after arrival"
+    )
 
 
-def _reason(path: ComponentPath, scene: Scene, detour: Detour, method: str, clearance: float, n_forbidden: int) -> str:
+def _jerk_reason(scene: Scene, detour: Detour, ratio: float, clearance: float) -> str:
+    if ratio <= MAX_JERK_RATIO:
+        return ""
+    tool = detour.clearance.tool
+    pair = int(np.argmin(detour.clearance.distance.min(axis=1))) if tool.n_pairs else 0
+    name = scene.name_of(pair // tool.n_spheres) if tool.n_pairs else "an obstacle"
+    return (
+        f"no smoother path was found that keeps {1e3 * clearance:.0f} mm from {name}: its jerk is {ratio:.0f} times "
+        f"that of the nominal path (limit {MAX_JERK_RATIO:.0f}); execute it more slowly, or move the obstacle"
+    )
+
+
+def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str, adapter: PathAdapter) -> str:
     """Say which obstacle can't be avoided and why, in words that tell what to change."""
-    asked = f"{1e3 * clearance:.0f} mm asked"
-    pairs = path.pairs(scene.obstacles)
-    pins = _pins(path)
-    at_pins = distances(pairs, detour.positions)[0][:, pins]
-    if at_pins.min() < clearance:
-        pair, pin = np.unravel_index(int(np.argmin(at_pins)), at_pins.shape)
-        return _at_pin(path, scene.name_of(pairs[pair].index), int(pins[pin]), float(at_pins.min()), asked)
+    path, k = problem.path, problem.nominal.tool.n_spheres
+    required = f"{1e3 * problem.clearance:.0f} mm required"
+    fixed = path.fixed
+    at_fixed = problem.nominal.distance[:, fixed]
+    if at_fixed.min(initial=np.inf) < problem.clearance:
+        pair, i = np.unravel_index(int(np.argmin(at_fixed)), at_fixed.shape)
+        return _at_fixed(path, scene.name_of(pair // k), int(fixed[i]), float(at_fixed.min()), required)
     worst = int(np.argmin(detour.bounds))
-    name = scene.name_of(pairs[worst].index)
+    name = scene.name_of(worst // k)
     left = f"{1e3 * float(detour.bounds[worst]) + 0.0:.1f} mm"
-    if method != "certified":
+    if not adapter.refuses:
         return (
-            f"the path passes {name} at {left} ({asked}): method {method!r} pushes components and does "
+            f"the path passes {name} at {left} ({required}): method {method!r} pushes components and does "
             "not look at the path between them; try method 'certified'"
         )
-    if detour.strays:
-        far = np.linalg.norm(detour.positions - path.nominal.positions, axis=1).max()
+    if not problem.allowed.dimension:
+        return f"{name} is in the way ({left} left, {required}), and every direction is forbidden: allow one"
+    if detour.out_of_limits:
+        far = np.linalg.norm(detour.clearance.positions - path.nominal.positions, axis=1).max()
         return (
-            f"no way round {name} with {asked}: next to a point that must not move it would lead {far:.2f} m away or "
-            "jump; move the obstacle, or ask for less clearance"
+            f"no path around {name} with {required} within the limits: it would lead {far:.2f} m away (at most "
+            f"{MAX_DISPLACEMENT:g} m) or make steps above {MAX_STEP_RATIO:.0f} times the longest nominal one; move the "
+            "obstacle, or ask for less clearance"
         )
-    near = {pairs[i].index for i in np.flatnonzero(detour.bounds < clearance)} - {pairs[worst].index}
-    sample = int(np.argmin(pairs[worst].distance(detour.positions)))
+    near = {pair // k for pair in np.flatnonzero(detour.bounds < problem.clearance).tolist()} - {worst // k}
+    sample = int(np.argmin(detour.clearance.distance[worst]))
     held = path.basis[sample].sum() < 0.5
+    n_forbidden = len(problem.allowed.forbidden)
     return (
-        f"no way round {name} with {asked}: the best attempt leaves {left}"
+        f"no path around {name} with {required}: the best attempt leaves {left}"
         + (f", and {', '.join(map(scene.name_of, sorted(near)))} too near as well" if near else "")
         + ("; it stands too close to a point that must not move" if held else "")
         + (f"; {n_forbidden} forbidden direction(s) were kept" if n_forbidden else "")
@@ -220,9 +372,9 @@ def _reason(path: ComponentPath, scene: Scene, detour: Detour, method: str, clea
     )
 
 
-def _at_pin(path: ComponentPath, name: str, sample: int, left: float, asked: str) -> str:
+def _at_fixed(path: ComponentPath, name: str, sample: int, left: float, required: str) -> str:
     """Say that an obstacle is too near to a point that must not move."""
-    moment, end = path.nominal.times[sample], path.nominal.times[-1]
-    where = "start" if moment < 0.02 * end else "goal" if moment > 0.98 * end else f"pinned point at {moment:.2f} s"
-    lies = f"covers the {where}" if left <= 0.0 else f"leaves {1e3 * left:.0f} mm at the {where} ({asked})"
+    at, end = path.nominal.times[sample], path.nominal.times[-1]
+    where = "start" if at < 0.02 * end else "goal" if at > 0.98 * end else f"pinned point at {at:.2f} s"
+    lies = f"covers the {where}" if left <= 0.0 else f"leaves {1e3 * left:.0f} mm at the {where} ({required})"
     return f"{name} {lies}, which must not move: move the obstacle, or ask for another {where.split(maxsplit=1)[0]}"

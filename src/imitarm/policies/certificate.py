@@ -59,14 +59,15 @@ class ToolAmongObstacles:
     """The spheres that contain the tool, and the obstacles that each of them must stay clear of.
 
     Every sphere with every obstacle is a *pair*; pair ``i`` is obstacle ``i // n_spheres`` with sphere
-    ``i % n_spheres``. The rotation of the tool is that of the nominal path, so the centre of a sphere is the position of
-    the tip plus a known offset at each sample.
+    ``i % n_spheres``. The tool rotates as on the nominal path, so the centre of a sphere is the position of the tip
+    plus a known offset at each sample.
 
     Attributes:
         obstacles: convex obstacles.
         radii: of the spheres, shape (n_spheres,) [m].
         offsets: for each obstacle, from the tip to the centres of the spheres at each sample, less the motion of the
             obstacle until then, in the base frame, shape (n_spheres, n, 3) [m]; None when all of them are zero.
+        reach: radius of the sphere about the tip that contains all spheres [m].
         bows: how far a centre leaves the straight line between two samples while the tool rotates, shape
             (n_spheres, n - 1) [m].
     """
@@ -75,6 +76,7 @@ class ToolAmongObstacles:
     radii: Array
     offsets: tuple[Array | None, ...]
     bows: Array
+    reach: float
 
     @classmethod
     def along(cls, nominal: Trajectory, spheres: Array, obstacles: Sequence[Obstacle]) -> ToolAmongObstacles:
@@ -101,7 +103,8 @@ class ToolAmongObstacles:
             travelled = nominal.times[:, None] * obstacle.velocity
             moved = np.zeros((len(spheres), n, 3)) if centres is None else centres
             offsets.append(moved - travelled)
-        return cls(tuple(obstacles), np.ascontiguousarray(spheres[:, 3]), tuple(offsets), bows)
+        reach = float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]))
+        return cls(tuple(obstacles), np.ascontiguousarray(spheres[:, 3]), tuple(offsets), bows, reach)
 
     @property
     def n_spheres(self) -> int:

@@ -3,10 +3,10 @@
 The algorithm of :func:`find_detour`:
 
 1. **Side.** Take the obstacle that is violated worst. Try directions across the path. Along each, the lift that a
-   violated sample needs is the exit from the inflated convex obstacle, found by Newton's method from outside, which on a
-   convex function never overshoots. The smallest amplitudes of the components that give this lift are a small quadratic
-   program. The direction of least cost (demonstrated variance used up, and clearance still violated) is followed first,
-   until nothing is violated; the others are kept and come up again if it leads nowhere.
+   violated sample needs is the exit from the inflated convex obstacle, found by Newton's method from outside, which
+   never overshoots on a convex function. The smallest amplitudes of the components that give this lift are a small
+   quadratic program. The direction of least cost (demonstrated variance used up, and clearance still violated) is
+   followed first, until nothing is violated; the others are kept and come up again if it leads nowhere.
 2. **Least detour** (:mod:`~imitarm.policies.least_detour`): on that side, the smallest displacement that keeps the
    clearance.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
@@ -68,6 +68,9 @@ class CertifiedAdapter(PathAdapter):
     def detour(self, problem: AvoidanceProblem) -> Detour:
         """Return a feasible detour, or the best attempt."""
         return find_detour(problem.path, problem.nominal, problem.clearance, problem.allowed)
+
+
+CERTIFIED = CertifiedAdapter()
 
 
 def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, allowed: AllowedDirections) -> Detour:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
@@ -43,8 +44,8 @@ class ComponentPath:
     r"""The nominal path, and the effect of moving its components.
 
     Time-driven GMR gives ``x0(t) = sum_k h_k(t) m_k(t)`` (thesis Eq 2.6 with its responsibilities). The
-    responsibilities ``h_k(t)`` depend on time alone. Moving the mean of component ``k`` by ``Delta_k`` therefore changes
-    the path by an affine, smooth amount::
+    responsibilities ``h_k(t)`` depend on time alone. So moving the mean of component ``k`` by ``Delta_k`` changes the
+    path by an affine, smooth amount::
 
         x(t) = x0(t) + w(t) sum_k h_k(t) Delta_k  =  x0(t) + basis(t) @ Delta
 
@@ -119,10 +120,15 @@ class ComponentPath:
         """Number of components."""
         return len(self.means)
 
-    @property
+    @cached_property
+    def lever(self) -> Array:
+        """The largest influence that a component has on each sample, shape (n,)."""
+        return np.asarray(self.basis.max(axis=1))
+
+    @cached_property
     def fixed(self) -> Index:
         """The samples that no displacement can move."""
-        return np.flatnonzero(self.basis.max(axis=1) == 0.0)
+        return np.flatnonzero(self.lever == 0.0)
 
     def displaced(self, displacement: Array) -> Array:
         """Return the positions (..., n, 3) when the means move by ``displacement`` (..., n_components, 3) [m]."""
@@ -133,29 +139,35 @@ class ComponentPath:
         squares = np.einsum("kd,kde,ke->k", displacement, self.precisions, displacement)
         return float(np.sqrt(squares.max(initial=0.0)))
 
+    def jerk(self, values: Array) -> Array:
+        """Return the third derivative of values at the samples, shape (n, m): six times the divided differences.
+
+        Returns:
+            Shape (n - 3, m).
+        """
+        for spans in self._spans:
+            values = (values[1:] - values[:-1]) / spans
+        return 6.0 * values
+
     @cached_property
-    def third_derivative(self) -> Array:
-        """The matrix (n - 3, n) [1/s^3] that gives the jerk from positions (n, 3): six times divided differences."""
-        t, rows = self.nominal.times, np.eye(len(self.nominal))
-        for k in (1, 2, 3):
-            rows = (rows[1:] - rows[:-1]) / (t[k:] - t[:-k])[:, None]
-        return 6.0 * rows
+    def _spans(self) -> tuple[Array, ...]:
+        t = self.nominal.times
+        return tuple((t[k:] - t[:-k])[:, None] for k in (1, 2, 3))
 
     @cached_property
     def basis_jerk(self) -> Array:
         """What a unit displacement of each component adds to the jerk, shape (n - 3, n_components) [1/s^3]."""
-        return np.asarray(self.third_derivative @ self.basis)
+        return self.jerk(self.basis)
 
     @cached_property
-    def nominal_jerk(self) -> Array:
-        """The jerk of the nominal path, shape (n - 3, 3) [m/s^3]."""
-        return np.asarray(self.third_derivative @ self.nominal.positions)
+    def nominal_jerk(self) -> float:
+        """The largest jerk along the nominal path [m/s^3]."""
+        return _largest_norm(self.jerk(self.nominal.positions))
 
     def jerk_ratio(self, positions: Array) -> float:
         """Return the largest jerk along a path (n, 3), divided by the largest jerk along the nominal path."""
-        largest = np.linalg.norm(self.nominal_jerk, axis=1).max()
-        jerk = float(np.linalg.norm(self.third_derivative @ positions, axis=1).max())
-        return jerk / largest if largest > 0.0 else 1.0 if jerk == 0.0 else np.inf
+        jerk = _largest_norm(self.jerk(positions))
+        return jerk / self.nominal_jerk if self.nominal_jerk > 0.0 else 1.0 if jerk == 0.0 else np.inf
 
     @cached_property
     def divided(self) -> ComponentPath:
@@ -186,6 +198,10 @@ class ComponentPath:
             centres=centres,
             precisions=np.asarray(np.linalg.inv(yields), dtype=np.float64),
         )
+
+
+def _largest_norm(vectors: Array) -> float:
+    return float(np.sqrt(np.einsum("nd,nd->n", vectors, vectors).max()))
 
 
 _PATHS: WeakKeyDictionary[GMR, tuple[Array, tuple[int, tuple[float, ...]], ComponentPath]] = WeakKeyDictionary()
@@ -237,7 +253,7 @@ def _knots(times: Array, fixed_times: Sequence[float]) -> Array:
     widest = max(last / _PIECES, 1.0)
     fixed = np.unique(np.searchsorted(times, fixed_times)).tolist()
     knots = set(fixed)
-    for start, end in zip(fixed[:-1], fixed[1:], strict=True):
+    for start, end in pairwise(fixed):
         reach, step = 0, 1.0
         while step < widest and 2 * (reach + step) < end - start:
             reach += round(step)

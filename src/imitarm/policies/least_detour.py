@@ -9,7 +9,7 @@ leaves the feasible set and never gets worse.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import daqp
 import numpy as np
@@ -178,7 +178,7 @@ class LeastDetour:
         sag = 1.5 * step**2 / (8.0 * max(radius, 1e-3))
         self.target = clearance + (_ROUNDING if exact else _ROUNDING + min(sag, _MAX_SAG))
         self.exact = exact
-        self.movable = path.basis.max(axis=1) > (1e-3 if exact else NEGLIGIBLE_LEVER)
+        self.movable = path.lever > (1e-3 if exact else NEGLIGIBLE_LEVER)
 
     def evaluate(self, displacement: Array, clearance: PathClearance) -> Detour:
         """Return what is proven of a displaced path, and whether it is within the stated limits."""
@@ -191,7 +191,9 @@ class LeastDetour:
         feasible = bool(proven.min(initial=np.inf) >= self.clearance) and not out
         return Detour(self.path, displacement, clearance, proven, feasible, out, close)
 
-    def shrink(self, start: PathClearance, moved: Index | None = None, *, smoothness: float | None = None) -> Detour | None:
+    def shrink(
+        self, start: PathClearance, moved: Index | None = None, *, smoothness: float | None = None
+    ) -> Detour | None:
         """Return the least detour that the tangents along a path allow, or the best attempt; None: no attempt.
 
         Where a segment is too close although its samples are not, that point gets a row of its own. Requiring more at
@@ -265,14 +267,15 @@ class LeastDetour:
         axes, m, d = self.allowed.axes, len(moved), self.allowed.dimension
         blocks = axes.T @ self.path.precisions[moved] @ axes
         weight = (_SMOOTHNESS if self.exact else 0.0) if smoothness is None else smoothness
-        h = np.zeros((m, d, m, d))
-        index = np.arange(m)
+        index, h = np.arange(m), np.zeros((m, d, m, d))
+        if weight == 0.0:
+            h[index, :, index, :] = np.swapaxes(np.linalg.inv(np.linalg.cholesky(blocks)), 1, 2)
+            return h.reshape(m * d, m * d)
         h[index, :, index, :] = blocks
-        if weight > 0.0:
-            jerk = self.path.basis_jerk[:, moved] / max(np.linalg.norm(self.path.nominal_jerk, axis=1).max(), 1e-9)
-            products = weight * (jerk.T @ jerk)
-            for axis in range(d):
-                h[:, axis, :, axis] += products
+        jerk = self.path.basis_jerk[:, moved] / max(self.path.nominal_jerk, 1e-9)
+        products = weight * (jerk.T @ jerk)
+        for axis in range(d):
+            h[:, axis, :, axis] += products
         lower = np.linalg.cholesky(h.reshape(m * d, m * d))
         return np.asarray(np.linalg.inv(lower).T)
 
@@ -338,6 +341,3 @@ def best_of(detours: Iterable[Detour | None]) -> Detour | None:
     """Return the feasible detour, or the one that comes nearest to the clearance; None when there is none."""
     found = [detour for detour in detours if detour is not None]
     return max(found, key=lambda x: (x.feasible, not x.out_of_limits, x.lowest), default=None)
-
-
-__all__ = ["AllowedDirections", "Detour", "LeastDetour", "best_of", "least_norm", "replace"]

@@ -122,7 +122,9 @@ class Roadmap:
             pair = obstacle * k + sphere
             points = self.tool.centres(pair, centre, self.layers)
             lift = np.maximum(support + self.tool.radii[sphere] + self.clearance - points @ rays.T, 0.0)
-            near = np.flatnonzero(solid.signed_distance(points) < self.clearance + self.tool.radii[sphere] + MAX_DISPLACEMENT)
+            near = np.flatnonzero(
+                solid.signed_distance(points) < self.clearance + self.tool.radii[sphere] + MAX_DISPLACEMENT
+            )
             lift[np.setdiff1d(np.arange(len(points)), near)] = 0.0
             for _ in range(_NEWTON_STEPS if len(near) else 0):
                 d, n = self.tool.distance_and_normal(pair, points[near, None] + lift[near, :, None] * rays)
@@ -162,7 +164,9 @@ class Roadmap:
     def _sweep(self, *, forward: bool) -> tuple[Array, Index]:
         """Return the cheapest cost of every node from the start (or to the goal), and the node before (or after) it."""
         precisions = np.linalg.inv(self.path.tolerance[self.layers] + 0.005**2 * np.eye(3))
-        style = np.einsum("lkd,lde,lke->lk", self.nodes, precisions, self.nodes) * (self.path.n_components / len(self.layers))
+        style = np.einsum("lkd,lde,lke->lk", self.nodes, precisions, self.nodes) * (
+            self.path.n_components / len(self.layers)
+        )
         n_layers, n_nodes = self.exists.shape
         start, end = self.pairs_of_nodes if forward else self.pairs_of_nodes[::-1]
         order = np.argsort(end, kind="stable")

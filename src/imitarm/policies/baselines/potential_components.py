@@ -1,4 +1,4 @@
-r"""ACFRA as the thesis has it: push the components' means by a repulsive potential (thesis Eqs 4.2-4.8, METHODS D.2.2).
+r"""ACFRA as printed in the thesis: push the components' means by a repulsive potential (thesis Eqs 4.2-4.8).
 
 Two readings share one descent. With ``d`` the distance from an obstacle to the component's ellipse, ``n`` the outward
 normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the obstacle:
@@ -20,7 +20,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.policies.adaptation import AvoidanceProblem, PathAdapter
 from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.least_detour import Detour
 from imitarm.scene.obstacle import Obstacle
 
 Array = NDArray[np.float64]
@@ -35,7 +37,7 @@ _GAIN_RANGE = (0.25, 4.0)
 def component_distances(
     path: ComponentPath, displacement: Array, obstacles: Sequence[Obstacle], margin: float
 ) -> tuple[Array, Array, Array]:
-    """Return how far the components' one-sigma ellipses are from the inflated obstacles (METHODS D.2.1).
+    """Return how far the components' one-sigma ellipses are from the inflated obstacles.
 
     ``d = sd(mu) - sqrt(n^T Sigma n) - margin``: the ellipse's support towards the obstacle is taken off the centre's
     distance. Exact for spheres, a lower bound for every convex obstacle that the centre is outside of.
@@ -64,7 +66,7 @@ def literal_force(distance: Array, normal: Array, spread: Array) -> Array:
 
 
 def modified_force(distance: Array, normal: Array, spread: Array) -> Array:
-    """Return ``s d_th (1/rho - 1) / rho^2 n``: minus the gradient of the modified potential (METHODS D.2.2).
+    """Return ``s d_th (1/rho - 1) / rho^2 n``: minus the gradient of the modified potential (docs/avoidance.md, 9).
 
     Args:
         distance: ellipse to obstacle, (n_obstacles, n_components) [m].
@@ -88,7 +90,7 @@ def push_components(
     Args:
         path: the nominal path and its components.
         obstacles: obstacles with signed distance and gradient.
-        margin: tool radius plus asked clearance [m].
+        margin: radius of the tool plus required clearance [m].
         method: ``"literal"`` or ``"mapf"``.
         forbidden: directions in which no mean may move, unit rows (m, 3).
 
@@ -105,3 +107,32 @@ def push_components(
             break
         displacement += _STEP * force / np.maximum(size, 1.0)
     return displacement
+
+
+class PotentialField(PathAdapter):
+    """The thesis's method: push components away from obstacles; the result is evaluated by the same certificate.
+
+    The tool counts as one sphere about its tip that contains all of its spheres. Obstacles count as standing where
+    they are at time 0.
+
+    Args:
+        force: a name in ``FORCES``.
+    """
+
+    def __init__(self, force: str) -> None:
+        self.force = force
+
+    def detour(self, problem: AvoidanceProblem) -> Detour:
+        """Return the path after the push, whether it keeps the clearance or not."""
+        tool = problem.nominal.tool
+        pushed = push_components(
+            problem.path,
+            tool.obstacles,
+            tool.reach + problem.clearance,
+            method=self.force,
+            forbidden=problem.allowed.forbidden,
+        )
+        return problem.evaluated(pushed)
+
+
+MAPF, LITERAL = PotentialField("mapf"), PotentialField("literal")
