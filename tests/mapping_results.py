@@ -23,7 +23,7 @@ def live(method, person, repeat, success=True, time=40.0):
 def replay(method, person, torque, path=3.0, singular=0.05, kind="stacking"):
     """A made-up result of a recording that was replayed."""
     values = {
-        **{"mean_torque": [torque] * 7, "path_length": path, "least_singular": singular, "led_share": 1.0},
+        **{"mean_torque": [torque] * 7, "path_length": path, "least_singular": singular, "engaged_fraction": 1.0},
         **{f"{kind_}_violations": 0 for kind_ in ("position", "velocity", "acceleration")},
         "failures": 0,
     }
@@ -43,6 +43,6 @@ def world(mine, theirs, persons=8):
 
 def captured(method, camera, lag, seed=JUDGED):
     """A made-up result of the captured arm before a camera."""
-    values = {"lag": lag, "led_share": 1.0, "recorded": 43.0, "beyond_reach": 0.0}
+    values = {"lag": lag, "engaged_fraction": 1.0, "recorded": 43.0, "beyond_reach": 0.0}
     values |= {f"{kind}_violations": 0 for kind in ("position", "velocity", "acceleration")} | {"failures": 0}
     return Result(Experiment(CAPTURED, method, seed=seed, repeat=camera, data="x"), "0", values, "", 1.0)

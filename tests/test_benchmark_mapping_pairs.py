@@ -51,7 +51,7 @@ MEASURED = sorted({figure.name for figure in COMPARED} - {"broken_limits", "mean
 
 @pytest.mark.parametrize("name", MEASURED)
 def test_in_every_measure_a_better_rival_is_named_and_a_worse_one_is_not(name):
-    more = name in {"led_share", "spectral_arc_length", "least_singular"}
+    more = name in {"engaged_fraction", "spectral_arc_length", "least_singular"}
     low, high = (-5.0, -4.0)
     better, worse = (high, low) if more else (low, high)
     named = rivals_table(one_measure(name, worse, better), ["stacking"]).rows
@@ -63,10 +63,10 @@ def test_in_every_measure_a_better_rival_is_named_and_a_worse_one_is_not(name):
 
 def test_nothing_that_the_tables_show_is_left_out_of_the_comparison():
     assert {f.name for f in (*ACCURACY, *EFFORT, *SMOOTHNESS)} <= {f.name for f in COMPARED}
-    for name in ("led_share", "mean_torque", "rms_torque", "mean_motion_torque", "broken_limits"):
+    for name in ("engaged_fraction", "mean_torque", "rms_torque", "mean_motion_torque", "broken_limits"):
         assert name in {f.name for f in COMPARED}
     for figure in COMPARED:
-        if figure.name in {"spectral_arc_length", "least_singular", "led_share"}:
+        if figure.name in {"spectral_arc_length", "least_singular", "engaged_fraction"}:
             assert figure.more
 
 

@@ -35,7 +35,7 @@ def test_a_run_is_the_same_every_time_and_whoever_made_the_recording(tmp_path):
     alone, first, second = ONE.run(), ONE.run(tmp_path), ONE.run(tmp_path)
     assert alone.failure == ""
     assert without_clock(alone) == without_clock(first) == without_clock(second)
-    assert alone.value("led_share") > 0.5
+    assert alone.value("engaged_fraction") > 0.5
 
 
 def test_a_result_is_read_as_it_was_written(tmp_path):
@@ -80,12 +80,12 @@ def test_another_configuration_has_another_file(tmp_path):
 
 
 def test_a_result_of_other_code_is_read_only_when_that_is_asked_for(tmp_path):
-    saved = Result(ONE, "commit of long ago", {"led_share": 2.0}, "", 1.0)
+    saved = Result(ONE, "commit of long ago", {"engaged_fraction": 2.0}, "", 1.0)
     saved.save(tmp_path / "runs")
     (reused,) = run_all([ONE], tmp_path, jobs=1, reuse=True)
-    assert (reused.code, reused.value("led_share")) == ("commit of long ago", 2.0)
+    assert (reused.code, reused.value("engaged_fraction")) == ("commit of long ago", 2.0)
     (done,) = run_all([ONE], tmp_path, jobs=1)
-    assert done.code == code_version() and done.value("led_share") <= 1.0
+    assert done.code == code_version() and done.value("engaged_fraction") <= 1.0
     before = stamps(tmp_path)
     run_all([ONE], tmp_path, jobs=1)
     assert stamps(tmp_path) == before

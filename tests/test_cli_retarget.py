@@ -16,7 +16,7 @@ from imitarm.capture.recording import SkeletonRecording
 from imitarm.capture.skeleton import JOINT, Skeleton
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.cli import main, screen
-from imitarm.cli.retarget import _places
+from imitarm.cli.retarget import _output_files
 from imitarm.cli.screen import watched
 from imitarm.errors import InputError
 from imitarm.retarget import RETARGETERS, LimbLengths
@@ -74,7 +74,7 @@ def test_the_waiting_can_be_kept(shown, tmp_path):
 
 
 @pytest.mark.slow
-def test_several_of_them_are_learnt(tmp_path, capsys):
+def test_several_of_them_are_learned(tmp_path, capsys):
     for camera in range(3):
         saved(tmp_path / f"seen_{camera}.csv", reach(camera))
         assert run(tmp_path / f"seen_{camera}.csv", "--out", tmp_path / f"demo_{camera}.csv", "--task", "reach") == 0
@@ -84,10 +84,10 @@ def test_several_of_them_are_learnt(tmp_path, capsys):
         main(["learn", *files, "--robot", "sawyer", "--tool", "gripper", "--task", "reach", "--out", str(skill)]) == 0
     )
     assert "0 errors" in capsys.readouterr().out
-    learnt = Skill.load(skill)
+    learned = Skill.load(skill)
     first = Demonstration.load(files[0]).trajectory
-    assert np.linalg.norm(learnt.start_.position - first.positions[0]) < 0.03
-    assert np.linalg.norm(learnt.goal_.position - first.positions[-1]) < 0.05
+    assert np.linalg.norm(learned.start_.position - first.positions[0]) < 0.03
+    assert np.linalg.norm(learned.goal_.position - first.positions[-1]) < 0.05
 
 
 @pytest.mark.slow
@@ -98,7 +98,7 @@ def test_all_methods_side_by_side(shown, tmp_path, capsys, monkeypatch):
     shown_table = capsys.readouterr().out
     for name in RETARGETERS:
         assert len(Demonstration.load(tmp_path / f"demo_{name}.csv")) > 100
-    row = next(line for line in shown_table.splitlines() if "driven: worst joint behind, RMS" in line)
+    row = next(line for line in shown_table.splitlines() if "simulated: error of the worst joint, RMS" in line)
     assert len(row.split("│")) == 2 + 1 + len(RETARGETERS)
     text = page.read_text(encoding="utf-8")
     assert text.count('id="tab-method-') == len(RETARGETERS)
@@ -121,7 +121,7 @@ def test_a_calibration_says_side_scale_and_turning_and_options_say_it_better(sho
     assert run(shown, "--calibration", file, "--out", demos[0]) == 0
     assert run(shown, "--calibration", file, "--scale", 0.25, "--out", demos[1]) == 0
     assert run(shown, "--calibration", file, "--side", "left", "--out", demos[2]) == 0
-    assert "the calibration is about the right arm" in capsys.readouterr().err
+    assert "the calibration is of the right arm" in capsys.readouterr().err
     half, quarter, left = (Demonstration.load(path).trajectory for path in demos)
     assert np.ptp(quarter.positions, axis=0).max() == pytest.approx(
         0.5 * np.ptp(half.positions, axis=0).max(), rel=0.15
@@ -133,7 +133,7 @@ def test_a_calibration_says_side_scale_and_turning_and_options_say_it_better(sho
 def test_with_fit_a_motion_that_is_too_large_is_made_smaller(shown, tmp_path, capsys):
     assert run(shown, "--scale", 6, "--fit", "--pace", 0.2, "--orientation", "fixed", "--out", tmp_path / "a.csv") == 0
     printed = capsys.readouterr()
-    assert "instead of 6.00, so that all of the motion is in reach" in printed.err
+    assert "instead of 6.00, so that the whole motion is within reach" in printed.err
     assert "slowed to 20 % of its pace" in printed.err
     assert Demonstration.load(tmp_path / "a.csv").trajectory.duration > 20.0
     row = next(line for line in printed.out.splitlines() if "tool to its own target" in line)
@@ -156,12 +156,12 @@ def test_what_is_in_the_way_is_kept_clear_of(shown, tmp_path):
     assert nearest(free) < 0.0 < nearest(round_it)
 
 
-def test_a_tool_that_does_not_follow_its_target_is_told_first_and_is_not_green(shown, tmp_path, capsys):
+def test_a_tool_that_does_not_follow_its_target_is_reported_first_and_is_not_green(shown, tmp_path, capsys):
     """Six times as large as the person's, the motion leaves the arm's reach; as large as that, it does not."""
     page, demo = tmp_path / "page.html", tmp_path / "demo.csv"
     assert run(shown, "--scale", 6, "--report", page, "--out", demo) == 0
     printed = capsys.readouterr()
-    assert printed.out.startswith("modern: does not follow") and "no joint breaks a limit" in printed.out
+    assert printed.out.startswith("modern: does not follow") and "no joint exceeds a limit" in printed.out
     assert "warning: the tool did not follow its target: try --orientation fixed" in printed.err
     text = page.read_text(encoding="utf-8")
     assert 'class="verdict bad"' in text and 'class="verdict good"' not in text
@@ -179,20 +179,20 @@ def test_one_of_two_persons_and_repairs(tmp_path, capsys):
     both = sorted(frames + skeletons(60, person=2, away=0.8), key=lambda s: s.time)
     source = saved(tmp_path / "two.csv", both)
     assert run(source) == 0
-    told = capsys.readouterr().err
+    reported = capsys.readouterr().err
     for words in ("repaired: kept person 1", "repaired: dropped 1 frames", "exchanged left and right back in 1 frames"):
-        assert words in told
+        assert words in reported
     assert run(source, "--person", 2) == 0
     assert "kept person" not in capsys.readouterr().err
     assert run(source, "--person", 5) == 2
     assert "person 5 is not in it; there is: 1, 2" in capsys.readouterr().err
 
 
-def test_a_stop_on_the_way_is_told(tmp_path, capsys):
+def test_a_stop_on_the_way_is_reported(tmp_path, capsys):
     frames = [s for s in reach(0) if not 2.0 < s.time < 2.8]
     assert run(saved(tmp_path / "gap.csv", frames)) == 0
-    told = capsys.readouterr().err
-    assert "stopped or waited for" in told and "warning gap" in told
+    reported = capsys.readouterr().err
+    assert "stopped or waited for" in reported and "warning gap" in reported
 
 
 def lost(skeleton):
@@ -207,13 +207,13 @@ def test_an_arm_that_is_never_seen_for_long_is_a_failure_and_nothing_is_written(
     source = saved(tmp_path / "lost.csv", [s if i < n else lost(s) for i, s in enumerate(reach(0))])
     out, page = tmp_path / "demo.csv", tmp_path / "page.html"
     assert run(source, "--out", out, "--report", page) == 1
-    told = capsys.readouterr().err
-    assert "right arm" in told and "--side" in told
+    reported = capsys.readouterr().err
+    assert "right arm" in reported and "--side" in reported
     assert not out.exists() and not page.exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "reported"),
     [
         (["--scale", "-1"], "scale must be between"),
         (["--pace", "2"], "pace must be between"),
@@ -228,17 +228,17 @@ def test_an_arm_that_is_never_seen_for_long_is_a_failure_and_nothing_is_written(
         (["--orientation", "sideways"], "invalid choice"),
     ],
 )
-def test_wrong_options_are_told_and_nothing_is_written(shown, tmp_path, monkeypatch, capsys, words, told):
+def test_wrong_options_are_reported_and_nothing_is_written(shown, tmp_path, monkeypatch, capsys, words, reported):
     monkeypatch.chdir(tmp_path)
     before = sorted(path.name for path in tmp_path.iterdir())
     assert run(shown, *words) == 2
     message = capsys.readouterr().err
-    assert told in message and "Traceback" not in message
+    assert reported in message and "Traceback" not in message
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "reported"),
     [
         (["--report", "reach.csv"], "--report reach.csv: is the file of SOURCE, too"),
         (["--report", "{}/reach.csv", "--force"], "is the file of SOURCE, too"),
@@ -258,7 +258,7 @@ def test_wrong_options_are_told_and_nothing_is_written(shown, tmp_path, monkeypa
         (["--out", ".", "--method", "all"], "--out .: is a folder; name a file in it"),
     ],
 )
-def test_no_file_is_lost_by_writing(shown, tmp_path, monkeypatch, capsys, words, told):
+def test_no_file_is_lost_by_writing(shown, tmp_path, monkeypatch, capsys, words, reported):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("imitarm.cli.retarget.ArmModel.load", lambda *_, **__: pytest.fail("it has begun to work"))
     (tmp_path / "mine.json").write_text("mine")
@@ -267,7 +267,7 @@ def test_no_file_is_lost_by_writing(shown, tmp_path, monkeypatch, capsys, words,
     before = {path.name: path.is_file() and path.read_bytes() for path in tmp_path.iterdir()}
     assert run(shown, *(word.format(tmp_path) for word in words)) == 2
     message = capsys.readouterr().err
-    assert told in message and message.startswith("imitarm: error: ")
+    assert reported in message and message.startswith("imitarm: error: ")
     assert {path.name: path.is_file() and path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -288,14 +288,14 @@ def test_a_report_replaces_a_page_and_nothing_else_unasked(tmp_path, content, mo
     words = argparse.Namespace(source="synthetic:1", out=None, report=page, force=bool(more), pace=1.0, seconds=None)
     words.robot, words.tool, words.scene, words.calibration = "sawyer", None, None, None
     if replaced:
-        assert _places(words, ["modern"]) == {}
+        assert _output_files(words, ["modern"]) == {}
     else:
         with pytest.raises(InputError, match="is there already and is no HTML page"):
-            _places(words, ["modern"])
+            _output_files(words, ["modern"])
     assert page.read_text() == content
 
 
-def test_wrong_sources_are_told(tmp_path, capsys):
+def test_wrong_sources_are_reported(tmp_path, capsys):
     foreign = tmp_path / "foreign.csv"
     foreign.write_text("a,b\n1,2\n")
     assert run(foreign) == 2

@@ -81,7 +81,7 @@ def test_a_served_robot_is_led_with_enable(person, served, capfd):
 
 
 def test_a_stopped_robot_without_an_operator_ends_it(person, served, capfd, monkeypatch):
-    monkeypatch.setattr("imitarm.cli.operator._standard_input", lambda: b"")
+    monkeypatch.setattr("imitarm.cli.teleoperate._standard_input", lambda: b"")
     assert main(["teleoperate", str(person), "--to", f"127.0.0.1:{served.address[1]}"]) == 1
     assert "the robot is stopped: just started; nobody can let it move again" in capfd.readouterr().err
     assert not served.supervisor.gate.admitted

@@ -17,7 +17,7 @@ from imitarm.capture.mediapipe_environment import find_python
 from imitarm.capture.recording import read_recording, slowed
 from imitarm.capture.sources import followed, open_source
 from imitarm.errors import InputError
-from imitarm.evaluation.seen_arm import seen_arm
+from imitarm.evaluation.tracking import seen_arm
 from imitarm.retarget import Correspondence, ModernRetargeter
 from imitarm.retarget.engagement import SEEN_FOR
 from imitarm.retarget.fitting import fit_motion

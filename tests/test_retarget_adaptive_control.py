@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from imitarm import ArmModel
-from imitarm.retarget import AdaptiveControl, Correspondence
-from imitarm.retarget.baselines.adaptive_control import CUT_OFF
+from imitarm.retarget import Correspondence
+from imitarm.retarget.baselines.adaptive_control import CUT_OFF, AdaptiveControl
 from imitarm.retarget.baselines.adaptive_law import START_STIFFNESS
 from shown_arm import EASY, LENGTHS, shown, swing
 

@@ -9,7 +9,8 @@ from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.errors import InputError
-from imitarm.retarget import Correspondence, DemonstrationModification, LimbLengths
+from imitarm.retarget import Correspondence, LimbLengths
+from imitarm.retarget.baselines.demonstration_modification import DemonstrationModification
 from imitarm.retarget.baselines.infeasible import above
 from shown_arm import EASY, LENGTHS, shown, swing
 

@@ -6,7 +6,8 @@ import pytest
 from imitarm import ArmModel
 from imitarm.capture.person import Person
 from imitarm.errors import InputError
-from imitarm.retarget import Correspondence, IncrementalIK, LimbLengths
+from imitarm.retarget import Correspondence, LimbLengths
+from imitarm.retarget.baselines.incremental_ik import IncrementalIK
 from shown_arm import EASY, LENGTHS, shown, swing
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}

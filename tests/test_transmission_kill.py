@@ -168,7 +168,9 @@ def test_each_process_may_be_killed_and_started_again_and_the_arm_never_jumps(st
     _, status, _, velocity = stage.steps()
     assert Status.SLOWING in status and not velocity[-1].any()
     stage.start_retargeting()  # nobody has said that the robot may move
-    stage.wait("question", lambda: "Is the way free? Enter lets it move again" in stage.log("retargeting"))
+    stage.wait(
+        "question", lambda: "If the workspace is clear, press Enter to let it move again" in stage.log("retargeting")
+    )
     stage.assert_still(0.3)
     stage.press_enter()
     stage.wait_for_motion()
@@ -176,7 +178,7 @@ def test_each_process_may_be_killed_and_started_again_and_the_arm_never_jumps(st
     stage.kill("robot")
     stage.wait("complaint", lambda: "the robot does not answer" in stage.log("retargeting"))
     stage.start_robot()  # which stands at home, far from where the other one was
-    stage.wait("question", lambda: "just started. Is the way free?" in stage.log("retargeting"))
+    stage.wait("question", lambda: "just started. If the workspace is clear" in stage.log("retargeting"))
     stage.assert_still(0.3)
     np.testing.assert_array_equal(stage.steps()[2][-1], ARM.home)
     stage.press_enter()

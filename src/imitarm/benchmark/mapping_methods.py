@@ -17,28 +17,28 @@ class Method:
 
     Attributes:
         retargeter: its name in :data:`imitarm.retarget.RETARGETERS`.
-        title: what people read.
+        label: of the row; empty: the method's own title.
         options: for its constructor.
     """
 
     retargeter: str
-    title: str
+    label: str = ""
     options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """The label of the row in tables and figures."""
+        return self.label or RETARGETERS[self.retargeter].title
 
     def __call__(self, arm: ArmModel, correspondence: Correspondence, *, dt: float = 0.01) -> Retargeter:
         """Return the retargeter for this arm and this person."""
         return RETARGETERS[self.retargeter](arm, correspondence, dt=dt, **self.options)
 
 
-MAIN: Mapping[str, Method] = {
-    "modern": Method("modern", "modern"),
-    "thesis": Method("thesis", "thesis"),
-    "m1": Method("m1", "M1"),
-    "m2": Method("m2", "M2"),
-    "m3": Method("m3", "M3"),
-}
-"""What Table 3.1 and Figs 3.6 to 3.8 compare: ``modern`` is ours, ``thesis`` is Me with its equations put right, M1 to
-M3 are our reading of its rivals."""
+MAIN: Mapping[str, Method] = {name: Method(name) for name in RETARGETERS}
+"""Every registered method with its default options. The built-in ones are those of the thesis's Table 3.1 and Figs 3.6
+to 3.8: ``thesis`` is its own method with corrected equations, M1 to M3 are our reading of what it compares with, and
+``modern`` is the method of this package. Methods of other packages are added by entry points."""
 
 VARIANTS: Mapping[str, Method] = {
     "me-thesis": Method("thesis", "Me-thesis", {"smoothing": "global", "small_angle": "thesis"}),
@@ -48,9 +48,9 @@ VARIANTS: Mapping[str, Method] = {
     "m1-scaled": Method("m1", "M1, scaled", {"velocity_scaling": True}),
     "m3-scaled": Method("m3", "M3, scaled", {"velocity_scaling": True}),
 }
-"""The same methods with something changed, so that what it is worth is seen. Me-thesis has one NURBS for the whole
-recording and the small-angle term, "as printed" every misprint that can be run; "scaled" slows all joints together
-where one would be too fast."""
+"""The same methods with one option changed, to show its effect. Me-thesis has one NURBS for the whole recording and the
+small-angle term; "as printed" has every misprint that can be run; "scaled" slows all joints together where one would be
+too fast."""
 
 METHODS: Mapping[str, Method] = {**MAIN, **VARIANTS}
 """All rows by name."""

@@ -64,7 +64,7 @@ SMOOTHNESS = (
     Figure("spectral_arc_length", "SPARC", digits=2, more=True),
     Figure("least_singular", "least singular value", digits=3, more=True),
 )
-LED = Figure("led_share", "led [%]", 100.0, 0, more=True)
+LED = Figure("engaged_fraction", "led [%]", 100.0, 0, more=True)
 TORQUES = (
     Figure("mean_torque", "mean torque [N m]", digits=2),
     Figure("rms_torque", "RMS torque [N m]", digits=2),
@@ -197,7 +197,7 @@ def accuracy_table(results: Results, task: str) -> Table:
     """Return how well the methods follow the true arm in one kind of recording."""
     rows = []
     for name in results.methods:
-        led = interval(results.values(name, [task], "led_share")).mean
+        led = interval(results.values(name, [task], "engaged_fraction")).mean
         cells = _cells(results, name, task, ACCURACY)
         rows.append((METHODS[name].title, *cells, f"{100 * led:.0f}" if math.isfinite(led) else "–"))
     columns = ("method", *(f"{figure.title}>" for figure in ACCURACY), "led [%]>")

@@ -23,9 +23,9 @@ from imitarm.capture.recording import SkeletonRecording, slowed
 from imitarm.capture.skeleton import Skeleton
 from imitarm.capture.sources import followed, open_source
 from imitarm.errors import ImitarmError, InputError
-from imitarm.evaluation.driving import drive
+from imitarm.evaluation.execution import execute_on_robot
 from imitarm.evaluation.mapping_metrics import measure
-from imitarm.evaluation.seen_arm import seen_arm, target_lag
+from imitarm.evaluation.tracking import seen_arm, target_lag
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import RETARGETERS, Correspondence
@@ -160,19 +160,19 @@ def _row(motion: Shown, robot: str, pace: float, method: str) -> list[str]:
     follow = replace(follow, scale=fit.scale)
     gone = np.linalg.norm(wrist[_STRIDE:] - wrist[:-_STRIDE], axis=1) / (_STRIDE * _PERIOD)
     run = RETARGETERS[method](arm, follow, dt=_PERIOD).run(skeletons, fit.q)
-    m, driven, links = measure(run, follow), drive(run), SelfClearance(arm)
+    m, execution, links = measure(run, follow), execute_on_robot(run), SelfClearance(arm)
     lag = 1e3 * target_lag(run.times, arm.tool_path(run.joints)[0], run.targets[0])
     return [
         f"{fit.scale:.2f}",
         f"{fit.scale * float(gone.max()):.1f}",
-        f"{100 * m.following_share:.0f}",
+        f"{100 * m.following_fraction:.0f}",
         f"{1e3 * m.target_rms:.0f}",
         f"{lag:.0f}" if np.isfinite(lag) else "–",
-        str(m.broken_limits),
+        str(m.limit_violations),
         f"{100 * m.velocity_ratio:.0f}, {100 * m.acceleration_ratio:.0f}",
         f"{1e3 * min(links.distance(q) for q in run.joints[::2]):.0f}",
-        f"{1e3 * driven.behind_max:.1f}",
-        f"{100 * driven.peak_torque_ratio:.0f}" + (" (stopped itself)" if driven.fault else ""),
+        f"{1e3 * execution.error_max:.1f}",
+        f"{100 * execution.peak_torque_ratio:.0f}" + (" (stopped itself)" if execution.fault else ""),
     ]
 
 

@@ -1,4 +1,4 @@
-"""``imitarm retarget``: a person's motion becomes a robot's, a demonstration to learn from, and a report."""
+"""``imitarm retarget``: convert a person's motion into a robot's, save it as a demonstration, and report on it."""
 
 from __future__ import annotations
 
@@ -14,27 +14,25 @@ from numpy.typing import NDArray
 from imitarm.capture.motions import Truth
 from imitarm.capture.recording import slowed
 from imitarm.capture.skeleton import SIDES, Skeleton
-from imitarm.cli.driven import with_driven
-from imitarm.cli.following import FAR, MOSTLY, Following, remedy
 from imitarm.cli.gathering import source_help
-from imitarm.cli.merit import TARGET_FAR, TARGET_LAG, TARGET_RMS, judged
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.person import person_of
 from imitarm.cli.screen import remark, say, show_table, watched, working
 from imitarm.cli.trial import provenance
 from imitarm.errors import InputError, TaskFailedError
-from imitarm.evaluation.driving import drive as drive_run
-from imitarm.evaluation.seen_arm import seen_arm
+from imitarm.evaluation.execution import Execution, execute_on_robot
+from imitarm.evaluation.run_evaluation import FAR, FAR_FRACTION, RunEvaluation, TargetTracking, evaluate_run
+from imitarm.evaluation.tracking import seen_arm
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_file import ARMS, TOOLS
 from imitarm.retarget import RETARGETERS, Correspondence, Retargeter, Retargeting
 from imitarm.retarget.calibration import Calibration
 from imitarm.retarget.correspondence import Orientation
-from imitarm.retarget.engagement import SEEN_FOR
+from imitarm.retarget.engagement import SEEN_FOR, EngagementState
 from imitarm.retarget.fitting import fit_motion
 from imitarm.scene import Scene, load_scene
 from imitarm.trajectory import Demonstration, Trajectory
-from imitarm.viewer.retarget_content import Measure, MethodResult, RetargetReport
+from imitarm.viewer.retarget_content import Measure, MethodResult, PlainTable, RetargetReport
 
 EPILOG = f"""\
 examples:
@@ -45,14 +43,15 @@ examples:
   imitarm retarget synthetic:7 --method all --report compare.html
   imitarm learn wave_*.csv --task wave --out wave.json
 
-The robot begins at its home, or with --fit where all of a recorded motion is in its reach; the tool stays there until
-the person has been seen for half a second, then it follows the hand. The demonstration is cut to what followed.
-The first line says whether the tool followed its target: not when it was more than {100 * FAR:.0f} cm from it (RMS), or
-that far for over {100 * MOSTLY:.0f} % of the time. What it did is written all the same, with a warning.
-Exit status 1 when the person was never seen for long enough, so that nothing was followed.
+The robot starts at its home posture, or with --fit at one from which the whole recorded motion is within reach. It
+waits until the person has been seen for half a second, then its tool follows the hand. The demonstration contains only
+the time in which the person led. The first line of the output says whether the tool followed its target: it did not if
+it was more than {100 * FAR:.0f} cm away (RMS), or that far for more than {100 * FAR_FRACTION:.0f} % of the time.
+The files are then written all the same, with a warning. The exit status is 1 when the person was never seen for long
+enough to lead.
 """
 
-PERIOD = 0.01  # [s] of control
+PERIOD = 0.01  # [s] control period
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,39 +63,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tool", metavar="NAME", help=f"{', '.join(TOOLS)} or an MJCF file")
     parser.add_argument("--method", choices=(*RETARGETERS, "all"), default="modern", help="default: modern")
     parser.add_argument(
-        "--drive", action="store_true", help="let the simulated robot do it, drives and all, and measure"
+        "--drive", action="store_true", help="let the simulated robot execute the motion, and measure it"
     )
-    parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles that 'modern' keeps clear of (YAML)")
+    parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles that 'modern' avoids (YAML)")
     person = parser.add_argument_group("the person")
-    person.add_argument("--side", choices=SIDES, help="the arm; default: as the calibration says, else right")
-    person.add_argument("--person", type=int, metavar="N", help="of several; default: the one seen most, or first")
+    person.add_argument("--side", choices=SIDES, help="the arm; default: as calibrated, else right")
+    person.add_argument(
+        "--person", type=int, metavar="N", help="of several people; default: the one seen most, or first"
+    )
     person.add_argument("--calibration", type=Path, metavar="FILE", help="as 'imitarm calibrate' writes it")
     person.add_argument("--seconds", type=float, metavar="S", help="how long; default: to the end, or till Ctrl-C")
-    person.add_argument("--trim", type=float, nargs=2, metavar=("A", "B"), help="only from A to B seconds")
-    person.add_argument("--pace", type=float, default=1.0, metavar="SHARE", help="slow the motion, e.g. to 0.5 of it")
-    follow = parser.add_argument_group("what follows what")
+    person.add_argument("--trim", type=float, nargs=2, metavar=("A", "B"), help="use only the time from A to B seconds")
+    person.add_argument(
+        "--pace", type=float, default=1.0, metavar="FACTOR", help="slow the motion down, e.g. 0.5: half as fast"
+    )
+    follow = parser.add_argument_group("correspondence")
     follow.add_argument(
-        "--scale", type=float, metavar="RHO", help="robot's motion over person's; default: as calibrated, else 1"
+        "--scale", type=float, metavar="FACTOR", help="robot's motion over person's; default: as calibrated, else 1"
     )
     follow.add_argument(
         "--orientation",
         choices=get_args(Orientation),
-        help="how the tool turns: as the hand, about the vertical only, or not; default: as calibrated, else upright",
+        help="how the tool rotates: with the hand, about the vertical, or not; default: as calibrated, else upright",
     )
     follow.add_argument(
-        "--fit", action="store_true", help="begin where all of the motion is in reach, at --scale or less if it must be"
+        "--fit", action="store_true", help="start where the whole motion is within reach, reducing --scale if necessary"
     )
     output = parser.add_argument_group("output")
-    output.add_argument("--task", default="", metavar="WORDS", help="what is shown, kept in the demonstration")
-    output.add_argument("--out", type=Path, metavar="FILE", help="the demonstration (CSV); one a method with 'all'")
-    output.add_argument("--force", action="store_true", help="replace files that are there")
-    output.add_argument("--keep-waiting", action="store_true", help="keep what was before and after the following")
+    output.add_argument("--task", default="", metavar="WORDS", help="name of the task, saved in the demonstration")
+    output.add_argument("--out", type=Path, metavar="FILE", help="the demonstration (CSV); with 'all' one per method")
+    output.add_argument("--force", action="store_true", help="overwrite existing files")
+    output.add_argument("--keep-waiting", action="store_true", help="keep the time before and after the person led")
     output.add_argument("--report", type=Path, metavar="FILE", help="a page with person and robot side by side (HTML)")
 
 
 @dataclass(frozen=True, eq=False)
 class _Setting:
-    """What all methods are given: the arm, where it begins, what follows what, what is in the way."""
+    """The same input for all methods: the arm, its start posture, the correspondence and the obstacles."""
 
     arm: ArmModel
     q: NDArray[np.float64]
@@ -105,15 +108,15 @@ class _Setting:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Retarget, say how good it is, write; see the module.
+    """Retarget a recording, print how good the result is, and write the files.
 
     Raises:
-        InputError: when an option, the source or a place to write to is wrong.
-        TaskFailedError: when nothing was followed.
-        UnreachableError: when a motion is to be fitted and can't be.
+        InputError: when an option, the source or an output path is wrong.
+        TaskFailedError: when the person never led.
+        UnreachableError: when a motion should be fitted (``--fit``) and can't be.
     """
     names = list(RETARGETERS) if arguments.method == "all" else [arguments.method]
-    files = _places(arguments, names)
+    files = _output_files(arguments, names)
     arm = ArmModel.load(arguments.robot, tool=arguments.tool)
     correspondence = _correspondence(arguments)
     scene = Scene() if arguments.scene is None else load_scene(arguments.scene)
@@ -121,23 +124,23 @@ def run(arguments: argparse.Namespace) -> int:
     skeletons, findings, truth = person_of(arguments, correspondence.side)
     setting = _setting(arguments, arm, correspondence, scene, skeletons)
     done = [_retargeted(name, setting, skeletons, truth, drive=arguments.drive) for name in names]
-    for _, following in done:
-        say(following.verdict())
+    for _, tracking in done:
+        say(tracking.verdict())
     _show([result for result, _ in done])
     for result, _ in done:
         for note in result.notes:
             remark(f"{result.title}: {note}")
-    hint = remedy(done[0][1], skeletons, setting.correspondence, fitted=arguments.fit, pace=arguments.pace)
+    hint = suggestion(done[0][1], skeletons, setting.correspondence, fitted=arguments.fit, pace=arguments.pace)
     if hint and done[0][1].engagements:
         remark(f"warning: {hint}")
-    if not any(following.engagements for _, following in done):
+    if not any(tracking.engagements for _, tracking in done):
         raise TaskFailedError(
-            f"{arguments.source}: the {correspondence.side} arm was never seen for {SEEN_FOR:g} s on end, so nothing "
-            "was followed and nothing is written; keep it in view, or choose the other by --side"
+            f"{arguments.source}: the {correspondence.side} arm was never seen for {SEEN_FOR:g} s without a gap, so "
+            "the robot did not move and nothing is written; keep the arm in view, or choose the other one with --side"
         )
     source = f"{Path(arguments.source).name}, {correspondence.side} arm"
-    for name, (result, following) in zip(names, done, strict=True):
-        if name in files and following.engagements:
+    for name, (result, tracking) in zip(names, done, strict=True):
+        if name in files and tracking.engagements:
             _demonstration(result.run, arguments.task, f"{source}, {name}", arguments.keep_waiting).save(files[name])
             say(f"wrote {files[name]}")
     if arguments.report is not None:
@@ -145,15 +148,15 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _places(arguments: argparse.Namespace, names: Sequence[str]) -> dict[str, Path]:
-    """Return for each method the file of its demonstration, and find out now what would only fail after the work."""
+def _output_files(arguments: argparse.Namespace, names: Sequence[str]) -> dict[str, Path]:
+    """Return the demonstration's file for each method; check now whatever would otherwise fail after the work."""
     slowed((), arguments.pace)
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
     out: Path | None = arguments.out
     files: dict[str, Path] = {}
     if out is not None:
-        one = len(names) == 1 or out.is_dir()  # which is refused
+        one = len(names) == 1 or out.is_dir()  # a folder is refused below
         files = {name: out if one else out.with_name(f"{out.stem}_{name}{out.suffix}") for name in names}
     inputs = [
         ("SOURCE", arguments.source),
@@ -165,14 +168,14 @@ def _places(arguments: argparse.Namespace, names: Sequence[str]) -> dict[str, Pa
 
 
 def _correspondence(arguments: argparse.Namespace) -> Correspondence:
-    """Return what follows what: what was said, else what was calibrated, else the usual."""
+    """Return the correspondence: from the options, else from the calibration, else the default."""
     calibration = Calibration() if arguments.calibration is None else Calibration.load(arguments.calibration)
     found = calibration.correspondence()
-    if calibration.orientation is None:  # a camera sees the hand's turning badly
+    if calibration.orientation is None:  # a camera sees the hand's rotation poorly
         found = replace(found, orientation="upright")
     if arguments.side is not None and arguments.side != found.side:
         if found.lengths is not None:
-            remark(f"the calibration is about the {found.side} arm; the {arguments.side} arm's lengths are learnt anew")
+            remark(f"the calibration is of the {found.side} arm; the {arguments.side} arm is measured again")
         found = replace(found, side=arguments.side, lengths=None)
     if arguments.scale is not None:
         found = replace(found, scale=arguments.scale)
@@ -188,43 +191,183 @@ def _setting(
     scene: Scene,
     skeletons: Sequence[Skeleton],
 ) -> _Setting:
-    """Return what the methods are given; with ``--fit`` the start and the scale that the motion needs."""
+    """Return the input for the methods; with ``--fit`` the start and the scale that the motion needs."""
     if not arguments.fit:
         return _Setting(arm, arm.home, correspondence, scene)
     duration = skeletons[-1].time - skeletons[0].time
-    times = np.arange(SEEN_FOR, max(duration, SEEN_FOR) + PERIOD, PERIOD)  # before that nothing is followed
-    with working("looking for a start from which all of the motion is in reach"):
+    times = np.arange(SEEN_FOR, max(duration, SEEN_FOR) + PERIOD, PERIOD)  # the person leads only after that
+    with working("searching for a start from which the whole motion is within reach"):
         wrist = seen_arm(skeletons, times, correspondence).wrist
         fit = fit_motion(arm, wrist, wrist[0], scale=correspondence.scale)
     if fit.scale < correspondence.scale:
-        remark(f"scale {fit.scale:.2f} instead of {correspondence.scale:.2f}, so that all of the motion is in reach")
+        remark(f"scale {fit.scale:.2f} instead of {correspondence.scale:.2f}, so that the whole motion is within reach")
     return _Setting(arm, fit.q, replace(correspondence, scale=fit.scale), scene)
 
 
 def _retargeted(
     name: str, setting: _Setting, skeletons: Sequence[Skeleton], truth: Truth | None, *, drive: bool
-) -> tuple[MethodResult, Following]:
-    """Let one method retarget the recording, and measure what it made of it."""
+) -> tuple[MethodResult, TargetTracking]:
+    """Let one method retarget the recording, and measure the result."""
     retargeter: Retargeter = RETARGETERS[name](setting.arm, setting.correspondence, dt=PERIOD, scene=setting.scene)
     duration = max(skeletons[-1].time - skeletons[0].time, PERIOD)
     with watched(f"retargeting by {name}", lambda: retargeter.latest.time / duration):
         made = retargeter.run(skeletons, setting.q)
-    result, following = judged(made, skeletons, setting.correspondence, truth)
+    evaluation, execution = evaluate_run(made, skeletons, setting.correspondence, truth), None
     if drive:
-        shares = [0.0]
-        with watched(f"driving {setting.arm.name}", lambda: shares[-1]):
-            result = with_driven(result, drive_run(made, setting.scene, shares.append))
-    return result, following
+        fractions = [0.0]
+        with watched(f"executing on {setting.arm.name}", lambda: fractions[-1]):
+            execution = execute_on_robot(made, setting.scene, fractions.append)
+    return _result(name, evaluation, execution), evaluation.tracking
+
+
+def _result(name: str, evaluation: RunEvaluation, execution: Execution | None) -> MethodResult:
+    """Return what the report shows of one method."""
+    run = evaluation.run
+    measures, notes = _measures(evaluation), list(evaluation.warnings)
+    if execution is not None:
+        measures += _execution_measures(execution)
+        notes += _execution_notes(execution)
+    return MethodResult(
+        name=name,
+        title=run.title or name,
+        run=run,
+        measures=measures,
+        tables=[_torques(evaluation)],
+        notes=notes,
+        caption=run.caption,
+        clock=run.shown_times,
+    )
 
 
 def _demonstration(made: Retargeting, task: str, source: str, whole: bool) -> Demonstration:
-    """Return what was followed as a demonstration, from 0 s; with ``whole`` the waiting before and after it, too."""
-    led = np.flatnonzero(made.engaged)
-    first, last = (0, len(made.times) - 1) if whole else (max(int(led[0]) - 1, 0), int(led[-1]))
+    """Return the time in which the person led as a demonstration that starts at 0 s; with ``whole`` the whole run."""
+    engaged = np.flatnonzero(made.engaged)
+    first, last = (0, len(made.times) - 1) if whole else (max(int(engaged[0]) - 1, 0), int(engaged[-1]))
     part = slice(first, max(last, first + 1) + 1)
     joints = made.joints[part]
     trajectory = Trajectory(made.times[part] - made.times[first], *made.arm.tool_path(joints))
     return Demonstration(trajectory, joints, task, source, made.arm.joint_names)
+
+
+TARGET_RMS = "tool to its own target, RMS"
+TARGET_FAR = f"farther than {1e2 * FAR:.0f} cm from its own target"
+TARGET_LAG = "lag behind its own target"
+_TILES = (TARGET_RMS, TARGET_FAR, TARGET_LAG)  # the measures that matter most
+_DEGREES = 180.0 / np.pi
+
+
+def _measures(evaluation: RunEvaluation) -> list[Measure]:
+    """Return the figures of merit in the units that people use."""
+    run, m, tracking = evaluation.run, evaluation.metrics, evaluation.tracking
+    hand = "true hand" if evaluation.truth_known else "hand as seen"
+    return [
+        Measure("duration", m.duration, "s", 2),
+        *(Measure(s, 100.0 * float(np.mean(run.states == s)), "% of the time", 1) for s in EngagementState),
+        Measure("person began to lead", m.engagements, "times", 0),
+        Measure(TARGET_RMS, 1e3 * m.target_rms, "mm", 1, "less"),
+        Measure(TARGET_FAR, 1e2 * tracking.far_fraction, "% of the time", 1, "less"),
+        Measure(TARGET_LAG, 1e3 * evaluation.target_lag, "ms", 0, "less"),
+        Measure(f"tool to the {hand}, RMS", 1e3 * m.tool_rms, "mm", 1, "less"),
+        Measure("the same without its lag", 1e3 * m.tool_rms_without_lag, "mm", 1, "less"),
+        Measure(f"lag behind the {hand}", 1e3 * evaluation.hand_lag, "ms", 0),
+        Measure("upper arm's direction, RMS error", _DEGREES * m.elbow_direction_rms, "°", 1, "less"),
+        Measure("beyond a limit of position", m.position_violations, "frames", 0, "less", fault=True),
+        Measure("beyond a limit of velocity", m.velocity_violations, "frames", 0, "less", fault=True),
+        Measure("beyond a limit of acceleration", m.acceleration_violations, "frames", 0, "less", fault=True),
+        Measure("highest velocity", 100.0 * m.velocity_ratio, "% of the limit", 0, "less"),
+        Measure("highest acceleration", 100.0 * m.acceleration_ratio, "% of the limit", 0, "less"),
+        Measure("jerk of the joints, RMS", m.joint_jerk_rms, "rad/s³", 0, "less"),
+        Measure("smallest singular value", m.least_singular, "m/rad", 3, "more"),
+        Measure("smallest distance between links", 1e3 * evaluation.link_distance, "mm", 0, "more"),
+        Measure("path length of the tool", m.path_length, "m", 2),
+        Measure("highest torque", 100.0 * m.peak_torque_ratio, "% of the rated", 0, "less"),
+    ]
+
+
+def _torques(evaluation: RunEvaluation) -> PlainTable:
+    """Return the torques of each joint."""
+    run, m = evaluation.run, evaluation.metrics
+    columns = (m.mean_torque, m.mean_gravity_torque, m.mean_motion_torque, m.rms_torque, run.arm.max_torque)
+    rows = [
+        (name, *(f"{value:.2f}" if np.isfinite(value) else "–" for value in values))
+        for name, *values in zip(run.arm.joint_names, *columns, strict=True)
+    ]
+    return PlainTable(
+        "Torques [N m]",
+        ("Joint", "Mean", "Weight", "Motion", "RMS", "Rated"),
+        tuple(rows),
+        "By inverse dynamics, without friction. Weight: the part that holds the arm's weight; motion: the rest. Means "
+        "are of absolute values, so the two parts need not add up to the whole.",
+    )
+
+
+def _execution_measures(execution: Execution) -> list[Measure]:
+    """Return what was measured on the simulated robot."""
+    return [
+        Measure("simulated: error of the worst joint, RMS", 1e3 * execution.error_rms, "mrad", 1, "less"),
+        Measure("simulated: largest error of a joint", 1e3 * execution.error_max, "mrad", 0, "less"),
+        Measure("simulated: highest torque", 100.0 * execution.peak_torque_ratio, "% of the rated", 0, "less"),
+        Measure("simulated: commands reduced by the robot's limits", execution.limited, "frames", 0, "less"),
+    ]
+
+
+def _execution_notes(execution: Execution) -> list[str]:
+    """Return what the user should know of the simulated execution, a sentence each."""
+    notes = []
+    if np.isfinite(execution.clearance):
+        notes.append(f"simulated: smallest distance of the arm to an obstacle {1e3 * execution.clearance:.0f} mm")
+    if execution.touched:
+        notes.append("simulated: touched " + ", ".join(execution.touched))
+    if execution.fault:
+        notes.append(f"simulated: the robot stopped itself after {execution.duration:.1f} s ({execution.fault})")
+    return notes
+
+
+_OTHER_MOVES_MORE = 2.0  # an arm whose wrist moves this many times as far as the other's is the one that shows the task
+
+
+def suggestion(
+    tracking: TargetTracking,
+    skeletons: Sequence[Skeleton],
+    correspondence: Correspondence,
+    *,
+    fitted: bool,
+    pace: float,
+) -> str:
+    """Return which options to try when the tool did not follow, the most promising first; empty when it did.
+
+    Args:
+        tracking: of the run.
+        skeletons: of the person.
+        correspondence: that the method was given.
+        fitted: whether ``--fit`` was given.
+        pace: value of ``--pace``.
+    """
+    if tracking.followed:
+        return ""
+    if tracking.near:  # it followed while the person led
+        return "nobody led for most of the time: keep the arm in view, use --trim, or choose the arm with --side"
+    tries, side = [], SIDES[1 - SIDES.index(correspondence.side)]
+    mine, other = _wrist_motion(skeletons, correspondence.side), _wrist_motion(skeletons, side)
+    if other > _OTHER_MOVES_MORE * mine:
+        moves = f"this wrist moves by {1e2 * other:.0f} cm, the {correspondence.side} one by {1e2 * mine:.0f} cm"
+        tries.append(f"--side {side} ({moves})")
+    if correspondence.orientation != "fixed":
+        tries.append("--orientation fixed (the tool need not rotate)")
+    if not fitted:
+        tries.append("--fit (starts where the whole motion is within reach)")
+    tries.append(f"--pace {0.5 * pace:.2g} (slower)")
+    tries.append(f"--scale {0.5 * correspondence.scale:.2g} (smaller)")
+    if mine / _OTHER_MOVES_MORE <= other <= _OTHER_MOVES_MORE * mine:
+        tries.append(f"--side {side} (if the other arm is meant)")
+    return "the tool did not follow its target: try " + ", ".join(tries)
+
+
+def _wrist_motion(skeletons: Sequence[Skeleton], side: str) -> float:
+    """Return the RMS distance of a wrist from its mean position [m]; 0 when it is never seen."""
+    wrists = np.array([skeleton.arm(side).wrist - skeleton.arm(side).shoulder for skeleton in skeletons])
+    seen = wrists[np.isfinite(wrists).all(axis=1)]
+    return float(np.sqrt(np.mean(np.sum((seen - seen.mean(axis=0)) ** 2, axis=1)))) if len(seen) else 0.0
 
 
 def _show(results: Sequence[MethodResult]) -> None:
@@ -243,13 +386,13 @@ def _written_report(
     setting: _Setting,
     skeletons: Sequence[Skeleton],
     findings: Sequence[str],
-    done: Sequence[tuple[MethodResult, Following]],
+    done: Sequence[tuple[MethodResult, TargetTracking]],
     hint: str,
 ) -> Path:
     """Write the report and return where."""
     from imitarm.viewer.retarget_report import write_retarget_report  # noqa: PLC0415 (only when it is asked for)
 
-    (result, following), arm, correspondence = done[0], setting.arm, setting.correspondence
+    (result, tracking), arm, correspondence = done[0], setting.arm, setting.correspondence
     with working("drawing the report"):
         return write_retarget_report(
             RetargetReport(
@@ -257,19 +400,19 @@ def _written_report(
                 methods=[one for one, _ in done],
                 skeletons=skeletons,
                 correspondence=correspondence,
-                verdict=following.verdict(),
-                good=following.good,
+                verdict=tracking.verdict(),
+                good=tracking.good,
                 tiles=[
                     *(m for m in result.measures if m.label in _TILES),
                     Measure(
-                        "joint positions, velocities or accelerations beyond a limit", following.broken, "frames", 0
+                        "joint positions, velocities or accelerations beyond a limit", tracking.violations, "frames", 0
                     ),
                 ],
                 scene=setting.scene,
-                summary=f"The {correspondence.side} arm of a person, {Path(arguments.source).name}, moves the tool of "
-                f"{arm.name}: "
-                f"10 cm of the hand are {10 * correspondence.scale:.1f} cm of the tool, which turns "
-                f"{_TURNS[correspondence.orientation]}." + (f" {hint[0].upper()}{hint[1:]}." if hint else ""),
+                summary=f"The {correspondence.side} arm of a person ({Path(arguments.source).name}) moves the tool of "
+                f"{arm.name}. When the hand moves by 10 cm, the tool moves by {10 * correspondence.scale:.1f} cm. "
+                f"The tool rotates {_ROTATES[correspondence.orientation]}."
+                + (f" {hint[0].upper()}{hint[1:]}." if hint else ""),
                 findings=findings,
                 provenance=provenance(
                     robot=arm.name,
@@ -282,5 +425,4 @@ def _written_report(
         )
 
 
-_TILES = (TARGET_RMS, TARGET_FAR, TARGET_LAG)  # the measures that matter most
-_TURNS = {"hand": "as the hand does", "upright": "with the hand about the vertical only", "fixed": "not at all"}
+_ROTATES = {"hand": "with the hand", "upright": "with the hand, but only about the vertical", "fixed": "not at all"}

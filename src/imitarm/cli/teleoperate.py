@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
+import queue
+import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -16,7 +19,6 @@ from imitarm.capture.skeleton import SIDES
 from imitarm.capture.sources import followed, open_source
 from imitarm.capture.stream import UdpSource
 from imitarm.cli.gathering import source_help
-from imitarm.cli.operator import Operator
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.cli.serve import terminated_as_interrupted
@@ -28,6 +30,7 @@ from imitarm.retarget import RETARGETERS, Correspondence
 from imitarm.retarget.calibration import Calibration
 from imitarm.retarget.correspondence import Orientation
 from imitarm.robots import Robot, SimulatedRobot, UdpRobot
+from imitarm.robots.udp import TAKEN
 from imitarm.scene import Scene, load_scene
 from imitarm.teleoperation.loop import INTERRUPTED, Moment, Tally, Teleoperation
 from imitarm.transmission.latency import STAGES, LatencyLog
@@ -164,12 +167,12 @@ def _connected(arm: ArmModel, address: str) -> UdpRobot:
     return UdpRobot(arm, parse_address(address), timeout=5.0)
 
 
-def _operator(arguments: argparse.Namespace, tell: Callable[[str], None]) -> Operator | None:
+def _operator(arguments: argparse.Namespace, tell: Callable[[str], None]) -> EnablePrompt | None:
     """Return who decides; None for a robot in this process, which is never stopped for want of commands."""
-    return Operator(tell, enable_first=arguments.enable) if arguments.to else None
+    return EnablePrompt(tell, enable_first=arguments.enable) if arguments.to else None
 
 
-def _shown(operator: Operator | None, update: Callable[[Text], None]) -> Callable[[Moment], None]:
+def _shown(operator: EnablePrompt | None, update: Callable[[Text], None]) -> Callable[[Moment], None]:
     """Return what to do after every step: tell the operator, and now and then show how it goes."""
     steps = 0
 
@@ -224,3 +227,78 @@ def _judge(tally: Tally, robot: Robot) -> None:
         raise TaskFailedError(f"the robot could not be led any more: {fault}")
     if not tally.doing["following"] and tally.reason != "stopped by the user":
         raise TaskFailedError("nobody took hold: the arm must be seen for half a second; see 'imitarm capture --check'")
+
+
+class EnablePrompt:
+    """Asks the user at the terminal whether a stopped robot may move again, without blocking the control loop.
+
+    It prints why the robot can't be led and waits for Enter. Lines typed before the question are ignored. Without a
+    terminal nobody can answer, and a stopped robot ends the command.
+
+    Args:
+        tell: prints a line.
+        enable_first: let the robot move at the start without asking.
+        read: blocks until something is typed and returns it; empty: input has ended. None: standard input.
+    """
+
+    def __init__(
+        self, tell: Callable[[str], None], *, enable_first: bool = False, read: Callable[[], bytes] | None = None
+    ) -> None:
+        self._tell, self._first = tell, enable_first
+        self._read = _standard_input if read is None else read
+        self._typed: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._ended = False
+        self._asked: tuple[str, bool] = ("", False)
+        # a thread, since standard input can't be asked without waiting on every system
+        threading.Thread(target=self._reading, daemon=True).start()
+
+    def led(self) -> None:
+        """The robot can be led again: the next problem is a new one."""
+        self._first, self._asked = False, ("", False)
+
+    def __call__(self, trouble: str, stopped: bool) -> bool:
+        """Return whether a stopped robot may move again.
+
+        Args:
+            trouble: why the robot can't be led.
+            stopped: whether it is stopped.
+
+        Raises:
+            TaskFailedError: when it is stopped and nobody can answer.
+        """
+        self._first = self._first and trouble != TAKEN  # never takes over from another client
+        if self._first:
+            return stopped
+        if (trouble, stopped) != self._asked:
+            self._asked = (trouble, stopped)
+            self._taken()
+            question = ". If the workspace is clear, press Enter to let it move again" if stopped else ""
+            self._tell(f"the robot can't be led: {trouble}{question}")
+            return False
+        if stopped and self._ended:
+            raise TaskFailedError(
+                f"the robot is stopped: {trouble}; nobody can let it move again, since there is no terminal. Run this "
+                "in one, or begin with --enable"
+            )
+        return stopped and b"\n" in self._taken()
+
+    def _reading(self) -> None:
+        while typed := self._read():
+            self._typed.put(typed)
+        self._ended = True
+
+    def _taken(self) -> bytes:
+        typed = b""
+        while not self._typed.empty():
+            typed += self._typed.get()
+        return typed
+
+
+def _standard_input() -> bytes:
+    """Block until something is typed and return it; empty when nobody can type here."""
+    try:
+        if os.isatty(0) and hasattr(os, "tcgetpgrp") and os.tcgetpgrp(0) != os.getpgrp():
+            return b""  # in the background, where reading would halt the process
+        return os.read(0, 4096)
+    except OSError:
+        return b""

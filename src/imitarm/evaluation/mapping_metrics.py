@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.evaluation.execution import execute_within_limits
 from imitarm.evaluation.motion import (
     ArmMotion,
-    executed,
     jerk_rms,
     path_length,
     spectral_arc_length,
@@ -43,12 +43,12 @@ class MappingMetrics:
 
     The reference of tool and elbow is the clutch's law with the *true* hand from the moment the method engaged; each
     engagement begins anew. Errors are taken over the frames in which the clutch is engaged, so read them beside
-    ``led_share``; ``tool_rms_from_first`` forgives nothing.
+    ``engaged_fraction``; ``tool_rms_from_first`` forgives nothing.
 
     Attributes:
         duration: of the robot's motion [s].
-        following_share: share of the frames with state "following".
-        led_share: share of the frames in which the clutch is engaged: following, coasting, holding.
+        following_fraction: share of the frames with state "following".
+        engaged_fraction: share of the frames in which the clutch is engaged: following, coasting, holding.
         engagements: how often the clutch was engaged.
         tool_rms: distance of the tool to the reference, as it is, lag included, root mean square [m].
         tool_rms_without_lag: the same with the best constant lag taken out [m].
@@ -89,8 +89,8 @@ class MappingMetrics:
     """
 
     duration: float
-    following_share: float
-    led_share: float
+    following_fraction: float
+    engaged_fraction: float
     engagements: int
     tool_rms: float
     tool_rms_without_lag: float
@@ -125,7 +125,7 @@ class MappingMetrics:
     failures: int
 
     @property
-    def broken_limits(self) -> int:
+    def limit_violations(self) -> int:
         """Frames that break a limit of position, velocity or acceleration, counted once for each kind of limit."""
         return self.position_violations + self.velocity_violations + self.acceleration_violations
 
@@ -155,8 +155,8 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
     moving = motion.torques - motion.gravity
     return MappingMetrics(
         duration=float(run.times[-1] - run.times[0]),
-        following_share=float(np.mean(run.states == "following")),
-        led_share=float(np.mean(hold.led)),
+        following_fraction=float(np.mean(run.states == "following")),
+        engaged_fraction=float(np.mean(hold.led)),
         engagements=hold.count,
         tool_rms=tool_rms,
         tool_rms_without_lag=without_lag,
@@ -220,7 +220,7 @@ def _executed(
     """Return how far an arm that keeps its limits is from the reference: as it is, and without lag."""
     if true is None or not hold.led.any():
         return math.nan, math.nan
-    tool = run.arm.tool_path(executed(run.arm, run.joints, motion.dt))[0]
+    tool = run.arm.tool_path(execute_within_limits(run.arm, run.joints, motion.dt))[0]
     off = tool - reference_positions(true, tool, hold, correspondence.scale)
     return rms(off[hold.led]), best_lag(true, tool, hold, correspondence.scale)[1]
 

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.bounds import VelocityBox
 from imitarm.kinematics.posture import ANGLE_LENGTH
 
 Array = NDArray[np.float64]
@@ -18,7 +17,6 @@ HIGHEST = 20.0  # [Hz] of the spectrum that counts for smoothness
 QUIET = 0.05  # what is smaller than this share of the spectrum's beginning does not count
 _PADDING = 4  # powers of two by which a spectrum is drawn finer
 _ROUNDING = 1e-6  # share by which a limit of velocity or acceleration may be passed: what rounding does to differences
-_CATCH_UP = 5.0  # [1/s] share of what an arm is behind its commands that it makes up for, as in the stacking task
 _ROUNDED = 1e-9  # [rad] the same of a position
 
 
@@ -129,33 +127,6 @@ def violations(arm: ArmModel, joints: ArrayLike, dt: float) -> Violations:
         float(fast.max()),
         float(sudden.max()),
     )
-
-
-def executed(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
-    r"""Return what an arm that keeps its limits makes of commanded positions, shape (n, n_joints) [rad].
-
-    In each period it takes the commanded velocity and a share of what it is behind,
-
-    .. math:: \dot q_k = \mathrm{clip}\left((q^c_{k+1} - q^c_k) / dt + 5\,\mathrm{s}^{-1}\,(q^c_k - q_k)\right)
-
-    cut to the box of position, velocity and acceleration that can always be kept
-    (:class:`~imitarm.kinematics.bounds.VelocityBox`). Commands within the limits are executed as they are.
-
-    Args:
-        arm: whose limits.
-        joints: as commanded, shape (n, n_joints) [rad]; the arm begins at rest at the first.
-        dt: sampling period [s].
-    """
-    commanded = np.asarray(joints, dtype=float)
-    box, done = VelocityBox(arm, dt), np.empty_like(commanded)
-    q, velocity = commanded[0].copy(), np.zeros(commanded.shape[1])
-    done[0] = q
-    for i, wanted in enumerate(np.diff(commanded, axis=0) / dt):
-        lower, upper = box.at(q, velocity)
-        velocity = np.clip(wanted + _CATCH_UP * (commanded[i] - q), lower, upper)
-        q = q + dt * velocity
-        done[i + 1] = q
-    return done
 
 
 def path_length(positions: ArrayLike) -> float:

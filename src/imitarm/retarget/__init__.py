@@ -1,37 +1,37 @@
-"""From a person's arm to a robot's arm: one method a file."""
+"""Human arm to robot arm. The built-in methods, and those of other packages, are in :data:`RETARGETERS`."""
 
-from collections.abc import Mapping
-
-from imitarm.retarget.baselines.adaptive_control import AdaptiveControl
-from imitarm.retarget.baselines.demonstration_modification import DemonstrationModification
-from imitarm.retarget.baselines.incremental_ik import IncrementalIK
-from imitarm.retarget.baselines.thesis import ThesisRetargeter
+from imitarm.registry import Registry
 from imitarm.retarget.correspondence import FACING, Correspondence
+from imitarm.retarget.engagement import EngagementRule, EngagementState
 from imitarm.retarget.limbs import LimbLengths, measure_limbs
 from imitarm.retarget.modern import ModernRetargeter
-from imitarm.retarget.retargeter import Retargeter, Retargeting, RetargetStep
+from imitarm.retarget.retargeter import Goal, Retargeter, Retargeting, RetargetStep
 
-RETARGETERS: Mapping[str, type[Retargeter]] = {
-    "modern": ModernRetargeter,
-    "thesis": ThesisRetargeter,
-    "m1": DemonstrationModification,
-    "m2": AdaptiveControl,
-    "m3": IncrementalIK,
-}
-"""All methods by name."""
+RETARGETERS: Registry[type[Retargeter]] = Registry(
+    "retargeting method",
+    "imitarm.retargeters",
+    {
+        "modern": "imitarm.retarget.modern:ModernRetargeter",
+        "thesis": "imitarm.retarget.baselines.thesis:ThesisRetargeter",
+        "m1": "imitarm.retarget.baselines.demonstration_modification:DemonstrationModification",
+        "m2": "imitarm.retarget.baselines.adaptive_control:AdaptiveControl",
+        "m3": "imitarm.retarget.baselines.incremental_ik:IncrementalIK",
+    },
+)
+"""All methods by name. Another package adds its own under the entry-point group ``imitarm.retargeters``; they then
+appear in ``imitarm retarget``, ``imitarm teleoperate``, ``imitarm benchmark mapping`` and in the reports."""
 
 __all__ = [
     "FACING",
     "RETARGETERS",
-    "AdaptiveControl",
     "Correspondence",
-    "DemonstrationModification",
-    "IncrementalIK",
+    "EngagementRule",
+    "EngagementState",
+    "Goal",
     "LimbLengths",
     "ModernRetargeter",
     "RetargetStep",
     "Retargeter",
     "Retargeting",
-    "ThesisRetargeter",
     "measure_limbs",
 ]

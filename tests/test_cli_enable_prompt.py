@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from imitarm.cli.operator import Operator, _standard_input
+from imitarm.cli.teleoperate import EnablePrompt, _standard_input
 from imitarm.errors import TaskFailedError
 from imitarm.robots.udp import TAKEN
 
@@ -40,10 +40,12 @@ def keyboard():
 
 
 def test_a_stopped_robot_waits_for_enter(keyboard):
-    told = []
-    operator = Operator(told.append, read=keyboard.read)
+    printed = []
+    operator = EnablePrompt(printed.append, read=keyboard.read)
     assert [operator("just started", True) for _ in range(5)] == [False] * 5
-    assert told == ["the robot can't be led: just started. Is the way free? Enter lets it move again"]
+    assert printed == [
+        "the robot can't be led: just started. If the workspace is clear, press Enter to let it move again"
+    ]
     keyboard.type(b"y", operator)
     assert not operator("just started", True)
     keyboard.type(b"\n", operator)
@@ -51,11 +53,11 @@ def test_a_stopped_robot_waits_for_enter(keyboard):
     assert not operator("just started", True)  # one Enter, one answer
     operator.led()
     operator("no valid command for 500 ms", True)
-    assert len(told) == 2
+    assert len(printed) == 2
 
 
 def test_what_was_typed_before_the_question_counts_for_nothing(keyboard):
-    operator = Operator(lambda line: None, read=keyboard.read)
+    operator = EnablePrompt(lambda line: None, read=keyboard.read)
     keyboard.type(b"\n\n\n", operator)
     assert [operator("just started", True) for _ in range(3)] == [False] * 3
     operator("another reason", True)
@@ -64,31 +66,31 @@ def test_what_was_typed_before_the_question_counts_for_nothing(keyboard):
 
 
 def test_a_robot_that_is_not_stopped_is_not_asked_about(keyboard):
-    told = []
-    operator = Operator(told.append, read=keyboard.read)
+    printed = []
+    operator = EnablePrompt(printed.append, read=keyboard.read)
     assert not operator("the robot does not answer", False)
     keyboard.type(b"\n", operator)
     assert not operator("the robot does not answer", False)
-    assert told == ["the robot can't be led: the robot does not answer"]
+    assert printed == ["the robot can't be led: the robot does not answer"]
     assert not operator("just started", True)  # that Enter was not an answer to this
 
 
 def test_at_the_start_it_may_be_let_without_asking_and_only_then(keyboard):
-    operator = Operator(lambda line: None, enable_first=True, read=keyboard.read)
+    operator = EnablePrompt(lambda line: None, enable_first=True, read=keyboard.read)
     assert operator("just started", True) and not operator("the robot does not answer", False)
     operator.led()
     assert not operator("no valid command for 500 ms", True)
 
 
 def test_a_robot_that_somebody_leads_at_the_start_is_not_taken_over_when_it_stops_later(keyboard):
-    operator = Operator(lambda line: None, enable_first=True, read=keyboard.read)
+    operator = EnablePrompt(lambda line: None, enable_first=True, read=keyboard.read)
     assert not operator(TAKEN, False)
     assert not operator("no valid command for 500 ms", True)
     assert not operator("no valid command for 500 ms", True)
 
 
 def test_where_nobody_can_answer_a_stopped_robot_ends_the_command(keyboard):
-    operator = Operator(lambda line: None, read=keyboard.read)
+    operator = EnablePrompt(lambda line: None, read=keyboard.read)
     keyboard.type(b"", operator)
     assert not operator("the robot does not answer", False)
     assert not operator("just started", True)

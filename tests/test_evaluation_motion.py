@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imitarm.errors import InputError
+from imitarm.evaluation.execution import execute_within_limits
 from imitarm.evaluation.motion import (
     ArmMotion,
-    executed,
     jerk_rms,
     path_length,
     spectral_arc_length,
@@ -127,7 +127,7 @@ def test_spectral_arc_length_knows_a_smooth_motion():
 
 def test_commands_within_the_limits_are_executed_as_they_are():
     joints = moved(minimum_jerk(TIMES / 2.0))
-    np.testing.assert_allclose(executed(ARM, joints, DT), joints, atol=1e-12)
+    np.testing.assert_allclose(execute_within_limits(ARM, joints, DT), joints, atol=1e-12)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 0.6))
@@ -137,7 +137,7 @@ def test_what_is_executed_breaks_no_limit_and_arrives(seed, size):
     goal = np.clip(ARM.home + rng.normal(0.0, size, 7), ARM.lower, ARM.upper)
     joints = np.tile(ARM.home, (500, 1)) + rng.normal(0.0, 0.1 * size, (500, 7))
     joints[0], joints[100:] = ARM.home, goal
-    done = executed(ARM, joints, DT)
+    done = execute_within_limits(ARM, joints, DT)
     found = violations(ARM, done, DT)
     assert (found.position, found.velocity, found.acceleration) == (0, 0, 0)
     np.testing.assert_allclose(done[-1], goal, atol=0.02)

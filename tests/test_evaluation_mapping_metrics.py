@@ -40,10 +40,10 @@ def test_a_good_follower_before_a_faultless_camera(followed):
     assert found.engagements == 1
     assert found.executed_rms == pytest.approx(found.tool_rms, rel=0.01)  # its commands are within the limits
     assert found.executed_rms_without_lag == pytest.approx(found.tool_rms_without_lag, rel=0.01)
-    assert found.broken_limits == 0
+    assert found.limit_violations == 0
     assert found.settling_time < 0.6
     assert found.orientation_rms < 0.02
-    assert 0.9 < found.led_share <= 1.0
+    assert 0.9 < found.engaged_fraction <= 1.0
     assert found.duration == pytest.approx(9.0, abs=0.02)
 
 
@@ -90,7 +90,7 @@ def test_a_robot_that_never_moved_has_followed_nobody(followed):
         *(np.zeros(n, bool), np.array(["waiting"] * n), {"teaching_time": 12.5, "failures": 2.0}),
     )
     found = measure(still, correspondence, true)
-    assert found.led_share == 0.0
+    assert found.engaged_fraction == 0.0
     assert math.isnan(found.tool_rms)
     assert math.isnan(found.settling_time)
     assert found.path_length == 0.0

@@ -7,8 +7,7 @@ from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import JOINT, Skeleton
 from imitarm.errors import TaskFailedError
-from imitarm.evaluation.seen_arm import seen_arm, target_lag
-from imitarm.evaluation.tracking import TrueArm
+from imitarm.evaluation.tracking import TrueArm, seen_arm, target_lag
 from imitarm.retarget import Correspondence
 
 TRUTH = reaching(Person.from_seed(3), 3, duration=5.0)

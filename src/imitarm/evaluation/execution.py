@@ -1,0 +1,108 @@
+"""What an arm makes of commanded joint positions: within its limits alone, and as a simulated robot with drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.bounds import VelocityBox
+from imitarm.retarget import Retargeting
+from imitarm.robots import SimulatedRobot
+from imitarm.scene import Scene
+
+Array = NDArray[np.float64]
+
+CATCH_UP = 5.0  # [1/s] fraction of the remaining error to the commanded position that is corrected per second
+
+
+def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
+    r"""Return the motion of an arm that keeps its limits and follows commanded positions, (n, n_joints) [rad].
+
+    In each period the arm takes the commanded velocity and a correction towards the commanded position,
+
+    .. math:: \dot q_k = \mathrm{clip}\left((q^c_{k+1} - q^c_k) / dt + 5\,\mathrm{s}^{-1}\,(q^c_k - q_k)\right)
+
+    clipped to the box of velocities from which all limits of position, velocity and acceleration can still be kept
+    (:class:`~imitarm.kinematics.bounds.VelocityBox`). Commands within the limits are executed unchanged.
+
+    Args:
+        arm: whose limits.
+        joints: commanded positions, shape (n, n_joints) [rad]; the arm starts at rest at the first.
+        dt: sampling period [s].
+    """
+    commanded = np.asarray(joints, dtype=float)
+    box, done = VelocityBox(arm, dt), np.empty_like(commanded)
+    q, velocity = commanded[0].copy(), np.zeros(commanded.shape[1])
+    done[0] = q
+    for i, wanted in enumerate(np.diff(commanded, axis=0) / dt):
+        lower, upper = box.at(q, velocity)
+        velocity = np.clip(wanted + CATCH_UP * (commanded[i] - q), lower, upper)
+        q = q + dt * velocity
+        done[i + 1] = q
+    return done
+
+
+@dataclass(frozen=True)
+class Execution:
+    """Measurements on a simulated robot that executed a retargeting.
+
+    Attributes:
+        error_rms: root mean square over time of the position error of the worst joint [rad].
+        error_max: largest position error of a joint [rad].
+        peak_torque_ratio: largest torque of a drive, relative to the rated torque.
+        limited: frames in which the robot's own limits changed a command.
+        clearance: smallest distance of the arm to an obstacle [m]; inf without obstacles.
+        touched: names of the obstacles that were touched.
+        fault: why the robot stopped itself; empty when it did not.
+        duration: until then, or of the whole motion [s].
+    """
+
+    error_rms: float
+    error_max: float
+    peak_torque_ratio: float
+    limited: int
+    clearance: float
+    touched: tuple[str, ...]
+    fault: str
+    duration: float
+
+
+def execute_on_robot(
+    run: Retargeting, scene: Scene | None = None, progress: Callable[[float], None] | None = None
+) -> Execution:
+    """Let a simulated robot, with drives and weight, execute a retargeting.
+
+    The robot's own limits are active: a command beyond them is reduced, and the arm falls behind.
+
+    Args:
+        run: of a method.
+        scene: obstacles, as solid bodies.
+        progress: called with the fraction that is done, 0 to 1.
+    """
+    robot = SimulatedRobot(run.arm, scene=scene, q=run.joints[0])
+    dt, n = float(run.times[1] - run.times[0]), len(run.times)
+    errors, torques, limited, clearance = np.zeros(n), np.zeros(n), 0, np.inf
+    for i in range(1, n):
+        state = robot.move(run.velocities[i] + CATCH_UP * (run.joints[i - 1] - robot.set_point), dt)
+        if robot.fault:
+            break
+        errors[i] = np.abs(state.q - run.joints[i]).max()
+        torques[i] = (np.abs(state.torque) / run.arm.max_torque).max()
+        limited += bool(robot.clamped)
+        clearance = min(clearance, robot.clearance())
+        if progress is not None:
+            progress(i / n)
+    return Execution(
+        float(np.sqrt(np.mean(errors**2))),
+        float(errors.max()),
+        float(torques.max()),
+        limited,
+        float(clearance),
+        tuple(sorted({obstacle for _, obstacle in robot.contacts})),
+        robot.fault,
+        robot.time,
+    )

@@ -1,0 +1,244 @@
+"""evaluate_run: how good one retargeting is, in figures, in one line, and in warnings; for the CLI and from Python."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.capture.motions import Truth
+from imitarm.capture.skeleton import Skeleton
+from imitarm.evaluation.mapping_metrics import MappingMetrics, measure
+from imitarm.evaluation.tracking import TrueArm, rms, seen_arm, target_lag
+from imitarm.kinematics.pose import quaternion_conjugate, quaternion_multiply
+from imitarm.kinematics.self_clearance import SelfClearance
+from imitarm.retarget import Correspondence, Retargeting
+
+Array = NDArray[np.float64]
+
+FAR = 0.05  # [m] a tool farther from its target has not reached it
+FAR_FRACTION = 0.1  # of the time with a target, for which the tool may be that far: it lags where the hand is quickest
+_LEAST_ENGAGED = 0.5  # fraction of the time for which the person must lead
+_BRIEF = 0.05  # [s] shorter times would be printed as 0.0 s
+_WOUND = math.radians(200.0)  # no hand rotates so far about the vertical
+_FOLLOWS = 0.5  # of the hand's own motion (RMS); a tool with a larger error does not follow and has no lag
+
+
+@dataclass(frozen=True)
+class TargetTracking:
+    """How well a tool tracked the target that its own method gave it.
+
+    It tracked the target if the person led for at least half of the time, the distance was at most :data:`FAR` (RMS),
+    and the tool was farther away for at most :data:`FAR_FRACTION` of the time with a target. These limits are a choice:
+    within 5 cm a gripper is still at the object that it should grasp, and the normal lag of ``modern`` at the speed of
+    arms stays below both.
+
+    Attributes:
+        title: of the method.
+        rms: root mean square distance to the target [m]; nan when there was none.
+        far_fraction: fraction of the time with a target in which the tool was farther than :data:`FAR`, 0 to 1; or nan.
+        far_time: the same as a time [s].
+        farthest: largest distance [m]; or nan.
+        engagements: how often the person began to lead.
+        engaged_fraction: fraction of the whole time in which the person led, 0 to 1.
+        violations: frames in which a joint exceeded a limit.
+    """
+
+    title: str
+    rms: float
+    far_fraction: float
+    far_time: float
+    farthest: float
+    engagements: int
+    engaged_fraction: float
+    violations: int
+
+    @classmethod
+    def of(cls, run: Retargeting, metrics: MappingMetrics) -> TargetTracking:
+        """Return how a run tracked its target.
+
+        Args:
+            run: of a method.
+            metrics: of this run.
+        """
+        away = np.linalg.norm(run.arm.tool_path(run.joints)[0] - run.targets[0], axis=1)
+        away = away[np.isfinite(away)]
+        far = away > FAR
+        return cls(
+            run.title or run.method,
+            metrics.target_rms if len(away) else math.nan,
+            float(far.mean()) if len(away) else math.nan,
+            float(far.sum() * (run.times[1] - run.times[0])),
+            float(away.max()) if len(away) else math.nan,
+            metrics.engagements,
+            metrics.engaged_fraction,
+            metrics.limit_violations,
+        )
+
+    @property
+    def near(self) -> bool:
+        """Whether the tool was near its target while it had one."""
+        return self.rms <= FAR and self.far_fraction <= FAR_FRACTION
+
+    @property
+    def mostly_engaged(self) -> bool:
+        """Whether the person led for at least half of the time."""
+        return self.engaged_fraction >= _LEAST_ENGAGED
+
+    @property
+    def followed(self) -> bool:
+        """Whether the tool tracked its target; see the class."""
+        return self.near and self.mostly_engaged
+
+    @property
+    def good(self) -> bool:
+        """Whether the tool tracked its target and no joint exceeded a limit."""
+        return self.followed and not self.violations
+
+    def verdict(self) -> str:
+        """Return the result in one line: first whether the tool followed and how well, then the limits."""
+        limits = f"limits are exceeded in {self.violations} frames" if self.violations else "no joint exceeds a limit"
+        if not np.isfinite(self.rms):
+            return f"{self.title}: followed nothing; {limits}"
+        word = "follows its target" if self.near else "does not follow its target"
+        far = f"farther than {1e2 * FAR:.0f} cm for {_percent(self.far_fraction)} of the time"
+        led = f"the person led for {_percent(self.engaged_fraction)}"
+        mostly = "" if self.mostly_engaged else "nobody led for most of the time: "
+        return f"{self.title}: {mostly}{word}, {1e3 * self.rms:.0f} mm from it (RMS), {far}; {led}; {limits}"
+
+
+@dataclass(frozen=True, eq=False)
+class RunEvaluation:
+    """The result of :func:`evaluate_run`.
+
+    Attributes:
+        run: that was evaluated.
+        metrics: against the person's arm.
+        tracking: how well the tool tracked its own target.
+        target_lag: of the tool behind its own target [s]; nan when it does not follow.
+        hand_lag: of the tool behind the hand [s]; nan when it does not follow.
+        link_distance: smallest distance between links that are not neighbours [m], between the spheres that cover them.
+        truth_known: whether the hand is the true one; otherwise it is the hand as the camera saw it.
+        warnings: what the user should know of this run, a sentence each.
+    """
+
+    run: Retargeting
+    metrics: MappingMetrics
+    tracking: TargetTracking
+    target_lag: float
+    hand_lag: float
+    link_distance: float
+    truth_known: bool
+    warnings: tuple[str, ...]
+
+
+def evaluate_run(
+    run: Retargeting,
+    skeletons: Sequence[Skeleton],
+    correspondence: Correspondence,
+    truth: Truth | None = None,
+) -> RunEvaluation:
+    """Measure how good a retargeting is.
+
+    Args:
+        run: of a method.
+        skeletons: of the person, as the method got them.
+        correspondence: that the method was given.
+        truth: the true positions of the person over time; None: what the camera saw is used instead.
+
+    Raises:
+        TaskFailedError: when the arm is never seen.
+        InputError: when the run is too short to be measured.
+    """
+    times = run.times if run.shown_times is None else run.shown_times
+    if truth is None:
+        true = seen_arm(skeletons, times, correspondence)
+    else:
+        true = TrueArm.of(truth, times, correspondence, start=skeletons[0].time)
+    metrics = measure(run, correspondence, true)
+    tracking = TargetTracking.of(run, metrics)
+    motion = correspondence.scale * rms(true.wrist - true.wrist.mean(axis=0))
+    follows = metrics.tool_rms_without_lag < _FOLLOWS * motion
+    links = SelfClearance(run.arm)
+    apart = min(links.distance(q) for q in run.joints[::2])
+    return RunEvaluation(
+        run=run,
+        metrics=metrics,
+        tracking=tracking,
+        target_lag=target_lag(run.times, run.arm.tool_path(run.joints)[0], run.targets[0]),
+        hand_lag=metrics.lag if follows else math.nan,
+        link_distance=apart,
+        truth_known=truth is not None,
+        warnings=tuple(warnings_of(run, metrics, tracking, apart)),
+    )
+
+
+def warnings_of(
+    run: Retargeting, metrics: MappingMetrics, tracking: TargetTracking, link_distance: float = math.inf
+) -> list[str]:
+    """Return what the user should know of a run, a sentence each.
+
+    Args:
+        run: of a method.
+        metrics: of the run.
+        tracking: of the run.
+        link_distance: smallest distance between links that are not neighbours [m].
+    """
+    dt = float(run.times[1] - run.times[0])
+    lines = []
+    if not metrics.engagements:
+        lines.append("the robot never moved: the arm was not seen for half a second without a gap")
+    stopped = int(np.sum(run.states == "stopped")) + _waiting_again(run.states)
+    if stopped:
+        lines.append(f"the robot stopped or waited for {stopped * dt:.1f} s in between, because the arm was not seen")
+    if tracking.far_time >= _BRIEF:
+        lines.append(
+            f"the tool was more than {1e2 * FAR:.0f} cm from its target for {tracking.far_time:.1f} s (at most "
+            f"{1e2 * tracking.farthest:.0f} cm): the target was out of reach or too fast for the joints"
+        )
+    wound = winding(run)
+    if wound > _WOUND:
+        lines.append(
+            f"the target of the tool rotated about the vertical by {np.degrees(wound):.0f} degrees in all: while a "
+            "hand points straight up or down, its heading is unknown; --orientation fixed keeps the tool's rotation"
+        )
+    exceeded = {
+        "position": metrics.position_violations,
+        "velocity": metrics.velocity_violations,
+        "acceleration": metrics.acceleration_violations,
+    }
+    beyond = [f"{what} in {count} frames" for what, count in exceeded.items() if count]
+    if beyond:
+        lines.append(f"exceeds limits of {', '.join(beyond)}: a real arm can't do this")
+    if link_distance < 0.0:
+        lines.append("links come so close that they may touch: choose another start (--fit) or scale")
+    if run.closed.any():
+        lines.append("the hand closed in between; a demonstration has no gripper, so this is not kept")
+    return lines
+
+
+def winding(run: Retargeting) -> float:
+    """Return the largest difference between two headings of the tool's target, full turns counted [rad]."""
+    rotations = run.targets[1]
+    rotations = rotations[np.isfinite(rotations).all(axis=1)]
+    if not len(rotations):
+        return 0.0
+    away = quaternion_multiply(rotations, quaternion_conjugate(rotations[0]))
+    return float(np.ptp(np.unwrap(2.0 * np.arctan2(away[:, 3], away[:, 0]))))
+
+
+def _waiting_again(states: NDArray[np.str_]) -> int:
+    """Return in how many frames the robot waited after it had once followed."""
+    followed = np.flatnonzero(states == "following")
+    return int(np.sum(states[followed[0] :] == "waiting")) if len(followed) else 0
+
+
+def _percent(fraction: float) -> str:
+    """Return a fraction in words: never 0 % of what is more than nothing, nor 100 % of what is not all."""
+    whole = round(100.0 * fraction)
+    if 0.0 < fraction < 0.01:
+        return "under 1 %"
+    return "over 99 %" if whole == 100 and fraction < 1.0 else f"{whole} %"
