@@ -288,8 +288,8 @@ def test_a_world_is_put_into_the_arms_posture():
 @pytest.mark.parametrize(
     ("q", "said"),
     [
-        (np.zeros(6), "needs 7 numbers, got shape \\(6,\\)"),
-        (np.zeros((1, 7)), "needs 7 numbers"),
+        (np.zeros(6), r"must be 7 numbers \[rad\], got shape \(6,\)"),
+        (np.zeros((1, 7)), "must be 7 numbers"),
         ([0, 0, np.nan, 0, 0, 0, 0], "finite"),
         ([0, 0, np.inf, 0, 0, 0, 0], "finite"),
     ],

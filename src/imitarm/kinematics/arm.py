@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,15 +12,17 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.errors import InputError, UnknownNameError
-from imitarm.kinematics.arm_file import ArmFile, quiet, read_arm
-from imitarm.kinematics.arm_limits import compiled
-from imitarm.kinematics.arm_memory import ArmMemories, ArmMemory, columns
-from imitarm.kinematics.landmarks import Landmarks
+from imitarm.errors import InputError
+from imitarm.kinematics.arm_file import ArmFile, compiled, read_arm, without_geoms
+from imitarm.kinematics.arm_kinematics import ArmKinematics
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.spheres import SphereCover
+from imitarm.validation import finite_number, flag, instance, text
 
 Array = NDArray[np.float64]
+Columns = slice | NDArray[np.int32]
+
+_FLOAT64 = np.dtype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +33,7 @@ class ArmState:
         q: joint positions, shape (n,) [rad].
         velocity: joint velocities, shape (n,) [rad/s].
         torque: torques of the joints' drives, shape (n,) [N m].
-        time: when [s].
+        time: time of the measurement [s].
     """
 
     q: Array
@@ -40,38 +42,37 @@ class ArmState:
     time: float
 
 
-class ArmModel:
+class ArmModel(ArmKinematics):
     r"""A robot arm, with or without a tool: kinematics, dynamics and limits. It never changes once built.
 
     The equation of motion of the arm's links and tool, which :meth:`inverse_dynamics` evaluates, is
 
     .. math:: M(q) \ddot q + C(q, \dot q) \dot q + g(q) = \tau
 
-    with the rigid-body inertia :math:`M` alone. Rotor inertia (``armature``), viscous damping and dry friction of
-    the joints, which a simulated arm also has, are no part of it; their values are in ``spec()``.
+    with the rigid-body inertia :math:`M`. Rotor inertia (``armature``), viscous damping and dry friction of the joints,
+    which a simulated arm also has, are not included; their values are in ``spec()``.
 
     All poses are in the base frame, whose origin is that of the file. Jacobians have the linear rows first. Methods
-    take one posture ``q`` of shape (n_joints,) and raise :class:`InputError` when its shape is wrong or a number
-    is not finite. One model can be used by several threads.
+    take one posture ``q`` of shape (n_joints,) and raise :class:`InputError` if its shape is wrong or a number
+    is not finite. Several threads can use one model.
 
     Attributes:
         name: for example ``"sawyer"``.
-        joint_names: from base to flange; joints of a gripper are not among them.
-        lower: least joint positions, shape (n_joints,) [rad]; -inf where there is no limit.
-        upper: largest joint positions, shape (n_joints,) [rad].
-        max_velocity: shape (n_joints,) [rad/s].
-        max_acceleration: shape (n_joints,) [rad/s^2].
-        max_torque: shape (n_joints,) [N m]; inf where the file names none.
-        home: a comfortable posture, shape (n_joints,) [rad].
-        tool_to_flange: where the tool's tip is; the identity when there is no tool.
-        tool_radius: radius of the cylinder about the tool's axis that holds the tool's head [m]; 0 without a tool.
+        joint_names: from base to flange; the joints of a gripper are not among them.
+        lower: lower limits of the joint positions, shape (n_joints,) [rad]; -inf where there is no limit.
+        upper: upper limits of the joint positions, shape (n_joints,) [rad]; inf where there is no limit.
+        max_velocity: largest joint speeds, shape (n_joints,) [rad/s].
+        max_acceleration: largest joint accelerations, shape (n_joints,) [rad/s^2].
+        max_torque: largest joint torques, shape (n_joints,) [N m]; inf where the file has no limit.
+        home: a posture to begin in, shape (n_joints,) [rad].
+        tool_to_flange: pose of the tool's tip in the flange frame; the identity without a tool.
+        tool_radius: radius of the cylinder about the tool's axis that contains the tool's head [m]; 0 without a tool.
         sphere_bodies: for each sphere of :meth:`collision_spheres` the name of its body.
         cover: the spheres themselves.
-        landmarks: shoulder, elbow and wrist, from sites of these names in the file; None when it has none.
+        landmarks: shoulder, elbow and wrist, from sites of these names in the file; None if the file has none.
+        notes: what the file does not say and was assumed, and which of its joints are not part of the arm.
     """
 
-    name: str
-    joint_names: tuple[str, ...]
     lower: Array
     upper: Array
     max_velocity: Array
@@ -82,7 +83,7 @@ class ArmModel:
     tool_radius: float
     sphere_bodies: tuple[str, ...]
     cover: SphereCover
-    landmarks: Landmarks | None
+    notes: tuple[str, ...]
 
     @classmethod
     def load(
@@ -91,56 +92,61 @@ class ArmModel:
         *,
         tool: str | Path | None = None,
         flange: str | None = None,
+        package_path: str | Path | Sequence[str | Path] = (),
         discard_meshes: bool = False,
     ) -> ArmModel:
         """Load a packaged arm, or any MJCF or URDF file.
 
-        Limits come from the file. What a format has no place for is looked up in MJCF elements
-        ``<custom><numeric name="max_velocity" data="..."/></custom>`` (and ``max_acceleration``) and in a URDF's
-        ``<limit velocity= effort=>``; where nothing is said, 2 rad/s and 10 rad/s^2 are taken (0.2 m/s and 1 m/s^2
-        for slides), and no limit of torque. ``home`` is the keyframe of that name, else the first keyframe, else the
-        middle of the joints' ranges.
+        Limits come from the file. Where it has none, 2 rad/s and 10 rad/s^2 are assumed (0.2 m/s and 1 m/s^2 for
+        slides), and the torque is unlimited; ``notes`` says so. Speeds and accelerations have no place of their own in
+        MJCF: put them into ``<custom><numeric name="max_velocity" data="..."/></custom>`` (and ``max_acceleration``),
+        one value for each joint.
+
+        ``home`` is the keyframe of that name, else the first keyframe. A file without keyframes gets the middle of the
+        joints' ranges if that is a usable posture: not singular, with 20 mm between the links. Otherwise it gets the
+        best of 1024 postures in this sense.
 
         Args:
             name_or_path: ``"sawyer"``, ``"panda"`` or a path.
             tool: ``"gripper"``, ``"brush"``, the path of an MJCF file with a site ``tool`` at its tip, or None.
-            flange: name of the body or site that is the flange; None: a site named ``flange``, else the last body of
-                the longest chain of joints (where two equally long ones part, as fingers do, it ends).
-            discard_meshes: leave out all meshes, for a file whose meshes are elsewhere; links keep only their
-                primitive shapes, so contact and :meth:`collision_spheres` see no more than those.
+            flange: name of the body or site that is the flange; None: a site named ``flange``, else the end of the only
+                arm in the file, before jaws and fingers.
+            package_path: one or more folders in which meshes and ROS packages are looked for.
+            discard_meshes: leave out all meshes. Links then keep only their primitive shapes, so that contact and
+                :meth:`collision_spheres` see no more than those.
 
         Raises:
-            UnknownNameError: when an arm, tool or flange of that name is not known.
-            FileFormatError: when a file can't be read as a robot.
-            InputError: when there is no joint between the base and the flange, or one that is neither hinge nor slide.
+            UnknownNameError: if an arm, tool or flange of that name is not known.
+            FileFormatError: if a file can't be read as a robot.
+            InputError: if the file holds no arm, or several.
         """
-        file = read_arm(name_or_path, tool, flange, discard_meshes)
-        kept = {"tool": tool, "flange": flange, "discard_meshes": discard_meshes}
-        return cls(file, (name_or_path, kept))
+        for what, value in (("robot", name_or_path), ("tool", tool)):
+            if not isinstance(value, str | Path) and (value is not None or what == "robot"):
+                raise InputError(f"{what} must be a name or a path, got {value!r}")
+        folders = (package_path,) if isinstance(package_path, str | Path) else package_path
+        if not isinstance(folders, Sequence) or not all(isinstance(folder, str | Path) for folder in folders):
+            raise InputError(f"package_path must be a folder or several, got {package_path!r}")
+        options = {
+            "tool": tool,
+            "flange": None if flange is None else text(flange, "flange"),
+            "package_path": tuple(folders),
+            "discard_meshes": flag(discard_meshes, "discard_meshes"),
+        }
+        return cls(read_arm(name_or_path, **options), (name_or_path, options))  # type: ignore[arg-type]
 
     def __init__(self, file: ArmFile, source: tuple[str | Path, dict[str, Any]]) -> None:
         """Build from what :func:`~imitarm.kinematics.arm_file.read_arm` returned; use :meth:`load` instead."""
         whole = compiled(file.spec, file.name)
         # Shapes without mass are left out of the working model: its kinematics then takes a third of the time.
-        model = compiled(quiet(file.spec, _massless), file.name)
+        model = compiled(without_geoms(file.spec, _massless), file.name)
         model.dof_armature[:] = 0.0
-        joints = [model.joint(name).id for name in file.joints]
-        limited = model.jnt_limited[joints].astype(bool)
         posture = np.array(model.qpos0)
         for name, position in file.home.items():
             posture[model.jnt_qposadr[model.joint(name).id]] = position
-        self._source, self._spec, self._model = source, file.spec, model
-        self._qpos = columns(model.jnt_qposadr[joints])
-        self._dofs = columns(model.jnt_dofadr[joints])
-        self.landmarks = Landmarks.find(model, np.array(joints))
-        marked = () if self.landmarks is None else self.landmarks.sites
-        self._memories = ArmMemories(model, posture, self._qpos, self._dofs, marked)
-        self._joints = np.array(joints)
-        self._flange = model.site("flange").id
-        names = [model.site(i).name for i in range(model.nsite)]
-        self._tool = names.index("tool") if "tool" in names else self._flange
-
-        self.name, self.joint_names = file.name, file.joints
+        super().__init__(file.name, file.joints, model, posture)
+        joints = np.array([model.joint(name).id for name in file.joints])
+        limited = model.jnt_limited[joints].astype(bool)
+        self._source, self._spec, self._mass_faults, self.notes = source, file.spec, file.mass_faults, file.notes
         self.lower = _frozen(np.where(limited, model.jnt_range[joints, 0], -np.inf))
         self.upper = _frozen(np.where(limited, model.jnt_range[joints, 1], np.inf))
         self.max_velocity = _frozen(file.max_velocity)
@@ -151,7 +157,7 @@ class ArmModel:
         self.tool_to_flange = Pose.identity()
         if self.has_tool:
             self.tool_to_flange = self.forward_kinematics(self.home).inverse() @ self.tool_pose(self.home)
-        self.cover = SphereCover(whole, self._joints)
+        self.cover = SphereCover(whole, joints)
         self.sphere_bodies = self.cover.bodies
         self._sealed = True
 
@@ -168,30 +174,19 @@ class ArmModel:
         path, options = self._source
         return f"ArmModel.load({str(path)!r}, tool={options['tool']!r})"
 
-    @property
-    def n_joints(self) -> int:
-        """Number of joints from base to flange."""
-        return len(self.joint_names)
-
-    @property
-    def has_tool(self) -> bool:
-        """Whether a tool is mounted, so that ``tool_pose`` differs from ``forward_kinematics``."""
-        return self._tool != self._flange
-
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh copy of the arm and its tool, for composing worlds; the base stands at the origin.
 
-        Names are those of the file; those of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
-        The flange is the site ``"flange"``. Geoms of group 3 count for contact, all others are looks (a
-        file that does not part the two is put in order so). The arm's
-        joints have no actuators, so that a world adds the ones it needs (joints carry their torque limit as
-        ``actuatorfrcrange``); a gripper has one, ``"tool/opening"``, a position servo of its opening [m].
-        There are no keyframes: take :meth:`posture`.
+        Names are those of the file; names of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
+        The flange is the site ``"flange"``. Geoms of group 3 count for contact; all others are only drawn (a file that
+        does not separate the two is arranged in this way). The arm's joints have no actuators, so that a world adds the
+        ones it needs (joints carry their torque limit as ``actuatorfrcrange``). A gripper has one actuator,
+        ``"tool/opening"``, a position servo of its opening [m]. There are no keyframes: use :meth:`posture`.
         """
         return self._spec.copy()
 
     def posture(self, model: mujoco.MjModel, q: ArrayLike | None = None, *, prefix: str = "") -> Array:
-        """Return the whole ``qpos`` of a world that holds this arm: the arm at ``q``, the rest as the world has it.
+        """Return the whole ``qpos`` of a world that contains this arm: the arm at ``q``, the rest as the world has it.
 
         Args:
             model: a compiled world.
@@ -200,113 +195,22 @@ class ArmModel:
 
         Returns:
             shape (model.nq,).
+
+        Raises:
+            InputError: if the world does not contain this arm.
         """
+        instance(model, mujoco.MjModel, "model")
         qpos = np.array(model.qpos0)
-        mine, home = self._model, self._memories.mine.data.qpos
-        for joint in range(mine.njnt):  # fingers too
-            address = model.jnt_qposadr[model.joint(prefix + mine.joint(joint).name).id]
-            qpos[address] = home[mine.jnt_qposadr[joint]]
         values = self.home if q is None else self._checked(q, "q")
-        for name, value in zip(self.joint_names, values, strict=True):
-            qpos[model.jnt_qposadr[model.joint(prefix + name).id]] = value
+        mine = [self._model.joint(joint).name for joint in range(self._model.njnt)]  # fingers too
+        positions = dict(zip(mine, self._posture[self._model.jnt_qposadr].tolist(), strict=True))
+        positions.update(zip(self.joint_names, values.tolist(), strict=True))
+        for name, position in positions.items():
+            joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, text(prefix, "prefix") + name)
+            if joint < 0:
+                raise InputError(f"the world has no joint {prefix + name!r}, so it does not contain {self.name}")
+            qpos[model.jnt_qposadr[joint]] = position
         return qpos
-
-    def at(self, q: ArrayLike) -> ArmMemory:
-        """Return this thread's working memory with kinematics at ``q``, for loops that ask for much of one posture.
-
-        It is computed only when the posture is a new one, and holds until the next is asked for.
-        """
-        memory = self._memories.mine
-        memory.move_to(self._checked(q, "q"))
-        return memory
-
-    def site(self, frame: str) -> int:
-        """Return the index of the site of a frame, ``"tool"`` or ``"flange"``, in :meth:`at`.
-
-        Raises:
-            UnknownNameError: when the frame is not known.
-        """
-        if frame not in {"tool", "flange"}:
-            raise UnknownNameError.among("frame", frame, ("tool", "flange"))
-        return self._tool if frame == "tool" else self._flange
-
-    def forward_kinematics(self, q: ArrayLike) -> Pose:
-        """Return the pose of the flange: ``flange_to_base``."""
-        return self.at(q).site_pose(self._flange)
-
-    def tool_pose(self, q: ArrayLike) -> Pose:
-        """Return the pose of the tool's tip: ``tool_to_base``."""
-        return self.at(q).site_pose(self._tool)
-
-    def tool_path(self, joints: ArrayLike) -> tuple[Array, Array]:
-        """Return the poses of the tool's tip for many postures.
-
-        Args:
-            joints: shape (n, n_joints) [rad].
-
-        Returns:
-            positions (n, 3) [m] and quaternions wxyz (n, 4).
-        """
-        poses = [self.at(q).site_pose(self._tool) for q in np.atleast_2d(np.asarray(joints, dtype=float))]
-        positions = np.array([pose.position for pose in poses]).reshape(-1, 3)
-        return positions, np.array([pose.quaternion for pose in poses]).reshape(-1, 4)
-
-    def jacobian(self, q: ArrayLike) -> Array:
-        """Return the Jacobian of the flange, shape (6, n_joints), linear rows first, in the base frame."""
-        return np.array(self.at(q).site_jacobian(self._flange))
-
-    def tool_jacobian(self, q: ArrayLike) -> Array:
-        """Return the Jacobian of the tool's tip, shape (6, n_joints), linear rows first, in the base frame."""
-        return np.array(self.at(q).site_jacobian(self._tool))
-
-    def point_jacobian(self, q: ArrayLike, body: str, point: ArrayLike) -> Array:
-        """Return the Jacobian of a point that moves with ``body``.
-
-        Args:
-            q: joint positions, shape (n_joints,) [rad].
-            body: name of the body, as in ``spec()``.
-            point: where it is now in the base frame, shape (3,) [m].
-
-        Returns:
-            shape (3, n_joints) [m/rad].
-
-        Raises:
-            UnknownNameError: when there is no such body.
-        """
-        index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_BODY, body)
-        if index < 0:
-            known = [self._model.body(i).name for i in range(1, self._model.nbody)]
-            raise UnknownNameError.among(f"body of {self.name}:", body, known)
-        scratch = self.at(q)
-        position = np.asarray(point, dtype=float).reshape(3, 1)
-        mujoco.mj_jac(self._model, scratch.data, scratch.linear, None, position, index)
-        return np.array(scratch.linear[:, self._dofs])
-
-    def sew_points(self, q: ArrayLike) -> Array:
-        """Return shoulder, elbow and wrist in the base frame, shape (3, 3) [m].
-
-        Raises:
-            InputError: when the arm's file does not say where they are.
-        """
-        return np.array(self.at(q).sites[list(self.marked().sites)])
-
-    def sew_jacobians(self, q: ArrayLike) -> Array:
-        """Return the Jacobians of shoulder, elbow and wrist, shape (3, 3, n_joints) [m/rad]; as ``sew_points``."""
-        self.marked()
-        return np.array(self.at(q).marked_jacobians()).reshape(3, 3, -1)
-
-    def marked(self) -> Landmarks:
-        """Return ``landmarks``.
-
-        Raises:
-            InputError: when the arm's file does not say where shoulder, elbow and wrist are.
-        """
-        if self.landmarks is None:
-            raise InputError(
-                f"{self.name} does not say where its shoulder, elbow and wrist are: add sites named 'shoulder', "
-                "'elbow' and 'wrist' to its MJCF file, on the links that these joints move"
-            )
-        return self.landmarks
 
     def collision_spheres(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return spheres that together cover all moving collision shapes of arm and tool.
@@ -321,9 +225,9 @@ class ArmModel:
 
     @property
     def tool_spheres(self) -> Array:
-        """Spheres that hold all that moves rigidly with the tool: last link, hand, fingers as they are at home.
+        """Spheres that cover all that moves rigidly with the tool: last link, hand, and fingers in their home position.
 
-        Rows x y z r in the tool's frame, shape (m, 4) [m]; what a policy keeps clear of obstacles.
+        Rows x y z r in the tool's frame, shape (m, 4) [m]; a policy keeps these clear of obstacles.
         """
         centers, radii = self.collision_spheres(self.home)
         rigid = self.cover.follows_last_joint
@@ -333,9 +237,25 @@ class ArmModel:
         """Return the Jacobians of the spheres' centers, shape (m, 3, n_joints) [m/rad]."""
         return self.cover.jacobians(self.at(q).data)
 
+    def check_dynamics(self) -> None:
+        """Do nothing if every moving link has a mass and an inertia, as torques and simulation need.
+
+        Raises:
+            InputError: naming the links that do not, and their lines in the file.
+        """
+        if self._mass_faults:
+            raise InputError(
+                f"{self.name}: {'; '.join(self._mass_faults)}. Kinematics works without, but torques and simulation "
+                "need a mass and an inertia of every moving link: add them to the file (<inertial>)"
+            )
+
     def gravity_torque(self, q: ArrayLike) -> Array:
-        """Return the torques g(q) that hold arm and tool against gravity, shape (n_joints,) [N m]."""
-        return self._recursive_newton_euler(self.at(q), None, None)
+        """Return the torques g(q) that hold arm and tool against gravity, shape (n_joints,) [N m].
+
+        Raises:
+            InputError: if a link has no usable mass; see :meth:`check_dynamics`.
+        """
+        return self._recursive_newton_euler(q, None, None)
 
     def inverse_dynamics(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Return the torques of a motion by the recursive Newton-Euler algorithm.
@@ -347,26 +267,37 @@ class ArmModel:
 
         Returns:
             shape (n_joints,) [N m]; without rotor inertia, damping and friction of the joints.
+
+        Raises:
+            InputError: if a link has no usable mass; see :meth:`check_dynamics`.
         """
-        velocity, acceleration = self._checked(qd, "qd"), self._checked(qdd, "qdd")
-        return self._recursive_newton_euler(self.at(q), velocity, acceleration)
+        return self._recursive_newton_euler(q, self._checked(qd, "qd"), self._checked(qdd, "qdd"))
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        """Return the rigid-body inertia M(q), shape (n_joints, n_joints) [kg m^2], without rotor inertia."""
-        scratch = self.at(q)
+        """Return the rigid-body inertia M(q), shape (n_joints, n_joints) [kg m^2], without rotor inertia.
+
+        Raises:
+            InputError: if a link has no usable mass; see :meth:`check_dynamics`.
+        """
+        self.check_dynamics()
+        memory = self.at(q)
         full = np.zeros((self._model.nv, self._model.nv))
-        mujoco.mj_crb(self._model, scratch.data)
-        mujoco.mj_fullM(self._model, scratch.data, full)
+        mujoco.mj_crb(self._model, memory.data)
+        mujoco.mj_fullM(self._model, memory.data, full)
         return full[self._dofs][:, self._dofs].copy()
 
     def check_limits(self, q: ArrayLike, *, tolerance: float = 1e-6) -> None:
-        """Do nothing when ``q`` (n_joints,) is within the joints' limits.
+        """Do nothing if ``q`` is within the limits of the joints.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            tolerance: how far outside a joint may be [rad].
 
         Raises:
             InputError: naming the first joint that is outside, its position and its limits.
         """
-        values = self._checked(q, "q")
-        outside = (values < self.lower - tolerance) | (values > self.upper + tolerance)
+        values, slack = self._checked(q, "q"), finite_number(tolerance, "tolerance", "rad", at_least=0.0)
+        outside = (values < self.lower - slack) | (values > self.upper + slack)
         if outside.any():
             i = int(np.argmax(outside))
             raise InputError(
@@ -374,21 +305,15 @@ class ArmModel:
                 f"[{self.lower[i]:.4f}, {self.upper[i]:.4f}]"
             )
 
-    def _checked(self, values: ArrayLike, what: str) -> Array:
-        array = np.asarray(values, dtype=float)
-        if array.shape != self.lower.shape:
-            raise InputError(f"{self.name}: {what} needs {self.n_joints} numbers, got shape {array.shape}")
-        if not math.isfinite(sum(array.tolist())):
-            raise InputError(f"{self.name}: {what} must be finite numbers, got {array}")
-        return array
-
-    def _recursive_newton_euler(self, scratch: ArmMemory, velocity: Array | None, acceleration: Array | None) -> Array:
-        data = scratch.data
+    def _recursive_newton_euler(self, q: ArrayLike, velocity: Array | None, acceleration: Array | None) -> Array:
+        self.check_dynamics()
+        memory = self.at(q)
+        data = memory.data
         data.qvel[self._dofs] = 0.0 if velocity is None else velocity
         data.qacc[self._dofs] = 0.0 if acceleration is None else acceleration
         mujoco.mj_comVel(self._model, data)
-        mujoco.mj_rne(self._model, data, acceleration is not None, scratch.force)
-        return scratch.force[self._dofs].copy()
+        mujoco.mj_rne(self._model, data, acceleration is not None, memory.force)
+        return memory.force[self._dofs].copy()
 
 
 def _massless(geom: mujoco.MjsGeom) -> bool:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import FileFormatError, InputError, UnknownNameError
-from imitarm.kinematics.arm_limits import HINGE, SLIDE, compiled, completed_home, explained, read_limits, taken_keyframe
+from imitarm.files.xml_tree import XmlElement, read_xml
+from imitarm.kinematics.arm_home import check_keyframe, complete_home, take_keyframe
+from imitarm.kinematics.arm_joints import arm_end, chain_to, check_joints, read_limits
+from imitarm.kinematics.arm_meshes import find_meshes
 from imitarm.kinematics.spheres import COLLISION_GROUP
 
 Array = NDArray[np.float64]
@@ -27,6 +31,57 @@ TOOL_PREFIX = "tool/"
 """Stands before every name that comes from a tool's file, except its site ``tool``."""
 
 _MESHES = {mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF, mujoco.mjtGeom.mjGEOM_HFIELD}
+_NAMES = {
+    "name",
+    "link",
+    "joint",
+    "body",
+    "site",
+    "class",
+    "childclass",
+    "file",
+    "filename",
+    "mesh",
+    "material",
+    "model",
+}
+_LANDMARKS = ("shoulder", "elbow", "wrist")  # sites that mark the three points
+_PLACEHOLDER_MASS, _PLACEHOLDER_INERTIA = 1e-3, 1e-6  # [kg], [kg m^2] of a link whose own can't be used
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Shoulder, elbow and wrist of an arm, and the joints that bend there, as the sites of these names define them.
+
+    The site ``elbow`` is on the link that the elbow's joint moves, the site ``wrist`` on the link that the bending
+    joint of the wrist moves.
+
+    Attributes:
+        sites: indices of the three sites.
+        elbow: index of the elbow's joint among the arm's.
+        wrist: index of the joint that bends the wrist among the arm's.
+        elbow_straight: position of the elbow's joint at which the arm is stretched and singular [rad], from the
+            file's ``<custom><numeric name="elbow_straight" data="..."/></custom>``, else 0.
+    """
+
+    sites: tuple[int, int, int]
+    elbow: int
+    wrist: int
+    elbow_straight: float
+
+    @classmethod
+    def find(cls, model: mujoco.MjModel, joints: NDArray[np.int_]) -> Landmarks | None:
+        """Return the landmarks of a model whose arm has ``joints``; None if a site or its joint is missing."""
+        sites = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) for name in _LANDMARKS]
+        if min(sites) < 0:
+            return None
+        bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
+        owners = [int(model.site_bodyid[site]) for site in sites]
+        if owners[1] not in bodies or owners[2] not in bodies:
+            return None
+        numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "elbow_straight")
+        straight = float(model.numeric_data[model.numeric_adr[numeric]]) if numeric >= 0 else 0.0
+        return cls((sites[0], sites[1], sites[2]), bodies.index(owners[1]), bodies.index(owners[2]), straight)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +92,13 @@ class ArmFile:
         name: of the arm.
         spec: with sites ``flange`` and, with a tool, ``tool``.
         joints: names of the joints from base to flange, in order.
-        max_velocity: by joint [rad/s] or [m/s].
-        max_acceleration: by joint [rad/s^2] or [m/s^2].
-        max_torque: by joint [N m] or [N]; inf when the file names none.
-        home: positions by name of every joint, those of the tool included.
-        tool_radius: of the cylinder about the tool axis that holds the tool's head [m]; 0 without a tool.
+        max_velocity: largest speed of each joint [rad/s] or [m/s].
+        max_acceleration: largest acceleration of each joint [rad/s^2] or [m/s^2].
+        max_torque: largest torque of each joint [N m] or force [N]; inf when the file has no limit.
+        home: position of every joint by name, those of the tool included.
+        tool_radius: radius of the cylinder about the tool's axis that holds the tool's head [m]; 0 without a tool.
+        notes: what the file does not say and was assumed, and which joints were left out.
+        mass_faults: links whose mass or inertia can't be used, so that no torque can be computed.
     """
 
     name: str
@@ -52,33 +109,72 @@ class ArmFile:
     max_torque: Array
     home: Mapping[str, float]
     tool_radius: float
+    notes: tuple[str, ...]
+    mass_faults: tuple[str, ...]
 
 
-def read_arm(source: str | Path, tool: str | Path | None, flange: str | None, discard_meshes: bool) -> ArmFile:
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One file as read: an arm or a tool."""
+
+    spec: mujoco.MjSpec
+    root: XmlElement
+    mass_faults: tuple[str, ...]
+
+
+def read_arm(
+    source: str | Path,
+    tool: str | Path | None,
+    flange: str | None,
+    discard_meshes: bool,
+    package_path: Iterable[str | Path] = (),
+) -> ArmFile:
     """Read an arm and attach a tool to its flange.
 
     Args:
         source: ``"sawyer"``, ``"panda"`` or the path of an MJCF or URDF file.
         tool: ``"gripper"``, ``"brush"``, the path of an MJCF file with a site ``tool``, or None.
-        flange: body or site that is the flange; None: a site ``flange``, or the last body of the longest chain.
+        flange: body or site that is the flange; None: a site ``flange``, or the end of the only arm in the file.
         discard_meshes: read the file without its meshes.
+        package_path: folders in which meshes and ROS packages are looked for.
 
     Raises:
         UnknownNameError: when the name is neither a packaged one nor a file.
         FileFormatError: when the file can't be read as a robot.
         InputError: when it has no joint, or the flange or the tool is not what was asked for.
     """
-    path = _located(source, ARMS, "robot")
-    spec = _read_spec(path, discard_meshes)
-    spec_home = taken_keyframe(spec)
-    chain = _flange_and_joints(spec, flange, path)
-    limits = read_limits(spec, path, chain)
+    path, folders = _located(source, ARMS, "robot"), [Path(folder) for folder in package_path]
+    for folder in folders:
+        if not folder.expanduser().is_dir():
+            raise InputError(
+                f"package path {str(folder)!r} is not a folder; give the folder that holds the ROS packages"
+            )
+    part = _read_part(path, discard_meshes, folders)
+    spec, root, faults = part.spec, part.root, part.mass_faults
+    keyframe, key_name = take_keyframe(spec, compiled(spec, path))
+    joints, notes = _set_flange(spec, flange, path, root)
+    model = compiled(spec, path)
+    limits = read_limits(spec, model, joints, path, root)
+    check_keyframe(keyframe, key_name, model, joints, path, root)
     tool_radius = 0.0
     if tool is not None:
-        tool_radius = _attach(spec, _located(tool, TOOLS, "tool"))
-    home = completed_home(spec, spec_home, TOOL_PREFIX)
+        tool_part = _read_part(_located(tool, TOOLS, "tool"), False, folders)
+        tool_radius = _attach(spec, tool_part.spec, _located(tool, TOOLS, "tool"))
+        faults += tool_part.mass_faults
+    home, home_notes = complete_home(spec, compiled(spec, path), joints, keyframe, TOOL_PREFIX)
     name = Path(source).stem if str(source) not in ARMS else str(source)
-    return ArmFile(name, spec, chain, *limits, home, tool_radius)
+    return ArmFile(
+        name,
+        spec,
+        joints,
+        limits.velocity,
+        limits.acceleration,
+        limits.torque,
+        home,
+        tool_radius,
+        (*notes, *limits.notes, *home_notes, *(f"{fault}: no torques and no simulation" for fault in faults)),
+        faults,
+    )
 
 
 def _located(source: str | Path, packaged: Mapping[str, str], kind: str) -> Path:
@@ -86,9 +182,13 @@ def _located(source: str | Path, packaged: Mapping[str, str], kind: str) -> Path
     if str(source) in packaged:
         return Path(str(resources.files("imitarm") / "robots" / "models" / packaged[str(source)]))
     path = Path(source).expanduser()
-    if path.is_file():
+    try:
+        is_file, is_folder = path.is_file(), path.is_dir()
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise InputError(f"{kind} {str(source)[:60]!r} can't be a file: {error}") from error
+    if is_file:
         return path
-    if path.is_dir():
+    if is_folder:
         raise InputError(f"{kind} {str(source)!r} is a folder; give the path of one MJCF or URDF file")
     if path.suffix or len(path.parts) > 1:
         raise InputError(f"{kind}: no such file: {path}")
@@ -96,19 +196,20 @@ def _located(source: str | Path, packaged: Mapping[str, str], kind: str) -> Path
     raise UnknownNameError(f"{known}; the path of an MJCF or URDF file will do as well")
 
 
-def _read_spec(path: Path, discard_meshes: bool) -> mujoco.MjSpec:
-    """Parse ``path``; fixed links of a URDF stay bodies of their own, so that a flange can be found among them."""
+def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _Part:
+    """Read ``path``; fixed links of a URDF stay bodies of their own, so that a flange can be found among them."""
+    root = read_xml(path, "an MJCF or URDF file")
+    _check_kind(path, root)
+    _check_numbers(path, root)
     try:
-        root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{path}: not an XML file ({error}); an MJCF or URDF file was expected") from error
-    if root.tag not in {"mujoco", "robot"}:
-        raise FileFormatError(f"{path}: root element is <{root.tag}>; MJCF has <mujoco>, URDF has <robot>")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        known = path.suffix.lower() in {".xml", ".urdf"}
+        spec = mujoco.MjSpec.from_file(str(path)) if known else mujoco.MjSpec.from_string(path.read_text())
     except ValueError as error:
-        raise FileFormatError(f"{path}: {explained(str(error))}") from error
+        raise FileFormatError(f"{path}: {_one_line(error)}") from error
     spec.compiler.fusestatic = False
+    if root.tag == "robot" and spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO:
+        # A URDF's link without <inertial> has no mass; MuJoCo would give it the mass of water of its shape.
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     for geom in list(spec.geoms):
         unwanted = spec.compiler.discardvisual and not _touches(geom)  # a URDF's, unless it says otherwise
         if unwanted or (discard_meshes and geom.type in _MESHES):
@@ -120,21 +221,151 @@ def _read_spec(path: Path, discard_meshes: bool) -> mujoco.MjSpec:
     for mesh in list(spec.meshes):
         if mesh.name not in used:
             spec.delete(mesh)
-        elif mesh.file.startswith("package:"):
-            mesh.file = _in_package(mesh.file, path)
+    find_meshes(spec, path, root, package_path)
+    _name_all(spec)
     _part_contact_from_looks(spec)
-    compiled(spec, path)
-    return spec
+    faults = _replace_unusable_masses(spec, path, root)
+    _check_finite(compiled(spec, path), path)
+    return _Part(spec, root, faults)
 
 
-def _in_package(file: str, path: Path) -> str:
-    """Find ``package://name/rest`` in a folder ``name`` above the URDF at ``path``; else return it as it is."""
-    name, _, rest = file.removeprefix("package:").lstrip("/").partition("/")
-    for folder in path.resolve().parents:
-        for root in (folder, folder / name):
-            if root.name == name and (root / rest).is_file():
-                return str(root / rest)
-    return file
+def _check_kind(path: Path, root: XmlElement) -> None:
+    """Refuse files that are no MJCF or URDF, with what they are.
+
+    Raises:
+        FileFormatError: when the file is a xacro file, a part of an MJCF file or something else.
+        InputError: when the base of the arm is not fixed.
+    """
+    for element in root.walk():
+        xacro = element.tag.startswith("xacro:")
+        unexpanded = [f"{key}={value!r}" for key, value in element.attributes.items() if re.search(r"\$[{(]", value)]
+        if xacro or unexpanded:
+            found = f"<{element.tag}>" if xacro else unexpanded[0]
+            target = path.name.removesuffix(".xacro").removesuffix(".urdf") + "_expanded.urdf"
+            raise FileFormatError(
+                f"{path}: is a xacro file, from which a URDF is made ({found} in line {element.line}). Expand it "
+                f"first, 'xacro {path.name} > {target}' (xacro comes with ROS, or with 'pip install xacro'), and load "
+                f"{target}"
+            )
+    if root.tag == "mujocoinclude":
+        raise FileFormatError(f"{path}: is a part that other MJCF files include; load the file that includes it")
+    if root.tag == "sdf":
+        raise FileFormatError(f"{path}: is an SDF file (Gazebo); load the robot's URDF or MJCF file instead")
+    if root.tag not in {"mujoco", "robot"}:
+        raise FileFormatError(f"{path}: root element is <{root.tag}>; MJCF has <mujoco>, URDF has <robot>")
+    for joint in root.all("joint"):
+        if joint.get("type") in {"floating", "planar"}:
+            raise InputError(
+                f"{path}: joint {joint.get('name')!r} (line {joint.line}) is {joint.get('type')}: the base moves. "
+                "imitarm needs an arm on a fixed base: make this joint fixed (type='fixed')"
+            )
+
+
+def _check_numbers(path: Path, root: XmlElement) -> None:
+    """Refuse attributes that are NaN or infinite, and limits that are no numbers.
+
+    Raises:
+        FileFormatError: naming the joint, link or body around the attribute, and the line.
+    """
+    pending = [(root, "")]
+    while pending:
+        element, owner = pending.pop()
+        if element.tag in {"joint", "link", "body", "geom", "site"} and element.get("name"):
+            owner = f"{element.tag} {element.get('name')!r}, "
+        for key, value in element.attributes.items():
+            if key in _NAMES:
+                continue
+            numbers, fault = _numbers(value), ""
+            if not all(math.isfinite(number) for number in numbers):
+                fault = "not finite"
+            elif element.tag == "limit" and value.strip() and not numbers:
+                fault = "not a number"
+            if fault:
+                raise FileFormatError(
+                    f"{path}: {owner}line {element.line}: {key}={value!r} of <{element.tag}> is {fault}; write a "
+                    "finite number, or leave the attribute out if there is no such limit"
+                )
+        pending += [(child, owner) for child in reversed(element.children)]
+
+
+def _numbers(value: str) -> list[float]:
+    """Return the numbers of an attribute; none when it holds anything else."""
+    try:
+        return [float(word) for word in value.split()]
+    except ValueError:
+        return []
+
+
+def _check_finite(model: mujoco.MjModel, path: Path) -> None:
+    """Refuse a model with NaN, which files that are included may have brought in."""
+    for kind in ("body", "jnt", "geom", "site", "dof"):
+        for field in ("mass", "inertia", "pos", "quat", "ipos", "axis", "range", "size", "armature", "damping"):
+            values = getattr(model, f"{kind}_{field}", None)
+            if values is not None and not np.isfinite(values).all():
+                what = {"jnt": "joint", "dof": "joint"}.get(kind, kind)
+                raise FileFormatError(f"{path}: {field} of a {what} is not finite; correct it in the files it includes")
+
+
+def _name_all(spec: mujoco.MjSpec) -> None:
+    """Give every joint and body without a name one of its own: joint1, joint2, ..., body1, body2, ..."""
+    for kind, items in (("joint", list(spec.joints)), ("body", list(spec.bodies)[1:])):
+        taken = {item.name for item in items}
+        free = (name for i in range(1, 2 * len(items) + 1) if (name := f"{kind}{i}") not in taken)
+        for item in items:
+            item.name = item.name or next(free)
+
+
+def _replace_unusable_masses(spec: mujoco.MjSpec, path: Path, root: XmlElement) -> tuple[str, ...]:
+    """Give links without a usable mass and inertia placeholders, so that the kinematics can be built.
+
+    Returns:
+        For each such link what is wrong with it.
+    """
+    faults: list[str] = []
+    for _ in range(len(spec.bodies)):
+        try:
+            spec.copy().compile()
+        except ValueError as error:
+            message = _one_line(error)
+            named = re.search(r"Element name '(.*)', id", message)
+            body = spec.body(named.group(1)) if named else None
+            if body is None or not re.search(r"\b(mass|inertia|fullinertia)\b", message):
+                return tuple(faults)  # something else is wrong: compiled() says what
+            faults.append(_mass_fault(body, message, root))
+            body.explicitinertial, body.mass = True, _PLACEHOLDER_MASS
+            body.fullinertia = [math.nan, 0.0, 0.0, 0.0, 0.0, 0.0]
+            body.inertia, body.ipos, body.iquat = [_PLACEHOLDER_INERTIA] * 3, [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
+        else:
+            break
+    return tuple(faults)
+
+
+def _mass_fault(body: mujoco.MjsBody, message: str, root: XmlElement) -> str:
+    lines = [e.line for e in root.walk() if e.tag in {"link", "body"} and e.get("name") == body.name]
+    where = f"link {body.name!r}" + (f" (line {lines[0]})" if lines else "")
+    if "A + B" in message or "eigenvalues" in message:
+        return f"{where} has an inertia that no rigid body can have"
+    return f"{where} has no inertia" if body.mass > 0.0 else f"{where} has no mass"
+
+
+def compiled(spec: mujoco.MjSpec, what: object) -> mujoco.MjModel:
+    """Compile a copy of ``spec``.
+
+    Raises:
+        FileFormatError: with MuJoCo's own words and what to do about the usual cause.
+    """
+    try:
+        return spec.copy().compile()
+    except ValueError as error:
+        message = _one_line(error)
+        if "mesh" in message.lower() or "opening file" in message:
+            message += "; a mesh can't be read: replace it, or load with discard_meshes=True (--discard-meshes)"
+        raise FileFormatError(f"{what}: {message}") from error
+
+
+def _one_line(error: Exception) -> str:
+    """Return MuJoCo's message in one line, without its remark on the copy that was compiled."""
+    return " ".join(str(error).split("The static bodies of the spec were fused")[0].split())
 
 
 def _touches(geom: mujoco.MjsGeom) -> bool:
@@ -156,12 +387,18 @@ def _part_contact_from_looks(spec: mujoco.MjSpec) -> None:
                 body.add_geom(**shape, **names, group=2, contype=0, conaffinity=0, density=0.0)
 
 
-def _flange_and_joints(spec: mujoco.MjSpec, flange: str | None, path: Path) -> tuple[str, ...]:
-    """Make sure of a site ``flange`` and return the names of the joints from the base to it."""
+def _set_flange(
+    spec: mujoco.MjSpec, flange: str | None, path: Path, root: XmlElement
+) -> tuple[tuple[str, ...], list[str]]:
+    """Make sure of a site ``flange``; return the names of the joints from the base to it, and notes."""
+    notes: list[str] = []
     site = spec.site(flange or "flange")
-    body = site.parent if site is not None else spec.body(flange) if flange else _last_body(spec)
-    if body is None and flange is None:
-        raise InputError(f"{path}: has no joint that moves a body, so it is no arm; give the MJCF or URDF file of one")
+    if site is not None:
+        body = site.parent
+    elif flange:
+        body = spec.body(flange)
+    else:
+        body, notes = arm_end(spec, path)
     if body is None:
         raise UnknownNameError.among(f"flange in {path}: body or site", flange, _names(spec))
     if site is None or site.name != "flange":
@@ -170,46 +407,22 @@ def _flange_and_joints(spec: mujoco.MjSpec, flange: str | None, path: Path) -> t
             former.name = "former_flange"
         pose = {} if site is None else {"pos": site.pos, "quat": site.quat}
         body.add_site(name="flange", group=4, **pose)
-    joints: list[mujoco.MjsJoint] = []
-    while body is not None and body.name != "world":
-        joints[:0] = list(body.joints)
-        body = body.parent
+    joints = chain_to(body)
     if not joints:
-        raise InputError(f"{path}: no joint between the base and the flange; name another one with flange=...")
-    for index, joint in enumerate(joints):
-        if int(joint.type) not in {HINGE, SLIDE}:
-            raise InputError(f"{path}: joint {joint.name!r} is neither a hinge nor a slide; fix the base of the arm")
-        joint.name = joint.name or f"joint{index + 1}"
-    return tuple(joint.name for joint in joints)
+        raise InputError(
+            f"{path}: no joint between the base and the flange {flange or body.name!r}; name another flange with "
+            "flange=... (--flange on the command line)"
+        )
+    check_joints(spec, joints, path, root)
+    return tuple(joint.name for joint in joints), notes
 
 
 def _names(spec: mujoco.MjSpec) -> list[str]:
     return [item.name for item in [*spec.bodies, *spec.sites] if item.name and item.name != "world"]
 
 
-def _last_body(spec: mujoco.MjSpec) -> mujoco.MjsBody | None:
-    """Follow the longest chain of joints; where two equally long ones part (fingers), the chain ends."""
-
-    def depth(body: mujoco.MjsBody) -> int:
-        return len(body.joints) + max((depth(child) for child in body.bodies), default=0)
-
-    body = spec.worldbody
-    while True:
-        children = list(body.bodies)
-        jointed = sorted((child for child in children if depth(child)), key=depth, reverse=True)
-        if not jointed:
-            if len(children) != 1:
-                return None if body.name == "world" else body
-            body = children[0]  # a fixed link at the end, such as a flange without a mass
-        elif len(jointed) > 1 and depth(jointed[0]) == depth(jointed[1]):
-            return None if body.name == "world" else body
-        else:
-            body = jointed[0]
-
-
-def _attach(spec: mujoco.MjSpec, path: Path) -> float:
-    """Attach the tool in ``path`` to the flange (turned as the site ``tool_mount`` says) and return its radius."""
-    tool = _read_spec(path, discard_meshes=False)
+def _attach(spec: mujoco.MjSpec, tool: mujoco.MjSpec, path: Path) -> float:
+    """Attach a tool, read from ``path``, to the flange (or to the site ``tool_mount``) and return its radius."""
     if tool.site("tool") is None:
         raise InputError(f"{path}: a tool needs a site named 'tool' at its tip, z pointing away from the flange")
     for key in list(tool.keys):
@@ -223,7 +436,7 @@ def _attach(spec: mujoco.MjSpec, path: Path) -> float:
     return 0.0 if radius is None else float(radius.data[0])
 
 
-def quiet(spec: mujoco.MjSpec, unwanted: Callable[[mujoco.MjsGeom], bool]) -> mujoco.MjSpec:
+def without_geoms(spec: mujoco.MjSpec, unwanted: Callable[[mujoco.MjsGeom], bool]) -> mujoco.MjSpec:
     """Return a copy of ``spec`` without the geoms that are ``unwanted``."""
     copy = spec.copy()
     for geom in list(copy.geoms):

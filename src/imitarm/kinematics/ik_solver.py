@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.arm_memory import ArmMemory
+from imitarm.kinematics.arm_kinematics import ArmMemory
 from imitarm.kinematics.bounds import VelocityBox, WristBound
 from imitarm.kinematics.ik_methods import METHODS, Task
 from imitarm.kinematics.posture import ANGLE_LENGTH

@@ -60,13 +60,14 @@ class SimulatedRobot(Robot):
             timestep: of the physics and of the drives [s].
 
         Raises:
-            InputError: when ``control`` is unknown, ``timestep`` is not in (0, 0.002], or ``q`` has a wrong shape or
-                is beyond the joints' limits.
+            InputError: when ``control`` is unknown, ``timestep`` is not in (0, 0.002], ``q`` has a wrong shape or
+                is beyond the joints' limits, or a link of the arm has no usable mass.
         """
         if control not in get_args(Control):
             raise UnknownNameError.among("control", control, get_args(Control))
         if not 0.0 < timestep <= 0.002:
             raise InputError(f"SimulatedRobot: timestep must be in (0, 0.002] s (500 Hz or faster), got {timestep!r}")
+        arm.check_dynamics()
         self.scene_at_start = scene if scene is not None else Scene()
         self.control: Control = control
         self._q_start = _checked_start(arm, arm.home if q is None else q)

@@ -1,0 +1,365 @@
+"""The joints of an arm: which joints of a file belong to it, and what their limits are."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import FileFormatError, InputError
+from imitarm.files.xml_tree import XmlElement
+
+Array = NDArray[np.float64]
+
+DEFAULT_MAX_VELOCITY = 2.0  # [rad/s] or, for a slide, a tenth of it [m/s]: assumed where a file has no limit
+DEFAULT_MAX_ACCELERATION = 10.0  # [rad/s^2] or a tenth of it [m/s^2]: assumed where a file has no limit
+HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+
+_HAND_JOINT = re.compile(r"gripper|finger|jaw|knuckle|thumb|claw|pincer|pinch", re.IGNORECASE)
+_WRIST_JOINT = re.compile(r"roll|pitch|yaw|rot|wrist|swivel", re.IGNORECASE)  # it turns the whole gripper
+_HAND_LINK = re.compile(r"finger|jaw|knuckle|thumb|claw|pincer|pinch", re.IGNORECASE)
+_PALM_LINK = re.compile(r"base|mount|palm|body|hand", re.IGNORECASE)
+_END_LINK = re.compile(r"(^|[_/-])(tool0|flange)$", re.IGNORECASE)
+_JAW_STROKE = 0.1  # [m] a slide at the end of an arm that moves no further is taken for a jaw
+_SIDE_BRANCH = 2  # joints: a branch with no more of them beside a far longer one is not an arm (a head, a wheel)
+_LONGER_BY = 3  # joints that the longer branch must have more
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits:
+    """Limits of an arm's joints, each of shape (n_joints,).
+
+    Attributes:
+        velocity: largest speed [rad/s] or [m/s].
+        acceleration: largest acceleration [rad/s^2] or [m/s^2].
+        torque: largest torque [N m] or force [N]; inf where the file has no limit.
+        notes: what the file does not say and was assumed.
+    """
+
+    velocity: Array
+    acceleration: Array
+    torque: Array
+    notes: tuple[str, ...]
+
+
+# Which joints belong to the arm
+
+
+@dataclass(frozen=True, eq=False)
+class _Limb:
+    """A chain of joints that could be the arm, and the body at its end."""
+
+    end: mujoco.MjsBody
+    joints: tuple[str, ...]
+
+
+def arm_end(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjsBody, list[str]]:
+    """Return the last body of the only arm in ``spec``, and notes on what was left out.
+
+    An arm ends before jaws and fingers: joints that are named so, that drive each other in parallel (mimic joints),
+    a short slide at the end, or several short chains that branch off behind a longer one. A short branch beside a
+    far longer chain (a head, a wheel) is left out.
+
+    Raises:
+        InputError: when no joint moves a body, or when several chains could be the arm; the message lists them.
+    """
+    notes: list[str] = []
+    hand = _hand_joints(spec)
+    limbs = _limbs(spec.worldbody, (), hand, notes)
+    if hand and limbs:
+        notes.insert(0, f"not part of the arm: {_listed(sorted(hand))} (gripper)")
+    if not limbs:  # a file that holds nothing but a gripper
+        notes.clear()
+        limbs = _limbs(spec.worldbody, (), frozenset(), notes)
+    if not limbs:
+        raise InputError(f"{path}: has no joint that moves a body, so it is no arm; give the MJCF or URDF file of one")
+    if len(limbs) > 1:
+        choices = "; ".join(
+            f"{limb.end.name!r} ({len(limb.joints)} joint{'s' * (len(limb.joints) > 1)}: {limb.joints[0]} to "
+            f"{limb.joints[-1]})"
+            for limb in limbs
+        )
+        raise InputError(
+            f"{path}: has several limbs, and only one can be the arm. Name its flange with flange=... (--flange on the "
+            f"command line); candidates: {choices}"
+        )
+    return limbs[0].end, notes
+
+
+def _limbs(body: mujoco.MjsBody, before: tuple[str, ...], hand: frozenset[str], notes: list[str]) -> list[_Limb]:
+    """Return the chains that could be an arm and that pass through ``body``; ``before`` are the joints above it."""
+    own = [joint.name for joint in body.joints]
+    if hand.intersection(own):
+        return []
+    joints = (*before, *own)
+    branches = [_limbs(child, joints, hand, notes) for child in body.bodies]
+    branches = [limbs for limbs in branches if any(len(limb.joints) > len(joints) for limb in limbs)]
+    if not branches:
+        return [_Limb(_last_fixed(body), joints)] if joints else []
+    depths = [max(len(limb.joints) for limb in limbs) - len(joints) for limbs in branches]
+    longest = max(depths)
+    if len(branches) > 1 and len(joints) >= 2 and longest < len(joints):
+        notes.append(f"not part of the arm: the {len(branches)} chains that branch off at {body.name!r} (a hand)")
+        return [_Limb(body, joints)]
+    kept = [
+        (limbs, depth)
+        for limbs, depth in zip(branches, depths, strict=True)
+        if depth > _SIDE_BRANCH or longest < depth + _LONGER_BY
+    ]
+    left_out = [
+        name
+        for limbs, depth in zip(branches, depths, strict=True)
+        if depth <= _SIDE_BRANCH and longest >= depth + _LONGER_BY
+        for limb in limbs
+        for name in limb.joints[len(joints) :]
+    ]
+    if left_out:
+        notes.append(f"not part of the arm: {_listed(left_out)} (a short branch at {body.name!r})")
+    return [limb for limbs, _ in kept for limb in limbs]
+
+
+def _last_fixed(body: mujoco.MjsBody) -> mujoco.MjsBody:
+    """Follow fixed links from the last moving one as long as there is only one, or one named tool0 or flange."""
+    while True:
+        fixed = [child for child in body.bodies if not list(child.joints)]
+        named = [child for child in fixed if _END_LINK.search(child.name)]
+        chosen = named if len(named) == 1 else fixed
+        if len(chosen) != 1:
+            return body
+        body = chosen[0]
+
+
+def _hand_joints(spec: mujoco.MjSpec) -> frozenset[str]:
+    """Return the joints of jaws and fingers; nothing but other such joints is moved by them."""
+    owners = {joint.name: body for body in spec.bodies for joint in body.joints}
+    prefix = len(os.path.commonprefix(list(owners))) if len(owners) > 1 else 0  # noqa: RUF071 (names, not paths)
+    suspects = {name for name, body in owners.items() if _is_hand_name(name[prefix:], body.name)}
+    suspects |= _parallel_mimics(spec, owners)
+    suspects |= {name for name, body in owners.items() if _is_short_slide(name, body)}
+    while True:  # a joint that moves an ordinary joint is none of a hand
+        wrong = {name for name in suspects if not suspects.issuperset(_joints_below(owners[name]))}
+        if not wrong:
+            return frozenset(suspects)
+        suspects -= wrong
+
+
+def _is_hand_name(joint: str, link: str) -> bool:
+    if _HAND_JOINT.search(joint) and not _WRIST_JOINT.search(joint):
+        return True
+    return bool(_HAND_LINK.search(link)) and not _PALM_LINK.search(link) and not _WRIST_JOINT.search(joint)
+
+
+def _is_short_slide(name: str, body: mujoco.MjsBody) -> bool:
+    """Return whether a joint is a slide with a jaw's stroke behind at least four hinges, with nothing after it."""
+    joint = next(joint for joint in body.joints if joint.name == name)
+    stroke = float(joint.range[1] - joint.range[0])
+    if int(joint.type) != SLIDE or not 0.0 < stroke <= _JAW_STROKE or len(_joints_below(body)) > 1:
+        return False
+    return sum(int(above.type) == HINGE for above in chain_to(body)) >= 4
+
+
+def _parallel_mimics(spec: mujoco.MjSpec, owners: Mapping[str, mujoco.MjsBody]) -> set[str]:
+    """Return the joints of each group of coupled joints of which two stand side by side, as fingers do."""
+    groups: list[set[str]] = []
+    for follower, leader in mimics(spec):
+        touched = [group for group in groups if group & {follower, leader}]
+        groups = [group for group in groups if group not in touched]
+        groups.append({follower, leader}.union(*touched))
+    found: set[str] = set()
+    for group in groups:
+        below = {name: set(_joints_below(owners[name])) for name in group if name in owners}
+        if any(a not in below[b] and b not in below[a] for a in below for b in below):
+            found |= set(below)
+    return found
+
+
+def mimics(spec: mujoco.MjSpec) -> dict[tuple[str, str], tuple[float, float]]:
+    """Return every coupling of two joints, (follower, leader), with the offset and the factor of its first order."""
+    return {
+        (equality.name1, equality.name2): (float(equality.data[0]), float(equality.data[1]))
+        for equality in spec.equalities
+        if equality.type == mujoco.mjtEq.mjEQ_JOINT and equality.active and equality.name2
+    }
+
+
+def chain_to(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
+    """Return the joints from the base to ``body``, in order."""
+    joints: list[mujoco.MjsJoint] = []
+    while body is not None and body.name != "world":
+        joints[:0] = list(body.joints)
+        body = body.parent
+    return joints
+
+
+def _joints_below(body: mujoco.MjsBody) -> set[str]:
+    """Return the names of all joints of ``body`` and of the bodies that it carries."""
+    names: set[str] = set()
+    pending = [body]
+    while pending:
+        link = pending.pop()
+        names |= {joint.name for joint in link.joints}
+        pending += list(link.bodies)
+    return names
+
+
+def check_joints(spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], path: Path, root: XmlElement) -> None:
+    """Refuse joints that an arm can't have: of other kinds than hinge and slide, or coupled to one another.
+
+    Raises:
+        InputError: naming the joint and its line.
+    """
+    names = [joint.name for joint in joints]
+    for joint in joints:
+        if int(joint.type) == FREE:
+            lines = [e.line for e in root.walk() if e.tag == "body" and e.get("name") == joint.parent.name]
+            line = f" (line {lines[0]})" if lines else ""
+            raise InputError(
+                f"{path}: body {joint.parent.name!r}{line} floats on a free joint: the base moves. imitarm "
+                "needs an arm on a fixed base: remove the <freejoint/>"
+            )
+        if int(joint.type) not in {HINGE, SLIDE}:
+            raise InputError(
+                f"{place(path, root, joint.name)} is a ball joint; the joints of an arm must be hinges or slides: "
+                "model it as three hinges"
+            )
+    for follower, leader in mimics(spec):
+        if follower in names or leader in names:
+            raise InputError(
+                f"{place(path, root, follower)} mimics joint {leader!r}, but imitarm moves every joint of an arm on "
+                "its own. Remove the coupling (<mimic> or <equality>) if the robot takes a command for each of the two "
+                "joints; else name a flange before them with flange=... (--flange on the command line)"
+            )
+
+
+def place(path: Path, root: XmlElement, joint: str) -> str:
+    """Return how messages name a joint: file, joint and, where it stands in this file, line."""
+    line = next((f" (line {e.line})" for e in root.walk() if e.tag == "joint" and e.get("name") == joint), "")
+    return f"{path}: joint {joint!r}{line}"
+
+
+# Limits
+
+
+def read_limits(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root: XmlElement
+) -> JointLimits:
+    """Return the limits of velocity, acceleration and torque, and check those of position.
+
+    Args:
+        spec: the file as MuJoCo has read it.
+        model: the same, compiled.
+        joints: names of the arm's joints.
+        path: of the file, for messages.
+        root: the file's own elements, which hold what MuJoCo drops from a URDF.
+
+    Raises:
+        FileFormatError: naming the joint and its line.
+    """
+    scale = np.array([1.0 if model.joint(name).type[0] == HINGE else 0.1 for name in joints])
+    velocity, acceleration = np.full(len(joints), np.nan), DEFAULT_MAX_ACCELERATION * scale
+    torque = np.array([_torque_limit(model, name) for name in joints])
+    for name, values in (("max_velocity", velocity), ("max_acceleration", acceleration)):
+        numeric = spec.numeric(name)
+        if numeric is None:
+            continue
+        if len(numeric.data) != len(joints) or not np.all(np.asarray(numeric.data) > 0.0):
+            raise FileFormatError(f"{path}: numeric {name!r} needs {len(joints)} positive values, one for each joint")
+        values[:] = numeric.data
+    if root.tag == "robot":
+        for element in root.all("joint"):
+            if element.get("name") in joints:
+                index = joints.index(element.get("name"))
+                velocity[index], torque[index] = _urdf_limits(element, place(path, root, joints[index]))
+    notes = []
+    if np.isnan(velocity).any():
+        assumed = [name for name, value in zip(joints, velocity, strict=True) if np.isnan(value)]
+        speeds = " and ".join(
+            text
+            for kind, text in ((1.0, f"{DEFAULT_MAX_VELOCITY:g} rad/s"), (0.1, f"{0.1 * DEFAULT_MAX_VELOCITY:g} m/s"))
+            if (scale[np.isnan(velocity)] == kind).any()
+        )
+        notes.append(f"no velocity limit in the file for {_located(assumed, joints, root)}: {speeds} assumed")
+        velocity = np.where(np.isnan(velocity), DEFAULT_MAX_VELOCITY * scale, velocity)
+    if np.isinf(torque).any():
+        free = [name for name, value in zip(joints, torque, strict=True) if np.isinf(value)]
+        notes.append(f"no torque limit in the file for {_located(free, joints, root)}: taken as unlimited")
+    return JointLimits(velocity, acceleration, torque, tuple(notes))
+
+
+def _urdf_limits(joint: XmlElement, where: str) -> tuple[float, float]:
+    """Return a URDF joint's limits of velocity, nan where it has none, and of effort, inf where it has none.
+
+    A velocity or effort of 0 means that it was not filled in, as exporters do.
+    """
+    limit = joint.find("limit")
+    kind = joint.get("type")
+    if kind in {"revolute", "prismatic"}:
+        free = ", or make it continuous" if kind == "revolute" else ""
+        if limit is None or not limit.attributes.keys() & {"lower", "upper"}:
+            raise FileFormatError(f"{where} is {kind} but has no limits; add <limit lower=... upper=.../>{free}")
+        lower, upper = (_limit(limit, key, where) or 0.0 for key in ("lower", "upper"))
+        if lower > upper:
+            raise FileFormatError(f"{where}: lower limit {lower:g} is above upper limit {upper:g}; exchange them")
+        if lower == upper:
+            raise FileFormatError(
+                f"{where}: lower and upper limit are both {lower:g}, so it can't move; write the true limits{free}, or "
+                "make it fixed"
+            )
+    velocity, effort = (0.0 if limit is None else _limit(limit, key, where) or 0.0 for key in ("velocity", "effort"))
+    for key, value in (("velocity", velocity), ("effort", effort)):
+        if value < 0.0:
+            raise FileFormatError(f"{where}: {key} limit {value:g} is negative; write its magnitude")
+    return velocity or math.nan, effort or math.inf
+
+
+def _limit(limit: XmlElement, key: str, where: str) -> float | None:
+    """Return one number of a ``<limit>``; None where it is not given."""
+    if key not in limit.attributes:
+        return None
+    try:
+        value = float(limit.get(key))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise FileFormatError(
+            f"{where}: {key}={limit.get(key)!r} in line {limit.line} is not a finite number; write one, or leave the "
+            "attribute out if there is no such limit"
+        )
+    return value
+
+
+def _torque_limit(model: mujoco.MjModel, name: str) -> float:
+    """Return the joint's own force range, else that of its actuator, else inf."""
+    joint = model.joint(name).id
+    if model.jnt_actfrclimited[joint]:
+        return float(np.max(np.abs(model.jnt_actfrcrange[joint])))
+    for actuator in range(model.nu):
+        transmission = model.actuator_trntype[actuator]
+        if transmission == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[actuator, 0] == joint:
+            gear = abs(float(model.actuator_gear[actuator, 0]))
+            if model.actuator_forcelimited[actuator]:
+                return gear * float(np.max(np.abs(model.actuator_forcerange[actuator])))
+            if model.actuator_ctrllimited[actuator] and not model.actuator_biastype[actuator]:  # a plain motor
+                gain = abs(float(model.actuator_gainprm[actuator, 0]))
+                return gear * gain * float(np.max(np.abs(model.actuator_ctrlrange[actuator])))
+    return math.inf
+
+
+def _located(names: list[str], all_names: tuple[str, ...], root: XmlElement) -> str:
+    """Return names of joints with their lines, or that it is all of them."""
+    if len(names) == len(all_names):
+        return "any joint"
+    lines = {e.get("name"): e.line for e in reversed(list(root.walk())) if e.tag == "joint"}
+    return ", ".join(f"{name} (line {lines[name]})" if name in lines else name for name in names)
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names) if len(names) <= 6 else f"{', '.join(names[:5])} and {len(names) - 5} more"

@@ -1,0 +1,251 @@
+"""ArmKinematics: poses and Jacobians of an arm, computed in a working memory of each thread."""
+
+from __future__ import annotations
+
+import math
+import threading
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError, UnknownNameError
+from imitarm.kinematics.arm_file import Landmarks
+from imitarm.kinematics.pose import Pose
+from imitarm.validation import finite_array, finite_vector, text
+
+Array = NDArray[np.float64]
+Columns = slice | NDArray[np.int32]
+
+_FLOAT64 = np.dtype(np.float64)
+
+
+class ArmMemory:
+    """MuJoCo's working memory of one arm, and the posture it holds; for one thread.
+
+    Attributes:
+        data: the kinematics of the posture.
+        jacobian: Jacobian of the site that was asked for last, shape (6, nv), linear rows first.
+        linear: its first three rows.
+        angular: its last three rows.
+        sites: positions of the sites in the base frame, shape (nsite, 3) [m].
+        force: generalised forces, shape (nv,).
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, home: Array, positions: Columns, joints: Columns, landmarks: tuple[int, ...]
+    ) -> None:
+        """Begin at ``home``.
+
+        Args:
+            model: the arm.
+            home: positions of all joints, fingers too, shape (nq,).
+            positions: indices of the arm's joints in qpos.
+            joints: indices of the arm's joints in qvel.
+            landmarks: sites whose Jacobians :meth:`marked_jacobians` returns.
+        """
+        self.data = mujoco.MjData(model)
+        self.data.qpos[:] = home
+        self.jacobian = np.zeros((6, model.nv))
+        self.linear, self.angular = self.jacobian[:3], self.jacobian[3:]
+        self.force = np.zeros(model.nv)
+        self._model, self._positions, self._joints, self._posture = model, positions, joints, b""
+        stacked = np.zeros((len(landmarks), 3, model.nv))
+        self._stacked = stacked.reshape(-1, model.nv)
+        # Views, where the joints stand side by side: making them anew takes as long as the computation itself.
+        self._views = None
+        if isinstance(joints, slice):
+            self._views = self.jacobian[:, joints], self._stacked[:, joints]
+        self._landmarks = list(zip(landmarks, stacked, strict=True))
+        self.sites = self.data.site_xpos
+        self._qpos = self.data.qpos  # asking MuJoCo for it takes as long as the kinematics of one link
+
+    def move_to(self, q: Array) -> None:
+        """Compute the kinematics at ``q``, shape (n,), unless the memory holds it already."""
+        posture = q.tobytes()
+        if posture != self._posture:
+            self._qpos[self._positions] = q
+            mujoco.mj_kinematics(self._model, self.data)
+            mujoco.mj_comPos(self._model, self.data)
+            self._posture = posture
+
+    def site_pose(self, site: int) -> Pose:
+        """Return the pose of a site in the base frame."""
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, self.data.site_xmat[site])
+        return Pose.trusted(self.data.site_xpos[site].copy(), quaternion)
+
+    def site_jacobian(self, site: int) -> Array:
+        """Return the Jacobian of a site, shape (6, n), as a view that the next call overwrites."""
+        mujoco.mj_jacSite(self._model, self.data, self.linear, self.angular, site)
+        return self.jacobian[:, self._joints] if self._views is None else self._views[0]
+
+    def marked_jacobians(self) -> Array:
+        """Return the Jacobians of the landmarks, one below the other, (3 m, n), as a view that is overwritten."""
+        for site, rows in self._landmarks:
+            mujoco.mj_jacSite(self._model, self.data, rows, None, site)
+        return self._stacked[:, self._joints] if self._views is None else self._views[1]
+
+
+class ArmKinematics:
+    """How the joints of an arm move its flange, its tool and its links; the base of :class:`~imitarm.ArmModel`."""
+
+    name: str
+    joint_names: tuple[str, ...]
+    landmarks: Landmarks | None
+
+    def __init__(self, name: str, joint_names: tuple[str, ...], model: mujoco.MjModel, posture: Array) -> None:
+        """Prepare the kinematics of a compiled model.
+
+        Args:
+            name: of the arm.
+            joint_names: the joints from base to flange, in order.
+            model: a model with a site ``flange`` and, with a tool, a site ``tool``.
+            posture: positions of all joints of the model, fingers too, shape (nq,).
+        """
+        joints = [model.joint(joint).id for joint in joint_names]
+        self.name, self.joint_names = name, joint_names
+        self.landmarks = Landmarks.find(model, np.array(joints))
+        self._model, self._posture, self._shape = model, posture, (len(joints),)
+        self._qpos = _columns(model.jnt_qposadr[joints])
+        self._dofs = _columns(model.jnt_dofadr[joints])
+        self._flange = model.site("flange").id
+        sites = [model.site(i).name for i in range(model.nsite)]
+        self._tool = sites.index("tool") if "tool" in sites else self._flange
+        self._local = threading.local()
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints from base to flange."""
+        return len(self.joint_names)
+
+    @property
+    def has_tool(self) -> bool:
+        """Whether a tool is mounted, so that ``tool_pose`` differs from ``forward_kinematics``."""
+        return self._tool != self._flange
+
+    def at(self, q: ArrayLike) -> ArmMemory:
+        """Return this thread's working memory with the kinematics at ``q``, for loops that need much of one posture.
+
+        It is computed only when the posture is a new one, and is valid until the next posture is asked for.
+        """
+        posture = self._checked(q, "q")
+        memory: ArmMemory
+        try:
+            memory = self._local.memory
+        except AttributeError:  # the first time in this thread
+            marked = () if self.landmarks is None else self.landmarks.sites
+            memory = self._local.memory = ArmMemory(self._model, self._posture, self._qpos, self._dofs, marked)
+        memory.move_to(posture)
+        return memory
+
+    def site(self, frame: str) -> int:
+        """Return the index of the site of a frame, ``"tool"`` or ``"flange"``, in :meth:`at`.
+
+        Raises:
+            UnknownNameError: if the frame is not known.
+        """
+        if frame not in ("tool", "flange"):
+            raise UnknownNameError.among("frame", frame, ("tool", "flange"))
+        return self._tool if frame == "tool" else self._flange
+
+    def forward_kinematics(self, q: ArrayLike) -> Pose:
+        """Return the pose of the flange: ``flange_to_base``."""
+        return self.at(q).site_pose(self._flange)
+
+    def tool_pose(self, q: ArrayLike) -> Pose:
+        """Return the pose of the tool's tip: ``tool_to_base``."""
+        return self.at(q).site_pose(self._tool)
+
+    def tool_path(self, joints: ArrayLike) -> tuple[Array, Array]:
+        """Return the poses of the tool's tip for many postures.
+
+        Args:
+            joints: joint positions, shape (n, n_joints) or (n_joints,) [rad].
+
+        Returns:
+            positions (n, 3) [m] and quaternions wxyz (n, 4).
+        """
+        postures = np.atleast_2d(finite_array(joints, (..., self.n_joints), f"{self.name}: joints", "rad"))
+        if postures.ndim != 2:
+            raise InputError(
+                f"{self.name}: joints must be an array of shape (n, {self.n_joints}), got {postures.shape}"
+            )
+        poses = [self.at(q).site_pose(self._tool) for q in postures]
+        positions = np.array([pose.position for pose in poses]).reshape(-1, 3)
+        return positions, np.array([pose.quaternion for pose in poses]).reshape(-1, 4)
+
+    def jacobian(self, q: ArrayLike) -> Array:
+        """Return the Jacobian of the flange, shape (6, n_joints), linear rows first, in the base frame."""
+        return np.array(self.at(q).site_jacobian(self._flange))
+
+    def tool_jacobian(self, q: ArrayLike) -> Array:
+        """Return the Jacobian of the tool's tip, shape (6, n_joints), linear rows first, in the base frame."""
+        return np.array(self.at(q).site_jacobian(self._tool))
+
+    def point_jacobian(self, q: ArrayLike, body: str, point: ArrayLike) -> Array:
+        """Return the Jacobian of a point that moves with ``body``.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            body: name of the body, as in ``spec()``.
+            point: its position at ``q`` in the base frame, shape (3,) [m].
+
+        Returns:
+            shape (3, n_joints) [m/rad].
+
+        Raises:
+            UnknownNameError: if there is no such body.
+        """
+        position = finite_vector(point, 3, "point", "m")
+        index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_BODY, text(body, "body"))
+        if index < 0:
+            known = [self._model.body(i).name for i in range(1, self._model.nbody)]
+            raise UnknownNameError.among(f"body of {self.name}:", body, known)
+        memory = self.at(q)
+        mujoco.mj_jac(self._model, memory.data, memory.linear, None, position[:, None], index)
+        return np.array(memory.linear[:, self._dofs])
+
+    def sew_points(self, q: ArrayLike) -> Array:
+        """Return shoulder, elbow and wrist in the base frame, shape (3, 3) [m].
+
+        Raises:
+            InputError: if the arm's file does not say where they are.
+        """
+        return np.array(self.at(q).sites[list(self.marked().sites)])
+
+    def sew_jacobians(self, q: ArrayLike) -> Array:
+        """Return the Jacobians of shoulder, elbow and wrist, shape (3, 3, n_joints) [m/rad].
+
+        Raises:
+            InputError: if the arm's file does not say where they are.
+        """
+        self.marked()
+        return np.array(self.at(q).marked_jacobians()).reshape(3, 3, -1)
+
+    def marked(self) -> Landmarks:
+        """Return ``landmarks``.
+
+        Raises:
+            InputError: if the arm's file does not say where shoulder, elbow and wrist are.
+        """
+        if self.landmarks is None:
+            raise InputError(
+                f"{self.name} does not say where its shoulder, elbow and wrist are: add sites named 'shoulder', "
+                "'elbow' and 'wrist' to its MJCF file, on the links that these joints move"
+            )
+        return self.landmarks
+
+    def _checked(self, values: ArrayLike, what: str) -> Array:
+        # The usual case is decided here: it is on the path of every control step.
+        usual = type(values) is np.ndarray and values.dtype is _FLOAT64 and values.shape == self._shape
+        if usual and math.isfinite(sum(values.tolist())):  # type: ignore[union-attr]
+            return values  # type: ignore[return-value]
+        unit = "rad" if what == "q" else "rad/s" if what == "qd" else "rad/s^2"
+        return finite_vector(values, self.n_joints, f"{self.name}: {what}", unit)
+
+
+def _columns(indices: NDArray[np.int32]) -> Columns:
+    """Return consecutive indices as a slice, which is several times quicker."""
+    first = int(indices[0])
+    return slice(first, first + len(indices)) if np.all(np.diff(indices) == 1) else indices
