@@ -256,7 +256,7 @@ def test_the_twist_is_clamped_as_a_whole():
         ({"dt": float("nan")}, InputError, "dt must be a positive"),
         ({"twist": [0, 0, 0]}, InputError, "twist must be 6 finite"),
         ({"twist": [0, 0, np.nan, 0, 0, 0]}, InputError, "twist must be 6 finite"),
-        ({"q": np.zeros(3)}, InputError, "needs 7 numbers"),
+        ({"q": np.zeros(3)}, InputError, "must be 7 numbers"),
         ({"velocity": np.zeros(3)}, InputError, "velocity must be 7"),
         ({"q_ref": [np.inf] * 7}, InputError, "q_ref must be 7"),
         ({"rows": (np.zeros((2, 6)), np.zeros(2))}, InputError, r"rows need shapes \(m, 7\)"),

@@ -61,5 +61,5 @@ def test_wrong_input_is_refused():
     arm = ARMS["panda"]
     with pytest.raises(UnknownNameError, match="known: flange, tool"):
         find_posture(arm, arm.tool_pose(arm.home), frame="hand")
-    with pytest.raises(InputError, match="needs 7 numbers"):
+    with pytest.raises(InputError, match="must be 7 numbers"):
         find_posture(arm, arm.tool_pose(arm.home), q0=np.zeros(3))

@@ -162,7 +162,7 @@ def test_an_arm_from_elsewhere_without_the_collision_group_has_clearance(tmp_pat
         ({"control": "magic"}, UnknownNameError, "position, torque"),
         ({"timestep": 0.01}, InputError, "500 Hz"),
         ({"timestep": 0.0}, InputError, "500 Hz"),
-        ({"q": np.zeros(6)}, InputError, "q needs 7 numbers"),
+        ({"q": np.zeros(6)}, InputError, "q must be 7 numbers"),
         ({"q": np.full(7, 9.0)}, InputError, "right_j0 at 9.0000 rad is outside"),
     ],
 )
@@ -177,7 +177,7 @@ def test_bad_commands_are_named(arm):
         robot.move(np.zeros(7), 0.005)
     with pytest.raises(InputError, match="wrench must be 6"):
         robot.guide([0.0, 0.0, np.nan, 0.0, 0.0, 0.0], DT)
-    with pytest.raises(InputError, match="finite numbers"):
+    with pytest.raises(InputError, match="q must be finite"):
         robot.reset(np.full(7, np.nan))
 
 

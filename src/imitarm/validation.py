@@ -213,8 +213,9 @@ def _check_finite(array: Array, what: str, unit: str) -> None:
     finite = np.isfinite(array)
     if not finite.all():
         place = np.unravel_index(int(np.argmin(finite)), array.shape)
-        index = f"[{', '.join(str(int(i)) for i in place)}]" if place else ""
-        raise InputError(f"{what} must be finite{_bracketed(unit)}, but {what}{index} is {array[place]}")
+        name = what.rpartition(": ")[2]  # without the owner that stands before it
+        entry = f"{name}[{', '.join(str(int(i)) for i in place)}]" if place else name
+        raise InputError(f"{what} must be finite{_bracketed(unit)}, but {entry} is {array[place]}")
 
 
 def _bounds(above: float | None, at_least: float | None, at_most: float | None) -> str:

@@ -29,8 +29,7 @@ _HAND_LINK = re.compile(r"finger|jaw|knuckle|thumb|claw|pincer|pinch", re.IGNORE
 _PALM_LINK = re.compile(r"base|mount|palm|body|hand", re.IGNORECASE)
 _END_LINK = re.compile(r"(^|[_/-])(tool0|flange)$", re.IGNORECASE)
 _JAW_STROKE = 0.1  # [m] a slide at the end of an arm that moves no further is taken for a jaw
-_SIDE_BRANCH = 2  # joints: a branch with no more of them beside a far longer one is not an arm (a head, a wheel)
-_LONGER_BY = 3  # joints that the longer branch must have more
+_SIDE_BRANCH = 2  # joints: a branch of at most so many beside one more than twice as long is no arm (a head, a wheel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,21 +108,17 @@ def _limbs(body: mujoco.MjsBody, before: tuple[str, ...], hand: frozenset[str], 
     if len(branches) > 1 and len(joints) >= 2 and longest < len(joints):
         notes.append(f"not part of the arm: the {len(branches)} chains that branch off at {body.name!r} (a hand)")
         return [_Limb(body, joints)]
-    kept = [
-        (limbs, depth)
-        for limbs, depth in zip(branches, depths, strict=True)
-        if depth > _SIDE_BRANCH or longest < depth + _LONGER_BY
-    ]
+    is_arm = [depth > _SIDE_BRANCH or longest <= 2 * depth for depth in depths]
     left_out = [
         name
-        for limbs, depth in zip(branches, depths, strict=True)
-        if depth <= _SIDE_BRANCH and longest >= depth + _LONGER_BY
+        for limbs, kept in zip(branches, is_arm, strict=True)
+        if not kept
         for limb in limbs
         for name in limb.joints[len(joints) :]
     ]
     if left_out:
         notes.append(f"not part of the arm: {_listed(left_out)} (a short branch at {body.name!r})")
-    return [limb for limbs, _ in kept for limb in limbs]
+    return [limb for limbs, kept in zip(branches, is_arm, strict=True) if kept for limb in limbs]
 
 
 def _last_fixed(body: mujoco.MjsBody) -> mujoco.MjsBody:
