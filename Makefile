@@ -43,7 +43,7 @@ format: $(VENV)/.dev  ## mend what can be mended mechanically
 	$(BIN)/ruff format .
 
 bench: $(VENV)/.bench  ## speed against installed peers, as ratios
-	$(BIN)/python -m imitarm.benchmark.speed
+	$(BIN)/python benchmarks/speed.py
 
 clean:  ## remove the environment and everything made
 	rm -rf $(VENV) .venv-mediapipe .cache demo .pytest_cache .mypy_cache .ruff_cache .hypothesis

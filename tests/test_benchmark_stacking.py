@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imitarm.benchmark import retarget_rows, speed_rows
 from imitarm.benchmark.experiment import LIVE, Experiment
 from imitarm.benchmark.mapping_tables import Results, success_table
 from imitarm.benchmark.stacking import StackingTrial, run_trial
@@ -31,11 +30,3 @@ def test_the_cameras_noise_is_1_to_2_cm_unless_it_is_given():
     usual = [StackingTrial("modern", 0, 0).camera(seed).sigma for seed in range(20)]
     assert 0.01 <= min(usual) < max(usual) <= 0.02
     assert StackingTrial("modern", 0, 0, 0.003).camera(5).sigma == 0.003
-
-
-def test_the_step_that_is_timed_follows_the_person():
-    row = retarget_rows.skeleton_to_command()
-    assert row.self_timed and 0.0 < row.ours() < 1.0  # [s]
-    good, note = row.check()
-    assert good, note
-    assert set(retarget_rows.ROWS) <= set(speed_rows.ROWS)

@@ -1,7 +1,7 @@
-"""What ``make bench`` times: one function a row.
+"""What ``make bench`` times of learning, avoidance and importing; ``ROWS`` lists all rows.
 
-To add one, write a function that returns a :class:`~imitarm.benchmark.timing.Row` and put it into ``ROWS``. Peers are
-imported inside it: where one is missing the row says how to install it.
+To add a row, write a function that returns a :class:`timing.Row` and put it into ``ROWS``. Peers are imported inside
+it: where one is missing, the row says how to install it.
 """
 
 from __future__ import annotations
@@ -11,24 +11,28 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
-from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark import avoidance, families, ik_rows, retarget_rows, transmission_rows
-from imitarm.benchmark.timing import Row
+import ik_rows
+import retarget_rows
+import transmission_rows
+from imitarm.benchmark import avoidance, families
 from imitarm.skills import DMP, GMR, GaussianMixture
 from imitarm.trajectory import Trajectory
+from timing import Row, seconds_of
+from yardsticks import named, sklearn_fit
 
 Array = NDArray[np.float64]
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def made_up_demonstrations(seed: int, n_demonstrations: int = 8, n: int = 200) -> list[Trajectory]:
-    """Return demonstrations of one made-up motion of 2 s, each a little different and with 2 mm of noise."""
+def synthetic_demonstrations(seed: int, n_demonstrations: int = 8, n: int = 200) -> list[Trajectory]:
+    """Return demonstrations of one synthetic motion of 2 s, each a little different and with 2 mm of noise."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 2.0, n)
     shown = []
@@ -47,18 +51,18 @@ def made_up_demonstrations(seed: int, n_demonstrations: int = 8, n: int = 200) -
 
 
 def _samples(seed: int) -> Array:
-    return np.concatenate([np.column_stack([k.times, k.positions]) for k in made_up_demonstrations(seed)])
+    return np.concatenate([np.column_stack([k.times, k.positions]) for k in synthetic_demonstrations(seed)])
 
 
 def _minimum_jerk(n: int = 201) -> Trajectory:
-    """Return 2 s of a known, smooth motion whose exact positions a reproduction can be held against."""
+    """Return 2 s of a smooth motion with known positions, to compare a reproduction with."""
     t = np.linspace(0.0, 2.0, n)
     u = t / 2.0
     return Trajectory(t, (u**3 * (10.0 + u * (6.0 * u - 15.0)))[:, None] * np.array([0.3, 0.2, -0.1]))
 
 
 def gaussian_mixture() -> Row:
-    """GMM of 8 demonstrations x 200 steps x 4 columns, 8 components; five data sets in turn, same for both."""
+    """GMM of 8 demonstrations x 200 steps x 4 columns, 8 components; the same five data sets for both."""
     from sklearn.mixture import GaussianMixture as Peer
 
     data = [_samples(seed) for seed in range(5)]
@@ -72,18 +76,18 @@ def gaussian_mixture() -> Row:
         "GMM fit, 1600 x 4, 8 components (5 data sets)",
         lambda: [GaussianMixture(8).fit(X) for X in data],
         lambda: [Peer(8, random_state=0).fit(X) for X in data],
-        _named("scikit-learn"),
-        least_ratio=3.0,
+        named("scikit-learn"),
+        faster=3.0,
         check=check,
-        repeats=9,
+        repeats=15,
     )
 
 
 def _regressions() -> tuple[GMR, Any, Array]:
-    """Return ours, the peer's with the same mixture, and 200 instants."""
+    """Return ours, the peer's with the same mixture, and 200 query times [s]."""
     import gmr
 
-    ours = GMR(8).fit(made_up_demonstrations(0))
+    ours = GMR(8).fit(synthetic_demonstrations(0))
     peer = gmr.GMM(8, priors=ours.weights_, means=ours.means_, covariances=ours.covariances_)
     return ours, peer, np.linspace(0.0, ours.duration_, 200)
 
@@ -101,36 +105,36 @@ def regression_with_covariance() -> Row:
         return bool(max(apart) < 1e-6), f"agree to {apart[0]:.0e} m, {apart[1]:.0e} m^2"
 
     name = "GMR, 200 queries, mean and covariance"
-    return Row(
-        name, lambda: ours.predict(times), peer_queries, _named("gmr"), least_ratio=150.0, check=check, repeats=5
-    )
+    return Row(name, lambda: ours.predict(times), peer_queries, named("gmr"), faster=100.0, check=check, repeats=7)
 
 
 def regression_threads_as_installed() -> Row:
     """GMR at 200 instants, ours with covariance, the peer's mean only, threads as NumPy comes.
 
-    The peer's time swings by a factor of ten with what else the machine does: its many small solves wait for threads.
+    The peer's many small solves wait for threads, so its time depends on what else the machine does.
     """
-    _regressions()  # say here and now what is missing
+    _regressions()  # fails here, not while it is timed, when the peer is missing
 
     def timed(which: str) -> Callable[[], float]:
-        return lambda: _in_fresh_interpreter(_TIME_REGRESSION.format(which=which), one_thread=False)
+        code = _TIME_REGRESSION.format(folder=str(Path(__file__).parent), which=which)
+        return lambda: _in_fresh_interpreter(code, one_thread=False)
 
     return Row(
         "GMR, 200 queries, peer mean only, threads as installed",
         timed("ours.predict(times)"),
         timed("peer.predict(np.array([0]), times[:, None])"),
-        _named("gmr"),
-        least_ratio=5.0,
-        repeats=5,
+        named("gmr"),
+        faster=5.0,
+        repeats=7,
         self_timed=True,
     )
 
 
 _TIME_REGRESSION = """
-import time
+import sys, time
+sys.path.insert(0, {folder!r})
 import numpy as np
-from imitarm.benchmark.speed_rows import _regressions
+from speed_rows import _regressions
 ours, peer, times = _regressions()
 seconds = []
 for _ in range(9):
@@ -148,8 +152,8 @@ def regression_mean_only() -> Row:
         "GMR, 200 queries, peer mean only, one thread",
         lambda: ours.predict(times),
         lambda: peer.predict(np.array([0]), times[:, None]),
-        _named("gmr"),
-        least_ratio=5.0,
+        named("gmr"),
+        faster=5.0,
     )
 
 
@@ -190,7 +194,7 @@ def steps_against_pydmps() -> Row:
             peer.step()
 
     name = "DMP, 200 times one step"
-    return Row(name, lambda: _all_steps(ours), peer_steps, _named("pydmps"), least_ratio=3.0, repeats=11)
+    return Row(name, lambda: _all_steps(ours), peer_steps, named("pydmps"), faster=3.0)
 
 
 def steps_against_movement_primitives() -> Row:
@@ -205,7 +209,7 @@ def steps_against_movement_primitives() -> Row:
             y, yd = peer.step(y, yd)
 
     name = "DMP, 200 times one step"
-    return Row(name, lambda: _all_steps(ours), peer_steps, _named("movement-primitives"), least_ratio=7.0, repeats=11)
+    return Row(name, lambda: _all_steps(ours), peer_steps, named("movement-primitives"), faster=7.0)
 
 
 def rollout() -> Row:
@@ -226,15 +230,10 @@ def rollout() -> Row:
         "DMP rollout of 200 steps",
         ours.generate,
         peer_rollout,
-        _named("movement-primitives"),
-        least_ratio=15.0,
+        named("movement-primitives"),
+        faster=15.0,
         check=check,
-        repeats=11,
     )
-
-
-def _named(distribution: str) -> str:
-    return f"{distribution} {version(distribution)}"
 
 
 def _in_fresh_interpreter(code: str, *, one_thread: bool = True) -> float:
@@ -247,13 +246,25 @@ def _in_fresh_interpreter(code: str, *, one_thread: bool = True) -> float:
 
 
 def importing() -> Row:
-    """``import imitarm`` in a fresh interpreter."""
-    code = "import time; t = time.perf_counter(); import imitarm; print(time.perf_counter() - t)"
-    return Row("import imitarm", lambda: _in_fresh_interpreter(code), most_seconds=0.3, repeats=5, self_timed=True)
+    """``import imitarm`` against ``import numpy``, each in a fresh interpreter."""
+
+    def timed(package: str) -> Callable[[], float]:
+        code = f"import time; t = time.perf_counter(); import {package}; print(time.perf_counter() - t)"
+        return lambda: _in_fresh_interpreter(code)
+
+    return Row(
+        "import imitarm",
+        timed("imitarm"),
+        timed("numpy"),
+        f"import numpy {np.__version__}",
+        cost=1.5,
+        repeats=9,
+        self_timed=True,
+    )
 
 
-def _avoidance(n_obstacles: int, most_seconds: float) -> Row:
-    """Certified ACFRA in 3-D over 40 seeded scenes of spheres and boxes; the median scene counts."""
+def _avoidance(n_obstacles: int, cost: float) -> Row:
+    """Certified ACFRA in 3-D over 40 seeded scenes of spheres and boxes, against a fit of scikit-learn."""
     skill, path = avoidance.learn(planar=False)
     cases = [
         families.sparse_clutter(seed, path, n_obstacles=n_obstacles, planar=False, kinds=families.SIMPLE)
@@ -269,25 +280,27 @@ def _avoidance(n_obstacles: int, most_seconds: float) -> Row:
         slow = 1e3 * np.percentile([o.seconds for o in done], 95)
         return kept == len(done), f"{kept} of {len(done)} keep 20 mm; 95th percentile {slow:.1f} ms"
 
-    name = f"certified ACFRA, 3-D, 200 samples, 8 components, {n_obstacles} obstacle{'s' * (n_obstacles > 1)}"
+    fit = sklearn_fit()
     return Row(
-        name,
+        f"certified ACFRA, 3-D, 200 samples, 8 components, {n_obstacles} obstacle{'s' * (n_obstacles > 1)}",
         lambda: float(np.median([o.seconds for o in outcomes()])),
-        most_seconds=most_seconds,
+        lambda: seconds_of(fit, 3),
+        f"{named('scikit-learn')}, GMM fit 1600 x 4",
+        cost=cost,
         check=check,
-        repeats=5,
+        repeats=11,
         self_timed=True,
     )
 
 
 def avoidance_of_one() -> Row:
-    """Certified ACFRA with one obstacle in the way."""
-    return _avoidance(1, 0.002)
+    """Certified ACFRA with one obstacle on the path."""
+    return _avoidance(1, 0.1)
 
 
 def avoidance_of_three() -> Row:
-    """Certified ACFRA with three obstacles in the way."""
-    return _avoidance(3, 0.006)
+    """Certified ACFRA with three obstacles on the path."""
+    return _avoidance(3, 0.3)
 
 
 ROWS: tuple[Callable[[], Row], ...] = (
