@@ -1,4 +1,4 @@
-"""check: says what is wrong with a recording of a person before a robot follows it; repaired: mends what is safe."""
+"""check: what is wrong with a recording of a person before a robot follows it; repaired: fixes what needs no guess."""
 
 from __future__ import annotations
 
@@ -9,30 +9,52 @@ from numpy.typing import NDArray
 
 from imitarm.capture.filters import SideMemory
 from imitarm.capture.issue import SEVERITIES, RecordingIssue, Severity
+from imitarm.capture.plausibility import (
+    FASTEST_HAND,
+    LARGEST_STEP,
+    PLAUSIBLE_RATE,
+    axes_that_fit,
+    find_spikes,
+    joint_steps,
+    length_unit_that_fits,
+    repeats_previous,
+    runs,
+    time_unit_name,
+    time_unit_that_fits,
+)
 from imitarm.capture.recording import SkeletonRecording
-from imitarm.capture.skeleton import JOINT, SIDES, Skeleton, Tracking
+from imitarm.capture.skeleton import JOINT, JOINTS, SIDES, Skeleton, Tracking
 from imitarm.errors import UnknownNameError
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _FEW = 10  # frames
-_LOST = (0.05, 0.5)  # share of frames without the arm: a warning, an error
-_INFERRED = 0.2  # share of frames in which a joint of the arm is guessed
-_HAND_LOST = 0.3  # share of frames without a hand's direction
-_GAP = 0.1  # [s] longer ones are bridged by coasting no more (METHODS A.9)
-_STOP = 0.3  # [s] longer ones stop a robot
-_RATE = (20.0, 10.0)  # [Hz] less is worth a warning, an error
-_SPREAD = 0.10  # of a limb's length: a Kinect has 2 to 5 percent
+_LOST = (0.05, 0.5)  # fraction of frames without the arm: a warning, an error
+_INFERRED = 0.2  # fraction of frames in which a joint of the arm is inferred
+_HAND_LOST = 0.3  # fraction of frames without the direction of the hand
+_GAP = 0.1  # [s] retargeters extrapolate across shorter gaps
+_STOP = 0.3  # [s] a robot stops in longer gaps
+_LOW_RATE = (20.0, 10.0)  # [Hz] a lower rate is a warning, an error
+_QUICK_HAND = 2.0  # [m/s] together with an implausible frame rate, an error
+_SPREAD = 0.10  # variation of a limb's length over its length: a Kinect has 2 to 5 percent
 _LIMB = (0.10, 0.60)  # [m]
-_TURNED = 0.3  # share of frames in which left is where right should be
+_TURNED = 0.3  # fraction of frames in which left is where right should be
+_REPEATED = 0.2  # fraction of frames that repeat the one before
 _MAD_TO_SIGMA = 1.4826
+
+_ARM = {
+    side: np.array([JOINT[f"{part}_{side}"] for part in ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")])
+    for side in SIDES
+}
+_TRUNK = np.array([JOINT[name] for name in ("spine_base", "spine_mid", "spine_shoulder", "neck", "head")])
 
 
 def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIssue]:
-    """Return all that is wrong with a recording, errors first.
+    """Return everything that is wrong with a recording, errors first.
 
     Args:
-        recording: as it was read or captured.
+        recording: as read or captured.
         side: of the arm that a robot is to follow.
 
     Raises:
@@ -40,23 +62,24 @@ def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIs
     """
     if side not in SIDES:
         raise UnknownNameError.among("side", side, SIDES)
-    findings = [*recording.issues, *_people(recording)]
+    issues = [*recording.issues, *_people(recording)]
     seen = [skeleton for skeleton in recording.skeletons if (skeleton.tracking > Tracking.LOST).any()]
     if seen:
         view = _View(recording, side)
-        for look in (_times, _rate, _gaps, _arm, _hand, _limbs, _sides):
-            findings += look(view)
-    return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
+        for look in (_times, _rate, _hand_speed, _axes, _gaps, _frozen, _spikes, _jumps, _arm, _hand, _limbs, _sides):
+            issues += look(view)
+    return sorted(issues, key=lambda issue: SEVERITIES.index(issue.severity))
 
 
 def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]]:
-    """Mend what can be mended without guessing, and say what was done.
+    """Fix what can be fixed without guessing, and say what was done.
 
-    Of several persons the one with the most frames is kept; a frame that is not later than the one before is dropped;
-    left and right that were exchanged from one frame to the next are exchanged back.
+    Of several persons the one with the most frames is kept. A frame is dropped when it is not later than the one
+    before, or repeats it exactly. Joints in a spike, and those of an arm that stands frozen while the body moves, are
+    taken as lost. Left and right that were exchanged from one frame to the next are exchanged back.
 
     Returns:
-        the mended recording, and a line for each kind of change; no lines: nothing was changed.
+        the repaired recording, and a line for each kind of change; without lines nothing was changed.
     """
     notes: list[str] = []
     frames = recording.skeletons
@@ -71,15 +94,55 @@ def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]
             kept.append(skeleton)
     if len(kept) < len(frames):
         notes.append(f"dropped {len(frames) - len(kept)} frames that were not later than the one before")
+    kept = _without_repeats(kept, notes)
     memory = SideMemory()
     right = [memory.update(skeleton) for skeleton in kept]
     if memory.swaps:
         notes.append(f"exchanged left and right back in {memory.swaps} frames")
-    return SkeletonRecording(right, name=recording.name, issues=recording.issues), notes
+    return recording.with_skeletons(_without_spikes(right, notes)), notes
+
+
+def _without_repeats(frames: list[Skeleton], notes: list[str]) -> list[Skeleton]:
+    if len(frames) < 2:
+        return frames
+    positions = np.array([skeleton.positions for skeleton in frames])
+    times = np.array([skeleton.time for skeleton in frames])
+    whole = repeats_previous(positions)
+    lost = np.zeros(positions.shape[:2], dtype=bool)
+    for side in SIDES:
+        for first, last in runs(repeats_previous(positions[:, _ARM[side]])):
+            if times[last] - times[first] > _GAP:
+                lost[first + 1 : last + 1, _ARM[side]] = True
+    lost[1:][whole] = False
+    if whole.any():
+        notes.append(f"dropped {int(whole.sum())} frames that repeat the one before")
+    if lost.any():
+        notes.append(f"took an arm as lost in {int(lost.any(axis=1).sum())} frames in which it was frozen")
+    changed = [_with_lost(skeleton, joints) for skeleton, joints in zip(frames, lost, strict=True)]
+    return [changed[0], *(s for s, repeated in zip(changed[1:], whole, strict=True) if not repeated)]
+
+
+def _without_spikes(frames: list[Skeleton], notes: list[str]) -> list[Skeleton]:
+    if len(frames) < 2:
+        return frames
+    times = np.array([skeleton.time for skeleton in frames])
+    spikes, _ = find_spikes(times, np.array([skeleton.positions for skeleton in frames]))
+    if not spikes.any():
+        return frames
+    notes.append(f"took joints as lost in {int(spikes.any(axis=1).sum())} frames with a spike")
+    return [_with_lost(skeleton, joints) for skeleton, joints in zip(frames, spikes, strict=True)]
+
+
+def _with_lost(skeleton: Skeleton, joints: Mask) -> Skeleton:
+    """Return the skeleton with some joints lost, shape (25,)."""
+    if not joints.any():
+        return skeleton
+    tracking = np.where(joints, Tracking.LOST, skeleton.tracking).astype(np.int8)
+    return Skeleton(skeleton.time, skeleton.positions, tracking, skeleton.hand_states, skeleton.person)
 
 
 class _View:
-    """The arm of the person with the most frames, as arrays."""
+    """The person with the most frames, as arrays."""
 
     def __init__(self, recording: SkeletonRecording, side: str) -> None:
         everybody = [skeleton.person for skeleton in recording.skeletons]
@@ -91,30 +154,62 @@ class _View:
         self.times = np.array([arm.time for arm in arms])
         self.points = np.array([arm.points for arm in arms])
         self.confidence = np.array([arm.confidence for arm in arms])
+        self.positions = np.array([skeleton.positions for skeleton in self.skeletons])
+        self.time_unit = recording.time_unit
         stamps = np.unique(self.times)
         self.period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+        later = np.concatenate([[True], self.times[1:] > np.maximum.accumulate(self.times)[:-1]])
+        self.later = np.flatnonzero(later)  # frames whose times increase
+        memory = SideMemory()
+        right, self.swapped = [], []  # with left and right kept apart; frames in which they were exchanged
+        for i, skeleton in enumerate(self.skeletons):
+            right.append(memory.update(skeleton).positions)
+            self.swapped += [i] if right[-1] is not skeleton.positions else []
+        self.path = np.array(right)[self.later]
+        self.spikes, self.spike_size = find_spikes(self.times[self.later], self.path)
+        self.other_axes = axes_that_fit(self.positions)
 
-    def finding(self, severity: Severity, code: str, message: str, remedy: str, i: int | None = None) -> RecordingIssue:
-        """Build a finding about sample ``i``."""
+    def issue(self, severity: Severity, code: str, message: str, remedy: str, i: int | None = None) -> RecordingIssue:
+        """Build an issue about sample ``i``."""
         if i is None:
             return RecordingIssue(severity, code, message, remedy=remedy)
         return RecordingIssue(severity, code, message, self.frames[i], float(self.times[i] - self.times[0]), remedy)
+
+    def hand_speed(self) -> float:
+        """Return the speed of the faster hand, 95th percentile without spikes [m/s]; nan when none is seen."""
+        wrists = [JOINT[f"wrist_{side}"] for side in SIDES]
+        _, speed = joint_steps(self.times[self.later], self.path)
+        spiky = self.spikes[1:] | self.spikes[:-1]
+        speeds = [speed[~spiky[:, wrist] & np.isfinite(speed[:, wrist]), wrist] for wrist in wrists]
+        return max((float(np.percentile(s, 95.0)) for s in speeds if len(s) >= _FEW), default=np.nan)
+
+    def unit_remedy(self) -> str:
+        """Return which unit of time fits, or where to look when none does."""
+        fit = time_unit_that_fits(1.0 / self.period, self.time_unit)
+        if fit is None:
+            return "check the units of time and length"
+        name, factor = fit
+        return (
+            f"the times were read in units of {time_unit_name(self.time_unit)} and fit in {name} "
+            f"({1.0 / (factor * self.period):.1f} frames a second): multiply them by {factor:.10g}"
+        )
 
 
 def _people(recording: SkeletonRecording) -> Iterator[RecordingIssue]:
     n = len(recording)
     if not any((skeleton.tracking > Tracking.LOST).any() for skeleton in recording.skeletons):
         message = f"nobody is seen in any of {n} frames" if n else "holds no frames"
-        yield RecordingIssue("error", "nobody", message, remedy="stand 1.5 to 3 m before the sensor and record again")
+        remedy = "stand 1.5 to 3 m in front of the sensor and record again"
+        yield RecordingIssue("error", "nobody", message, remedy=remedy)
         return
     if len(recording.persons) > 1:
         everybody = [skeleton.person for skeleton in recording.skeletons]
-        shares = ", ".join(f"{person} ({everybody.count(person)} frames)" for person in recording.persons)
+        shown = ", ".join(f"{person} ({everybody.count(person)} frames)" for person in recording.persons)
         second = next(i for i, person in enumerate(everybody) if person != everybody[0])
         yield RecordingIssue(
             "warning",
             "several-persons",
-            f"{len(recording.persons)} persons: {shares}; the rest of these findings is about the one seen most",
+            f"{len(recording.persons)} persons: {shown}; all other issues are about the one seen most",
             second,
             recording.skeletons[second].time - recording.skeletons[0].time,
             "choose one by --person, or .person(number)",
@@ -127,9 +222,9 @@ def _times(view: _View) -> Iterator[RecordingIssue]:
         i = int(np.argmax(steps <= 0.0)) + 1
         message = f"time runs backwards or stands still in {int((steps <= 0.0).sum())} frames, by up to "
         message += f"{1e3 * max(-float(steps.min()), 0.0):.0f} ms"
-        yield view.finding("error", "time-backwards", message, "repair drops these frames", i)
+        yield view.issue("error", "time-backwards", message, "repair drops these frames", i)
     if len(view.times) < _FEW:
-        yield view.finding("error", "few-frames", f"{len(view.times)} frames only", "record for longer")
+        yield view.issue("error", "few-frames", f"{len(view.times)} frames only", "record for longer")
 
 
 def _rate(view: _View) -> Iterator[RecordingIssue]:
@@ -137,11 +232,35 @@ def _rate(view: _View) -> Iterator[RecordingIssue]:
         return
     rate = 1.0 / view.period
     message = f"{rate:.1f} frames a second"
-    if rate < _RATE[1]:
-        message += ": between two frames a robot that follows would already brake"
-        yield view.finding("error", "frame-rate", message, "use a faster camera or computer; 30 are usual")
-    elif rate < _RATE[0]:
-        yield view.finding("warning", "frame-rate", message, "more light or a smaller model; 30 are usual")
+    if rate > PLAUSIBLE_RATE[1]:
+        speed = view.hand_speed()
+        quick = speed > _QUICK_HAND
+        message += ", more than a skeleton camera delivers"
+        message += f"; the hands move at up to {speed:.1f} m/s" if quick else ""
+        yield view.issue("error" if quick else "warning", "frame-rate", message, view.unit_remedy())
+    elif rate < _LOW_RATE[1]:
+        message += ": a robot that follows would brake between two frames"
+        fits = time_unit_that_fits(rate, view.time_unit) is not None
+        remedy = view.unit_remedy() if fits else "use a faster camera or computer; 30 are usual"
+        yield view.issue("error", "frame-rate", message, remedy)
+    elif rate < _LOW_RATE[0]:
+        yield view.issue("warning", "frame-rate", message, "more light or a smaller model; 30 are usual")
+
+
+def _hand_speed(view: _View) -> Iterator[RecordingIssue]:
+    speed = view.hand_speed()
+    if speed > FASTEST_HAND:
+        message = f"the hands move at {speed:.0f} m/s (95th percentile), faster than a person's"
+        yield view.issue("error", "hand-speed", message, view.unit_remedy())
+
+
+def _axes(view: _View) -> Iterator[RecordingIssue]:
+    if view.other_axes is not None:
+        fault, fit = view.other_axes
+        remedy = "x must point to the sensor's left, y up, z away from it"
+        if fit:
+            remedy += f"; for a person who faces the sensor, take {fit} of the file as x, y, z"
+        yield view.issue("error", "axes", fault, remedy)
 
 
 def _gaps(view: _View) -> Iterator[RecordingIssue]:
@@ -152,65 +271,118 @@ def _gaps(view: _View) -> Iterator[RecordingIssue]:
         stops = int((steps > _STOP).sum())
         message = f"{int(long.sum())} gaps between frames, the longest {steps[i]:.2f} s; {stops} are long enough "
         message += f"(over {_STOP:g} s) for a robot to stop"
-        yield view.finding("warning", "gap", message, "cut there by trim, or record again", i)
+        yield view.issue("warning", "gap", message, "cut there by trim, or record again", i)
+
+
+def _frozen(view: _View) -> Iterator[RecordingIssue]:
+    whole, arm = repeats_previous(view.positions), repeats_previous(view.positions[:, _ARM[view.side]])
+    for what, repeated in (("person", whole), (f"{view.side} arm", arm)):
+        lasting = [
+            (view.times[b] - view.times[a], a) for a, b in runs(repeated) if view.times[b] - view.times[a] > _GAP
+        ]
+        if lasting:
+            longest, first = max(lasting)
+            message = f"the {what} is exactly the same for {longest:.2f} s"
+            message += f", and in {len(lasting) - 1} other places" if len(lasting) > 1 else ""
+            remedy = "repair drops these frames, which leaves a gap; record again if the motion is in it"
+            yield view.issue("error" if longest > _STOP else "warning", "frozen", message, remedy, first)
+            return
+    fraction = whole.sum() / len(view.times)
+    if fraction > _REPEATED and view.period > 0.0:
+        rate = (1.0 - fraction) / view.period
+        message = f"{100 * fraction:.0f} % of the frames repeat the one before: {rate:.1f} different frames a second"
+        yield view.issue("warning", "frozen", message, "repair drops these frames", int(np.argmax(whole)) + 1)
+
+
+def _spikes(view: _View) -> Iterator[RecordingIssue]:
+    joints = _followed(view)
+    spikes, size = view.spikes[:, joints], view.spike_size[:, joints]
+    if spikes.any():
+        frames = np.flatnonzero(spikes.any(axis=1))
+        i, joint = divmod(int(np.argmax(size)), len(joints))
+        message = f"single-frame spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints leap away and "
+        message += f"back, {JOINTS[joints[joint]]} by {size[i, joint]:.2f} m"
+        remedy = "repair takes these joints as lost there"
+        yield view.issue("error", "spike", message, remedy, int(view.later[frames[0]]))
+
+
+def _jumps(view: _View) -> Iterator[RecordingIssue]:
+    joints = _followed(view)
+    step, speed = joint_steps(view.times[view.later], view.path)
+    with np.errstate(invalid="ignore"):
+        jump = (step > LARGEST_STEP) & (speed > FASTEST_HAND) & ~view.spikes[1:] & ~view.spikes[:-1]
+    jump = jump[:, joints]
+    if jump.any():
+        size = np.where(jump, step[:, joints], 0.0)
+        i, joint = divmod(int(np.argmax(size)), len(joints))
+        message = f"{int(jump.any(axis=1).sum())} jumps that do not come back, the largest {size[i, joint]:.2f} m from "
+        message += f"one frame to the next ({JOINTS[joints[joint]]}, {speed[i, joints[joint]]:.0f} m/s)"
+        remedy = "cut there by trim, or record again"
+        yield view.issue("error", "jump", message, remedy, int(view.later[int(np.argmax(jump.any(axis=1))) + 1]))
+
+
+def _followed(view: _View) -> list[int]:
+    """Return the joints that matter to a robot: those of the arm and of the trunk."""
+    return [*_ARM[view.side].tolist(), *_TRUNK.tolist()]
 
 
 def _arm(view: _View) -> Iterator[RecordingIssue]:
     known = view.confidence[:, :3].min(axis=1)
-    lost, guessed = known == 0.0, (known > 0.0) & (known < 1.0)
+    lost, inferred = known == 0.0, (known > 0.0) & (known < 1.0)
     if lost.mean() > _LOST[0]:
         severity: Severity = "error" if lost.mean() > _LOST[1] else "warning"
         message = f"the {view.side} arm is lost in {100 * lost.mean():.0f} % of the frames"
-        yield view.finding(severity, "arm-lost", message, "keep it in view, away from the body", int(np.argmax(lost)))
+        yield view.issue(severity, "arm-lost", message, "keep it in view, away from the body", int(np.argmax(lost)))
     elif lost.any():
         message = f"the {view.side} arm is lost in {int(lost.sum())} of {len(lost)} frames"
-        yield view.finding("note", "arm-lost", message, "none needed", int(np.argmax(lost)))
-    if guessed.mean() > _INFERRED:
-        message = f"a joint of the {view.side} arm is guessed, not seen, in {100 * guessed.mean():.0f} % of the frames"
-        yield view.finding("warning", "arm-inferred", message, "keep it in view", int(np.argmax(guessed)))
+        yield view.issue("note", "arm-lost", message, "none needed", int(np.argmax(lost)))
+    if inferred.mean() > _INFERRED:
+        message = (
+            f"a joint of the {view.side} arm is inferred, not seen, in {100 * inferred.mean():.0f} % of the frames"
+        )
+        yield view.issue("warning", "arm-inferred", message, "keep it in view", int(np.argmax(inferred)))
 
 
 def _hand(view: _View) -> Iterator[RecordingIssue]:
     lost = view.confidence[:, [2, 4, 5]].min(axis=1) < 1.0
     if lost.mean() > _HAND_LOST:
         message = f"wrist, hand tip and thumb are not all tracked in {100 * lost.mean():.0f} % of the frames; the tool "
-        message += "will not turn with the hand there"
-        yield view.finding("note", "hand-lost", message, "use orientation 'fixed', or spread the thumb")
+        message += "will not rotate with the hand there"
+        yield view.issue("note", "hand-lost", message, "use orientation 'fixed', or spread the thumb")
 
 
 def _limbs(view: _View) -> Iterator[RecordingIssue]:
-    tracked = view.points[view.confidence[:, :3].min(axis=1) >= 1.0, :3]
-    if len(tracked) < _FEW:
-        return
-    lengths = np.linalg.norm(np.diff(tracked, axis=1), axis=2)
-    middle = np.median(lengths, axis=0)
-    spread = _MAD_TO_SIGMA * np.median(np.abs(lengths - middle), axis=0)
-    for name, length, deviation in zip(("upper arm", "forearm"), middle, spread, strict=True):
+    known = view.confidence[:, :3].min(axis=1)
+    lengths = np.linalg.norm(np.diff(view.points[:, :3], axis=1), axis=2)
+    tracked = lengths[known >= 1.0]
+    for i, name in enumerate(("upper arm", "forearm")):
+        seen = (tracked if len(tracked) >= _FEW else lengths[known > 0.0])[:, i]
+        if len(seen) < _FEW:
+            continue
+        length = float(np.median(seen))
+        deviation = _MAD_TO_SIGMA * float(np.median(np.abs(seen - length)))
         if not _LIMB[0] <= length <= _LIMB[1]:
+            unit = length_unit_that_fits(length)
+            remedy = "is this an arm?" if unit is None else f"these fit in {unit}: convert them"
             message = f"the {name} is {length:.2f} m long"
-            yield view.finding("error", "limb-length", message, "positions must be in metres: is this an arm?")
-        elif deviation > _SPREAD * length:
+            yield view.issue("error", "limb-length", message, f"positions must be in metres; {remedy}")
+        elif deviation > _SPREAD * length and len(tracked) >= _FEW:
             message = f"the {name}'s length varies by {100 * deviation / length:.0f} % about {100 * length:.0f} cm"
-            yield view.finding("warning", "limb-length", message, "more light, or turn to the sensor")
+            yield view.issue("warning", "limb-length", message, "more light, or face the sensor")
 
 
 def _sides(view: _View) -> Iterator[RecordingIssue]:
-    memory = SideMemory()
-    first: int | None = None
-    for i, skeleton in enumerate(view.skeletons):
-        memory.update(skeleton)
-        if memory.swaps and first is None:
-            first = i
-    if memory.swaps:
-        message = f"left and right are exchanged in {memory.swaps} frames"
-        yield view.finding("warning", "sides-swapped", message, "repair exchanges them back", first)
-    positions = np.array([skeleton.positions for skeleton in view.skeletons])
-    across = positions[:, JOINT["shoulder_right"], 0] - positions[:, JOINT["shoulder_left"], 0]
+    if view.swapped:
+        message = f"left and right are exchanged in {len(view.swapped)} frames"
+        yield view.issue("warning", "sides-swapped", message, "repair exchanges them back", view.swapped[0])
+    if view.other_axes is not None:
+        return
+    across = view.positions[:, JOINT["shoulder_right"], 0] - view.positions[:, JOINT["shoulder_left"], 0]
     seen = np.isfinite(across)
     turned = seen & (across < 0.0)
-    if seen.any() and turned.sum() > max(_TURNED * seen.sum(), memory.swaps):
+    if seen.any() and turned.sum() > max(_TURNED * seen.sum(), len(view.swapped)):
         message = (
             f"the left shoulder is where the right one should be in {100 * turned.sum() / seen.sum():.0f} % of the "
         )
-        message += "frames: the person has the back to the sensor, or the picture is mirrored"
-        yield view.finding("warning", "turned-away", message, "face the sensor; do not mirror", int(np.argmax(turned)))
+        message += "frames: the person has the back to the sensor, or the image is mirrored"
+        yield view.issue("warning", "turned-away", message, "face the sensor; do not mirror", int(np.argmax(turned)))

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.capture.issue import RecordingIssue, length_unit_that_fits, time_unit_that_fits
+from imitarm.capture.issue import RecordingIssue
+from imitarm.capture.plausibility import length_unit_that_fits, time_unit_that_fits
 from imitarm.capture.skeleton import FARTHEST, JOINT, JOINTS, HandState, Skeleton
 from imitarm.errors import FileFormatError
 from imitarm.files.table import Table, parse_table

@@ -93,8 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise TaskFailedError(
             f"{arguments.source}: nobody was seen, nothing is written; stand 1.5 to 3 m before the sensor"
         )
-    found = recorded.issues if recorded is not None else ()
-    recording = _finished(SkeletonRecording(taken, name=source.name, issues=found), arguments)
+    captured = SkeletonRecording(taken, name=source.name) if recorded is None else recorded.with_skeletons(taken)
+    recording = _finished(captured, arguments)
     findings = check(recording, arguments.side)
     _show(recording, arguments.side)
     show_findings(findings)

@@ -47,7 +47,8 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
         taken, _ = gather(one, arguments.seconds, "capturing", live=going_on, total=_duration(source))
     if one.passed_over:
         notes.append(f"passed over {one.passed_over} frames that show somebody else")
-    recording = SkeletonRecording(taken, name=source.name)
+    unit = source.time_unit if isinstance(source, SkeletonRecording) else 1.0
+    recording = SkeletonRecording(taken, name=source.name, time_unit=unit)
     if arguments.trim is not None:
         recording = recording.trim(*arguments.trim)
     if len(recording) < 2:

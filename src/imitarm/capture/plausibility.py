@@ -1,0 +1,205 @@
+"""Whether numbers can be those of a person in front of a sensor: units, axes, repeated frames, spikes."""
+
+from __future__ import annotations
+
+import math
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.capture.skeleton import JOINT, JOINTS, SIDES
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PLAUSIBLE_RATE = (10.0, 120.0)  # [Hz] frame rates of skeleton cameras
+PLAUSIBLE_LIMB = (0.15, 0.45)  # [m] upper arms and forearms of adults, with margin
+
+_TIME_UNITS = {"ns": 1e-9, "100 ns": 1e-7, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0}  # [s]
+_LENGTH_UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "dm": 0.1, "feet": 0.3048}  # [m]
+FASTEST_HAND = 10.0  # [m/s] faster than a person moves for a robot to follow; gestures reach 2 to 4
+LARGEST_STEP = 0.3  # [m] from one frame to the next, if it is also faster than FASTEST_HAND
+_UPRIGHT = 0.5  # cosine of the largest angle between spine and vertical, as a median over the recording
+_SPIKE = 0.2  # [m] a smaller excursion is noise: real recordings have up to 0.12, synthetic ones 0.16
+_BONE_CHANGE = 0.12  # [m] of a bone's length in a spike
+_SPIKE_WIDTHS, _SPIKE_TIME = (1, 2, 3), 0.25  # [frames] a spike lasts, and [s] from the frame before to the one after
+
+_TRUNK = np.array([JOINT[name] for name in ("spine_base", "spine_mid", "spine_shoulder", "neck", "head")])
+_UPPER = np.array([JOINT[name] for name in ("head", "neck", "spine_shoulder", "shoulder_left", "shoulder_right")])
+_LOWER = np.array([JOINT[name] for name in ("spine_base", "hip_left", "hip_right")])
+_BONES = np.array(
+    [
+        (JOINT[a if a in JOINT else f"{a}_{side}"], JOINT[f"{b}_{side}"])
+        for side in SIDES
+        for a, b in (("spine_shoulder", "shoulder"), ("shoulder", "elbow"), ("elbow", "wrist"), ("wrist", "hand"))
+    ]
+)
+
+
+# --- units
+
+
+def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
+    """Return the unit in which time stamps give a plausible frame rate.
+
+    Args:
+        rate: frame rate when the stamps are read in ``unit`` [Hz].
+        unit: the unit in which the stamps were read [s].
+
+    Returns:
+        the unit's name, and its length over that of ``unit``: what the times must be multiplied by. None when no
+        other unit fits.
+    """
+    low, high = PLAUSIBLE_RATE
+    fits = [
+        (abs(math.log(rate * unit / (30.0 * other))), name, other / unit)
+        for name, other in _TIME_UNITS.items()
+        if low <= rate * unit / other <= high and not math.isclose(other, unit)
+    ]
+    return min(fits)[1:] if fits and rate > 0.0 else None
+
+
+def time_unit_name(unit: float) -> str:
+    """Return the name of a unit of time [s]: ``"s"``, ``"100 ns"`` and so on."""
+    return next((name for name, other in _TIME_UNITS.items() if math.isclose(other, unit)), f"{unit:g} s")
+
+
+def length_unit_that_fits(limb: float) -> str | None:
+    """Return the unit in which the length of a limb is that of a person's, None when no unit fits.
+
+    Args:
+        limb: length of an upper arm or a forearm, as read; in metres it is not plausible.
+    """
+    low, high = PLAUSIBLE_LIMB
+    fits = [name for name, unit in _LENGTH_UNITS.items() if low <= limb * unit <= high]
+    return fits[0] if fits else None
+
+
+# --- axes
+
+
+def axes_that_fit(positions: Array) -> tuple[str, str] | None:
+    """Return what is wrong with the axes of positions, shape (n, 25, 3), and the axes that fit; None when these do.
+
+    In the sensor's frame the spine points up (y), and the trunk is in front of the sensor (z above 0). Of all axes in
+    which both hold, those are proposed in which the person also faces the sensor: the right shoulder has a larger x
+    than the left one. A right-handed choice goes before a mirrored one.
+    """
+    spine = _median(_mean(positions[:, _UPPER]) - _mean(positions[:, _LOWER]))
+    trunk = _median(_mean(positions[:, _TRUNK]))
+    across = _median(positions[:, JOINT["shoulder_right"]] - positions[:, JOINT["shoulder_left"]])
+    if not (np.isfinite(spine).all() and np.isfinite(trunk).all() and np.linalg.norm(spine) > 0.0):
+        return None
+    spine = spine / np.linalg.norm(spine)
+    upright = spine[1] >= _UPRIGHT
+    if upright and trunk[2] > 0.0:
+        return None
+    if upright:
+        fault = f"the person is behind the sensor (z = {trunk[2]:.2f} m)"
+    else:
+        axis = int(np.argmax(np.abs(spine)))
+        fault = f"the head is not above the hips: from hips to head is {'-' if spine[axis] < 0.0 else ''}"
+        fault += f"{'xyz'[axis]} where it should be y"
+    best: tuple[float, str] | None = None
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        axes, sign = list(order), np.array(signs)
+        rows = np.eye(3)[axes] * sign[:, None]
+        if (rows @ spine)[1] < np.sqrt(0.5) or (rows @ trunk)[2] <= 0.0:
+            continue
+        facing = float((rows @ across)[0] / np.linalg.norm(across)) if np.isfinite(across).all() else 0.0
+        mirrored = float(np.linalg.det(rows)) < 0.0
+        score = facing - 0.5 * mirrored + 1e-6 * float(np.trace(rows))
+        names = ", ".join(("-" if s < 0.0 else "") + "xyz"[a] for a, s in zip(axes, sign, strict=True))
+        if best is None or score > best[0]:
+            best = score, ("mirrored, " if mirrored else "") + names
+    return fault, "" if best is None else best[1]
+
+
+def _mean(points: Array) -> Array:
+    """Return the mean over the joints that are seen, shape (n, 3); nan in frames without any."""
+    seen: Mask = np.all(np.isfinite(points), axis=2, keepdims=True)
+    count = seen.sum(axis=1)
+    total = np.where(seen, points, 0.0).sum(axis=1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _median(points: Array) -> Array:
+    """Return the median over the frames that are known, shape (3,); nan when there is none."""
+    known = points[np.isfinite(points).all(axis=1)]
+    return np.median(known, axis=0) if len(known) else np.full(3, np.nan)
+
+
+# --- frames that repeat, joints that leap
+
+
+def repeats_previous(positions: Array) -> Mask:
+    """Return which frames after the first are, number by number, the one before; shape (n - 1,)."""
+    same = (positions[1:] == positions[:-1]) | (np.isnan(positions[1:]) & np.isnan(positions[:-1]))
+    seen = np.any(np.all(np.isfinite(positions[1:]), axis=2), axis=1)
+    return np.asarray(same.all(axis=(1, 2)) & seen)
+
+
+def runs(repeated: Mask) -> list[tuple[int, int]]:
+    """Return first and last frame of each run of frames that are all the same."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], repeated.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def joint_steps(times: Array, positions: Array) -> tuple[Array, Array]:
+    """Return how far [m] and how fast [m/s] each joint moves from each frame to the next, shape (n - 1, 25)."""
+    step = np.linalg.norm(np.diff(positions, axis=0), axis=2)
+    period = np.diff(times)[:, None]
+    return step, np.where(period > 0.0, step / np.where(period > 0.0, period, 1.0), 0.0)
+
+
+def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
+    r"""Find joints that leap away for one to three frames and come back.
+
+    A joint is in a spike when it is more than 0.2 m from the straight line between the frames before and after, these
+    two are less than half as far apart, and either it gets there and back faster than 10 m/s, or a bone of the arm
+    that ends in it is more than 0.12 m longer or shorter than in those two frames. At both ends of a recording a leap
+    of more than 0.3 m faster than 10 m/s is enough.
+
+    Args:
+        times: shape (n,) [s], increasing.
+        positions: shape (n, 25, 3) [m].
+
+    Returns:
+        whether each joint is in a spike, shape (n, 25), and how far it leaps there, shape (n, 25) [m].
+    """
+    n = len(times)
+    found, size = np.zeros(positions.shape[:2], dtype=bool), np.zeros(positions.shape[:2])
+    bones = np.linalg.norm(positions[:, _BONES[:, 0]] - positions[:, _BONES[:, 1]], axis=2)
+    step, speed = joint_steps(times, positions)
+    with np.errstate(invalid="ignore"):
+        for width in _SPIKE_WIDTHS:
+            m = n - width - 1
+            if m < 1:
+                break
+            span = times[width + 1 :] - times[:m]
+            base = positions[width + 1 :] - positions[:m]
+            away = np.full((m, len(JOINTS)), np.inf)
+            for k in range(1, width + 1):
+                fraction = ((times[k : k + m] - times[:m]) / span)[:, None, None]
+                line = positions[:m] + fraction * base
+                away = np.minimum(away, np.linalg.norm(positions[k : k + m] - line, axis=2))
+            fast = np.minimum(speed[:m], speed[width : width + m]) > FASTEST_HAND
+            change = np.full((m, len(_BONES)), np.inf)
+            for k in range(1, width + 1):
+                change = np.minimum(change, np.abs(bones[k : k + m] - 0.5 * (bones[:m] + bones[width + 1 :])))
+            stretched = np.zeros_like(fast)
+            for bone, joints in zip(np.moveaxis(change > _BONE_CHANGE, 1, 0), _BONES, strict=True):
+                stretched[:, joints] |= bone[:, None]
+            spike = (span <= _SPIKE_TIME)[:, None] & (away > _SPIKE) & (np.linalg.norm(base, axis=2) < 0.5 * away)
+            spike &= fast | stretched
+            for k in range(1, width + 1):
+                found[k : k + m] |= spike
+                size[k : k + m] = np.maximum(size[k : k + m], np.where(spike, away, 0.0))
+        leap = (step > LARGEST_STEP) & (speed > FASTEST_HAND)
+    for width in _SPIKE_WIDTHS[: max((n - 1) // 2, 0)]:
+        for edge, i in ((slice(0, width), width - 1), (slice(n - width, n), n - 1 - width)):
+            at = leap[i] & ~found[i] & ~found[i + 1]
+            found[edge] |= at
+            size[edge] = np.maximum(size[edge], np.where(at, step[i], 0.0))
+    return found, size
