@@ -115,7 +115,9 @@ def _without_repeats(frames: list[Skeleton], notes: list[str]) -> list[Skeleton]
                 lost[first + 1 : last + 1, _ARM[side]] = True
     lost[1:][whole] = False
     if whole.any():
-        notes.append(f"dropped {int(whole.sum())} frames that repeat the one before")
+        longest = max(float(times[last] - times[first]) for first, last in runs(whole))
+        note = f"dropped {int(whole.sum())} frames that repeat the one before, for up to {longest:.2f} s on end"
+        notes.append(note)
     if lost.any():
         notes.append(f"took an arm as lost in {int(lost.any(axis=1).sum())} frames in which it was frozen")
     changed = [_with_lost(skeleton, joints) for skeleton, joints in zip(frames, lost, strict=True)]
