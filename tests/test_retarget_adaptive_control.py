@@ -3,8 +3,7 @@ import pytest
 
 from imitarm import ArmModel
 from imitarm.retarget import Correspondence
-from imitarm.retarget.baselines.adaptive_control import CUT_OFF, AdaptiveControl
-from imitarm.retarget.baselines.adaptive_law import START_STIFFNESS
+from imitarm.retarget.baselines.adaptive_control import CUT_OFF, START_STIFFNESS, AdaptiveControl
 from shown_arm import EASY, LENGTHS, shown, swing
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}

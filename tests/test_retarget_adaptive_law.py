@@ -5,8 +5,7 @@ from hypothesis import strategies as st
 
 from imitarm import ArmModel
 from imitarm.errors import InputError
-from imitarm.retarget.baselines.adaptive_law import START_STIFFNESS, AdaptiveLaw
-from imitarm.retarget.baselines.joint_plant import JointPlant
+from imitarm.retarget.baselines.adaptive_control import START_STIFFNESS, AdaptiveLaw, JointPlant
 
 SAWYER, PANDA = ArmModel.load("sawyer", tool="gripper"), ArmModel.load("panda", tool="gripper")
 T = 0.01

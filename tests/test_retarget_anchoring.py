@@ -11,8 +11,8 @@ from imitarm import InputError
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import JOINT, Skeleton, Tracking
 from imitarm.retarget import FACING, Correspondence, LimbLengths
-from imitarm.retarget.anchoring import FARTHEST, Anchoring
 from imitarm.retarget.arm_estimator import ArmEstimator
+from imitarm.retarget.smoothing import FARTHEST, Anchoring
 
 T = 1 / 30
 SEEN, GUESSED = [1.0, 1.0, 1.0], [1.0, 1.0, 0.5]

@@ -10,8 +10,8 @@ from imitarm.capture.skeleton import JOINT, HandState, Skeleton, Tracking
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.errors import UnknownNameError
 from imitarm.retarget import FACING, Correspondence, LimbLengths
-from imitarm.retarget.anchoring import Anchoring
 from imitarm.retarget.arm_estimator import ArmEstimator
+from imitarm.retarget.smoothing import Anchoring
 
 PERSON = Person.from_seed(2)
 LENGTHS = LimbLengths(PERSON.upper_arm, PERSON.forearm)

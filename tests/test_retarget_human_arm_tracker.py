@@ -4,7 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from imitarm.kinematics.pose import matrix_to_quaternion, quaternion_conjugate, quaternion_log, quaternion_multiply
 from imitarm.retarget.arm_estimator import ArmEstimate
-from imitarm.retarget.baselines.human_arm_tracker import HumanArmTracker, roll_pitch_yaw
+from imitarm.retarget.baselines.thesis import HumanArmTracker, roll_pitch_yaw
 from imitarm.retarget.human_arm import human_arm_pose
 from imitarm.retarget.limbs import LimbLengths
 

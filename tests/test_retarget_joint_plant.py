@@ -3,7 +3,7 @@ import pytest
 
 from imitarm import ArmModel
 from imitarm.errors import InputError
-from imitarm.retarget.baselines.joint_plant import JointPlant
+from imitarm.retarget.baselines.adaptive_control import JointPlant
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
 each = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)

@@ -3,8 +3,7 @@ import pytest
 from scipy.interpolate import make_lsq_spline
 
 from imitarm.errors import InputError
-from imitarm.retarget.baselines.nurbs import NURBS
-from imitarm.retarget.baselines.nurbs_fit import averaged_knots, bends, fit_nurbs
+from imitarm.retarget.baselines.nurbs import NURBS, averaged_knots, bends, fit_nurbs
 
 SIGMA = 0.01
 

@@ -4,7 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_exp, quaternion_log, quaternion_multiply
-from imitarm.retarget.baselines.rotation_curve import fit_rotations
+from imitarm.retarget.baselines.hand_curve import fit_rotations
 
 TIMES = np.linspace(0.0, 4.0, 121)
 

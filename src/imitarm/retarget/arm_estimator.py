@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from imitarm.capture.skeleton import HandState, Skeleton
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import matrix_to_quaternion
-from imitarm.retarget.anchoring import Anchoring
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import carried, hand_rotation
 from imitarm.retarget.limbs import LimbLengths, correct_limbs, fit_limbs, measure_limbs
-from imitarm.retarget.smoothing import GAP, Hampel, OneEuro, OneEuroRotation
+from imitarm.retarget.smoothing import GAP, Anchoring, Hampel, OneEuro, OneEuroRotation
 
 Array = NDArray[np.float64]
 
@@ -74,7 +73,7 @@ class ArmEstimator:
     Args:
         correspondence: which arm, and where the sensor is.
         smoothing: One-Euro filters on, and jumps that come with a change of tracking taken out
-            (:class:`~imitarm.retarget.anchoring.Anchoring`); off, the corrected points are given as they are.
+            (:class:`~imitarm.retarget.smoothing.Anchoring`); off, the corrected points are given as they are.
         limbs: how the bones get their lengths: ``"fit"`` by the least change of all three points,
             ``"direction"`` as the thesis does, from the shoulder outwards.
     """

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.retarget.baselines.advice import COUNTED, Advice
 from imitarm.retarget.baselines.baseline_retargeter import BaselineRetargeter
-from imitarm.retarget.baselines.infeasible import Constraint, Infeasible
+from imitarm.retarget.baselines.demonstrated_motion import ShownMotion, holds
+from imitarm.retarget.baselines.feasibility import Constraint, Infeasible
 from imitarm.retarget.baselines.joint_mapping import Approach, JointMapping
-from imitarm.retarget.baselines.shown_motion import ShownMotion, holds
+from imitarm.retarget.baselines.segment_correction import COUNTED, Advice
 from imitarm.retarget.correspondence import Clutch, Correspondence
 from imitarm.retarget.engagement import EngagementState
 from imitarm.retarget.retargeter import Goal, Retargeting, RetargetStep, in_order
@@ -40,9 +40,9 @@ class DemonstrationModification(BaselineRetargeter):
 
     1. the person's joint angles in closed form are the robot's
        (:class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`);
-    2. :class:`~imitarm.retarget.baselines.infeasible.Infeasible` says where the arm can't do that;
+    2. :class:`~imitarm.retarget.baselines.feasibility.Infeasible` says where the arm can't do that;
     3. for each such segment, widened by 0.2 s, the first that clears it is taken of: slower, wrist pulled in, elbow
-       turned; else its key frames are repaired (:mod:`imitarm.retarget.baselines.advice_operators`);
+       turned; else its key frames are repaired (:mod:`imitarm.retarget.baselines.segment_correction`);
     4. up to five rounds; what is still infeasible then is counted, and cut at the limits of position.
 
     :meth:`step` is the mapping of step 1, uncorrected, cut at the limits of position, for what must be live.

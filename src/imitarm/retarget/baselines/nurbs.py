@@ -1,17 +1,30 @@
-"""NURBS: curves of rational splines (thesis Eq 3.6 and 3.7, METHODS A.6)."""
+"""NURBS: rational spline curves (thesis Eq 3.6 and 3.7), and their fit to noisy samples."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import lapack
+from scipy.optimize import brentq, minimize_scalar
 
 from imitarm.errors import InputError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Smoothing = float | str
+
+SMOOTHINGS = ("gcv", "morozov")
+"""How the strength of the smoothing may be chosen, beside a number."""
+
+_MU = (-6.0, 6.0)  # decades that are searched
+_HUBER, _PASSES = 2.5, 3  # an outlier is farther than 2.5 sigma; reweighted so often
+_MAD = 1.4826  # median of |normal| to its standard deviation
+_WEIGHTS = (0.2, 5.0)  # of rational curves
+_RATIONAL_PASSES = 3
 
 
 def basis_functions(knots: Array, degree: int, u: ArrayLike) -> tuple[Indices, Array]:
@@ -147,3 +160,267 @@ class NURBS:
                 top = top - math.comb(r, j) * parts[j][:, -1:] * found[r - j]
             found.append(top / bottom)
         return found[order].reshape(*at.shape, self.control_points.shape[1])
+
+
+def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
+    """Return knots that follow where the data are, so that every span holds some (Piegl and Tiller, Eq 9.69).
+
+    Args:
+        u: parameters of the data, increasing, shape (k,), k at least ``n_control``.
+        n_control: number of control points.
+        degree: of the curve.
+
+    Returns:
+        shape (n_control + degree + 1,).
+    """
+    inner = np.arange(1, n_control - degree) * (len(u) / (n_control - degree))
+    i = inner.astype(int)
+    share = inner - i
+    between = (1.0 - share) * u[i - 1] + share * u[i]
+    return np.concatenate([np.full(degree + 1, u[0]), between, np.full(degree + 1, u[-1])])
+
+
+class _Problem:
+    """The samples, the basis functions at them, and all of the normal equations that no confidence changes."""
+
+    def __init__(self, first: Indices, values: Array, points: Array, rows: Array) -> None:
+        self.first, self.values, self.points, self.rows = first, values, points, rows
+        self.n_control = n_control = len(rows) + 2
+        self.order, self.dim = order, dim = values.shape[1], points.shape[1]
+        self.reached = first[:, None] + np.arange(order)  # which control points each sample depends on
+        pairs = [(a, b) for a in range(order) for b in range(a + 1)]
+        a, b = (np.array(x) for x in zip(*pairs, strict=True))
+        self._cells = ((a - b) * n_control + self.reached[:, b]).ravel()
+        self._products = values[:, a] * values[:, b]
+        self._places = (self.reached[:, :, None] * dim + np.arange(dim)).ravel()
+        self._moments = (values[:, :, None] * points[:, None, :]).reshape(len(first), -1)
+        self.bend = _bend_band(rows, order)
+
+    def normal(self, confidence: Array) -> tuple[Array, Array]:
+        """Return the lower band of R^T C R, shape (degree + 1, n), and R^T C Q, shape (n, d)."""
+        c, n, order, dim = confidence[:, None], self.n_control, self.order, self.dim
+        band = np.bincount(self._cells, (c * self._products).ravel(), order * n)
+        right = np.bincount(self._places, (c * self._moments).ravel(), n * dim)
+        return np.asarray(band.reshape(order, n), dtype=float), np.asarray(right.reshape(n, dim), dtype=float)
+
+    def residual(self, control: Array) -> Array:
+        """Return R P - Q, shape (k, d)."""
+        return np.asarray((self.values[:, None, :] @ control[self.reached])[:, 0] - self.points)
+
+    def with_weights(self, weights: Array) -> _Problem:
+        """Return the same samples for a rational curve with weights (n,)."""
+        weighted = self.values * weights[self.reached]
+        return _Problem(self.first, weighted / weighted.sum(axis=1, keepdims=True), self.points, self.rows)
+
+
+def fit_nurbs(
+    times: ArrayLike,
+    points: ArrayLike,
+    confidence: ArrayLike | None = None,
+    *,
+    degree: int = 3,
+    n_control: int | None = None,
+    smoothing: Smoothing = "gcv",
+    sigma: float | None = None,
+    robust: bool = True,
+    rational: bool = False,
+) -> NURBS:
+    r"""Fit a curve to a motion, each sample by how far it is believed (METHODS A.6).
+
+    .. math:: \min_P \sum_k c_k \Bigl|\sum_i R_{ik} P_i - Q_k\Bigr|^2 + \mu \sum_j |(D P)_j|^2,
+        \qquad R_{ik} = \frac{N_i(t_k)\, w_i}{\sum_j N_j(t_k)\, w_j}
+
+    with D the second differences of :func:`bends`. The parameter is the time itself, not the length of the chord: the
+    speed is part of the motion. The normal equations have a band of width p, so the time it takes grows with the number
+    of samples only; ``"gcv"`` takes longer, since it needs the inverse.
+
+    Args:
+        times: strictly increasing, shape (k,) [s].
+        points: Q, shape (k, d); whatever where the confidence is 0, nan too.
+        confidence: c, 0 to 1, shape (k,); None: all 1.
+        degree: p.
+        n_control: number of control points; None: k/4 + p.
+        smoothing: :math:`\mu`, or ``"gcv"``: the one whose prediction of left-out samples is best (generalised cross
+            validation; supposes independent errors), or ``"morozov"``: the one that leaves a residual of ``sigma``.
+        sigma: standard deviation of a sample on each axis, in the points' unit; None: from the residuals.
+        robust: samples farther than 2.5 sigma off count for less (Huber), found in three passes.
+        rational: fit the weights w too, between 0.2 and 5, mean 1; else all are 1. Needed for exact arcs only.
+
+    Raises:
+        InputError: when shapes do not fit, times do not increase, fewer than p + 1 samples are believed, or an option
+            is none.
+    """
+    t, q, c = _checked(times, points, confidence, degree)
+    _check_options(smoothing, sigma)
+    believed = t[c > 0.0]
+    n = min(math.ceil(len(t) / 4) + degree, len(believed)) if n_control is None else n_control
+    if not degree + 1 <= n <= len(believed):
+        raise InputError(f"fit_nurbs: n_control must be {degree + 1} to {len(believed)} (samples believed), got {n}")
+    knots = averaged_knots(believed, n, degree)
+    knots[: degree + 1], knots[-degree - 1 :] = t[0], t[-1]
+    first, values = basis_functions(knots, degree, t)
+    problem = _Problem(first, values, q, bends(knots, degree))
+    used = c
+    mu = _strength(problem, c, smoothing, sigma)
+    control = _solve(problem, c, mu)
+    for _ in range(_PASSES if robust else 0):
+        away = problem.residual(control)
+        least = _MAD * float(np.median(np.abs(away[c > 0.0]))) if sigma is None else sigma
+        used = c * _huber(away, _HUBER * least)
+        control = _solve(problem, used, mu)
+    if robust and isinstance(smoothing, str):
+        mu = _strength(problem, used, smoothing, sigma)
+        control = _solve(problem, used, mu)
+    weights = np.ones(n)
+    if rational:
+        weights = _rational_weights(problem, used, mu)
+        problem = problem.with_weights(weights)
+        control = _solve(problem, used, mu)
+    return NURBS(knots, control, weights, degree)
+
+
+def _checked(
+    times: ArrayLike, points: ArrayLike, confidence: ArrayLike | None, degree: int
+) -> tuple[Array, Array, Array]:
+    t, q = np.asarray(times, dtype=float), np.array(points, dtype=float)
+    c = np.ones(len(t)) if confidence is None else np.array(confidence, dtype=float)
+    if t.ndim != 1 or q.ndim != 2 or len(q) != len(t) or c.shape != t.shape:
+        raise InputError(f"fit_nurbs: needs times (k,), points (k, d), confidence (k,); got {t.shape}, {q.shape}")
+    if degree < 2:
+        raise InputError(f"fit_nurbs: degree must be at least 2, or the speed jumps; got {degree!r}")
+    if not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
+        raise InputError("fit_nurbs: times must be finite and strictly increasing; sort them, drop repeated frames")
+    if not ((c >= 0.0) & (c <= 1.0)).all():
+        raise InputError("fit_nurbs: confidence must be between 0 and 1")
+    if int((c > 0.0).sum()) < degree + 1:
+        raise InputError(
+            f"fit_nurbs: degree {degree} needs {degree + 1} samples of confidence above 0, got {int((c > 0.0).sum())}"
+        )
+    q[c == 0.0] = 0.0
+    if not np.isfinite(q).all():
+        raise InputError("fit_nurbs: points must be finite where their confidence is above 0")
+    return t, q, c
+
+
+def _check_options(smoothing: Smoothing, sigma: float | None) -> None:
+    if isinstance(smoothing, str) and smoothing not in SMOOTHINGS:
+        raise InputError(f"fit_nurbs: smoothing must be a number or one of {SMOOTHINGS}, got {smoothing!r}")
+    if not isinstance(smoothing, str) and not 0.0 <= smoothing < math.inf:
+        raise InputError(f"fit_nurbs: smoothing must not be negative, got {smoothing!r}")
+    if sigma is not None and not 0.0 < sigma < math.inf:
+        raise InputError(f"fit_nurbs: sigma must be positive, got {sigma!r}")
+    if smoothing == "morozov" and sigma is None:
+        raise InputError("fit_nurbs: smoothing='morozov' needs sigma, the standard deviation of a sample")
+
+
+def bends(knots: Array, degree: int) -> Array:
+    r"""Return the second differences D of the control points, shape (n - 2, 3): row j acts on points j, j+1, j+2.
+
+    Control points stand over the means of p knots, :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`, which crowd at the
+    ends. Plain differences :math:`P_{j+1} - 2 P_j + P_{j-1}` would take a straight steady motion for a bent one there
+    and slow it down, so they are divided ones, :math:`h (\frac{P_{j+1} - P_j}{g_{j+1} - g_j} - \frac{P_j -
+    P_{j-1}}{g_j - g_{j-1}})` with h the mean distance: where knots are even, they are the plain ones.
+    """
+    means = np.convolve(knots[1:-1], np.full(degree, 1.0 / degree), "valid")
+    apart = np.diff(means)
+    share = apart.mean() / apart
+    return np.column_stack([share[:-1], -share[:-1] - share[1:], share[1:]])
+
+
+def _bend_band(rows: Array, order: int) -> Array:
+    """Return the lower band of D^T D, shape (order, n)."""
+    n = len(rows) + 2
+    band = np.zeros((order, n))
+    for shift in range(3):
+        for j in range(3 - shift):
+            band[shift, j : n - 2 + j] += rows[:, j] * rows[:, j + shift]
+    return band
+
+
+def _system(problem: _Problem, confidence: Array, mu: float) -> tuple[Array, Array, Array]:
+    band, right = problem.normal(confidence)
+    system = band + mu * problem.bend
+    system[0] += 1e-12 * float(system[0].max())  # where nothing was seen and nothing is smoothed: stay finite
+    return band, system, right
+
+
+def _solve(problem: _Problem, confidence: Array, mu: float) -> Array:
+    _, system, right = _system(problem, confidence, mu)
+    return np.asarray(lapack.dpbsv(system, right, lower=1)[1])
+
+
+def _huber(residual: Array, delta: float) -> Array:
+    length = np.sqrt(np.sum(residual * residual, axis=1))
+    return np.asarray(np.minimum(1.0, delta / np.maximum(length, 1e-300)))
+
+
+def _strength(problem: _Problem, confidence: Array, smoothing: Smoothing, sigma: float | None) -> float:
+    """Return mu."""
+    if not isinstance(smoothing, str):
+        return float(smoothing)
+    if smoothing == "morozov":
+        assert sigma is not None
+        total, dim = float(confidence.sum()), problem.points.shape[1]
+
+        def excess(decade: float) -> float:
+            away = problem.residual(_solve(problem, confidence, 10.0**decade))
+            return math.sqrt(float(confidence @ np.sum(away * away, axis=1)) / (total * dim)) - sigma
+
+        low, high = excess(_MU[0]), excess(_MU[1])
+        if low >= 0.0 or high <= 0.0:  # the residual can't be that small or that large
+            return float(10.0 ** (_MU[0] if low >= 0.0 else _MU[1]))
+        return float(10.0 ** brentq(excess, *_MU, xtol=0.02))
+    return _cross_validated(problem, confidence)
+
+
+def _cross_validated(problem: _Problem, confidence: Array) -> float:
+    r"""Return the mu with the least :math:`k\,RSS / (k - \mathrm{tr} H)^2`, H the matrix that smooths."""
+    count = float((confidence > 0.0).sum())
+    eye = np.eye(problem.n_control)
+
+    def score(decade: float) -> float:
+        band, system, right = _system(problem, confidence, 10.0**decade)
+        both = lapack.dpbsv(system, np.column_stack([right, eye]), lower=1)[1]
+        control, inverse = both[:, : right.shape[1]], both[:, right.shape[1] :]
+        trace = float(band[0] @ np.diagonal(inverse))
+        for shift in range(1, len(band)):
+            trace += 2.0 * float(band[shift, :-shift] @ np.diagonal(inverse, -shift))
+        away = problem.residual(control)
+        return float(confidence @ np.sum(away * away, axis=1)) / max(count - trace, 1e-6) ** 2
+
+    return _least(score)
+
+
+def _least(score: Callable[[float], float]) -> float:
+    """Return 10 to the power of the decade of least score: first whole decades, then between their neighbours."""
+    decades = np.arange(_MU[0], _MU[1] + 0.5)
+    best = float(decades[int(np.argmin([score(float(d)) for d in decades]))])
+    finer = minimize_scalar(score, bounds=(best - 1.0, best + 1.0), method="bounded", options={"xatol": 0.1})
+    return float(10.0 ** float(finer.x))
+
+
+def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
+    r"""Return weights w (n,), mean 1, by least squares that are reweighted by the last denominator.
+
+    :math:`\sum_k \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is quadratic in
+    both; X is eliminated, and of all w that do as well the one nearest to ones is taken.
+    """
+    n = problem.n_control
+    basis = np.zeros((len(problem.first), n))
+    np.put_along_axis(basis, problem.reached, problem.values, axis=1)
+    middle = problem.points - problem.points.mean(axis=0)  # the origin must not matter
+    weights = np.ones(n)
+    bend = np.zeros((n - 2, n))
+    np.put_along_axis(bend, np.arange(n - 2)[:, None] + np.arange(3), problem.rows, axis=1)
+    stiff = mu * bend.T @ bend
+    for _ in range(_RATIONAL_PASSES):
+        share = (confidence / np.square(basis @ weights))[:, None] * basis
+        inverse = np.linalg.pinv(basis.T @ share + stiff)
+        cost = np.zeros((n, n))
+        for axis in middle.T:
+            cross = share.T @ (axis[:, None] * basis)
+            cost += (np.square(axis)[:, None] * share).T @ basis - cross.T @ inverse @ cross
+        near = 1e-9 * np.trace(cost) / n + 1e-300
+        weights = np.linalg.solve(cost + near * np.eye(n), near * np.ones(n))
+        weights = np.clip(weights / weights.mean(), *_WEIGHTS) if weights.mean() != 0.0 else np.ones(n)
+    return weights

@@ -3,7 +3,7 @@ import pytest
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_exp
-from imitarm.retarget.baselines.playback import HandCurve, HandSample, Playback
+from imitarm.retarget.baselines.hand_curve import HandCurve, HandSample, Playback
 
 LAG, DT = 0.07, 0.01
 

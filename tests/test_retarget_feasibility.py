@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from imitarm import ArmModel
 from imitarm.errors import InputError
-from imitarm.retarget.baselines.infeasible import Infeasible, above, blend, segments, upright
+from imitarm.retarget.baselines.feasibility import Infeasible, above, blend, segments, upright
 
 SAWYER = ArmModel.load("sawyer", tool="gripper")
 F = Infeasible(SAWYER, 0.01)

@@ -6,10 +6,10 @@ from hypothesis import strategies as st
 from imitarm import ArmModel
 from imitarm.kinematics.sew import sew_angle
 from imitarm.retarget.arm_estimator import ArmEstimator
-from imitarm.retarget.baselines.advice_operators import elbow_turned, pull, pulled_in, repaired, slowed
-from imitarm.retarget.baselines.infeasible import Infeasible, blend, segments
+from imitarm.retarget.baselines.demonstrated_motion import ShownMotion
+from imitarm.retarget.baselines.feasibility import Infeasible, blend, segments
 from imitarm.retarget.baselines.joint_mapping import JointMapping
-from imitarm.retarget.baselines.shown_motion import ShownMotion
+from imitarm.retarget.baselines.segment_correction import elbow_turned, pull, pulled_in, repaired, slowed
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import human_arm_pose
 from shown_arm import EASY, LENGTHS, shown, swing
