@@ -53,39 +53,39 @@ def test_four_pieces_need_four_components() -> None:
 
 def test_held_out_error_is_that_of_learning_without_each() -> None:
     demonstrations = tables()
-    (judged,) = try_numbers_of_components(demonstrations, [4], MIN_STD, 1e-6)
+    (evaluated,) = try_numbers_of_components(demonstrations, [4], MIN_STD, 1e-6)
     squares = []
     for i, left_out in enumerate(demonstrations):
         rest = [Trajectory(d[:, 0], d[:, 1:]) for j, d in enumerate(demonstrations) if j != i]
         squares.append(np.sum((GMR(4).fit(rest).predict(left_out[:, 0])[0] - left_out[:, 1:]) ** 2, axis=1))
-    assert judged.held_out_rmse_mm == pytest.approx(1e3 * np.sqrt(np.mean(squares)), rel=0.02)
+    assert evaluated.held_out_rmse_mm == pytest.approx(1e3 * np.sqrt(np.mean(squares)), rel=0.02)
 
 
 def test_criteria_are_those_of_the_mixture() -> None:
     demonstrations = tables()
-    (judged,) = try_numbers_of_components(demonstrations, [4], MIN_STD, 1e-6)
+    (evaluated,) = try_numbers_of_components(demonstrations, [4], MIN_STD, 1e-6)
     X = np.concatenate(demonstrations)
     mixture = GaussianMixture(4, tol=1e-3).fit(X)
-    assert judged.bic == pytest.approx(mixture.bic(X), rel=2e-3)
-    assert judged.aic - judged.bic == pytest.approx(mixture.aic(X) - mixture.bic(X), rel=1e-9)
+    assert evaluated.bic == pytest.approx(mixture.bic(X), rel=2e-3)
+    assert evaluated.aic - evaluated.bic == pytest.approx(mixture.aic(X) - mixture.bic(X), rel=1e-9)
 
 
 def test_a_still_axis_is_left_out_but_counts_in_the_error() -> None:
     flat = tables()
     for i, table in enumerate(flat):
         table[:, 3] = 0.2 + 1e-5 * i
-    (judged,) = try_numbers_of_components(flat, [4], MIN_STD, 1e-6)
-    assert np.isfinite([judged.bic, judged.held_out_rmse_mm]).all()
+    (evaluated,) = try_numbers_of_components(flat, [4], MIN_STD, 1e-6)
+    assert np.isfinite([evaluated.bic, evaluated.held_out_rmse_mm]).all()
 
 
 def test_large_numbers_are_not_tried_in_vain() -> None:
-    judged = try_numbers_of_components(tables(spread=0.03), range(1, 41), MIN_STD, 1e-6)
-    assert len(judged) == 8  # 4, and four more that are no better
+    evaluated = try_numbers_of_components(tables(spread=0.03), range(1, 41), MIN_STD, 1e-6)
+    assert len(evaluated) == 8  # 4, and four more that are no better
 
 
 def test_numbers_beyond_the_samples_are_skipped_or_refused() -> None:
     few = [table[::20] for table in tables(n=3)]  # 5 samples each
-    judged = try_numbers_of_components(few, [2, 4, 90], MIN_STD, 1e-6)
-    assert [c.n_components for c in judged] == [2, 4]
+    evaluated = try_numbers_of_components(few, [2, 4, 90], MIN_STD, 1e-6)
+    assert [c.n_components for c in evaluated] == [2, 4]
     with pytest.raises(InputError, match="too few"):
         try_numbers_of_components(few, [90], MIN_STD, 1e-6)

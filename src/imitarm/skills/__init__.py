@@ -5,10 +5,9 @@ from __future__ import annotations
 from imitarm.skills.dmp import DMP, DMPState
 from imitarm.skills.dynamical_systems import GAINS, Gains
 from imitarm.skills.gmm import DegenerateAxisWarning, GaussianMixture, ellipsoid_scale
-from imitarm.skills.gmr import GMR
+from imitarm.skills.gmr import GMR, SingleDemonstrationWarning, UnalignedWarning
 from imitarm.skills.quaternion_dmp import QuaternionDMP
 from imitarm.skills.rhythmic_dmp import RhythmicDMP
-from imitarm.skills.samples import SingleDemonstrationWarning, UnalignedWarning
 from imitarm.skills.skill import Skill
 
 __all__ = [

@@ -1,23 +1,25 @@
-"""Expectation maximisation of Gaussian mixtures, many fits side by side, without a loop over components or samples.
+"""Expectation maximisation (EM) of Gaussian mixtures: many fits side by side, and the responsibilities to start from.
 
 The logarithm of a weighted Gaussian is linear in the quadratic features ``phi(z) = [1, z_i, z_i z_j (i <= j)]``::
 
     log pi_k N(z; mu_k, Sigma_k) = theta_k . phi(z)
 
-so that all log-densities are one matrix product ``theta @ phi``, and all sufficient statistics are another one,
-``responsibilities @ phi^T``. Put into a symmetric matrix, the statistics of one component are the second moments of
-``[1; z]``, and one inverse gives everything that ``theta_k`` needs (``P = Sigma^-1``)::
+so all log-densities are one matrix product ``theta @ phi``, and all sufficient statistics are another one,
+``responsibilities @ phi^T``. There is no loop over components or samples. Written as a symmetric matrix, the
+statistics of one component are the second moments of ``[1; z]``, and its inverse holds all parts of ``theta_k``
+(``P = Sigma^-1``)::
 
     M = [1     mu^T             ]     M^-1 = [1 + mu^T P mu   -mu^T P]     det M = det Sigma
         [mu    Sigma + mu mu^T  ]            [-P mu            P     ]
 
-Fits that differ only in where they start or in which samples they may see (restarts, held-out folds) are further rows
-of the same two products. Data are meant to be standardised (mean 0, deviation 1 of each column), which keeps the sums
-of squares well conditioned.
+Fits that differ only in their start or in their samples (restarts, folds of a cross-validation) are further rows of
+the same two products. The samples must be standardised (each column with mean 0 and standard deviation 1), so that the
+sums of squares are well conditioned.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -26,19 +28,23 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 LOG_2PI = float(np.log(2.0 * np.pi))
-_NOTHING = -45.0  # exp(-45) is lost beside 1 in double precision; numbers far below make np.exp slow
+_SLOTS = 40  # least number of equal time slots that segments are made of; 4 per component if that is more
+_EDGE = 1e-4  # of a slot: rounding must not move a time that lies on an edge into the other slot
+_SOFT = 1e-6  # variance added to a segment, relative to the columns', so that a straight one costs a finite amount
+_EVEN = 0.05  # weight of the squared lengths; a sample costs about 10. It makes lengths equal where the data allow it
+_NOTHING = -45.0  # exp(-45) vanishes beside 1 in double precision; np.exp is slow for much smaller numbers
 
 
 class Fit(NamedTuple):
-    """What :func:`expectation_maximisation` found, for each of ``B`` fits.
+    """The result of :func:`expectation_maximisation`, for each of ``B`` fits.
 
     Attributes:
         weights: priors pi, shape (B, K).
-        moments: second moments of [1; z], the matrix M of the module's docstring, shape (B, K, d + 1, d + 1).
+        moments: second moments of [1; z], the matrix M in the docstring of this module, shape (B, K, d + 1, d + 1).
         theta: weights of the quadratic features, shape (B, K, F), F = (d + 1) (d + 2) / 2.
         log_likelihood: mean log-likelihood per sample at exactly these parameters, shape (B,).
         converged: whether its last change was below the tolerance, shape (B,).
-        n_iter: number of iterations done (the fits run side by side).
+        n_iter: number of iterations, the same for all fits.
     """
 
     weights: Array
@@ -61,11 +67,11 @@ class Fit(NamedTuple):
 
 @cache
 def packing(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Return how a symmetric (size, size) matrix and its packed upper triangle map to each other.
+    """Return the maps between a symmetric (size, size) matrix and its packed upper triangle.
 
     Returns:
-        Places of the packed numbers in the flat matrix, the (size, size) table of the way back, and the factors that
-        ``-[1; z]^T M^-1 [1; z] / 2`` gives to the packed numbers.
+        The indices of the packed numbers in the flat matrix, the (size, size) indices of each entry in the packed
+        numbers, and the factors of the packed numbers in ``-[1; z]^T M^-1 [1; z] / 2``.
     """
     i, j = np.triu_indices(size)
     unpack = np.empty((size, size), dtype=np.intp)
@@ -88,8 +94,8 @@ def _theta(weights: Array, moments: Array, floor: float) -> Array | None:
         inverse = np.linalg.inv(moments)
     except np.linalg.LinAlgError:
         return None
-    # The smallest eigenvalue is at least 1 / trace(P), so most iterations need no eigenvalues at all. A negative one,
-    # which only rounding can make, shows on the diagonal of P as a negative number.
+    # The smallest eigenvalue is at least 1 / trace(P), so most iterations need no eigenvalues at all. A negative
+    # eigenvalue, which only rounding can cause, makes a number on the diagonal of P negative.
     diagonal = np.einsum("bkii->bki", inverse)[..., 1:]
     if not (diagonal.min() > 0.0 and diagonal.sum(axis=-1).max() < 1.0 / floor):
         return None
@@ -138,7 +144,7 @@ def normalise(log_density: Array) -> tuple[Array, Array]:
     """Turn log-densities (B, K, n) into responsibilities, in place, by log-sum-exp over the components.
 
     Returns:
-        Responsibilities (B, K, n), in the memory given, and log-likelihoods of the samples (B, n).
+        Responsibilities (B, K, n), in the memory of ``log_density``, and log-likelihoods of the samples (B, n).
     """
     top = log_density.max(axis=1)
     ratio = np.subtract(log_density, top[:, None], out=log_density)
@@ -162,13 +168,13 @@ def expectation_maximisation(
 
     Args:
         features: :func:`quadratic_features` of the standardised samples, shape (F, n).
-        responsibilities: where to start, shape (B, K, n).
-        sample_weights: how often each sample counts in each fit, shape (B, n); 0 holds it out. None: once each.
+        responsibilities: of the start, shape (B, K, n).
+        sample_weights: weight of each sample in each fit, shape (B, n); 0 leaves it out. None: 1 for all.
         floor: smallest eigenvalue of a covariance, in squared standard deviations of the columns.
         tol: stop when the mean log-likelihood per sample changes by less, in every fit.
         max_iter: most iterations.
     """
-    share = None if sample_weights is None else sample_weights / sample_weights.sum(axis=1, keepdims=True)
+    fraction = None if sample_weights is None else sample_weights / sample_weights.sum(axis=1, keepdims=True)
     last = np.full(len(responsibilities), -np.inf)
     n_iter = 0
     while True:
@@ -177,8 +183,102 @@ def expectation_maximisation(
             responsibilities = responsibilities * sample_weights[:, None]
         weights, moments, theta = _maximise(features, responsibilities, floor)
         responsibilities, by_sample = normalise(log_densities(theta, features))
-        likelihood = by_sample.mean(axis=1) if share is None else (by_sample * share).sum(axis=1)
+        likelihood = by_sample.mean(axis=1) if fraction is None else (by_sample * fraction).sum(axis=1)
         converged = np.abs(likelihood - last) < tol
         if converged.all() or n_iter >= max_iter:
             return Fit(weights, moments, theta, likelihood, converged, n_iter)
         last = likelihood
+
+
+def responsibilities_by_segments(features: Array, column: Array, numbers: Sequence[int]) -> list[Array]:
+    """Divide time into the K segments that Gaussians describe best, for several K at once.
+
+    The span of ``column`` is divided into slots of equal length. A segment with n of the N samples and covariance Sigma
+    costs ``n (log det Sigma / 2 - log(n / N))``, the negative log-likelihood under a Gaussian of its own, plus a small
+    amount for its squared length, so that lengths are equal where the data allow it. Dynamic programming over the slots
+    finds the cheapest division for every K up to the largest. It is deterministic, and EM needs fewer iterations from
+    there than from equal bins.
+
+    Args:
+        features: of the standardised samples, shape (F, n).
+        column: times of the samples, shape (n,).
+        numbers: the numbers K of segments.
+
+    Returns:
+        Responsibilities of 0 or 1, shape (K, n), in the order of time, for each K. Equal bins where a division into
+        slots is impossible (few samples, or gaps in time).
+    """
+    most = max(numbers)
+    n_slots = max(_SLOTS, 4 * most)
+    low, high = column.min(), column.max()
+    slots = (column - low) * (n_slots / max(high - low, 1e-300)) + _EDGE
+    slot = np.minimum(slots.astype(np.intp), n_slots - 1)
+    sums = np.asarray(slot == np.arange(n_slots)[:, None], dtype=float) @ features.T
+    cumulative = np.concatenate([np.zeros((1, len(features))), np.cumsum(sums, axis=0)])
+    first, last = np.triu_indices(n_slots + 1, 1)
+    cost = np.full((n_slots + 1, n_slots + 1), np.inf)
+    evenly = _EVEN * len(column) * ((last - first) / n_slots) ** 2
+    cost[first, last] = _segment_costs(cumulative[last] - cumulative[first], len(column)) + evenly
+    cheapest = cost[0]
+    came_from: list[NDArray[np.intp]] = []
+    answers: dict[int, Array | None] = {}
+    for k in range(1, most + 1):
+        if k in numbers:
+            answers[k] = _cut(slot, came_from, n_slots) if np.isfinite(cheapest[-1]) else None
+        totals = cheapest[:, None] + cost
+        came_from.append(np.argmin(totals, axis=0))
+        cheapest = totals.min(axis=0)
+    return [responsibilities_by_bins(column, k) if (cut := answers[k]) is None else cut for k in numbers]
+
+
+def _segment_costs(statistics: Array, n_samples: int) -> Array:
+    """Return the costs of segments with these sums of features, inf for those of too few samples."""
+    number = statistics[:, 0]
+    size = round(float(np.sqrt(8 * statistics.shape[1] + 1) - 1) / 2)
+    moments = (statistics / np.maximum(number, 1.0)[:, None]).take(packing(size)[1], axis=-1)
+    diagonal = np.arange(1, size)
+    moments[:, diagonal, diagonal] += _SOFT
+    moments[:, 0, 0] = 1.0
+    log_det = np.linalg.slogdet(moments)[1]
+    costs = number * (0.5 * log_det - np.log(np.maximum(number, 1.0) / n_samples))
+    return np.where(number >= 2 * size, costs, np.inf)
+
+
+def _cut(slot: NDArray[np.intp], came_from: list[NDArray[np.intp]], n_slots: int) -> Array:
+    """Follow the cheapest division back from the last slot and return its responsibilities (K, n)."""
+    borders = [n_slots]
+    for back in reversed(came_from):
+        borders.append(int(back[borders[-1]]))
+    labels = np.searchsorted(borders[::-1], np.arange(n_slots), side="right")
+    return np.asarray(labels[slot] == np.arange(len(came_from) + 1)[:, None], dtype=float)
+
+
+def responsibilities_by_bins(column: Array, n_bins: int) -> Array:
+    """Return responsibilities of 0 or 1, shape (K, n), of bins of one column, in order.
+
+    The bins have equal widths, or equal numbers of samples when a bin would hold fewer than two.
+    """
+    low, high = column.min(), column.max()
+    labels = np.minimum(((column - low) * (n_bins / max(high - low, 1e-300)) + _EDGE).astype(np.intp), n_bins - 1)
+    if np.bincount(labels, minlength=n_bins).min() < 2:
+        order = np.argsort(column, kind="stable")
+        labels = np.empty(len(column), dtype=np.intp)
+        labels[order] = np.arange(len(column)) * n_bins // len(column)
+    return np.asarray(labels == np.arange(n_bins)[:, None], dtype=float)
+
+
+def responsibilities_by_seeds(Z: Array, n_components: int, rng: np.random.Generator, n_lloyd: int = 5) -> Array:
+    """Return the responsibilities (K, n) of k-means++ (Arthur and Vassilvitskii 2007) and a few Lloyd iterations."""
+    seeds = Z[rng.integers(len(Z), size=1)]
+    nearest = np.sum((Z - seeds[0]) ** 2, axis=1)
+    while len(seeds) < n_components:
+        total = nearest.sum()
+        pick = rng.choice(len(Z), size=1, p=nearest / total if total > 0.0 else None)
+        seeds = np.concatenate([seeds, Z[pick]])
+        nearest = np.minimum(nearest, np.sum((Z - Z[pick]) ** 2, axis=1))
+    for _ in range(n_lloyd):
+        labels = np.argmin(np.sum(seeds**2, axis=1)[:, None] - 2.0 * seeds @ Z.T, axis=0)
+        members = np.asarray(labels == np.arange(n_components)[:, None], dtype=float)
+        number = members.sum(axis=1, keepdims=True)
+        seeds = np.where(number > 0.0, members @ Z / np.maximum(number, 1.0), seeds)
+    return members

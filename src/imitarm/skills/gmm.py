@@ -16,12 +16,15 @@ from imitarm.skills.em import (
     log_densities,
     normalise,
     quadratic_features,
+    responsibilities_by_seeds,
+    responsibilities_by_segments,
 )
-from imitarm.skills.starts import responsibilities_by_seeds, responsibilities_by_segments
+from imitarm.validation import finite_array, finite_number, real_array, whole_number
 
 Array = NDArray[np.float64]
 
-_CONSTANT = 1e-6  # a column whose deviation is below this share of its largest value holds rounding, not motion
+_CONSTANT = 1e-6  # of a column's largest value: a smaller standard deviation is rounding, not motion
+_MOST_COMPONENTS = 10_000
 
 
 class DegenerateAxisWarning(UserWarning):
@@ -29,19 +32,19 @@ class DegenerateAxisWarning(UserWarning):
 
 
 def ellipsoid_scale(probability: float, n_dims: int) -> float:
-    """Return how many standard deviations wide an ellipsoid is that holds ``probability`` of a Gaussian.
+    """Return the semi-axis, in standard deviations, of the ellipsoid that contains ``probability`` of a Gaussian.
 
-    The squared Mahalanobis distance of a Gaussian in ``n_dims`` dimensions is chi-square distributed with ``n_dims``
-    degrees of freedom, so the semi-axes are ``scale * sqrt(eigenvalue)``: 1.960, 2.448, 2.796 for 95 % in 1, 2, 3
-    dimensions (METHODS D.2). The one-dimensional 1.960 covers only 85 % in the plane and 72 % in space.
+    The squared Mahalanobis distance of a Gaussian in ``n_dims`` dimensions has a chi-square distribution with
+    ``n_dims`` degrees of freedom. So the semi-axes are ``scale * sqrt(eigenvalue)`` with the scale 1.960, 2.448, 2.796
+    for 95 % in 1, 2, 3 dimensions. The one-dimensional 1.960 contains only 85 % in the plane and 72 % in space.
 
     Raises:
         InputError: when ``probability`` is not in [0, 1) or ``n_dims`` is below 1.
     """
-    if not 0.0 <= probability < 1.0:
+    probability = finite_number(probability, "ellipsoid_scale: probability", at_least=0.0)
+    if not probability < 1.0:
         raise InputError(f"ellipsoid_scale: probability must be at least 0 and below 1, got {probability!r}")
-    if n_dims < 1:
-        raise InputError(f"ellipsoid_scale: n_dims must be at least 1, got {n_dims!r}")
+    n_dims = whole_number(n_dims, "ellipsoid_scale: n_dims", at_least=1)
     return float(np.sqrt(2.0 * gammaincinv(0.5 * n_dims, probability)))
 
 
@@ -55,32 +58,32 @@ class GaussianMixture:
         N_k = \sum_n h_k(z_n), \quad \pi_k = N_k / N, \quad \mu_k = \frac{1}{N_k} \sum_n h_k z_n, \quad
         \Sigma_k = \frac{1}{N_k} \sum_n h_k z_n z_n^T - \mu_k \mu_k^T
 
-    (thesis 2.2.1, METHODS C). The names are those of scikit-learn. What differs:
+    (thesis 2.2.1). The names are those of scikit-learn. The differences:
 
-    * Columns are standardised inside, so that the choice of units does not decide the result.
-    * ``init="time"`` starts from the best cut of column 0 into K segments
-      (:func:`~imitarm.skills.starts.responsibilities_by_segments`), deterministic and right for data [t; x].
-    * A column that does not move (a planar task has a constant z) is kept apart: the other columns come out as
-      though it were not there. It is named in ``degenerate_axes_`` and in a :class:`DegenerateAxisWarning`.
+    * Columns are standardised internally, so the result does not depend on the units.
+    * ``init="time"`` starts from the best division of column 0 into K segments
+      (:func:`~imitarm.skills.em.responsibilities_by_segments`). It is deterministic and suits samples [t; x].
+    * A column that does not move (a planar task has a constant z) does not influence the other columns. It is listed
+      in ``degenerate_axes_`` and reported by a :class:`DegenerateAxisWarning`.
 
     Args:
         n_components: number K of Gaussians.
         reg_covar: smallest eigenvalue of a covariance, relative to the variances of the columns.
         n_init: number of starts; the best fit is kept. All but the first start from k-means++ seeds.
-        init: how the first start is made: ``"time"`` (segments of column 0) or ``"kmeans++"``.
+        init: the first start: ``"time"`` (segments of column 0) or ``"kmeans++"``.
         min_std: smallest standard deviation of a column [the column's unit] that counts as motion, one number or one
-            a column; it is also the deviation that a degenerate column is given.
-        random_state: seed of the k-means++ starts and of nothing else.
+            per column. A column that does not move is given this standard deviation.
+        random_state: seed of the k-means++ starts.
         tol: stop when the mean log-likelihood per sample changes by less.
-        max_iter: most iterations of one start.
+        max_iter: largest number of iterations of one start.
 
     Attributes:
         weights_: priors, shape (K,).
         means_: shape (K, d).
         covariances_: shape (K, d, d).
-        lower_bound_: mean log-likelihood per sample of the data fitted.
+        lower_bound_: mean log-likelihood per sample of the fitted data.
         converged_: whether the last change of ``lower_bound_`` was below ``tol``.
-        n_iter_: number of iterations done.
+        n_iter_: number of iterations.
         degenerate_axes_: indices of the columns that do not move.
 
     Raises:
@@ -107,32 +110,30 @@ class GaussianMixture:
         tol: float = 1e-4,
         max_iter: int = 500,
     ) -> None:
-        for name, value in {"n_components": n_components, "n_init": n_init, "max_iter": max_iter}.items():
-            if not isinstance(value, int | np.integer) or value < 1:
-                raise InputError(f"GaussianMixture: {name} must be a whole number of at least 1, got {value!r}")
-        if not (np.isfinite(reg_covar) and reg_covar > 0.0):
-            raise InputError(f"GaussianMixture: reg_covar must be above 0, got {reg_covar!r}")
-        if not tol >= 0.0:
-            raise InputError(f"GaussianMixture: tol must be at least 0, got {tol!r}")
-        if init not in {"time", "kmeans++"}:
-            raise InputError(f"GaussianMixture: init must be 'time' or 'kmeans++', got {init!r}")
-        self.n_components = int(n_components)
-        self.reg_covar = reg_covar
-        self.n_init = n_init
+        what = "GaussianMixture:"
+        self.n_components = whole_number(n_components, f"{what} n_components", at_least=1, at_most=_MOST_COMPONENTS)
+        self.n_init = whole_number(n_init, f"{what} n_init", at_least=1, at_most=1000)
+        self.max_iter = whole_number(max_iter, f"{what} max_iter", at_least=1)
+        self.random_state = whole_number(random_state, f"{what} random_state", at_least=0)
+        self.reg_covar = finite_number(reg_covar, f"{what} reg_covar", above=0.0)
+        self.tol = finite_number(tol, f"{what} tol", at_least=0.0)
+        if init not in ("time", "kmeans++"):
+            raise InputError(f"{what} init must be 'time' or 'kmeans++', got {init!r:.80}")
         self.init = init
-        self.min_std = np.asarray(min_std, dtype=float)
-        self.random_state = random_state
-        self.tol = tol
-        self.max_iter = max_iter
+        self.min_std = finite_array(min_std, (...,), f"{what} min_std")
+        if self.min_std.ndim > 1 or np.any(self.min_std < 0.0):
+            raise InputError(f"{what} min_std must be one number or one per column, each at least 0")
 
     def fit(self, X: ArrayLike) -> Self:
         """Fit to samples ``X`` (n, d).
 
         Raises:
-            InputError: when ``X`` is not a finite table, has fewer samples than components or less than 2, or no
-                column of it moves.
+            InputError: when ``X`` is not a table of finite numbers, has fewer than 2 samples or fewer samples than
+                components, or none of its columns moves.
         """
         X = _table(X, "GaussianMixture.fit")
+        if self.min_std.ndim and len(self.min_std) != X.shape[1]:
+            raise InputError(f"GaussianMixture.fit: {len(self.min_std)} min_std for {X.shape[1]} columns")
         if len(X) < max(2, self.n_components):
             raise InputError(
                 f"GaussianMixture.fit: {len(X)} samples are too few for {self.n_components} components; "
@@ -159,19 +160,19 @@ class GaussianMixture:
         if self.degenerate_axes_:
             warnings.warn(
                 f"columns {list(self.degenerate_axes_)} do not move (deviation at most {fixed_std[~moves].max():.2g}); "
-                "they are kept constant and do not influence the others",
+                "they are kept constant and do not influence the other columns",
                 DegenerateAxisWarning,
                 stacklevel=2,
             )
         return self
 
     def _standardisation(self, X: Array) -> tuple[Array, Array, NDArray[np.bool_], Array]:
-        """Return mean and deviation of the columns, which of them move, and the deviation given to those that don't."""
+        """Return mean and deviation of the columns, which of them move, and the deviation of those that don't."""
         center = X.mean(axis=0)
         scale = X.std(axis=0)
         largest = np.abs(X).max(axis=0)
         least = np.maximum(self.min_std, _CONSTANT * np.where(largest > 0.0, largest, 1.0))
-        # deviation of the deviations from the mean: a large offset (an epoch stamp) is no reason to call time constant
+        # compared with the rounding of the largest value: times with a large offset (epoch stamps) still move
         moves = scale > np.maximum(self.min_std, 1e-12 * np.maximum(largest, 1e-300))
         if not moves.any():
             raise InputError("GaussianMixture.fit: no column moves; there is nothing to learn from constant data")
@@ -240,9 +241,18 @@ class GaussianMixture:
     def sample(self, n_samples: int = 1, random_state: int = 0) -> tuple[Array, NDArray[np.intp]]:
         """Draw samples.
 
+        Args:
+            n_samples: how many.
+            random_state: seed.
+
         Returns:
-            Samples (n_samples, d), and the component each was drawn from (n_samples,).
+            Samples (n_samples, d), and the component of each (n_samples,).
+
+        Raises:
+            InputError: when not fitted, or an argument is not a whole number in range.
         """
+        n_samples = whole_number(n_samples, "GaussianMixture.sample: n_samples", at_least=0, at_most=100_000_000)
+        random_state = whole_number(random_state, "GaussianMixture.sample: random_state", at_least=0)
         if not hasattr(self, "means_"):
             raise InputError("GaussianMixture.sample: not fitted yet; call fit first")
         rng = np.random.default_rng(random_state)
@@ -255,7 +265,7 @@ class GaussianMixture:
 def _in_units(
     means: Array, covariances: Array, center: Array, scale: Array, moves: NDArray[np.bool_], fixed_std: Array
 ) -> tuple[Array, Array]:
-    """Undo the standardisation, and put the columns that do not move back in."""
+    """Return means and covariances in the units of the samples, with the columns that do not move."""
     K = len(means)
     all_means = np.repeat(center[None], K, axis=0)
     all_means[:, moves] += means * scale[moves]
@@ -266,13 +276,10 @@ def _in_units(
 
 
 def _table(X: ArrayLike, what: str) -> Array:
-    """Return ``X`` as a finite table of floats (n, d), or say what is wrong with it."""
-    try:
-        table = np.asarray(X, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{what}: X is not a table of numbers ({error})") from error
-    if table.ndim != 2 or table.shape[1] < 1:
-        raise InputError(f"{what}: X must have shape (n, d), got {table.shape}")
+    """Return ``X`` as a table of finite numbers (n, d)."""
+    table = real_array(X, (None, None), f"{what}: X")
+    if table.shape[1] < 1:
+        raise InputError(f"{what}: X must have at least one column, got shape {table.shape}")
     bad = ~np.isfinite(table).all(axis=1)
     if bad.any():
         raise InputError(f"{what}: row {int(np.flatnonzero(bad)[0])} of X is not finite; remove or repair it")

@@ -1,9 +1,9 @@
-"""Gaussian mixture regression: the mean motion and its spread at every instant, from several demonstrations."""
+"""Gaussian mixture regression: the mean motion and its covariance at every time, from several demonstrations."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal, Self
 
 import numpy as np
@@ -13,21 +13,31 @@ from imitarm.errors import InputError
 from imitarm.kinematics.pose import mean_quaternion
 from imitarm.skills.gmm import DegenerateAxisWarning, GaussianMixture
 from imitarm.skills.rotation_reference import RotationReference, left_jacobian
-from imitarm.skills.samples import SingleDemonstrationWarning, samples_of
-from imitarm.skills.selection import Candidate, choose, try_numbers_of_components
+from imitarm.skills.selection import MORE_NUMBERS, NUMBERS, Candidate, choose, try_numbers_of_components
 from imitarm.trajectory import Demonstration, Trajectory
+from imitarm.validation import finite_array, finite_number, finite_vector, flag, instance, real_array, whole_number
 
 Array = NDArray[np.float64]
 
 _AXES = ("x", "y", "z")
-_LEAST_CORRECTED = 0.05  # of the duration: the shortest time over which the nominal path leaves an end's correction
+_LEAST_CORRECTED = 0.05  # of the duration: the shortest time in which the correction of an end fades out
+_SAME_DURATION = 0.01  # demonstrations whose durations differ by a larger fraction were not aligned
+_CLOCK_DIGITS = 6  # microseconds, the resolution of epoch times: rounded, they give the same skill as other times
+
+
+class SingleDemonstrationWarning(UserWarning):
+    """There is only one demonstration: its covariance shows how well it was fitted, not how much a person varies."""
+
+
+class UnalignedWarning(UserWarning):
+    """Demonstrations of different durations were given; demonstrations that are not aligned flatten the mean."""
 
 
 class GMR:
     r"""Gaussian mixture regression over time, of positions and rotations.
 
     A :class:`~imitarm.skills.gmm.GaussianMixture` is fitted to all samples z = [t; x] of all demonstrations, and then
-    conditioned on t (METHODS C; thesis Eq 2.6, whose print lacks the responsibilities h_k):
+    conditioned on t (thesis Eq 2.6, whose print lacks the responsibilities h_k):
 
     .. math::
         \beta_k = \Sigma_k^{xt} / \Sigma_k^{tt}, \quad
@@ -39,17 +49,17 @@ class GMR:
         \hat x(t) = \sum_k h_k m_k, \qquad
         \hat\Sigma(t) = \sum_k h_k \left( S_k + (m_k - \hat x)(m_k - \hat x)^T \right)
 
-    When the demonstrations have quaternions, x holds six columns: position [m] and the rotation vector [rad] in the
-    tangent space of a reference rotation, which turns along when the motion turns far
+    When the demonstrations have quaternions, x has six columns: the position [m] and a rotation vector [rad] from a
+    reference rotation, which moves with the motion when that rotates far
     (:class:`~imitarm.skills.rotation_reference.RotationReference`).
 
-    Times are those since the first sample. A query outside the demonstrated span is held at its end, because the
-    linear pieces drift away there.
+    Times are counted from the first sample. Outside the demonstrated span the ends are held, because the linear pieces
+    would drift away.
 
     Args:
-        n_components: number K of Gaussians, or ``"auto"``: the smallest K that reproduces held-out demonstrations as
-            well as any and rounds off little, see :func:`~imitarm.skills.selection.choose`.
-        candidates: the numbers that ``"auto"`` tries.
+        n_components: number K of Gaussians, or ``"auto"``: the smallest K that reproduces left-out demonstrations as
+            well as any and has little bias, see :func:`~imitarm.skills.selection.choose`.
+        candidates: the numbers that ``"auto"`` tries; None: 2 to 16, and more while the bias is large.
         reg_covar: as in GaussianMixture.
         n_init: as in GaussianMixture.
         min_std: smallest standard deviations that count as motion (position [m], rotation [rad]).
@@ -57,16 +67,16 @@ class GMR:
 
     Attributes:
         n_components_: number K of Gaussians.
-        selection_: what ``"auto"`` tried, one row a number of components; empty when the number was given.
+        selection_: what ``"auto"`` tried, one entry per number of components; empty when the number was given.
         duration_: demonstrated span [s]; the median when demonstrations differ.
         n_demonstrations_: number of demonstrations.
-        has_orientation_: whether rotations were learnt.
+        has_orientation_: whether rotations were learned.
         weights_: priors, shape (K,).
         means_: of [t; x], shape (K, 1 + D), D = 3 or 6.
         covariances_: of [t; x], shape (K, 1 + D, 1 + D).
-        reference_: the rotation near which rotations are vectors; None without rotations.
+        reference_: the reference of the rotation vectors; None without rotations.
         ends_: mean start and mean goal of the demonstrations, as x (position, rotation vector), shape (2, D).
-        degenerate_axes_: columns of x that don't move, 0 to 2 for x, y, z, 3 to 5 for rotations.
+        degenerate_axes_: columns of x that do not move: 0 to 2 for x, y, z, 3 to 5 for rotations.
         converged_: whether the fit converged.
         lower_bound_: mean log-likelihood per sample.
 
@@ -91,33 +101,36 @@ class GMR:
         self,
         n_components: int | Literal["auto"] = "auto",
         *,
-        candidates: Sequence[int] = tuple(range(2, 17)),
+        candidates: Sequence[int] | None = None,
         reg_covar: float = 1e-6,
         n_init: int = 1,
         min_std: tuple[float, float] = (1e-4, 1e-3),
         random_state: int = 0,
     ) -> None:
-        if isinstance(n_components, str):
-            if n_components != "auto":
-                raise InputError(f"GMR: n_components must be a whole number or 'auto', got {n_components!r}")
-            if len(candidates) == 0:
-                raise InputError("GMR: candidates is empty; give the numbers of components to try")
-        numbers = candidates if n_components == "auto" else [n_components]
+        if isinstance(n_components, str) and n_components != "auto":
+            raise InputError(f"GMR: n_components must be a whole number or 'auto', got {n_components!r:.80}")
+        if candidates is not None and (isinstance(candidates, str) or not isinstance(candidates, Iterable)):
+            raise InputError(f"GMR: candidates must be a sequence of whole numbers, got {candidates!r:.80}")
+        self.candidates = None if candidates is None else tuple(candidates)
+        if self.candidates == ():
+            raise InputError("GMR: candidates is empty; give the numbers of components to try")
+        numbers = (self.candidates or NUMBERS) if n_components == "auto" else (n_components,)
         for number in numbers:  # the options are checked here, when they are given
-            GaussianMixture(number, reg_covar=reg_covar, n_init=n_init)
+            GaussianMixture(number, reg_covar=reg_covar, n_init=n_init, random_state=random_state)
         self.n_components = n_components
-        self.candidates = tuple(candidates)
         self.reg_covar = reg_covar
         self.n_init = n_init
-        self.min_std = min_std
+        self.min_std = tuple(finite_vector(min_std, 2, "GMR: min_std (position, rotation)", "m, rad").tolist())
         self.random_state = random_state
 
     def fit(self, demonstrations: Sequence[Demonstration | Trajectory]) -> Self:
         """Learn from demonstrations, aligned beforehand (``imitarm.demonstrations.align``).
 
-        Times start anywhere: each demonstration's first time is subtracted. Durations that differ by more than 1 %
-        are scaled to their median, with an
-        :class:`~imitarm.skills.samples.UnalignedWarning`.
+        Times may start anywhere: the first time of each demonstration is subtracted. Durations that differ by more than
+        1 % are scaled to their median, with an :class:`UnalignedWarning`.
+
+        Args:
+            demonstrations: at least one.
 
         Raises:
             InputError: when there is no demonstration, only some have quaternions, or there are fewer samples than
@@ -128,14 +141,15 @@ class GMR:
         min_std = np.array([0.0, *[self.min_std[0]] * 3, *[self.min_std[1]] * 3])[: tables[0].shape[1]]
         if len(tables) == 1:
             warnings.warn(
-                "only one demonstration: the covariance tells how well it was fitted, not how much a person varies; "
+                "only one demonstration: the covariance shows how well it was fitted, not how much a person varies; "
                 "give 3 or more",
                 SingleDemonstrationWarning,
                 stacklevel=2,
             )
         self.selection_ = ()
         if self.n_components == "auto":
-            self.selection_ = try_numbers_of_components(tables, self.candidates, min_std, self.reg_covar)
+            numbers, more = (self.candidates, ()) if self.candidates else (NUMBERS, MORE_NUMBERS)
+            self.selection_ = try_numbers_of_components(tables, numbers, min_std, self.reg_covar, more)
             number = choose(self.selection_)
         else:
             number = int(self.n_components)
@@ -154,10 +168,10 @@ class GMR:
         self.converged_, self.lower_bound_ = mixture.converged_, mixture.lower_bound_
         self.degenerate_axes_ = tuple(i - 1 for i in mixture.degenerate_axes_)
         still = [_AXES[i] for i in self.degenerate_axes_ if i < len(_AXES)]
-        if still:  # rotations that stay, or turn about one axis, are nothing unusual
+        if still:  # rotations about one axis only, or none, are usual
             warnings.warn(
-                f"the demonstrations don't move in {', '.join(still)}; kept constant there, without influence on the "
-                "other axes",
+                f"the demonstrations do not move in {', '.join(still)}; the skill is constant there, without effect on "
+                "the other axes",
                 DegenerateAxisWarning,
                 stacklevel=2,
             )
@@ -179,64 +193,49 @@ class GMR:
         converged: bool = True,
         lower_bound: float = np.nan,
     ) -> GMR:
-        """Build from a mixture that was learnt before.
+        """Build from a mixture that was learned before.
 
-        Args:
-            weights: priors, shape (K,).
-            means: of [t; x], shape (K, 1 + D), D = 3, or 6 with a reference.
-            covariances: of [t; x], shape (K, 1 + D, 1 + D).
-            duration: demonstrated span [s].
-            n_demonstrations: how many it was learnt from.
-            reference: the rotation near which the last three columns are rotation vectors.
-            ends: mean start and mean goal of the demonstrations, shape (2, D); None: where the mixture's mean begins
-                and ends.
-            selection: what was tried.
-            degenerate_axes: columns of x that don't move.
-            converged: whether the fit converged.
-            lower_bound: mean log-likelihood per sample.
+        The arguments are the attributes of the class. Without ``ends``, they are those of the mixture's mean.
 
         Raises:
-            InputError: when shapes disagree, the weights don't sum to one, a covariance is not symmetric and positive
+            InputError: when shapes disagree, the weights do not sum to one, a covariance is not symmetric and positive
                 definite, or the duration is not above 0.
         """
-        w, mu, sigma = (np.array(a, dtype=float) for a in (weights, means, covariances))
+        what = "GMR.from_mixture:"
         columns = 4 if reference is None else 7
-        K = len(w) if w.ndim == 1 else 0
-        if K < 1 or mu.shape != (K, columns) or sigma.shape != (K, columns, columns):
-            raise InputError(
-                f"GMR.from_mixture: shapes (K,), (K, {columns}), (K, {columns}, {columns}) are needed, "
-                f"got {w.shape}, {mu.shape}, {sigma.shape}"
-            )
-        if not (np.all(w > 0.0) and abs(w.sum() - 1.0) < 1e-6):
-            raise InputError("GMR.from_mixture: weights must be above 0 and sum to one")
-        if not (np.all(np.isfinite(mu)) and np.all(np.isfinite(sigma))):
-            raise InputError("GMR.from_mixture: means and covariances must be finite")
+        w = finite_array(weights, (None,), f"{what} weights").copy()
+        mu = finite_array(means, (len(w), columns), f"{what} means").copy()
+        sigma = finite_array(covariances, (len(w), columns, columns), f"{what} covariances").copy()
+        if not (len(w) and np.all(w > 0.0) and abs(w.sum() - 1.0) < 1e-6):
+            raise InputError(f"{what} weights must be above 0 and sum to one")
         sizes = np.sqrt(np.maximum(np.diagonal(sigma, axis1=1, axis2=2), 1e-300))
         scaled = sigma / (sizes[:, :, None] * sizes[:, None, :])  # metres and radians side by side
         if not np.allclose(scaled, np.swapaxes(scaled, 1, 2)) or np.linalg.eigvalsh(scaled).min() <= 0.0:
-            raise InputError("GMR.from_mixture: every covariance must be symmetric and positive definite")
-        if not (np.isfinite(duration) and duration > 0.0):
-            raise InputError(f"GMR.from_mixture: duration must be above 0 s, got {duration!r}")
-        gmr = cls(K)
-        gmr.duration_, gmr.n_demonstrations_, gmr.reference_ = float(duration), int(n_demonstrations), reference
-        gmr.selection_, gmr.degenerate_axes_ = tuple(selection), tuple(int(i) for i in degenerate_axes)
-        gmr.converged_, gmr.lower_bound_ = converged, float(lower_bound)
+            raise InputError(f"{what} every covariance must be symmetric and positive definite")
+        gmr = cls(len(w))
+        gmr.duration_ = finite_number(duration, f"{what} duration", "s", above=0.0)
+        gmr.n_demonstrations_ = whole_number(n_demonstrations, f"{what} n_demonstrations", at_least=1)
+        gmr.reference_ = None if reference is None else instance(reference, RotationReference, f"{what} reference")
+        gmr.selection_ = tuple(instance(c, Candidate, f"{what} selection") for c in selection)
+        gmr.degenerate_axes_ = tuple(
+            whole_number(i, f"{what} degenerate_axes", at_least=0, at_most=columns - 2) for i in degenerate_axes
+        )
+        gmr.converged_ = flag(converged, f"{what} converged")
+        gmr.lower_bound_ = float(real_array(lower_bound, (), f"{what} lower_bound"))
         gmr._learn(w, mu, sigma)
-        gmr.ends_ = gmr._regress(np.array([0.0, gmr.duration_]), columns - 1)[0]
-        if ends is not None:
-            given = np.array(ends, dtype=float)
-            if given.shape != gmr.ends_.shape or not np.all(np.isfinite(given)):
-                raise InputError(f"GMR.from_mixture: ends must be 2 rows of {columns - 1} finite numbers")
-            gmr.ends_ = given
+        if ends is None:
+            gmr.ends_ = gmr._regress(np.array([0.0, gmr.duration_]), columns - 1)[0]
+        else:
+            gmr.ends_ = finite_array(ends, (2, columns - 1), f"{what} ends").copy()
         return gmr
 
     def _learn(self, weights: Array, means: Array, covariances: Array) -> None:
-        """Take the mixture, its components in the order of time, and prepare the regression."""
+        """Store the mixture with its components in the order of time, and prepare the regression."""
         order = np.argsort(means[:, 0], kind="stable")
         self.weights_, self.means_, self.covariances_ = weights[order], means[order], covariances[order]
         self.n_components_ = len(order)
-        # m_k is linear and m_k m_k^T quadratic in u_k = t - mu_k^t, so that both sums over the components are products
-        # of [h, h u, h u^2] with a table. Taken about the centre of the motion nothing is lost by cancellation.
+        # m_k is linear and m_k m_k^T quadratic in u_k = t - mu_k^t, so both sums over the components are products of
+        # [h, h u, h u^2] with a table. Positions relative to the centre of the motion avoid cancellation.
         self._center = self.weights_ @ self.means_[:, 1:]
         mu = self.means_[:, 1:] - self._center
         beta = self.covariances_[:, 1:, 0] / self.covariances_[:, 0, :1]
@@ -253,12 +252,12 @@ class GMR:
 
     @property
     def has_orientation_(self) -> bool:
-        """Whether rotations were learnt."""
+        """Whether rotations were learned."""
         return self.reference_ is not None
 
     @property
     def time_means_(self) -> Array:
-        """Where in time the components lie [s], increasing, shape (K,)."""
+        """Means of the components' times [s], increasing, shape (K,)."""
         return self.means_[:, 0]
 
     @property
@@ -274,17 +273,18 @@ class GMR:
     def _clamped(self, times: ArrayLike) -> Array:
         if not hasattr(self, "means_"):
             raise InputError("GMR: not fitted yet; call fit first")
-        t = np.atleast_1d(np.asarray(times, dtype=float))
-        if t.ndim != 1 or not np.all(np.isfinite(t)):
-            raise InputError(f"GMR: times must be finite numbers [s] of shape (n,), got shape {t.shape}")
+        t = finite_array(times, (...,), "GMR: times", "s")
+        if t.ndim > 1:
+            raise InputError(f"GMR: times must be one number or have shape (n,) [s], got shape {t.shape}")
+        t = t.reshape(-1)
         return np.clip(t, 0.0, self.duration_)
 
     def responsibilities(self, times: ArrayLike) -> Array:
-        """Return h_k(t), how much each component has to say at ``times`` (n,) [s], shape (n, K), rows sum to one."""
+        """Return h_k(t), the weight of each component at ``times`` (n,) [s], shape (n, K); each row sums to one."""
         return self._responsibilities(self._clamped(times)[:, None] - self.time_means_)
 
     def _responsibilities(self, u: Array) -> Array:
-        """Return h (n, K) for times since the components' own, u (n, K)."""
+        """Return h (n, K) for u (n, K), the times relative to the components' mean times."""
         variances = self.covariances_[:, 0, 0]
         h = u * u * (-0.5 / variances) + (np.log(self.weights_) - 0.5 * np.log(variances))
         np.exp(h - h.max(axis=1, keepdims=True), out=h)
@@ -308,8 +308,8 @@ class GMR:
         """Return the mean rotation and its covariance at ``times`` (n,) [s].
 
         Returns:
-            Quaternions wxyz (n, 4), and covariance (n, 3, 3) [rad^2] of the small turn, in the base frame, that takes
-            the mean rotation to a demonstrated one.
+            Quaternions wxyz (n, 4), and covariance (n, 3, 3) [rad^2] of the small rotation, in the base frame, from the
+            mean rotation to a demonstrated one.
 
         Raises:
             InputError: when the demonstrations had no quaternions.
@@ -321,7 +321,7 @@ class GMR:
         """Return position, rotation and their joint covariance at ``times`` (n,) [s].
 
         Returns:
-            Positions (n, 3) [m], quaternions wxyz (n, 4), and covariance (n, 6, 6) of [position; small turn in the
+            Positions (n, 3) [m], quaternions wxyz (n, 4), and covariance (n, 6, 6) of [position; small rotation in the
             base frame], in m and rad.
 
         Raises:
@@ -329,7 +329,7 @@ class GMR:
         """
         t = self._clamped(times)
         if self.reference_ is None:
-            raise InputError("GMR: the demonstrations had no quaternions, so no orientation was learnt")
+            raise InputError("GMR: the demonstrations had no quaternions, so no orientation was learned")
         mean, covariance = self._regress(t, 6)
         transport = np.zeros_like(covariance)
         transport[:, :3, :3] = np.eye(3)
@@ -338,18 +338,18 @@ class GMR:
         return mean[:, :3], self.reference_.to_quaternions(t, mean[:, 3:]), covariance
 
     def nominal(self, times: ArrayLike) -> tuple[Array, Array | None]:
-        r"""Return the nominal path at ``times`` (n,) [s]: the mean motion, made to begin and end exactly as shown.
+        r"""Return the nominal path at ``times`` (n,) [s]: the mean motion, with exact start and goal.
 
-        The mean :math:`\hat x` consists of straight pieces, blended, and misses the mean start and goal of the
-        demonstrations by millimetres. The nominal path closes both gaps by smooth steps that depend on time alone:
+        The mean :math:`\hat x` blends straight pieces, so it misses the mean start and the mean goal of the
+        demonstrations by some millimetres. The nominal path corrects both ends by smooth steps:
 
         .. math::
             x_0(t) = \hat x(t) + b(t / w_1) (x_{start} - \hat x(0)) + b((T - t) / w_K) (x_{goal} - \hat x(T)), \quad
             b(u) = 1 - 10 u^3 + 15 u^4 - 6 u^5
 
-        The widths :math:`w_1 = \mu_1^t` and :math:`w_K = T - \mu_K^t` reach to the centres of the first and the last
-        Gaussian, at least a twentieth of the duration. Moving the mean of Gaussian k by :math:`\Delta_k` still moves
-        the path by :math:`h_k(t) \Delta_k`.
+        The widths :math:`w_1 = \mu_1^t` and :math:`w_K = T - \mu_K^t` reach from the ends to the centres of the first
+        and the last Gaussian; they are at least a twentieth of the duration. The correction depends on time alone, so
+        moving the mean of Gaussian k by :math:`\Delta_k` still moves the path by :math:`h_k(t) \Delta_k`.
 
         Returns:
             Positions (n, 3) [m], and quaternions wxyz (n, 4), None without rotations.
@@ -378,6 +378,69 @@ class GMR:
         return np.stack(rows)
 
     def trajectory(self, n: int = 200) -> Trajectory:
-        """Return the nominal path at ``n`` equally spaced times of the demonstrated span."""
+        """Return the nominal path at ``n`` equally spaced times of the demonstrated span.
+
+        Raises:
+            InputError: when not fitted, or ``n`` is not a whole number from 2 to 10 million.
+        """
+        n = whole_number(n, "GMR.trajectory: n", at_least=2, at_most=10_000_000)
+        if not hasattr(self, "duration_"):
+            raise InputError("GMR: not fitted yet; call fit first")
         times = np.linspace(0.0, self.duration_, n)
         return Trajectory(times, *self.nominal(times))
+
+
+def samples_of(
+    demonstrations: Sequence[Demonstration | Trajectory],
+) -> tuple[list[Array], RotationReference | None, float]:
+    """Return the samples of each demonstration as a table.
+
+    Times are counted from the first sample and scaled to the median duration. Rotations, when all demonstrations have
+    them, become rotation vectors from a common reference.
+
+    Returns:
+        Tables of rows [t, x, y, z] or [t, x, y, z, r1, r2, r3], the reference of the rotations or None, and the
+        duration [s].
+
+    Raises:
+        InputError: when there is no demonstration, only some have quaternions, or their rotations differ too much.
+    """
+    if isinstance(demonstrations, Demonstration | Trajectory):
+        raise InputError("GMR.fit: give a list of demonstrations, not a single one")
+    if isinstance(demonstrations, str) or not isinstance(demonstrations, Sequence):
+        raise InputError(f"GMR.fit: demonstrations must be a list, got {type(demonstrations).__name__}")
+    if len(demonstrations) < 1:
+        raise InputError("GMR.fit: no demonstrations; give at least 1, better 3 or more")
+    trajectories = [d.trajectory if isinstance(d, Demonstration) else d for d in demonstrations]
+    for i, trajectory in enumerate(trajectories):
+        if not isinstance(trajectory, Trajectory):
+            raise InputError(f"GMR.fit: demonstration {i} is a {type(trajectory).__name__}, not a Demonstration")
+    without = [i for i, trajectory in enumerate(trajectories) if trajectory.quaternions is None]
+    if 0 < len(without) < len(trajectories):
+        raise InputError(
+            f"GMR.fit: demonstrations {without} have no quaternions while the others have; "
+            "record orientation in all of them or drop it from all"
+        )
+    durations = np.array([trajectory.duration for trajectory in trajectories])
+    duration = float(np.median(durations))
+    if np.ptp(durations) > _SAME_DURATION * duration:
+        warnings.warn(
+            f"demonstrations last from {durations.min():.3g} to {durations.max():.3g} s; their times are scaled to "
+            f"{duration:.3g} s. Align them first, or the mean is flattened",
+            UnalignedWarning,
+            stacklevel=3,
+        )
+    times = [_since_start(k.times) * (duration / k.duration) for k in trajectories]
+    tables = [np.column_stack([t, k.positions]) for t, k in zip(times, trajectories, strict=True)]
+    if without:
+        return tables, None, duration
+    rotations = [(t, k.quaternions) for t, k in zip(times, trajectories, strict=True) if k.quaternions is not None]
+    reference = RotationReference.among(rotations)
+    vectors = [reference.to_vectors(t, q) for t, q in rotations]
+    return [np.column_stack(pair) for pair in zip(tables, vectors, strict=True)], reference, duration
+
+
+def _since_start(times: Array) -> Array:
+    t = times - times[0]
+    rounded = np.round(t, _CLOCK_DIGITS)
+    return rounded if np.all(np.diff(rounded) > 0.0) else t
