@@ -15,7 +15,7 @@ WRITES = {
     "learn": (["shown.csv"], ["--out"]),
     "reproduce": (["skill.json", "--robot", "panda"], ["--out", "--report"]),
     "retarget": (["synthetic:1"], ["--out", "--report"]),
-    "serve": (["sawyer", "--port", "0"], ["--trace"]),
+    "serve": (["--robot", "sawyer", "--port", "0"], ["--trace"]),
     "teleoperate": (["synthetic:1"], ["--record", "--latency"]),
 }
 CASES = [(command, words, option) for command, (words, options) in WRITES.items() for option in options]
@@ -26,8 +26,7 @@ def place(tmp_path, monkeypatch):
     """A folder to be in, in which no command can begin its work."""
     monkeypatch.chdir(tmp_path)
     began = lambda *_, **__: pytest.fail("it has begun to work")  # noqa: E731 (it stands for several functions)
-    for module in ("retarget", "teleoperate", "serve", "reproduce"):
-        monkeypatch.setattr(f"imitarm.cli.{module}.ArmModel.load", began)
+    monkeypatch.setattr("imitarm.cli.robot_options.ArmModel.load", began)
     for name in ("capture.open_source", "learn.read_and_lint", "reproduce.Skill.load"):
         monkeypatch.setattr(f"imitarm.cli.{name}", began)
     return tmp_path
@@ -56,7 +55,7 @@ def test_no_command_writes_anywhere_else(command, monkeypatch):
 
     monkeypatch.setattr(argparse._ActionsContainer, "add_argument", noted)
     cli._parser([command])
-    reads = {"--calibration", "--scene", "--points", "--config", "--data", "--tool", "--robot"}
+    reads = {"--calibration", "--scene", "--points", "--config", "--data", "--tool", "--robot", "--package-path"}
     files = {name for name, action in seen.items() if action.metavar in ("FILE", "FOLDER")} - reads
     own = {"benchmark": {"--out", "--report", "--fill"}, "demo": {"--out"}}
     assert files == set(own.get(command, WRITES.get(command, ((), ()))[1]))

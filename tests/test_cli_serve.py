@@ -17,7 +17,7 @@ from imitarm.transmission.messages import Status
 
 def test_it_serves_for_a_time_and_says_how_it_went(tmp_path, capfd):
     trace = tmp_path / "trace.csv"
-    assert main(["serve", "sawyer", "--port", "0", "--seconds", "0.3", "--trace", str(trace)]) == 0
+    assert main(["serve", "--robot", "sawyer", "--port", "0", "--seconds", "0.3", "--trace", str(trace)]) == 0
     shown = capfd.readouterr()
     assert "sawyer" in shown.out and "listens at 127.0.0.1:" in shown.out
     assert "stopped: just started" in shown.err
@@ -29,7 +29,7 @@ def test_it_serves_for_a_time_and_says_how_it_went(tmp_path, capfd):
 
 
 def test_an_address_that_others_reach_is_warned_of(capfd):
-    assert main(["serve", "panda", "--port", "0", "--host", "0.0.0.0", "--seconds", "0.05"]) == 0
+    assert main(["serve", "--robot", "panda", "--port", "0", "--host", "0.0.0.0", "--seconds", "0.05"]) == 0
     shown = capfd.readouterr()
     assert "whoever can reach this address can move the robot" in shown.err and "panda" in shown.out
 
@@ -37,18 +37,24 @@ def test_an_address_that_others_reach_is_warned_of(capfd):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["nosuch"], "unknown"),
-        (["sawyer", "--tool", "spoon"], "spoon"),
-        (["sawyer", "--port", "70000"], "--port must be from 0 to 65535"),
-        (["sawyer", "--seconds", "-1"], "--seconds must be above 0"),
-        (["sawyer", "--seconds", "1", "--port", "0", "--rate", "30"], "rate must be between 100 and 1000 Hz"),
-        (["sawyer", "--seconds", "1", "--port", "0", "--rate", "200"], "multiple of the timestep"),
-        (["sawyer", "--scene", "{}/no.yaml"], "no.yaml"),
-        (["sawyer", "--port", "0", "--trace", "{}/there.csv"], "is there already; name another file"),
-        (["sawyer", "--port", "0", "--trace", "{}/no/there.csv"], "there is no folder"),
-        (["sawyer", "--port", "0", "--trace", "{}", "--force"], "is a folder; name a file in it"),
-        (["sawyer", "--scene", "{}/there.csv", "--trace", "{}/there.csv", "--force"], "is the file of --scene, too"),
-        (["sawyer", "--port", "0", "--host", "no.such.host.invalid"], "there is no such host"),
+        (["--robot", "nosuch"], "unknown"),
+        (["--tool", "spoon"], "spoon"),
+        (["--port", "70000"], "--port must be from 0 to 65535"),
+        (["--seconds", "-1"], "--seconds must be above 0"),
+        (
+            ["--robot", "sawyer", "--seconds", "1", "--port", "0", "--rate", "30"],
+            "rate must be between 100 and 1000 Hz",
+        ),
+        (["--seconds", "1", "--port", "0", "--rate", "200"], "multiple of the timestep"),
+        (["--scene", "{}/no.yaml"], "no.yaml"),
+        (["--port", "0", "--trace", "{}/there.csv"], "is there already; name another file"),
+        (["--port", "0", "--trace", "{}/no/there.csv"], "there is no folder"),
+        (["--port", "0", "--trace", "{}", "--force"], "is a folder; name a file in it"),
+        (
+            ["--robot", "sawyer", "--scene", "{}/there.csv", "--trace", "{}/there.csv", "--force"],
+            "is the file of --scene, too",
+        ),
+        (["--port", "0", "--host", "no.such.host.invalid"], "there is no such host"),
     ],
 )
 def test_a_wrong_option_is_one_message(tmp_path, capsys, options, message):
@@ -64,7 +70,12 @@ def test_a_port_that_is_taken_is_said_and_no_more(tmp_path, capsys):
     trace.write_text("an older one")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
-        assert main(["serve", "sawyer", "--port", str(taken.getsockname()[1]), "--trace", str(trace), "--force"]) == 2
+        assert (
+            main(
+                ["serve", "--robot", "sawyer", "--port", str(taken.getsockname()[1]), "--trace", str(trace), "--force"]
+            )
+            == 2
+        )
     shown = capsys.readouterr()
     assert "can't listen there" in shown.err and shown.err.startswith("imitarm: error: ") and not shown.out
     assert trace.read_text() == "an older one"

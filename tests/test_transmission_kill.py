@@ -79,7 +79,7 @@ class Stage:
 
     def start_robot(self):
         self.traces.append(self.folder / f"trace_{len(self.traces)}.csv")
-        self.start("robot", "serve", "sawyer", "--port", self.robot_port, "--trace", self.traces[-1])
+        self.start("robot", "serve", "--robot", "sawyer", "--port", self.robot_port, "--trace", self.traces[-1])
 
     def kill(self, name):
         process = self.running.pop(name)

@@ -12,11 +12,10 @@ from imitarm.capture.sources import followed, live, open_source
 from imitarm.cli.gathering import add_side_and_person, gather, source_help
 from imitarm.cli.guiding import ask, choose, touched_points
 from imitarm.cli.outputs import check_outputs
+from imitarm.cli.robot_options import add_robot_options, load_robot
 from imitarm.cli.screen import remark, say, show_table
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.files.table import read_table
-from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.arm_file import ARMS
 from imitarm.retarget.calibration import ANCHORS, Anchor, Calibration, suggested_scale
 from imitarm.retarget.correspondence import Orientation
 from imitarm.retarget.limbs import ACCEPTED, LimbLengths, measure_limbs
@@ -63,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     sensor.add_argument("--points", metavar="FILE", help="guided: points in the robot's base frame, x y z [m]")
     sensor.add_argument("--seconds", type=float, default=1.0, metavar="S", help="guided: of each point; default: 1")
     clutch = kinds.add_parser("clutch", help="choose scale and turning; asks for what is not given")
-    clutch.add_argument("--robot", metavar="NAME", default="sawyer", help=f"{', '.join(ARMS)} or a file")
+    add_robot_options(clutch)
     clutch.add_argument("--scale", type=float, metavar="RHO", help="robot's motion over person's motion")
     clutch.add_argument("--anchor", choices=ANCHORS, help="suggest a scale: " + _listed(_ANCHORS))
     clutch.add_argument("--orientation", choices=get_args(Orientation), help=_listed(_ORIENTATIONS))
@@ -87,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
         TaskFailedError: when what was measured is not good enough to be kept.
     """
     out: Path = arguments.out
-    read = (("source", "SOURCE"), ("pairs", "PAIRS"), ("points", "--points"), ("robot", "--robot"))
+    read = (("source", "SOURCE"), ("pairs", "PAIRS"), ("points", "--points"), ("robot", "--robot"), ("tool", "--tool"))
     inputs = [(said, getattr(arguments, name, None)) for name, said in read]
     check_outputs([("--out", out)], inputs, force=True)  # the file is added to
     before = Calibration.load(out) if out.exists() else Calibration()
@@ -229,7 +228,7 @@ def _clutch(arguments: argparse.Namespace, before: Calibration) -> Calibration:
             )
         scale = 1.0
         if before.lengths is not None:
-            scale = suggested_scale(ArmModel.load(arguments.robot), before.lengths, anchor)
+            scale = suggested_scale(load_robot(arguments), before.lengths, anchor)
     orientation: Orientation | None = arguments.orientation
     if orientation is None:
         orientation = choose("How should the tool turn?", _ORIENTATIONS)

@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 
 from imitarm.cli.outputs import check_outputs
-from imitarm.cli.reading import add_reading_arguments, arm_of, read_and_lint, show_findings
+from imitarm.cli.reading import add_reading_arguments, read_and_lint, show_findings
+from imitarm.cli.robot_options import load_optional_robot, robot_files
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.demonstrations import Alignment, compute_alignment, files_of
 from imitarm.demonstrations.align import METHODS
@@ -60,9 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         InputError: when an option, a file or the place for the skill is wrong.
     """
-    inputs = [*(("FILE", file) for file in files_of(arguments.files)), ("--robot", arguments.robot)]
-    check_outputs([("--out", arguments.out)], [*inputs, ("--tool", arguments.tool)], force=arguments.force)
-    arm = arm_of(arguments)
+    inputs = [*(("FILE", file) for file in files_of(arguments.files)), *robot_files(arguments)]
+    check_outputs([("--out", arguments.out)], inputs, force=arguments.force)
+    arm = load_optional_robot(arguments)
     raw, findings = read_and_lint(arguments, arm, task=arguments.task, repair=arguments.repair)
     show_findings(raw, findings)
     if any(finding.severity == "error" for finding in findings) and not arguments.allow_errors:

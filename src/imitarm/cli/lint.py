@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from imitarm.cli.reading import add_reading_arguments, arm_of, read_and_lint, show_findings
+from imitarm.cli.reading import add_reading_arguments, read_and_lint, show_findings
+from imitarm.cli.robot_options import load_optional_robot
 
 EPILOG = """\
 examples:
@@ -23,6 +24,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings; return 2 when one is an error."""
-    raw, findings = read_and_lint(arguments, arm_of(arguments))
+    raw, findings = read_and_lint(arguments, load_optional_robot(arguments))
     show_findings(raw, findings)
     return 2 if any(finding.severity == "error" for finding in findings) else 0

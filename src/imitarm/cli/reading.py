@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from imitarm.cli.robot_options import add_robot_options
 from imitarm.cli.screen import say, show_table
 from imitarm.demonstrations import Finding, RawDemonstration, files_of, lint, read_raw
 from imitarm.demonstrations.finding import SEVERITIES
 from imitarm.demonstrations.reader import LENGTH_UNITS, QUATERNION_ORDERS, TIME_UNITS
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.arm_file import ARMS, TOOLS
 
 _COLOURS = {"error": "red", "warning": "yellow", "note": ""}
 
@@ -31,22 +31,7 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
     unsaid.add_argument(
         "--quaternion-order", choices=QUATERNION_ORDERS, default="wxyz", help="of unnamed columns; default: wxyz"
     )
-    arm = parser.add_argument_group("the arm that was guided")
-    arm.add_argument("--robot", metavar="NAME", help=f"{', '.join(ARMS)} or an MJCF or URDF file")
-    arm.add_argument("--tool", metavar="NAME", help=f"{', '.join(TOOLS)} or an MJCF file")
-
-
-def arm_of(arguments: argparse.Namespace) -> ArmModel | None:
-    """Load the arm that was named, None when none was.
-
-    Raises:
-        InputError: when a tool was named without an arm, or one of them is unknown.
-    """
-    if arguments.robot is None:
-        if arguments.tool is not None:
-            raise InputError("--tool needs --robot: name the arm that holds it")
-        return None
-    return ArmModel.load(arguments.robot, tool=arguments.tool)
+    add_robot_options(parser, default=None)  # else recordings of another arm would be compared with Sawyer
 
 
 def read_and_lint(

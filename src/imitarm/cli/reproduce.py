@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.cli.outputs import check_outputs
+from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
 from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.cli.trial import provenance, show_results, try_scene
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.arm_file import ARMS, TOOLS
 from imitarm.kinematics.ik import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.policies import ACFRA, ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN
@@ -39,8 +39,7 @@ FORBIDDEN = {"keep_height": HORIZONTAL_ONLY, "not_down": NOT_DOWN}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes."""
     parser.add_argument("skill", metavar="SKILL", type=Path, help="a skill file, as 'imitarm learn' writes it")
-    parser.add_argument("--robot", required=True, metavar="NAME", help=f"{', '.join(ARMS)} or an MJCF or URDF file")
-    parser.add_argument("--tool", metavar="NAME", help=f"{', '.join(TOOLS)} or an MJCF file")
+    add_robot_options(parser)
     parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles and goal (YAML); default: nothing")
     way = parser.add_argument_group("the way round")
     way.add_argument("--method", choices=ADAPTERS, default="certified", help="how to adapt; default: certified")
@@ -70,11 +69,12 @@ def run(arguments: argparse.Namespace) -> int:
     """
     inputs = [
         ("SKILL", arguments.skill),
-        *((f"--{name}", getattr(arguments, name)) for name in ("scene", "robot", "tool")),
+        ("--scene", arguments.scene),
+        *robot_files(arguments),
     ]
     check_outputs([("--out", arguments.out), ("--report", arguments.report)], inputs, force=arguments.force)
     skill = Skill.load(arguments.skill)
-    arm = ArmModel.load(arguments.robot, tool=arguments.tool)
+    arm = load_robot(arguments)
     scene = Scene() if arguments.scene is None else load_scene(arguments.scene)
     if arguments.goal is not None:
         scene = Scene(Pose(0.01 * np.array(arguments.goal), skill.goal_.quaternion), scene.obstacles)

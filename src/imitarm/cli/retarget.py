@@ -17,6 +17,7 @@ from imitarm.capture.skeleton import SIDES, Skeleton
 from imitarm.cli.gathering import source_help
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.person import person_of
+from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
 from imitarm.cli.screen import remark, say, show_table, watched, working
 from imitarm.cli.trial import provenance
 from imitarm.errors import InputError, TaskFailedError
@@ -24,7 +25,6 @@ from imitarm.evaluation.execution import Execution, execute_on_robot
 from imitarm.evaluation.run_evaluation import FAR, FAR_FRACTION, RunEvaluation, TargetTracking, evaluate_run
 from imitarm.evaluation.tracking import seen_arm
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.arm_file import ARMS, TOOLS
 from imitarm.retarget import RETARGETERS, Correspondence, Retargeter, Retargeting
 from imitarm.retarget.calibration import Calibration
 from imitarm.retarget.correspondence import Orientation
@@ -57,10 +57,7 @@ PERIOD = 0.01  # [s] control period
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes."""
     parser.add_argument("source", metavar="SOURCE", help=source_help())
-    parser.add_argument(
-        "--robot", default="sawyer", metavar="NAME", help=f"{', '.join(ARMS)} or a file; default: sawyer"
-    )
-    parser.add_argument("--tool", metavar="NAME", help=f"{', '.join(TOOLS)} or an MJCF file")
+    add_robot_options(parser)
     parser.add_argument("--method", choices=(*RETARGETERS, "all"), default="modern", help="default: modern")
     parser.add_argument(
         "--drive", action="store_true", help="let the simulated robot execute the motion, and measure it"
@@ -117,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     names = list(RETARGETERS) if arguments.method == "all" else [arguments.method]
     files = _output_files(arguments, names)
-    arm = ArmModel.load(arguments.robot, tool=arguments.tool)
+    arm = load_robot(arguments)
     correspondence = _correspondence(arguments)
     scene = Scene() if arguments.scene is None else load_scene(arguments.scene)
     scene.check()
@@ -160,7 +157,8 @@ def _output_files(arguments: argparse.Namespace, names: Sequence[str]) -> dict[s
         files = {name: out if one else out.with_name(f"{out.stem}_{name}{out.suffix}") for name in names}
     inputs = [
         ("SOURCE", arguments.source),
-        *((f"--{name}", getattr(arguments, name)) for name in ("calibration", "scene", "robot", "tool")),
+        *((f"--{name}", getattr(arguments, name)) for name in ("calibration", "scene")),
+        *robot_files(arguments),
     ]
     outputs = [*(("--out", path) for path in files.values()), ("--report", arguments.report)]
     check_outputs(outputs, inputs, force=arguments.force)

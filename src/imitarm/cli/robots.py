@@ -6,8 +6,10 @@ import argparse
 
 import numpy as np
 
+from imitarm.cli.robot_options import add_robot_options, load_robot
 from imitarm.cli.screen import say, show_table
 from imitarm.demonstrations.arm_checks import reach
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_file import ARMS, TOOLS
 
@@ -15,35 +17,30 @@ EPILOG = """\
 examples:
   imitarm robots
   imitarm robots sawyer --tool brush
-  imitarm robots my_arm.urdf --flange tool0
+  imitarm robots my_arm.urdf --flange tool0 --package-path ~/catkin_ws/src
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes."""
-    parser.add_argument(
-        "arm", nargs="?", metavar="ARM", help="a known name, or an MJCF or URDF file; default: list all"
-    )
-    parser.add_argument("--tool", metavar="NAME", help=f"tool at the flange: {', '.join(TOOLS)} or an MJCF file")
-    parser.add_argument("--flange", metavar="NAME", help="body or site that is the flange; default: the last one")
-    parser.add_argument(
-        "--discard-meshes", action="store_true", help="read a file whose meshes are elsewhere; only shapes count"
-    )
+    parser.add_argument("arm", nargs="?", metavar="ARM", help="the same as --robot; default: list all known arms")
+    add_robot_options(parser, default=None)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print one arm, or the list of all."""
-    if arguments.arm is None:
+    """Print one arm, or the list of all.
+
+    Raises:
+        InputError: if the robot can't be loaded, or two are named.
+    """
+    if arguments.arm is not None:
+        if arguments.robot not in (None, arguments.arm):
+            raise InputError(f"name one robot: {arguments.arm!r} and --robot {arguments.robot!r} differ")
+        arguments.robot = arguments.arm
+    if arguments.robot is None:
         _list(arguments.tool)
     else:
-        _inspect(
-            ArmModel.load(
-                arguments.arm,
-                tool=arguments.tool,
-                flange=arguments.flange,
-                discard_meshes=arguments.discard_meshes,
-            )
-        )
+        _inspect(load_robot(arguments))
     return 0
 
 
@@ -62,7 +59,10 @@ def _list(tool: str | None) -> None:
             for arm in arms
         ],
     )
-    say(f"tools: {', '.join(sorted(TOOLS))}", "any MJCF or URDF file is an arm too; its name or path shows its joints")
+    say(
+        f"tools: {', '.join(sorted(TOOLS))}",
+        "any MJCF or URDF file is an arm too; give a name or a path to see its joints and limits",
+    )
 
 
 def _inspect(arm: ArmModel) -> None:

@@ -14,10 +14,10 @@ import numpy as np
 from rich.text import Text
 
 from imitarm.cli.outputs import check_outputs
+from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.arm_file import ARMS, TOOLS
 from imitarm.robots import RobotServer, SimulatedRobot
 from imitarm.scene import Scene, load_scene
 from imitarm.transmission.gate import REASONS
@@ -25,9 +25,9 @@ from imitarm.transmission.sockets import LOOPBACK
 
 EPILOG = """\
 examples:
-  imitarm serve sawyer --tool gripper --port 7500
-  imitarm serve panda --scene table.yaml --seconds 600
-  imitarm serve sawyer --trace steps.csv
+  imitarm serve --robot sawyer --tool gripper --port 7500
+  imitarm serve --robot panda --scene table.yaml --seconds 600
+  imitarm serve --robot sawyer --trace steps.csv
 
 Lead it with 'imitarm teleoperate SOURCE --to 127.0.0.1:7500'. It begins stopped, until the operator there enables it;
 0.1 s without commands and it brakes, 0.5 s and it stays stopped. Whoever can reach the port can move the robot: it
@@ -40,10 +40,7 @@ _SHOWN_EVERY = 25  # periods between two looks at the status line
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes."""
-    parser.add_argument("robot", metavar="ROBOT", help=f"to simulate: {', '.join(ARMS)} or an MJCF or URDF file")
-    parser.add_argument(
-        "--tool", metavar="NAME", default="gripper", help=f"{', '.join(TOOLS)} or a file; default: gripper"
-    )
+    add_robot_options(parser)
     parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles (YAML); default: none")
     parser.add_argument("--control", choices=("position", "torque"), default="position", help="of the simulated drives")
     wire = parser.add_argument_group("the wire")
@@ -65,10 +62,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
     if not 0 <= arguments.port < 65536:
         raise InputError(f"--port must be from 0 to 65535, got {arguments.port}")
-    inputs = [("--scene", arguments.scene), ("ROBOT", arguments.robot), ("--tool", arguments.tool)]
+    inputs = [("--scene", arguments.scene), *robot_files(arguments)]
     check_outputs([("--trace", arguments.trace)], inputs, force=arguments.force)
     scene = Scene() if arguments.scene is None else load_scene(arguments.scene)
-    arm = ArmModel.load(arguments.robot, tool=arguments.tool)
+    arm = load_robot(arguments)
     robot = SimulatedRobot(arm, scene=scene, control=arguments.control)
     with ExitStack() as stack:
         stack.enter_context(terminated_as_interrupted())

@@ -20,12 +20,12 @@ from imitarm.capture.sources import followed, open_source
 from imitarm.capture.stream import UdpSource
 from imitarm.cli.gathering import source_help
 from imitarm.cli.outputs import check_outputs
+from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.cli.serve import terminated_as_interrupted
 from imitarm.demonstrations.recorder import DemonstrationRecorder
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.arm_file import ARMS, TOOLS
 from imitarm.retarget import RETARGETERS, Correspondence
 from imitarm.retarget.calibration import Calibration
 from imitarm.retarget.correspondence import Orientation
@@ -64,13 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=get_args(Orientation),
         help="what of the hand's turning the tool follows; default: as calibrated, else upright",
     )
-    robot = parser.add_argument_group("the robot")
-    robot.add_argument(
-        "--robot", default="sawyer", metavar="NAME", help=f"{', '.join(ARMS)} or a file; default: sawyer"
-    )
-    robot.add_argument(
-        "--tool", default="gripper", metavar="NAME", help=f"{', '.join(TOOLS)} or a file; default: gripper"
-    )
+    add_robot_options(parser)
+    robot = parser.add_argument_group("how the robot is led")
     robot.add_argument("--to", metavar="HOST:PORT", help="lead a served robot; default: simulate it here")
     robot.add_argument(
         "--enable", action="store_true", help="let a stopped robot move, once at the start, without asking"
@@ -96,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     _check_options(arguments)
     correspondence = _correspondence(arguments)
     scene = Scene() if arguments.scene is None else load_scene(arguments.scene)
-    arm = ArmModel.load(arguments.robot, tool=arguments.tool)
+    arm = load_robot(arguments)
     retargeter = RETARGETERS[arguments.method](arm, correspondence, dt=1.0 / arguments.rate, scene=scene)
     with ExitStack() as stack:
         stack.enter_context(terminated_as_interrupted())
@@ -141,7 +136,8 @@ def _check_options(arguments: argparse.Namespace) -> None:
         raise InputError(f"--rate must be from 50 to 1000 Hz, got {arguments.rate:g}")
     inputs = [
         ("SOURCE", arguments.source),
-        *((f"--{name}", getattr(arguments, name)) for name in ("calibration", "scene", "robot", "tool")),
+        *((f"--{name}", getattr(arguments, name)) for name in ("calibration", "scene")),
+        *robot_files(arguments),
     ]
     check_outputs([("--record", arguments.record), ("--latency", arguments.latency)], inputs, force=arguments.force)
     if arguments.enable and not arguments.to:

@@ -1,0 +1,84 @@
+"""The options that name a robot arm: the same in every command that needs one."""
+
+from __future__ import annotations
+
+import argparse
+
+from imitarm.cli.screen import remark
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_file import ARMS, TOOLS
+
+DEFAULT_ROBOT = "sawyer"
+
+
+def add_robot_options(parser: argparse.ArgumentParser, *, default: str | None = DEFAULT_ROBOT) -> None:
+    """Add ``--robot``, ``--tool``, ``--flange``, ``--package-path`` and ``--discard-meshes``.
+
+    Args:
+        parser: of the command.
+        default: the robot that is taken when none is named; None for a command that can do without a robot.
+    """
+    group = parser.add_argument_group("the robot arm")
+    group.add_argument(
+        "--robot",
+        metavar="NAME",
+        default=default,
+        help=f"{', '.join(sorted(ARMS))}, or a URDF or MJCF file; default: {default or 'none'}",
+    )
+    group.add_argument(
+        "--tool", metavar="NAME", help=f"tool at the flange: {', '.join(sorted(TOOLS))}, or an MJCF file; default: none"
+    )
+    group.add_argument(
+        "--flange", metavar="NAME", help="body or site of the file that is the flange; default: the end of the arm"
+    )
+    group.add_argument(
+        "--package-path",
+        metavar="FOLDER",
+        action="append",
+        default=[],
+        help="folder in which ROS packages and meshes of the file are looked for; may be given several times",
+    )
+    group.add_argument(
+        "--discard-meshes", action="store_true", help="leave out all meshes; only primitive shapes count for contact"
+    )
+
+
+def load_robot(arguments: argparse.Namespace) -> ArmModel:
+    """Load the arm that the options name, and tell what its file does not say.
+
+    Raises:
+        InputError: if no robot is named but another option needs one, or the robot can't be loaded.
+    """
+    arm = load_optional_robot(arguments)
+    if arm is None:
+        raise InputError("name a robot with --robot")
+    return arm
+
+
+def load_optional_robot(arguments: argparse.Namespace) -> ArmModel | None:
+    """Do what :func:`load_robot` does; None if no robot is named.
+
+    Raises:
+        InputError: if no robot is named but another option needs one, or the robot can't be loaded.
+    """
+    if arguments.robot is None:
+        for option in ("tool", "flange", "package_path", "discard_meshes"):
+            if getattr(arguments, option):
+                raise InputError(f"--{option.replace('_', '-')} needs --robot: name the arm that it belongs to")
+        return None
+    arm = ArmModel.load(
+        arguments.robot,
+        tool=arguments.tool,
+        flange=arguments.flange,
+        package_path=arguments.package_path,
+        discard_meshes=arguments.discard_meshes,
+    )
+    for note in arm.notes:
+        remark(f"note: {arm.name}: {note}")
+    return arm
+
+
+def robot_files(arguments: argparse.Namespace) -> list[tuple[str, str | None]]:
+    """Return the options that may name a file, with their values, for checking that no output overwrites one."""
+    return [("--robot", arguments.robot), ("--tool", arguments.tool)]
