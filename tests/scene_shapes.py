@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay
 from imitarm.kinematics.pose import Pose
 from imitarm.scene import OBSTACLES, Box, Capsule, Cone, ConvexHull, Cylinder, Ellipsoid, Sphere
 
-KINDS = list(OBSTACLES)
+KINDS = [kind for kind in OBSTACLES if kind != "half_space"]  # all shapes that have an end
 
 
 def random_pose(rng):

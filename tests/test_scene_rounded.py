@@ -18,7 +18,7 @@ def test_sphere_by_hand():
     ball = Sphere([1.0, 0.0, 0.0], 0.25)
     distance, gradient = ball.distance_and_gradient([[2.0, 0.0, 0.0], [1.0, 0.1, 0.0], [1.0, 0.0, 0.0]])
     np.testing.assert_allclose(distance, [0.75, -0.15, -0.25])
-    np.testing.assert_allclose(gradient, [[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    np.testing.assert_allclose(gradient, [[1, 0, 0], [0, 1, 0], [1, 0, 0]])
     np.testing.assert_allclose(ball.bounds(), [[0.75, -0.25, -0.25], [1.25, 0.25, 0.25]])
 
 

@@ -25,7 +25,7 @@ def test_distances_clearance_and_nearest_belong_together(scene, shape):
     distances = scene.distances(points)
     assert distances.shape == (len(scene.obstacles), *shape)
     for row, obstacle in zip(distances, scene.obstacles, strict=True):
-        np.testing.assert_array_equal(row, obstacle.signed_distance(points))
+        np.testing.assert_allclose(row, obstacle.signed_distance(points), atol=1e-14)
     assert scene.clearance(points).shape == shape
     assert scene.nearest(points).shape == shape
     np.testing.assert_array_equal(scene.clearance(points), distances.min(axis=0))
@@ -40,13 +40,13 @@ def test_without_obstacles_everything_is_clear():
     np.testing.assert_array_equal(empty.clearance(np.zeros((2, 5, 3))), np.full((2, 5), np.inf))
     np.testing.assert_array_equal(empty.nearest(np.zeros((5, 3))), np.full(5, -1))
     assert empty.distances(np.zeros((5, 3))).shape == (0, 5)
-    assert empty.after(1.0).obstacles == ()
+    assert empty.at(1.0).obstacles == ()
     empty.check(0.1)
 
 
-def test_after_moves_the_obstacles_and_not_the_goal(scene):
+def test_at_moves_the_obstacles_and_not_the_goal(scene):
     points = np.random.default_rng(2).normal(size=(30, 3))
-    later = scene.after(2.0)
+    later = scene.at(2.0)
     assert later.goal is scene.goal
     for before, after in zip(scene.obstacles, later.obstacles, strict=True):
         np.testing.assert_allclose(
@@ -86,8 +86,8 @@ def test_check_tells_a_goal_that_is_in_the_way():
         (lambda: Scene(None, 3), "obstacles must be a list of obstacles, got 3"),
         (lambda: Scene(None, [Sphere([0, 0, 0], 1), "box"]), r"obstacles\[1\] must be an obstacle .* got 'box'"),
         (lambda: Scene(None, Sphere([0, 0, 0], 1)), "obstacles must be a list"),
-        (lambda: Scene().clearance([0, 0]), r"points must have shape \(\.\.\., 3\), got \(2,\)"),
-        (lambda: Scene().nearest(np.zeros((3, 2))), "points must have shape"),
+        (lambda: Scene().clearance([0, 0]), r"points must be an array of shape \(\.\.\., 3\) \[m\], got shape \(2,\)"),
+        (lambda: Scene().nearest(np.zeros((3, 2))), "points must be an array of shape"),
     ],
 )
 def test_bad_input_is_refused(build, message):

@@ -228,20 +228,23 @@ BAD = {
     ),
     "nan": (
         one("type: sphere, center: [0, 0, .nan], radius: 1"),
-        "obstacles[1] (sphere): center must be 3 finite numbers",
+        "obstacles[1] (sphere): center must be finite [m], but center[2] is nan",
     ),
-    "infinite": (one("type: sphere, center: [0, 0, 0], radius: .inf"), "radius must be one positive, finite number"),
+    "infinite": (
+        one("type: sphere, center: [0, 0, 0], radius: .inf"),
+        "radius must be a finite number above 0 [m], got inf",
+    ),
     "a very long number": (
         one(f"type: sphere, center: [0, 0, 0], radius: 1{'0' * 400}"),
         "radius is too large for a nu",
     ),
     "negative": (
         one("type: sphere, center: [0, 0, 0], radius: -1"),
-        "(sphere): radius must be one positive, finite numb",
+        "(sphere): radius must be a finite number above 0",
     ),
     "two numbers": (
         one("type: sphere, center: [0, 0], radius: 1"),
-        "center must be 3 finite numbers [m], got [0.0, 0.0]",
+        "center must be 3 numbers [m], got shape (2,)",
     ),
     "wrong unit": (
         one("type: box, position: [0, 0, 0], size: [80, 80, 200]"),
@@ -251,7 +254,7 @@ BAD = {
         one("type: box, position: [450, 0, 0], size: [1, 1, 1]"),
         "(box): position [450.0, 0.0, 0.0] is beyond",
     ),
-    "velocity": (one(SPHERE + ", velocity: 3"), "obstacles[1] (sphere): velocity must be 3 finite numbers [m/s]"),
+    "velocity": (one(SPHERE + ", velocity: 3"), "obstacles[1] (sphere): velocity must be 3 numbers [m/s]"),
     "two rotations": (
         one(BOX + ", yaw_degrees: 3, quaternion: [1, 0, 0, 0]"),
         "quaternion and yaw_degrees both give the",
@@ -273,7 +276,7 @@ BAD = {
     ),
     "ragged hull": (
         one("type: convex_hull, points: [[0, 0, 0], [1, 0]]"),
-        "points must be a table of numbers with 3 co",
+        "points must be numbers [m], got",
     ),
 }
 
@@ -287,7 +290,7 @@ def test_what_is_wrong_is_said(tmp_path, text, expected):
 
 def test_a_name_may_hold_what_messages_are_split_at(tmp_path):
     message = message_of(tmp_path, one('type: sphere, name: "a: b", center: [0, 0, 0], radius: 0'))
-    assert message.endswith('obstacles[1] (sphere "a: b"): radius must be one positive, finite number [m], got 0.0')
+    assert message.endswith('obstacles[1] (sphere "a: b"): radius must be a finite number above 0 [m], got 0.0')
 
 
 def test_a_file_that_repeats_itself_is_refused_at_once(tmp_path):

@@ -57,13 +57,45 @@ class SphereCover:
         moves = [[_carries(model, int(model.jnt_bodyid[joint]), body) for joint in joints] for body in owners]
         self._moves = np.array(moves, dtype=float).reshape(len(owners), 1, len(joints))
         self._moves_of_all = np.concatenate([self._moves[:, 0], np.zeros((len(self.base_radii), len(joints)))])
+        # one product gives every local center in every body's rotation; the right ones are picked out of it
+        self._columns = np.ascontiguousarray(self._centers[:, :, 0].T)
+        rows = 3 * self._owners[:, None] + np.arange(3)
+        self._picked = rows * len(owners) + np.arange(len(owners))[:, None]
+        self._root = int(model.body_rootid[model.jnt_bodyid[joints[0]]])
+        self._dofs = model.jnt_dofadr[joints]
+        self._moved = self._moves[:, 0].copy()
         self.links = self._moves[:, 0].sum(axis=1).astype(int)
         self.follows_last_joint = self._moves[:, 0, -1] > 0.0
 
     def centers(self, data: mujoco.MjData) -> Array:
         """Return where the spheres are, shape (m, 3) [m]; ``data`` holds the kinematics of a posture."""
-        turned = data.xmat[self._owners].reshape(-1, 3, 3) @ self._centers
-        return np.asarray(data.xpos[self._owners] + turned[:, :, 0])
+        turned = (data.xmat.reshape(-1, 3) @ self._columns).take(self._picked)
+        turned += data.xpos.take(self._owners, axis=0)
+        return np.asarray(turned)
+
+    def speeds(self, data: mujoco.MjData, spheres: NDArray[np.int_], centers: Array, normals: Array) -> Array:
+        """Return how fast each joint moves chosen spheres along chosen directions, shape (k, n_joints) [m/rad].
+
+        A joint's twist about the centre of mass ``o`` is ``(w, v)``, as MuJoCo keeps it; it moves ``c`` along ``n`` by
+        ``n.(v + w x (c - o)) = n.v + w.((c - o) x n)``.
+
+        Args:
+            data: the kinematics of a posture.
+            spheres: shape (k,).
+            centers: of these spheres, shape (3, k) [m].
+            normals: the directions, unit vectors, shape (3, k).
+        """
+        a, b, c = centers - data.subtree_com[self._root][:, None]
+        x, y, z = normals
+        wrenches = np.empty((6, len(spheres)))
+        for row, left, right in zip(wrenches, (b, c, a), (z, x, y), strict=False):
+            np.multiply(left, right, out=row)
+        for row, left, right in zip(wrenches, (c, a, b), (y, z, x), strict=False):
+            np.subtract(row, left * right, out=row)
+        wrenches[3:] = normals
+        speeds = np.dot(wrenches.T, data.cdof.take(self._dofs, axis=0).T)
+        speeds *= self._moved.take(spheres, axis=0)
+        return speeds
 
     def parting(
         self, data: mujoco.MjData, outer: NDArray[np.int_], inner: NDArray[np.int_], centers: Array, normals: Array

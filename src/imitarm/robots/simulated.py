@@ -129,7 +129,7 @@ class SimulatedRobot(Robot):
     @property
     def scene(self) -> Scene:
         """The scene as it truly is now."""
-        return self.scene_at_start.after(self.time)
+        return self.scene_at_start.at(self.scene_at_start.stamp + self.time)
 
     @property
     def tool_to_base(self) -> Pose:

@@ -1,17 +1,17 @@
-"""ConvexHull: the smallest convex solid around some points, for everything that has flat faces."""
+"""Faces and edges of a convex hull, and the signed distance of points to it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.errors import InputError
-from imitarm.scene.obstacle import MAX_COORDINATE, MAX_SIZE, TINY, Array, Obstacle
+from imitarm.scene.distances import TINY
 
-_FLAT = 1e-6  # a hull thinner than this share of its longest extent is taken as flat
+Array = NDArray[np.float64]
+
 _BLOCK = 512  # points at a time: tables of points times edges stay in the processor's cache
 _CLOSE = 1e-5  # [m] nearer than this the edges are compared without cancellation
 _ON_PLANE = 1e-12  # [m] rounding of a height over a face
@@ -19,8 +19,12 @@ _SAME_PLANE = 1e-12  # neighbouring triangles whose normals' cosine is this near
 
 
 @dataclass(frozen=True)
-class _Polytope:
-    """Faces and edges of a hull, relative to its centroid, so that a moved hull keeps them.
+class Polytope:
+    """Faces and edges of a hull in its own frame, so that a hull that moves keeps them.
+
+    With the planes ``n_i.x = b_i`` of its faces, inside ``sd = max_i (n_i.x - b_i)``. Outside, that maximum is a lower
+    bound. It is the distance when its foot ``x - sd n_i`` is on the face; otherwise the nearest point is on an edge or
+    at a corner, and the distance is the smallest distance to an edge.
 
     Attributes:
         vertices: corners of the hull, shape (v, 3) [m].
@@ -48,10 +52,15 @@ class _Polytope:
     starts_twice: Array
     starts_squared: Array
 
+    @cached_property
+    def radius(self) -> float:
+        """Largest distance of a corner from the origin of the own frame [m]."""
+        return float(np.linalg.norm(self.vertices, axis=1).max())
+
     @classmethod
-    def around(cls, points: Array) -> _Polytope:
+    def around(cls, points: Array) -> Polytope:
         """Build from centred points (n, 3) that span space."""
-        from scipy.spatial import ConvexHull as Qhull  # noqa: PLC0415  takes long to import, and few scenes need it
+        from scipy.spatial import ConvexHull as Qhull  # noqa: PLC0415  slow to import, and few scenes need it
 
         hull = Qhull(points)
         corners = np.sort(hull.vertices)
@@ -81,7 +90,10 @@ class _Polytope:
         )
 
     def distance_and_normal(self, q: Array) -> tuple[Array, Array]:
-        """Return signed distances (n,) and unit gradients (n, 3) at ``q`` (n, 3), relative to the centroid."""
+        """Return signed distances (n,) and unit gradients (n, 3) at ``q`` (n, 3), both in the own frame."""
+        if len(q) > _BLOCK:
+            parts = [self.distance_and_normal(q[i : i + _BLOCK]) for i in range(0, len(q), _BLOCK)]
+            return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
         heights = q @ self.normals.T - self.offsets  # (n, m)
         face = heights.argmax(axis=1)
         distance = heights[np.arange(len(q)), face]
@@ -133,81 +145,3 @@ def _edges(vertices: Array, triangles: NDArray[np.intp], facing: Array) -> tuple
     keep[twin + 1] = False
     keep[twin[flat]] = False
     return vertices[pairs[keep, 0]], vertices[pairs[keep, 1]]
-
-
-@dataclass(frozen=True, eq=False)
-class ConvexHull(Obstacle):
-    """The smallest convex solid around ``points``.
-
-    With the planes ``n_i·x = b_i`` of its faces, inside ``sd = max_i (n_i·x - b_i)``. Outside that maximum is a lower
-    bound, and it is the distance when its foot ``x - sd n_i`` is on the face; otherwise the nearest point is on an
-    edge or at a corner, and the distance is the smallest one to an edge.
-
-    Attributes:
-        points: at least 4 that are not all in one plane, in the base frame, shape (n, 3) [m].
-    """
-
-    kind: ClassVar[str] = "convex_hull"
-
-    points: Array
-    _centroid: Array = field(init=False, repr=False)
-    _polytope: _Polytope = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        points = self._checked_points()
-        centroid = points.mean(axis=0)
-        spread = np.linalg.svd(points - centroid, compute_uv=False)
-        if spread[-1] <= _FLAT * spread[0]:
-            raise InputError(
-                f"{self._label}: the {len(points)} points lie in one plane; a hull needs points that span a volume "
-                "(a thin Box does for a plate)"
-            )
-        self._set(points=points, _centroid=centroid, _polytope=_Polytope.around(points - centroid))
-
-    def _checked_points(self) -> Array:
-        try:
-            points = np.array(self.points, dtype=float)
-        except (TypeError, ValueError):
-            points = np.empty(0)
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise InputError(f"{self._label}: points must be a table of numbers with 3 columns [m]")
-        if len(points) < 4:
-            raise InputError(f"{self._label}: points must be at least 4 to span a volume, got {len(points)}")
-        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-        if len(bad):
-            raise InputError(f"{self._label}: points[{bad[0]}] is not finite: {points[bad[0]].tolist()}")
-        if np.abs(points).max() > MAX_COORDINATE or np.ptp(points, axis=0).max() > MAX_SIZE:
-            raise InputError(
-                f"{self._label}: points reach from {points.min(axis=0).tolist()} to {points.max(axis=0).tolist()}, "
-                f"beyond {MAX_SIZE:g} m in size or {MAX_COORDINATE:g} m in place; give them in metres"
-            )
-        points.setflags(write=False)
-        return points
-
-    @property
-    def vertices(self) -> Array:
-        """Those of ``points`` that are corners of the hull, shape (v, 3) [m]."""
-        return self._polytope.vertices + self._centroid
-
-    @property
-    def triangles(self) -> NDArray[np.intp]:
-        """Surface as rows of ``vertices``, counter-clockwise seen from outside, shape (k, 3)."""
-        return self._polytope.triangles.copy()
-
-    def _distance(self, points: Array) -> Array:
-        return self._distance_and_gradient(points)[0]
-
-    def _distance_and_gradient(self, points: Array) -> tuple[Array, Array]:
-        distance, normal = np.empty(len(points)), np.empty((len(points), 3))
-        for i in range(0, len(points), _BLOCK):
-            part = slice(i, i + _BLOCK)
-            distance[part], normal[part] = self._polytope.distance_and_normal(points[part] - self._centroid)
-        return distance, normal
-
-    def _support(self, directions: Array) -> Array:
-        vertices = self._polytope.vertices
-        return vertices[(directions @ vertices.T).argmax(axis=1)] + self._centroid
-
-    def _shift(self, offset: Array) -> None:
-        self._set(points=self.points + offset, _centroid=self._centroid + offset)

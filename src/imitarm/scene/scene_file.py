@@ -31,7 +31,8 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 _TOP = ("format", "version", "units", "goal", "obstacles")
 _ROTATIONS = ("quaternion", "rpy_degrees", "yaw_degrees")
-_COMMON = ("name", "velocity")
+_COMMON = ("name", "velocity", "angular_velocity")
+_UNWRITTEN = ("covariance", "track_id")  # what only a tracker knows
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
@@ -180,11 +181,13 @@ def _obstacle(entry: object, index: int, metres: float) -> Obstacle:
         values["pose"] = _pose(entry, where, metres)
     if "velocity" in entry:
         values["velocity"] = _scaled(entry["velocity"], f"{where}: velocity", metres)
+    if "angular_velocity" in entry:
+        values["angular_velocity"] = _scaled(entry["angular_velocity"], f"{where}: angular_velocity", 1.0)
     try:
         return shape(**values, name=name)
     except InputError as error:
         label = f'{shape.__name__} "{name}": ' if name else f"{shape.__name__}: "
-        raise InputError(f"{where}: {str(error).removeprefix(label)}") from error
+        raise InputError(f"{where}: {str(error).replace(label, '')}") from error
 
 
 def _shape(kind: object, where: str) -> type[Obstacle]:
@@ -199,7 +202,7 @@ def _shape(kind: object, where: str) -> type[Obstacle]:
 
 def _own_keys(shape: type[Obstacle]) -> list[str]:
     """Return the fields that make this shape, without those that all obstacles have."""
-    return [f.name for f in fields(shape) if f.init and f.name not in _COMMON]
+    return [f.name for f in fields(shape) if f.init and f.name not in (*_COMMON, *_UNWRITTEN)]
 
 
 def _pose(entry: Mapping[Any, Any], where: str, metres: float) -> Pose:
@@ -278,4 +281,6 @@ def _obstacle_entry(obstacle: Obstacle) -> dict[str, Any]:
         entry.update(_pose_entry(value) if key == "pose" else {key: np.asarray(value).tolist()})
     if obstacle.velocity.any():
         entry["velocity"] = obstacle.velocity.tolist()
+    if obstacle.angular_velocity.any():
+        entry["angular_velocity"] = obstacle.angular_velocity.tolist()
     return entry

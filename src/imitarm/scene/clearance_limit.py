@@ -1,0 +1,80 @@
+"""ClearanceLimit: no part of the arm may approach an obstacle faster than it can still stay clear."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.rows import Rows
+from imitarm.scene.distances import near_pairs
+from imitarm.scene.scene import Scene
+from imitarm.validation import finite_number, instance
+
+Array = NDArray[np.float64]
+
+
+class ClearanceLimit:
+    r"""Inequalities on the joint velocity that keep every link, and the tool, clear of every obstacle.
+
+    Spheres cover the arm and its tool (``ArmModel.collision_spheres``). For the sphere with centre ``c`` and radius
+    ``r`` near an obstacle with signed distance ``sd`` and outward normal ``n``, the room left is
+    ``h = sd(c) - r - clearance``. With ``v_o`` the velocity of the obstacle's nearest point, the row
+
+    .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - \xi h
+
+    lets the room shrink at most exponentially: it never gets below zero, and where it is negative it must grow. Every
+    sphere within ``influence`` of an obstacle has a row; none is left out. The spheres stand out from the shapes
+    they cover, so the true distance is never smaller than the one that is used.
+
+    Args:
+        arm: the arm with its tool.
+        clearance: required distance of every link to every obstacle [m].
+        rate: ``xi``, the fraction of the room that may be used up per second [1/s].
+        influence: room beyond which a sphere has no row [m].
+
+    Raises:
+        InputError: when ``arm`` is not an ArmModel, or a number is not finite or is negative.
+    """
+
+    def __init__(self, arm: ArmModel, clearance: float, *, rate: float = 6.0, influence: float = 0.15) -> None:
+        self.arm = instance(arm, ArmModel, "ClearanceLimit: arm")
+        self.clearance = finite_number(clearance, "ClearanceLimit: clearance", "m", at_least=0.0)
+        self.rate = finite_number(rate, "ClearanceLimit: rate", "1/s", at_least=0.0)
+        self.influence = finite_number(influence, "ClearanceLimit: influence", "m", above=0.0)
+        cover = arm.cover
+        self._cover = cover
+        self._reduced = cover.radii + self.clearance  # [m] what is taken off a distance
+        self._reach = self._reduced + self.influence
+
+    def rows(self, q: ArrayLike, scene: Scene) -> Rows | None:
+        """Return the inequalities for one posture.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            scene: the obstacles, as predicted for now, with their velocities.
+
+        Returns:
+            One row for each pair of a sphere and an obstacle within ``influence``; None when there is none.
+
+        Raises:
+            InputError: when ``q`` is not n_joints finite numbers.
+        """
+        packed = scene.packed
+        if not len(packed):
+            return None
+        data = self.arm.at(q).data
+        centers = self._cover.centers(data)
+        pairs = near_pairs(packed, centers, self._reach)
+        if pairs is None:
+            return None
+        obstacle, sphere, distance, normal = pairs
+        points = centers.T.take(sphere, axis=1)
+        velocity = packed.velocities.T.take(obstacle, axis=1)
+        if packed.rotating:  # the nearest surface point moves at v + w x (p - origin); its offset along n adds nothing
+            arms = points - packed.positions.T[:, obstacle]
+            velocity += np.cross(packed.angular_velocities.T[:, obstacle], arms, axis=0)
+        velocity *= normal
+        lower = np.add.reduce(velocity, axis=0)
+        lower -= self.rate * (distance - self._reduced.take(sphere))
+        return Rows(self._cover.speeds(data, sphere, points, normal), lower)
