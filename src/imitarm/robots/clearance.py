@@ -30,7 +30,8 @@ class ClearanceGauge:
         self._model = model
         self._arm = np.array(arm_geoms, dtype=np.intp)
         self._obstacles = np.array(obstacle_geoms, dtype=np.intp)
-        self._radii = model.geom_rbound[self._arm][:, None] + model.geom_rbound[self._obstacles][None]
+        bounding = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, np.inf, model.geom_rbound)
+        self._radii = bounding[self._arm][:, None] + bounding[self._obstacles][None]
         self._group = np.zeros(model.ngeom, dtype=np.int8)
         self._group[self._arm], self._group[self._obstacles] = 1, 2
         self._from_to = np.zeros(6)

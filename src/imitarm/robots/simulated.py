@@ -15,7 +15,7 @@ from imitarm.kinematics.pose import Pose, matrix_to_quaternion
 from imitarm.robots.clearance import ClearanceGauge
 from imitarm.robots.drives import Drives, add_drives
 from imitarm.robots.robot import Robot
-from imitarm.robots.world import COLLISION_GROUP, OBSTACLE, add_obstacles, arm_world, obstacle_position
+from imitarm.robots.world import COLLISION_GROUP, OBSTACLE, add_obstacles, arm_world
 from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -95,10 +95,9 @@ class SimulatedRobot(Robot):
             in_arm &= m.geom_group == COLLISION_GROUP
         obstacles = [m.geom(f"{OBSTACLE}{i}").id for i in range(len(self.scene_at_start.obstacles))]
         self._gauge = ClearanceGauge(m, np.flatnonzero(in_arm).tolist(), obstacles)
-        moving = [(i, o) for i, o in enumerate(self.scene_at_start.obstacles) if o.velocity.any()]
-        self._moving = [
-            (m.body_mocapid[m.body(f"{OBSTACLE}{i}").id], obstacle_position(o), o.velocity) for i, o in moving
-        ]
+        count = len(self.scene_at_start.obstacles)
+        self._mocap = np.array([m.body_mocapid[m.body(f"{OBSTACLE}{i}").id] for i in range(count)], dtype=int)
+        self._moving = any(obstacle.moves for obstacle in self.scene_at_start.obstacles)
 
     def reset(self, q: ArrayLike | None = None) -> ArmState:
         """Put everything back to time 0, and the arm at rest at ``q``.
@@ -233,8 +232,10 @@ class SimulatedRobot(Robot):
         if touching:
             self.contact_steps += 1
             self.contacts.update(self._names(pair) for pair in touching)
-        for mocap, position, velocity in self._moving:
-            self.data.mocap_pos[mocap] = position + velocity * self.data.time
+        if self._moving:
+            now = self.scene.packed
+            self.data.mocap_pos[self._mocap] = now.positions
+            self.data.mocap_quat[self._mocap] = now.quaternions
 
 
 def _checked_start(arm: ArmModel, q: ArrayLike) -> Array:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.kinematics.pose import Pose, quaternion_exp
-from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Obstacle, Scene, Sphere
+from imitarm.kinematics.pose import Pose
+from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, HalfSpace, Obstacle, Scene, Sphere
 
 if TYPE_CHECKING:
     from imitarm.kinematics.arm import ArmModel
@@ -22,7 +22,6 @@ OBSTACLE = "obstacle/"  # bodies and geoms of obstacles are called so, followed 
 _COLORS = ((0.20, 0.42, 0.70), (0.78, 0.22, 0.20), (0.93, 0.58, 0.15), (0.45, 0.32, 0.60), (0.30, 0.55, 0.40))
 _FLOOR = (0.55, 0.57, 0.60, 1.0)
 _PEDESTAL = (0.28, 0.30, 0.33, 1.0)
-_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def arm_world(arm: ArmModel, *, floor: float = -0.75, pedestal_radius: float = 0.12) -> mujoco.MjSpec:
@@ -67,59 +66,52 @@ def arm_world(arm: ArmModel, *, floor: float = -0.75, pedestal_radius: float = 0
 
 
 def add_obstacles(spec: mujoco.MjSpec, scene: Scene) -> None:
-    """Add every obstacle of ``scene`` as a solid body that can be moved about but not pushed away.
+    """Add every obstacle of ``scene`` as a solid body that can be moved but not pushed away.
 
     Args:
         spec: the world; changed in place.
         scene: obstacles in the base frame, which is the world frame.
     """
     for index, obstacle in enumerate(scene.obstacles):
-        name = f"{OBSTACLE}{index}"
-        pose, shape, size, vertices = _geometry(obstacle)
-        body = spec.worldbody.add_body(name=name, mocap=True, pos=pose.position, quat=pose.quaternion)
-        color = (*_COLORS[index % len(_COLORS)], 1.0)
-        if vertices is None:
-            body.add_geom(name=name, type=shape, size=size, rgba=color)
-        else:
-            spec.add_mesh(name=name, uservert=np.ascontiguousarray(vertices, dtype=float).ravel())
-            body.add_geom(name=name, type=shape, meshname=name, rgba=color)
+        name, solid = f"{OBSTACLE}{index}", obstacle.solid()
+        body = spec.worldbody.add_body(name=name, mocap=True, pos=solid.position, quat=solid.quaternion)
+        _add_geom(spec, body, name, obstacle, (*_COLORS[index % len(_COLORS)], 1.0))
 
 
-def obstacle_position(obstacle: Obstacle) -> Array:
-    """Return where the body of ``obstacle`` has its origin in the base frame, shape (3,) [m]."""
-    return _geometry(obstacle)[0].position
+def _add_geom(
+    spec: mujoco.MjSpec, body: Any, name: str, obstacle: Obstacle, color: tuple[float, ...], **place: Any
+) -> None:
+    """Add the shape of an obstacle to a body whose frame is the obstacle's own."""
+    shape, size, vertices = _shape(obstacle)
+    if vertices is None:
+        body.add_geom(name=name, type=shape, size=size, rgba=color, **place)
+    else:
+        spec.add_mesh(name=name, uservert=np.ascontiguousarray(vertices, dtype=float).ravel())
+        body.add_geom(name=name, type=shape, meshname=name, rgba=color, **place)
 
 
-def _geometry(obstacle: Obstacle) -> tuple[Pose, mujoco.mjtGeom, list[float], Array | None]:
-    """Return the pose of an obstacle's body, the shape and the size of its geom, and the vertices of its mesh."""
+def _shape(obstacle: Obstacle) -> tuple[mujoco.mjtGeom, list[float], Array | None]:
+    """Return the type of an obstacle's geom, its size, and the vertices of its mesh in the own frame."""
+    types = mujoco.mjtGeom
     match obstacle:
         case Sphere():
-            return Pose(obstacle.center, _UPRIGHT), mujoco.mjtGeom.mjGEOM_SPHERE, [obstacle.radius, 0.0, 0.0], None
+            return types.mjGEOM_SPHERE, [obstacle.radius, 0.0, 0.0], None
         case Box():
-            return obstacle.pose, mujoco.mjtGeom.mjGEOM_BOX, list(0.5 * obstacle.size), None
+            return types.mjGEOM_BOX, list(0.5 * obstacle.size), None
         case Cylinder():
-            size = [obstacle.radius, 0.5 * obstacle.length, 0.0]
-            return obstacle.pose, mujoco.mjtGeom.mjGEOM_CYLINDER, size, None
+            return types.mjGEOM_CYLINDER, [obstacle.radius, 0.5 * obstacle.length, 0.0], None
         case Ellipsoid():
-            return obstacle.pose, mujoco.mjtGeom.mjGEOM_ELLIPSOID, list(obstacle.semi_axes), None
+            return types.mjGEOM_ELLIPSOID, list(obstacle.semi_axes), None
         case Capsule():
-            axis = obstacle.end - obstacle.start
-            length = float(np.linalg.norm(axis))
-            pose = Pose(0.5 * (obstacle.start + obstacle.end), _turn_from_z(axis))
-            return pose, mujoco.mjtGeom.mjGEOM_CAPSULE, [obstacle.radius, max(0.5 * length, 1e-6), 0.0], None
+            half = 0.5 * float(np.linalg.norm(obstacle.end - obstacle.start))
+            return types.mjGEOM_CAPSULE, [obstacle.radius, max(half, 1e-6), 0.0], None
+        case HalfSpace():
+            return types.mjGEOM_PLANE, [3.0, 3.0, 0.05], None  # drawn so large; it has no end
         case _:  # any other convex solid becomes the hull of its vertices, or of points of its surface
-            vertices = np.asarray(obstacle.points if isinstance(obstacle, ConvexHull) else _surface(obstacle))
-            center = vertices.mean(axis=0)
-            return Pose(center, _UPRIGHT), mujoco.mjtGeom.mjGEOM_MESH, [0.0, 0.0, 0.0], vertices - center
-
-
-def _turn_from_z(axis: Array) -> Array:
-    """Return the quaternion wxyz (4,) that turns z into the direction of ``axis`` (3,)."""
-    across = np.cross([0.0, 0.0, 1.0], axis)
-    sine = float(np.linalg.norm(across))
-    if sine < 1e-12:
-        return _UPRIGHT  # along z either way: a capsule has no up and down
-    return quaternion_exp(np.arctan2(sine, axis[2]) / sine * across)
+            vertices = obstacle.vertices if isinstance(obstacle, ConvexHull) else _surface(obstacle)
+            solid = obstacle.solid()
+            own = Pose(solid.position, solid.quaternion).inverse().apply(vertices)
+            return types.mjGEOM_MESH, [0.0, 0.0, 0.0], own
 
 
 def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
