@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.kinematics.pose import Pose
-from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, HalfSpace, Obstacle, Scene, Sphere
+from imitarm.scene import ConvexHull, Obstacle, Scene
 
 if TYPE_CHECKING:
     from imitarm.kinematics.arm import ArmModel
@@ -92,26 +92,22 @@ def _add_geom(
 
 def _shape(obstacle: Obstacle) -> tuple[mujoco.mjtGeom, list[float], Array | None]:
     """Return the type of an obstacle's geom, its size, and the vertices of its mesh in the own frame."""
-    types = mujoco.mjtGeom
-    match obstacle:
-        case Sphere():
-            return types.mjGEOM_SPHERE, [obstacle.radius, 0.0, 0.0], None
-        case Box():
-            return types.mjGEOM_BOX, list(0.5 * obstacle.size), None
-        case Cylinder():
-            return types.mjGEOM_CYLINDER, [obstacle.radius, 0.5 * obstacle.length, 0.0], None
-        case Ellipsoid():
-            return types.mjGEOM_ELLIPSOID, list(obstacle.semi_axes), None
-        case Capsule():
-            half = 0.5 * float(np.linalg.norm(obstacle.end - obstacle.start))
-            return types.mjGEOM_CAPSULE, [obstacle.radius, max(half, 1e-6), 0.0], None
-        case HalfSpace():
-            return types.mjGEOM_PLANE, [3.0, 3.0, 0.05], None  # drawn so large; it has no end
-        case _:  # any other convex solid becomes the hull of its vertices, or of points of its surface
-            vertices = obstacle.vertices if isinstance(obstacle, ConvexHull) else _surface(obstacle)
-            solid = obstacle.solid()
-            own = Pose(solid.position, solid.quaternion).inverse().apply(vertices)
-            return types.mjGEOM_MESH, [0.0, 0.0, 0.0], own
+    types, solid = mujoco.mjtGeom, obstacle.solid()
+    a, b, c = (float(length) for length in solid.size)
+    primitives = {
+        "sphere": (types.mjGEOM_SPHERE, [a, 0.0, 0.0]),
+        "box": (types.mjGEOM_BOX, [0.5 * a, 0.5 * b, 0.5 * c]),
+        "cylinder": (types.mjGEOM_CYLINDER, [a, 0.5 * b, 0.0]),
+        "capsule": (types.mjGEOM_CAPSULE, [a, max(0.5 * b, 1e-6), 0.0]),
+        "ellipsoid": (types.mjGEOM_ELLIPSOID, [a, b, c]),
+        "half_space": (types.mjGEOM_PLANE, [3.0, 3.0, 0.05]),  # the size it is drawn in; it has no end
+    }
+    if solid.kind in primitives:
+        return *primitives[solid.kind], None
+    # any other convex solid becomes the hull of its vertices, or of points of its surface
+    vertices = obstacle.vertices if isinstance(obstacle, ConvexHull) else _surface(obstacle)
+    own = Pose(solid.position, solid.quaternion).inverse().apply(vertices)
+    return types.mjGEOM_MESH, [0.0, 0.0, 0.0], own
 
 
 def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
