@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik import ElbowTask, IKSolver
+from imitarm.kinematics.ik import IKSolver
+from imitarm.kinematics.limits import JointLimits, singularity_limits
 from imitarm.kinematics.self_clearance import SelfClearance
+from imitarm.kinematics.tasks import ElbowTask, Task, TwistTask
 from imitarm.scene import Scene, Sphere
-from imitarm.scene.barrier import clearance_rows
+from imitarm.scene.clearance_limit import ClearanceLimit
 from timing import Row
 from yardsticks import DT, MinkStep, mink_step, named
 
@@ -32,30 +34,30 @@ class State(NamedTuple):
     velocity: Array
 
 
-def loop_states(solver: IKSolver, n: int = 64, sew: ElbowTask | None = None) -> list[State]:
+def loop_states(solver: IKSolver, *more: Task, n: int = 64) -> list[State]:
     """Return the states of a control loop in which the tool moves in a circle at the usual speed of a hand."""
     q, velocity, states = solver.arm.home, np.zeros(solver.arm.n_joints), []
     for step in range(n + 50):  # the first steps, from rest, are left out
         angle = 0.05 * step
         twist = np.array([0.1 * np.cos(angle), 0.1 * np.sin(angle), 0.03, 0.2 * np.cos(angle), 0.0, 0.1])
         states.append(State(q, twist, velocity))
-        velocity = solver.solve(q, twist, velocity=velocity, sew=sew)
+        velocity = solver.solve(q, [TwistTask(twist), *more], velocity=velocity)
         q = q + DT * velocity
     return states[-n:]
 
 
 def damped_step() -> Row:
     """One step of damped least squares inside the limits of position and velocity."""
-    solver = IKSolver(ArmModel.load("sawyer", tool="gripper"), "dls", dt=DT)
-    states = loop_states(solver)
+    arm = ArmModel.load("sawyer", tool="gripper")
+    solver, states = IKSolver(arm, dt=DT, method="dls"), loop_states(IKSolver(arm, dt=DT))
     ticks = cycle(states)
 
     def step() -> Array:
         q, twist, _ = next(ticks)
-        return solver.solve(q, twist)
+        return solver.solve(q, TwistTask(twist))
 
     def check() -> tuple[bool, str]:
-        missing = max(np.linalg.norm(solver.step(q, twist).error) for q, twist, _ in states)
+        missing = max(np.linalg.norm(solver.step(q, TwistTask(twist)).missing[0]) for q, twist, _ in states)
         return bool(missing < 1e-9), f"error of the tool's twist: {missing:.0e}"
 
     return Row("IK step, dls", step, mink_step(), f"{named('mink')}, qp", faster=6.0, check=check)
@@ -63,17 +65,18 @@ def damped_step() -> Row:
 
 def quadratic_step() -> Row:
     """One step of the QP: limits of position, velocity, acceleration and singularity, and the elbow's angle."""
-    solver = IKSolver(ArmModel.load("sawyer", tool="gripper"), dt=DT, singularity_bounds=True)
-    states = loop_states(solver, sew=_ELBOW)
+    arm = ArmModel.load("sawyer", tool="gripper")
+    solver = IKSolver(arm, [JointLimits(arm), *singularity_limits(arm)], dt=DT)
+    states = loop_states(solver, _ELBOW)
     ticks = cycle(states)
 
     def step() -> Array:
         q, twist, velocity = next(ticks)
-        return solver.solve(q, twist, velocity=velocity, sew=_ELBOW)
+        return solver.solve(q, [TwistTask(twist), _ELBOW], velocity=velocity)
 
     def check() -> tuple[bool, str]:
         most = solver.arm.max_acceleration * DT
-        used = max(np.max(np.abs(solver.solve(q, t, velocity=v, sew=_ELBOW) - v) / most) for q, t, v in states)
+        used = max(np.max(np.abs(solver.solve(q, [TwistTask(t), _ELBOW], velocity=v) - v) / most) for q, t, v in states)
         return bool(used <= 1.0 + 1e-9), f"uses at most {100 * used:.0f} % of the acceleration limits"
 
     name = "IK step, qp, all limits and the elbow"
@@ -91,7 +94,7 @@ def steps_against_mink() -> Row:
 
     def step() -> Array:
         q, _, velocity = next(ticks)
-        return solver.solve(q, 5.0 * arm.tool_pose(q).error_to(target), velocity=velocity)
+        return solver.solve(q, TwistTask(5.0 * arm.tool_pose(q).error_to(target)), velocity=velocity)
 
     def check() -> tuple[bool, str]:
         near = states[0].q
@@ -99,7 +102,7 @@ def steps_against_mink() -> Row:
         peer.aim(goal)
         moved, their_velocity = arm.tool_jacobian(near), peer(near)[: arm.n_joints]
         peer.aim(target)
-        ours = IKSolver(arm, dt=DT).solve(near, arm.tool_pose(near).error_to(goal) / DT)
+        ours = IKSolver(arm, dt=DT).solve(near, TwistTask(arm.tool_pose(near).error_to(goal) / DT))
         apart = float(np.linalg.norm(moved @ (ours - their_velocity)) / np.linalg.norm(moved @ ours))
         return apart < 0.02, f"tool velocities differ by {100 * apart:.2g} % where no limit is near"
 
@@ -135,16 +138,16 @@ def obstacles(arm: ArmModel, n: int) -> Scene:
 def obstacle_rows() -> Row:
     """The inequalities that keep the whole arm clear of 10 obstacles."""
     arm = ArmModel.load("sawyer", tool="gripper")
-    scene, ticks = obstacles(arm, 10), cycle(loop_states(IKSolver(arm, dt=DT)))
+    limit, scene, ticks = ClearanceLimit(arm, _CLEARANCE), obstacles(arm, 10), cycle(loop_states(IKSolver(arm, dt=DT)))
 
     def check() -> tuple[bool, str]:
-        rows = clearance_rows(arm, arm.home, scene, _CLEARANCE)
-        return rows is not None, f"{0 if rows is None else len(rows[1])} rows"
+        rows = limit.rows(arm.home, scene)
+        return rows is not None, f"{0 if rows is None else len(rows.lower)} rows"
 
     name = "clearance rows of the arm, 10 obstacles"
     return Row(
         name,
-        lambda: clearance_rows(arm, next(ticks).q, scene, _CLEARANCE),
+        lambda: limit.rows(next(ticks).q, scene),
         mink_step(),
         f"{named('mink')}, step",
         cost=0.9,  # a third of what rows of covering spheres took
@@ -157,7 +160,7 @@ def avoiding_steps_against_mink() -> Row:
     import mink
 
     arm = ArmModel.load("sawyer", tool="gripper")
-    solver, scene = IKSolver(arm, dt=DT), obstacles(arm, 5)
+    limit, solver, scene = ClearanceLimit(arm, _CLEARANCE), IKSolver(arm, dt=DT), obstacles(arm, 5)
     states = loop_states(solver)
     target = arm.tool_pose(states[-1].q + 0.01)
     spec = arm.spec()
@@ -188,13 +191,14 @@ def avoiding_steps_against_mink() -> Row:
 
     def step() -> Array:
         q, _, velocity = next(ticks)
-        rows = clearance_rows(arm, q, scene, _CLEARANCE)
-        return solver.solve(q, 5.0 * arm.tool_pose(q).error_to(target), velocity=velocity, rows=rows)
+        rows = limit.rows(q, scene)
+        task = TwistTask(5.0 * arm.tool_pose(q).error_to(target))
+        return solver.solve(q, task, velocity=velocity, rows=rows)
 
     def check() -> tuple[bool, str]:
         near = states[0].q
-        rows, moved = clearance_rows(arm, near, scene, _CLEARANCE), peer(near)
-        count = 0 if rows is None else len(rows[1])
+        rows, moved = limit.rows(near, scene), peer(near)
+        count = 0 if rows is None else len(rows.lower)
         return bool(np.all(np.isfinite(moved))) and count > 0, f"{count} rows of ours"
 
     name = "clearance rows and IK step, 5 obstacles"

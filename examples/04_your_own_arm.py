@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imitarm import ArmModel, Pose, SimulatedRobot, UnreachableError, find_posture, solve_ik
+from imitarm import ArmModel, Pose, SimulatedRobot, TwistTask, UnreachableError, find_posture, solve_ik
 
 # Six axes: axis of the joint, where it is in the frame of the one before [m], mass [kg], torque [N m], speed [rad/s].
 AXES = (
@@ -69,7 +69,7 @@ def main() -> None:
     for step in range(200):
         target = Pose(pose.position + np.array([0.0, -0.001 * step, 0.0]), down)
         twist = np.array([0.0, -0.1, 0.0, 0.0, 0.0, 0.0]) + 5.0 * arm.tool_pose(q).error_to(target)
-        velocity = solve_ik(arm, q, twist, dt=dt, velocity=velocity)
+        velocity = solve_ik(arm, q, TwistTask(twist), dt=dt, velocity=velocity)
         q = q + velocity * dt
         line.append(arm.tool_pose(q))
         beside = max(beside, float(np.abs(line[-1].position - pose.position)[[0, 2]].max()))

@@ -6,6 +6,7 @@ import numpy as np
 
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.tasks import TwistTask
 from imitarm.tasks.stack import CLOSED, LOOKING_DOWN, OPEN, SIDE, History
 
 DT = 0.01
@@ -30,7 +31,7 @@ class Script:
             twist = 8.0 * error
             twist[:3] *= min(1.0, speed / np.linalg.norm(twist[:3]))
             arm, q = self.robot.arm, self.robot.set_point
-            self._move(solve_ik(arm, q, twist, dt=DT, velocity=self.robot.velocity))
+            self._move(solve_ik(arm, q, TwistTask(twist), dt=DT, velocity=self.robot.velocity))
         self.hold(0.15)
 
     def grasp(self, opening):

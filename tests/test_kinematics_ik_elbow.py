@@ -1,4 +1,4 @@
-"""The elbow's angle, the bounds at singularities, and what METHODS A.8 says about them."""
+"""The elbow's angle, and the limits that keep an arm away from its singularities."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from imitarm.errors import InputError, UnknownNameError
-from imitarm.kinematics import ik_methods
+from imitarm.kinematics import ik
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik import METHODS, ElbowTask, IKSolver, solve_ik
+from imitarm.kinematics.ik import METHODS, IKSolver, solve_ik
+from imitarm.kinematics.limits import ElbowSingularityLimit, JointLimits, singularity_limits
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.sew import sew_angle, sew_derivatives
+from imitarm.kinematics.tasks import ElbowTask, PostureTask, TwistTask
 
 ARMS = {name: ArmModel.load(name, tool="brush") for name in ("sawyer", "panda")}
 SAWYER = ARMS["sawyer"]
@@ -42,7 +44,7 @@ def test_the_elbow_swings_to_its_angle_while_the_tool_stands_still(name, change,
     for _ in range(400):
         task = ElbowTask(wanted, convention=convention)
         twist = 10.0 * arm.tool_pose(q).error_to(start)
-        velocity = solver.solve(q, twist, velocity=velocity, sew=task)
+        velocity = solver.solve(q, [TwistTask(twist), task], velocity=velocity)
         q = q + DT * velocity
         assert np.linalg.norm(arm.tool_pose(q).error_to(start)) < 0.01
     assert abs(wrapped(sew_angle(*arm.sew_points(q), convention=convention) - wanted)) < 1e-3
@@ -69,8 +71,9 @@ def test_the_elbow_has_the_documented_cost(seed, name, moving):
     before = 0.3 * rng.normal(size=7) if moving else None
     twist = 0.3 * rng.normal(size=6)
     elbow = ElbowTask(rng.uniform(-3, 3), weight=rng.uniform(0.01, 1.0), confidence=rng.random())
-    ours = solve_ik(arm, q, twist, velocity=before, sew=elbow, max_speed=1e9)
-    task = IKSolver(arm, max_speed=1e9).task(q, twist, velocity=before)
+    task = TwistTask(twist, max_speed=1e9)
+    ours = solve_ik(arm, q, [task, elbow], velocity=before)
+    box = IKSolver(arm).problem(q, task, before).box
     angle, sine_squared, reference, gradient = gradient_of_the_angle(arm, q)
     inverse, wanted = np.linalg.pinv(jacobian), WEIGHTS[:, 0] * twist
     spare = gradient - inverse @ (jacobian @ gradient)
@@ -81,16 +84,16 @@ def test_the_elbow_has_the_documented_cost(seed, name, moving):
     share = elbow.confidence * min(1.0, sine_squared / 0.1) * min(1.0, reference / 0.04)
     speed = share * (rate - gradient @ inverse @ wanted) / turns
     if moving:  # by no more than half of what the joints can change in a step
-        change = 0.5 * np.min(0.5 * (task.upper - task.lower) / np.abs(direction))
+        change = 0.5 * np.min(0.5 * (box.upper - box.lower) / np.abs(direction))
         speed = np.clip(speed, direction @ before - change, direction @ before + change)
 
     def cost(v):
         miss = jacobian @ v - wanted
         changed = 0.0 if before is None else np.sum((v - before) ** 2)
-        small = ik_methods._EFFORT * v @ v + ik_methods._CHANGE * changed
+        small = ik._EFFORT * v @ v + ik._CHANGE * changed
         return 0.5 * (miss @ miss + elbow.weight * (direction @ v - speed) ** 2 + small)
 
-    other = minimize(cost, ours, bounds=list(zip(task.lower, task.upper, strict=True)), method="L-BFGS-B")
+    other = minimize(cost, ours, bounds=list(zip(*box, strict=True)), method="L-BFGS-B")
     assert cost(ours) <= (1.0 + 1e-6) * other.fun + 1e-6
 
 
@@ -102,35 +105,35 @@ def test_while_no_limit_is_near_the_elbow_takes_nothing_from_the_tool(seed, name
     q = middle + 0.8 * half * rng.uniform(-1.0, 1.0, size=7)
     assume(least_singular_value(arm, q) > 0.03)
     twist, solver = 0.05 * rng.normal(size=6), IKSolver(arm)
-    free = solver.step(q, twist)
-    led = solver.step(q, twist, sew=ElbowTask(rng.uniform(-3, 3), weight, rng.random(), max_rate=0.2))
+    free = solver.step(q, TwistTask(twist))
+    led = solver.step(q, [TwistTask(twist), ElbowTask(rng.uniform(-3, 3), weight, rng.random(), max_rate=0.2)])
     assume(not free.limited.any() and not led.limited.any())
     np.testing.assert_allclose(arm.tool_jacobian(q) @ led.velocity, arm.tool_jacobian(q) @ free.velocity, atol=1e-5)
 
 
 @either
-def test_without_confidence_the_spare_motion_stands_still_and_without_weight_it_is_free(name):
-    """The posture pulls at the spare motion: free it follows, held it does not."""
+def test_without_confidence_the_self_motion_stands_still_and_without_weight_it_is_free(name):
+    """The posture pulls at the self-motion: free it follows, held it does not."""
     arm = ARMS[name]
-    q, twist = arm.home, [0.1, 0.05, 0, 0, 0, 0.1]
+    q, twist = arm.home, TwistTask([0.1, 0.05, 0, 0, 0, 0.1])
     jacobian = WEIGHTS * arm.tool_jacobian(q)
     spare = np.linalg.svd(jacobian)[2][-1]
-    q_ref = q + 0.5 * spare
-    free = solve_ik(arm, q, twist, q_ref=q_ref)
+    posture = PostureTask(q + 0.5 * spare)
+    free = solve_ik(arm, q, [twist, posture])
     assert abs(spare @ free) > 0.1
-    weightless = solve_ik(arm, q, twist, q_ref=q_ref, sew=ElbowTask(2.0, weight=0.0))
+    weightless = solve_ik(arm, q, [twist, posture, ElbowTask(2.0, weight=0.0)])
     np.testing.assert_allclose(weightless, free, atol=1e-9)
-    held = solve_ik(arm, q, twist, q_ref=q_ref, sew=ElbowTask(2.0, confidence=0.0))
+    held = solve_ik(arm, q, [twist, posture, ElbowTask(2.0, confidence=0.0)])
     assert abs(spare @ held) < 0.01 * abs(spare @ free)
-    led = solve_ik(arm, q, twist, q_ref=q_ref, sew=ElbowTask(sew_angle(*arm.sew_points(q)) + 0.5))
+    led = solve_ik(arm, q, [twist, posture, ElbowTask(sew_angle(*arm.sew_points(q)) + 0.5)])
     assert abs(spare @ led) > 0.1
 
 
 def test_a_lost_angle_does_no_harm():
     """A straight arm: its elbow is on the line from shoulder to wrist, and has no angle."""
-    panda, twist = ARMS["panda"], [0.1, 0.05, 0, 0, 0, 0.1]
+    panda, twist = ARMS["panda"], TwistTask([0.1, 0.05, 0, 0, 0, 0.1])
     straight = np.array([0.2, 0.3, 0, panda.landmarks.elbow_straight, 0, 1.5, 0])
-    led = solve_ik(panda, straight, twist, sew=ElbowTask(2.0))
+    led = solve_ik(panda, straight, [twist, ElbowTask(2.0)])
     assert np.isfinite(led).all()
     moved, free = (panda.tool_jacobian(straight) @ v for v in (led, solve_ik(panda, straight, twist)))
     np.testing.assert_allclose(moved, free, atol=1e-3)
@@ -144,13 +147,14 @@ def test_no_limit_is_ever_broken_with_everything_on(seed, name, dt):
     elbow, straight = arm.landmarks.elbow, arm.landmarks.elbow_straight
     q, velocity = arm.home.copy(), np.zeros(7)
     side = np.sign(q[elbow] - straight)
-    solver = IKSolver(arm, dt=dt, singularity_bounds=True)
+    solver = IKSolver(arm, [JointLimits(arm), *singularity_limits(arm)], dt=dt)
     for step in range(200):
         if step % 20 == 0:
             twist = rng.normal(size=6) * 10.0 ** rng.uniform(-2, 1)
             angle = rng.uniform(-np.pi, np.pi)
-            q_ref = rng.uniform(arm.lower, arm.upper) if rng.random() < 0.5 else None
-        new = solver.solve(q, twist, velocity=velocity, q_ref=q_ref, sew=ElbowTask(angle, weight=rng.random()))
+            posture = [PostureTask(rng.uniform(arm.lower, arm.upper))] if rng.random() < 0.5 else []
+        tasks = [TwistTask(twist), ElbowTask(angle, weight=rng.random()), *posture]
+        new = solver.solve(q, tasks, velocity=velocity)
         assert np.all(np.abs(new) <= arm.max_velocity * (1 + 1e-12))
         assert np.all(np.abs(new - velocity) <= arm.max_acceleration * dt + 1e-9)
         velocity, q = new, q + dt * new
@@ -165,16 +169,18 @@ def test_every_method_keeps_the_elbow_bent_beyond_the_reach(name, method):
     elbow, straight = arm.landmarks.elbow, arm.landmarks.elbow_straight
     target = Pose(arm.tool_pose(arm.home).position + [0.7, 0, 0], arm.tool_pose(arm.home).quaternion)
 
-    def most_stretched(singularity_bounds):
+    def most_stretched(limits):
+        solver = IKSolver(arm, limits, dt=DT, method=method)
         q, least, smallest = arm.home.copy(), np.inf, np.inf
         for _ in range(300):
             twist = 5.0 * arm.tool_pose(q).error_to(target)
-            q = q + DT * solve_ik(arm, q, twist, method=method, dt=DT, singularity_bounds=singularity_bounds)
+            q = q + DT * solver.solve(q, TwistTask(twist))
             least = min(least, abs(q[elbow] - straight))
             smallest = min(smallest, least_singular_value(arm, q))
         return least, smallest
 
-    (free, free_value), (kept, kept_value) = most_stretched(False), most_stretched(True)
+    joints, elbow_limit = JointLimits(arm), ElbowSingularityLimit(arm)
+    (free, free_value), (kept, kept_value) = most_stretched([joints]), most_stretched([joints, elbow_limit])
     assert kept >= 0.15 - 1e-9
     if method == "qp":
         assert free < 0.05 and kept_value > free_value
@@ -189,16 +195,17 @@ def test_the_wrist_keeps_off_its_singular_position_where_the_task_can_spare_it(n
     start[wrist] = 0.3
     axis = arm.tool_jacobian(start)[:, wrist]
 
-    def led(singularity_bounds):
+    def led(limits):
+        solver = IKSolver(arm, limits, dt=DT)
         q, velocity, least = start.copy(), np.zeros(7), np.inf
         reached = arm.tool_pose(start)
         for _ in range(60):  # first turns the wrist's joint towards its singular position, if nothing holds it back
-            velocity = solve_ik(arm, q, -0.5 * axis, velocity=velocity, dt=DT, singularity_bounds=singularity_bounds)
+            velocity = solver.solve(q, TwistTask(-0.5 * axis), velocity=velocity)
             q = q + DT * velocity
             least = min(least, abs(q[wrist]))
         return least, reached
 
-    assert led(True)[0] > led(False)[0]
+    assert led([JointLimits(arm), *singularity_limits(arm)])[0] > led([JointLimits(arm)])[0]
 
 
 def test_the_wrist_bound_gives_way_to_a_task_that_needs_to_pass():
@@ -207,15 +214,16 @@ def test_the_wrist_bound_gives_way_to_a_task_that_needs_to_pass():
     start[5], end[5] = 0.4, -0.4
     target = SAWYER.tool_pose(end)
     q, velocity = start.copy(), np.zeros(7)
+    solver = IKSolver(SAWYER, [JointLimits(SAWYER), *singularity_limits(SAWYER)], dt=DT)
     for _ in range(800):
         twist = 4.0 * SAWYER.tool_pose(q).error_to(target)
-        velocity = solve_ik(SAWYER, q, twist, velocity=velocity, dt=DT, singularity_bounds=True)
+        velocity = solver.solve(q, TwistTask(twist), velocity=velocity)
         q = q + DT * velocity
     assert np.linalg.norm(SAWYER.tool_pose(q).error_to(target)) < 0.02
 
 
 def test_joints_offset_from_zero_barely_help_on_the_sawyer():
-    """METHODS A.8: what the thesis's offset of all joints can and can't do; orders of magnitude."""
+    """Thesis, after Eq 3.9: what the thesis's offset of all joints can and can't do; orders of magnitude."""
     table = {0.0: 0.0, 0.01: 2.0e-4, 0.05: 9.9e-4, 0.1: 2.0e-3, 0.2: 4.4e-3}
     flange = ArmModel.load("sawyer")
     for offset, expected in table.items():
@@ -226,7 +234,7 @@ def test_joints_offset_from_zero_barely_help_on_the_sawyer():
 
 
 def test_only_elbow_and_wrist_of_the_sawyer_matter():
-    """METHODS A.8: with one joint at zero and the others anywhere, only joints 3 and 5 cost the arm a direction."""
+    """Thesis, after Eq 3.9: with one joint at zero and the others anywhere, only 3 and 5 cost a direction."""
     flange, rng = ArmModel.load("sawyer"), np.random.default_rng(1)
     postures = rng.uniform(flange.lower, flange.upper, (250, 7))
     medians = []
@@ -256,25 +264,23 @@ def test_the_panda_is_stretched_inside_its_range_not_at_zero():
 def test_a_solver_kept_is_the_function_called():
     rng = np.random.default_rng(0)
     for method in METHODS:
-        solver = IKSolver(SAWYER, method, dt=0.02, frame="flange", max_speed=0.3)
+        solver = IKSolver(SAWYER, dt=0.02, method=method)
         for _ in range(20):
-            q, twist = rng.uniform(SAWYER.lower, SAWYER.upper), rng.normal(size=6)
-            called = solve_ik(SAWYER, q, twist, method=method, dt=0.02, frame="flange", max_speed=0.3)
-            assert np.array_equal(solver.solve(q, twist), called)
-            assert np.array_equal(solver.step(q, twist).velocity, called)
+            q = rng.uniform(SAWYER.lower, SAWYER.upper)
+            task = TwistTask(rng.normal(size=6), "flange", max_speed=0.3)
+            called = solve_ik(SAWYER, q, task, method=method, dt=0.02)
+            assert np.array_equal(solver.solve(q, task), called)
+            assert np.array_equal(solver.step(q, task).velocity, called)
 
 
 @pytest.mark.parametrize(
-    ("options", "error", "said"),
+    ("elbow", "error", "said"),
     [
-        ({"sew": ElbowTask(np.nan)}, InputError, "finite angle"),
-        ({"sew": ElbowTask(0.1, weight=-1.0)}, InputError, "not negative"),
-        ({"sew": ElbowTask(0.1, convention="polar")}, UnknownNameError, "conventional, stereographic"),
-        ({"sew": ElbowTask(0.1), "method": "dls"}, InputError, "can't lead the elbow"),
-        ({"posture_gain": np.inf}, InputError, "posture_gain must be finite"),
-        ({"max_speed": -1.0}, InputError, "max_speed not negative"),
+        (ElbowTask(np.nan), InputError, "finite angle"),
+        (ElbowTask(0.1, weight=-1.0), InputError, "not negative"),
+        (ElbowTask(0.1, convention="polar"), UnknownNameError, "conventional, stereographic"),
     ],
 )
-def test_what_can_not_be_used_is_refused(options, error, said):
+def test_what_can_not_be_used_is_refused(elbow, error, said):
     with pytest.raises(error, match=said):
-        solve_ik(SAWYER, SAWYER.home, np.zeros(6), **options)
+        solve_ik(SAWYER, SAWYER.home, [TwistTask(np.zeros(6)), elbow])

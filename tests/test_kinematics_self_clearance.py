@@ -13,6 +13,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.reach_of_links import _shapes, meeting_links
 from imitarm.kinematics.self_clearance import SelfClearance
+from imitarm.kinematics.tasks import PostureTask, TwistTask
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
 CLEARANCES = {name: SelfClearance(arm) for name, arm in ARMS.items()}
@@ -63,7 +64,7 @@ def test_rows_are_the_gradients_of_the_distances(name, seed):
     q = folded(name, seed)
     pairs, distances = own.nearest(q)
     assume(len(pairs) > 0)
-    rows, lower = own.rows(q)
+    rows, lower, _ = own.rows(q)
     assert np.allclose(lower, -5.0 * (distances - 0.02))
     h = 1e-6
 
@@ -96,15 +97,9 @@ def test_an_arm_that_is_led_into_itself_stops_short(name, fold):
         q, velocity, nearest = arm.home.copy(), np.zeros(7), np.inf
         for _ in range(500):
             twist = 3.0 * arm.tool_pose(q).error_to(target)
-            velocity = solve_ik(
-                arm,
-                q,
-                twist,
-                velocity=velocity,
-                max_speed=0.4,
-                rows=own.rows(q) if rows else None,
-                q_ref=np.array(fold),
-            )
+            tasks = [TwistTask(twist, max_speed=0.4), PostureTask(np.array(fold))]
+            found = own.rows(q) if rows else None
+            velocity = solve_ik(arm, q, tasks, velocity=velocity, rows=() if found is None else found)
             q = q + 0.01 * velocity
             nearest = min(nearest, own.distance(q))
         return nearest

@@ -10,6 +10,7 @@ import pytest
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import solve_ik
+from imitarm.kinematics.tasks import TwistTask
 from imitarm.scene import HalfSpace, Scene, Sphere
 from imitarm.scene.clearance_limit import ClearanceLimit
 from scene_shapes import KINDS, random_obstacle
@@ -127,7 +128,7 @@ def test_an_arm_that_is_pulled_into_an_obstacle_stays_clear(arm):
         least[guarded] = np.inf
         for _ in range(300):
             rows = ClearanceLimit(arm, 0.02).rows(q, scene) if guarded else None
-            q = q + 0.01 * solve_ik(arm, q, [0.2, 0, 0, 0, 0, 0], dt=0.01, rows=rows)
+            q = q + 0.01 * solve_ik(arm, q, TwistTask([0.2, 0, 0, 0, 0, 0]), dt=0.01, rows=rows)
             least[guarded] = min(least[guarded], float(rooms(arm, q, scene).min()))
     assert least[False] < 0.0
     assert least[True] > 0.018
@@ -141,7 +142,7 @@ def test_an_arm_gives_way_to_what_comes_at_it(arm):
     for k in range(250):
         scene = start.at(0.01 * k)
         rows = ClearanceLimit(arm, 0.02).rows(q, scene)
-        q = q + 0.01 * solve_ik(arm, q, np.zeros(6), dt=0.01, rows=rows)
+        q = q + 0.01 * solve_ik(arm, q, TwistTask(np.zeros(6)), dt=0.01, rows=rows)
         least = min(least, float(rooms(arm, q, start.at(0.01 * (k + 1))).min()))
     assert rooms(arm, arm.home, start.at(2.5)).min() < 0.0  # it would have been hit
     assert least > 0.015

@@ -6,6 +6,7 @@ import pytest
 
 from imitarm.errors import InputError
 from imitarm.kinematics.ik import solve_ik
+from imitarm.kinematics.tasks import TwistTask
 from imitarm.tasks import TASKS, StackTask
 from imitarm.tasks.stack import CLOSED, N_CUBES, OPEN, SIDE, History
 from stacking_script import DT, Script
@@ -72,7 +73,7 @@ def test_a_held_cube_does_not_slip_in_five_seconds_of_motion(robot):
         t = k * DT
         twist = np.zeros(6)
         twist[:3] = 0.3 * np.sin(2.0 * np.pi * np.array([0.8, 1.1, 1.3]) * t)
-        robot.move(solve_ik(robot.arm, robot.set_point, twist, dt=DT, velocity=robot.velocity), DT)
+        robot.move(solve_ik(robot.arm, robot.set_point, TwistTask(twist), dt=DT, velocity=robot.velocity), DT)
         now = robot.tool_to_base.inverse().apply(task.cubes(robot)[2])
         farthest = max(farthest, float(np.linalg.norm(now - held)))
         weight = max(weight, float(np.linalg.norm(robot.tool_to_base.position - task.start.position)))

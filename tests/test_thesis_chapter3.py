@@ -7,12 +7,12 @@ import pytest
 from scipy.stats import spearmanr, t
 
 from imitarm import ArmModel
-from imitarm.kinematics.posture import ANGLE_LENGTH
+from imitarm.kinematics.ik_problem import ROTATION_LENGTH
 from imitarm.retarget.human_arm import human_arm_pose
 from imitarm.retarget.limbs import LimbLengths, correct_limbs
 
 SAWYER = ArmModel.load("sawyer")
-WEIGHTS = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
+WEIGHTS = np.array([1.0, 1.0, 1.0, ROTATION_LENGTH, ROTATION_LENGTH, ROTATION_LENGTH])
 
 # Table 3.1, experiments 1 to 10 in rows: path length ("cm.10"), mean torques of seven joints [N m], time [s]
 TABLE_3_1 = np.array(

@@ -4,8 +4,11 @@ from .control_loop import reproduce
 from .demonstrations import Finding, align, lint, read
 from .errors import ImitarmError, InfeasibleError, InputError, TaskFailedError, UnreachableError
 from .kinematics.arm import ArmModel, ArmState
-from .kinematics.ik import find_posture, solve_ik
+from .kinematics.ik import IKSolver, solve_ik
+from .kinematics.limits import JointLimits, singularity_limits
 from .kinematics.pose import Pose
+from .kinematics.posture import find_posture
+from .kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, TwistTask
 from .policies import ACFRA, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Adaptation, Observation, Policy, adapt
 from .retarget import RETARGETERS, Correspondence, Retargeter
 from .robots import Robot, SimulatedRobot
@@ -45,18 +48,23 @@ __all__ = [
     "Correspondence",
     "Cylinder",
     "Demonstration",
+    "ElbowTask",
     "Ellipsoid",
     "Experiment",
     "Finding",
     "GaussianMixture",
     "HalfSpace",
+    "IKSolver",
     "ImitarmError",
     "InfeasibleError",
     "InputError",
+    "JointLimits",
+    "JointVelocityTask",
     "Observation",
     "Obstacle",
     "Policy",
     "Pose",
+    "PostureTask",
     "Result",
     "Retargeter",
     "Robot",
@@ -69,6 +77,7 @@ __all__ = [
     "Sphere",
     "TaskFailedError",
     "Trajectory",
+    "TwistTask",
     "UnreachableError",
     "adapt",
     "align",
@@ -78,5 +87,6 @@ __all__ = [
     "read",
     "reproduce",
     "save_scene",
+    "singularity_limits",
     "solve_ik",
 ]

@@ -14,8 +14,8 @@ from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
 from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.cli.trial import provenance, show_results, try_scene
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik import find_posture
 from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.posture import find_posture
 from imitarm.policies import ACFRA, ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN
 from imitarm.robots import SimulatedRobot
 from imitarm.scene import Scene, load_scene

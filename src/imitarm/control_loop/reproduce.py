@@ -14,10 +14,11 @@ from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.tasks import TwistTask
 from imitarm.policies.policy import Observation, Policy
 from imitarm.robots.robot import Robot
 from imitarm.scene import Scene
-from imitarm.scene.barrier import clearance_rows
+from imitarm.scene.clearance_limit import ClearanceLimit
 from imitarm.trajectory import Rollout, Trajectory
 
 Array = NDArray[np.float64]
@@ -70,8 +71,8 @@ def reproduce(
         timeout: longest duration [s].
         method: of :func:`solve_ik`.
         link_clearance: distance that every link must keep to every obstacle [m], held by
-            :func:`~imitarm.scene.barrier.clearance_rows` in the inverse kinematics (``method="qp"``); the tool then
-            leaves its path where a link would not get by. None: only the policy looks after obstacles.
+            :class:`~imitarm.scene.clearance_limit.ClearanceLimit` in the inverse kinematics (``method="qp"``); the tool
+            then leaves its path where a link would not get by. None: only the policy looks after obstacles.
         on_step: called after each step, for progress or drawing; what it raises stops the robot and is passed on.
 
     Returns:
@@ -99,8 +100,10 @@ def reproduce(
                 raise InputError(f"{type(policy).__name__}.step must answer 6 finite numbers, got {twist!r}")
             q, rows = notes.state.q, None
             if link_clearance is not None:
-                rows = clearance_rows(robot.arm, q, observation.scene, link_clearance)
-            velocity = solve_ik(robot.arm, q, twist, method=method, dt=dt, velocity=robot.velocity, rows=rows)
+                rows = ClearanceLimit(robot.arm, link_clearance).rows(q, observation.scene)
+            velocity = solve_ik(
+                robot.arm, q, TwistTask(twist), method=method, dt=dt, velocity=robot.velocity, rows=rows
+            )
             robot.move(velocity, dt)
             step = notes.take(robot, observation.scene, twist)
             if on_step is not None:

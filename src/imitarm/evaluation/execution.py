@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.bounds import VelocityBox
+from imitarm.kinematics.limits import JointLimits
 from imitarm.retarget import Retargeting
 from imitarm.robots import SimulatedRobot
 from imitarm.scene import Scene
@@ -27,7 +27,7 @@ def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
     .. math:: \dot q_k = \mathrm{clip}\left((q^c_{k+1} - q^c_k) / dt + 5\,\mathrm{s}^{-1}\,(q^c_k - q_k)\right)
 
     clipped to the box of velocities from which all limits of position, velocity and acceleration can still be kept
-    (:class:`~imitarm.kinematics.bounds.VelocityBox`). Commands within the limits are executed unchanged.
+    (:class:`~imitarm.kinematics.limits.JointLimits`). Commands within the limits are executed unchanged.
 
     Args:
         arm: whose limits.
@@ -35,11 +35,11 @@ def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
         dt: sampling period [s].
     """
     commanded = np.asarray(joints, dtype=float)
-    box, done = VelocityBox(arm, dt), np.empty_like(commanded)
+    limits, done = JointLimits(arm), np.empty_like(commanded)
     q, velocity = commanded[0].copy(), np.zeros(commanded.shape[1])
     done[0] = q
     for i, wanted in enumerate(np.diff(commanded, axis=0) / dt):
-        lower, upper = box.at(q, velocity)
+        lower, upper = limits.box(q, dt, velocity)
         velocity = np.clip(wanted + CATCH_UP * (commanded[i] - q), lower, upper)
         q = q + dt * velocity
         done[i + 1] = q

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.posture import ANGLE_LENGTH
+from imitarm.kinematics.ik_problem import ROTATION_LENGTH
 
 Array = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ class ArmMotion:
                 sew[i] = arm.sew_points(posture)
             torques[i] = arm.inverse_dynamics(posture, velocity[i], acceleration[i])
             gravity[i] = arm.gravity_torque(posture)
-        jacobians[:, 3:] *= ANGLE_LENGTH
+        jacobians[:, 3:] *= ROTATION_LENGTH
         least = np.asarray(np.linalg.svd(jacobians, compute_uv=False)[:, -1], dtype=float)
         return cls(dt, q, tool, quaternions, sew, torques, gravity, least)
 

@@ -1,150 +1,455 @@
-r"""From a wanted motion of the tool to the motion of the joints, one control step at a time.
+r"""Inverse kinematics, one control step at a time: from tasks and limits to the velocity of the joints.
 
-All methods weight the task rows so that 1 rad counts as 0.3 m, and clamp the wanted twist: damped least squares fed
-with an unclamped error freezes short of its target, because its damping grows with the error (METHODS A.7).
+:func:`solve_ik` combines :mod:`tasks <imitarm.kinematics.tasks>` (what the joints should do) with
+:mod:`limits <imitarm.kinematics.limits>` (what they must not exceed). :class:`IKSolver` does the same in a loop.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
+import daqp
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import lapack
 
-from imitarm.errors import UnknownNameError
+from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.bounds import clearance_rows, velocity_box
-from imitarm.kinematics.ik_methods import METHODS
-from imitarm.kinematics.ik_solver import ElbowTask, IKSolver, IKStep, Rows
-from imitarm.kinematics.posture import find_posture
-
-__all__ = [
-    "METHODS",
-    "ElbowTask",
-    "IKSolver",
-    "IKStep",
-    "clearance_rows",
-    "find_posture",
-    "solve_ik",
-    "solve_ik_step",
-    "velocity_box",
-]
+from imitarm.kinematics.ik_problem import Box, IKProblem, Rows
+from imitarm.kinematics.limits import JointLimits, Limit
+from imitarm.kinematics.tasks import PostureTask, Task, TwistTask, joint_vector
 
 Array = NDArray[np.float64]
+
+_MAX_SPEED = {"dls": 0.6, "dls_small_angle": 0.6, "qp": 2.0, "svd": 0.6}  # [m/s] clamp of a weighted twist
+_NULL = 1e-12  # squared singular values below this belong to directions in which the arm can't move
+_FILTER = 0.06  # [m/rad] "svd": directions with a smaller singular value are damped, by up to this much
+_EFFORT, _CHANGE = 1e-5, 1e-6  # "qp": weights of the joint velocity and of its change beside a task of weight 1
+_TINY_ROW = 1e-9
+_ROUNDING = 1e-8  # [rad/s]
+_CLEAR = 1e-3  # squared singular values above this can be factored without losing half of the digits
+_VIOLATED = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class IKStep:
+    """One step of inverse kinematics and how well it could be done.
+
+    Attributes:
+        velocity: of the joints, shape (n_joints,) [rad/s].
+        missing: of each task, what it asked for less what it gets, in the task's own weighted units.
+        limited: joints that stand at a bound of their box, shape (n_joints,) bool.
+        slack: by how much each row is violated, shape (m,); 0 where it holds.
+    """
+
+    velocity: Array
+    missing: tuple[Array, ...]
+    limited: NDArray[np.bool_]
+    slack: Array
+
+
+class IKSolver:
+    r"""Inverse kinematics of one arm for a control loop: what does not change is checked once.
+
+    ``"qp"`` minimises, over the joint velocity v inside every :class:`~imitarm.kinematics.limits.Box`,
+
+    .. math:: \sum_i \tfrac12 |J_i v - t_i|^2 + \tfrac{\mu}2 |v|^2 + \tfrac{w_a}2 |v - v_p|^2
+              + \sum_j \tfrac{c_j}2 \max(0, b_j - A_j v)^2 / |A_j|^2
+
+    with a Jacobian :math:`J_i` and a target :math:`t_i` for each task, the previous velocity :math:`v_p`, and the
+    rows :math:`A_j v \ge b_j` with their prices :math:`c_j`. Rows without a finite price are kept wherever the boxes
+    allow it; where they don't, the violations, in rad/s along each row, are as small as they can be (least sum of
+    squares), and the tasks come after that. The other methods take one
+    :class:`~imitarm.kinematics.tasks.TwistTask`, perhaps a :class:`~imitarm.kinematics.tasks.PostureTask`, and boxes:
+
+    * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9): in joints scaled by their velocity limits
+      :math:`v = J^T (J J^T+\lambda^2)^{-1} t`, with :math:`\lambda=0` for :math:`s_{min}\ge d`,
+      :math:`\lambda^2=s_{min}(d-s_{min})` for :math:`d/2\le s_{min}<d` and :math:`\lambda=d/2` below, :math:`d=|t|`.
+      This keeps the norm of the scaled velocity at most 1.
+    * ``"dls_small_angle"``: the same with half the least singular value subtracted from d, as the thesis prints
+      after Eq 3.9; that weakens the damping, and is there to compare with.
+    * ``"svd"``, numerical filtering (Maciejewski and Klein 1988):
+      :math:`v=\sum_i s_i/(s_i^2+\lambda_i^2)\, v_i u_i^T t` with :math:`\lambda_i^2=0.06^2(1-(s_i/0.06)^2)` where
+      :math:`s_i<0.06`.
+
+    These three are scaled down as a whole when a joint would be too fast, then clipped to the box. A solver holds
+    nothing of the previous step and can be used by several threads.
+
+    Args:
+        arm: the arm.
+        limits: kept in every step; None: the arm's :class:`~imitarm.kinematics.limits.JointLimits` alone.
+        dt: length of the control step [s].
+        method: ``"qp"``, ``"dls"``, ``"dls_small_angle"`` or ``"svd"``.
+
+    Raises:
+        UnknownNameError: when the method is not known.
+        InputError: when ``dt`` is not a positive time, or a method other than ``"qp"`` is given soft limits.
+    """
+
+    def __init__(
+        self, arm: ArmModel, limits: Sequence[Limit] | None = None, *, dt: float = 0.01, method: str = "qp"
+    ) -> None:
+        if method not in METHODS:
+            raise UnknownNameError.among("IK method", method, METHODS)
+        if not 0.0 < dt < math.inf:
+            raise InputError(f"IKSolver: dt must be a positive time [s], got {dt}")
+        self.arm, self.method, self.dt = arm, method, float(dt)
+        self.limits: tuple[Limit, ...] = (JointLimits(arm),) if limits is None else tuple(limits)
+        if method != "qp" and any(limit.soft for limit in self.limits):
+            soft = ", ".join(type(limit).__name__ for limit in self.limits if limit.soft)
+            raise InputError(f"IKSolver: method {method!r} can't keep {soft}; use method='qp', or leave it out")
+        self._solve = METHODS[method]
+        self._max_speed = _MAX_SPEED[method]
+        self._scaled = method.startswith("dls")
+        self._free = Box(-arm.max_velocity, arm.max_velocity)
+
+    def solve(
+        self,
+        q: ArrayLike,
+        tasks: Task | Sequence[Task],
+        *,
+        velocity: ArrayLike | None = None,
+        rows: Rows | Sequence[Rows] | None = None,
+    ) -> Array:
+        """Return the joint velocity, shape (n_joints,) [rad/s].
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            tasks: one task or several; the first one is the tool's.
+            velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; with it the acceleration limits
+                are kept.
+            rows: more inequalities of this step, for ``"qp"`` only.
+
+        Raises:
+            InputError: when a shape is wrong, a number is not finite, or the method does not take such tasks or rows.
+        """
+        return self._solve(self.problem(q, tasks, velocity, rows))
+
+    def step(
+        self,
+        q: ArrayLike,
+        tasks: Task | Sequence[Task],
+        *,
+        velocity: ArrayLike | None = None,
+        rows: Rows | Sequence[Rows] | None = None,
+    ) -> IKStep:
+        """Do what :meth:`solve` does, and report what could not be done; same arguments and errors."""
+        problem = self.problem(q, tasks, velocity=velocity, rows=rows)
+        result = self._solve(problem)
+        counted = result / self.arm.max_velocity if self._scaled else result
+        missing = tuple(part.target - part.jacobian @ counted for part in problem.tasks)
+        near = 1e-6 * self.arm.max_velocity
+        limited = (result >= problem.box.upper - near) | (result <= problem.box.lower + near)
+        slack = [np.maximum(0.0, part.lower - part.matrix @ result) for part in problem.rows]
+        return IKStep(result, missing, limited, np.concatenate(slack) if slack else np.zeros(0))
+
+    def problem(
+        self,
+        q: ArrayLike,
+        tasks: Task | Sequence[Task],
+        velocity: ArrayLike | None = None,
+        rows: Rows | Sequence[Rows] | None = None,
+    ) -> IKProblem:
+        """Return what the methods solve; same arguments and errors as :meth:`solve`."""
+        arm = self.arm
+        position = np.asarray(q, dtype=float)
+        memory = arm.at(position)
+        previous = None if velocity is None else joint_vector(velocity, arm.n_joints, "solve_ik: velocity")
+        problem = IKProblem(arm, memory, position, previous, self.dt, self._free, [], [], self._max_speed, self._scaled)
+        first: Task
+        others: Sequence[Task]
+        if isinstance(tasks, list) or type(tasks) is tuple:  # a NamedTuple is one task
+            if not tasks:
+                raise InputError("solve_ik: needs at least one task, for example TwistTask(twist)")
+            first, others = tasks[0], tasks[1:]
+        else:
+            first, others = tasks, ()  # type: ignore[assignment]
+        if type(first) is TwistTask:  # it needs no box, and tells the limits whether anything is to move
+            problem.tasks.append(first.rows(problem))
+        else:
+            others = (first, *others)
+        for limit in self.limits:
+            part = limit.restrict(problem)
+            if part is None:
+                continue
+            if isinstance(part, Rows):
+                problem.rows.append(part)
+            elif problem.box is self._free:
+                problem.box = part
+            else:
+                lower, upper = problem.box
+                problem.box = Box(np.maximum(lower, part.lower), np.minimum(upper, part.upper))
+        if others:
+            self._add_tasks(problem, others)
+        if rows:
+            problem.rows += self._checked_rows(rows)
+        return problem
+
+    def _add_tasks(self, problem: IKProblem, tasks: Sequence[Task]) -> None:
+        """Add what more tasks ask for."""
+        for task in tasks:
+            if self.method != "qp":
+                if not (isinstance(task, PostureTask) and problem.tasks) or problem.posture is not None:
+                    raise InputError(
+                        f"solve_ik: method {self.method!r} takes one TwistTask and perhaps a PostureTask after it, "
+                        f"got {type(task).__name__}; use method='qp'"
+                    )
+                problem.posture = task.drift(problem)
+                continue
+            wanted = task.rows(problem)
+            if wanted is not None:
+                problem.tasks.append(wanted)
+        if not problem.tasks:
+            raise InputError("solve_ik: no task asks for anything; put a TwistTask first")
+
+    def _checked_rows(self, rows: Rows | Sequence[Rows]) -> list[Rows]:
+        if self.method != "qp":
+            raise InputError(f"solve_ik: method {self.method!r} can't keep rows; use method='qp'")
+        given: Sequence[Rows] = (rows,) if isinstance(rows, Rows) else rows
+        checked = []
+        n = self.arm.n_joints
+        for part in given:
+            matrix, lower = np.asarray(part.matrix, dtype=float), np.asarray(part.lower, dtype=float)
+            if lower.ndim != 1 or matrix.shape != (len(lower), n):
+                raise InputError(f"solve_ik: rows need shapes (m, {n}) and (m,), got {matrix.shape}, {lower.shape}")
+            if not math.isfinite(float(np.vdot(matrix, matrix)) + sum(lower.tolist())) or not part.price > 0.0:
+                raise InputError("solve_ik: rows must be finite numbers, with a price above 0")
+            if len(lower):
+                checked.append(Rows(matrix, lower, part.price))
+        return checked
 
 
 def solve_ik(
     arm: ArmModel,
     q: ArrayLike,
-    twist: ArrayLike,
+    tasks: Task | Sequence[Task],
     *,
-    method: str = "qp",
+    limits: Sequence[Limit] | None = None,
     dt: float = 0.01,
-    frame: str = "tool",
+    method: str = "qp",
     velocity: ArrayLike | None = None,
-    q_ref: ArrayLike | None = None,
-    posture_gain: float = 1.0,
-    rows: Rows | None = None,
-    max_speed: float | None = None,
-    sew: ElbowTask | None = None,
-    singularity_bounds: bool = False,
-    small_angle: str | None = None,
+    rows: Rows | Sequence[Rows] | None = None,
 ) -> Array:
-    r"""Return the joint velocity that moves the tool with ``twist``, as far as the arm's limits let it.
+    """Return the joint velocity that does the tasks as far as the limits allow.
 
-    With :math:`J` and :math:`e` the weighted Jacobian and twist, the methods are
-
-    * ``"qp"`` (default, METHODS A.9): minimise
-      :math:`\tfrac12|J v-e|^2+\tfrac{\mu}2|v|^2+\tfrac{w_a}2|v-v_p|^2+\tfrac{w_q}2|v-k(q_{ref}-q)|^2`
-      inside :func:`velocity_box`, with ``rows`` under them, and with the cost of ``sew`` (see :class:`ElbowTask`).
-    * ``"dls"`` (thesis Eq 3.8 and 3.9, Baerlocher's damping, METHODS A.7): in joints scaled by their velocity limits,
-      :math:`v = J^T (J J^T+\lambda^2)^{-1} e`, with :math:`\lambda=0` for :math:`s_{min}\ge d`,
-      :math:`\lambda^2=s_{min}(d-s_{min})` for :math:`d/2\le s_{min}<d` and :math:`\lambda=d/2` below, :math:`d=|e|`.
-      This keeps the norm of the scaled velocity at most 1.
-    * ``"svd"`` (numerical filtering, METHODS A.9): :math:`v=\sum_i s_i/(s_i^2+\lambda_i^2)\, v_i u_i^T e` with
-      :math:`\lambda_i^2=0.06^2(1-(s_i/0.06)^2)` where :math:`s_i<0.06`.
-
-    The last two are scaled down as a whole when a joint would be too fast, then cut to the same box.
-    :class:`IKSolver` does the same in a loop and checks its options only once.
+    ``solve_ik(arm, q, TwistTask([0.1, 0, 0, 0, 0, 0]))`` moves the tool at 0.1 m/s along x. :class:`IKSolver`
+    explains the methods, and does the same in a loop.
 
     Args:
         arm: the arm.
         q: joint positions, shape (n_joints,) [rad].
-        twist: wanted velocity in the base frame, linear rows first, shape (6,) [m/s, rad/s].
-        method: ``"qp"``, ``"dls"`` or ``"svd"``.
+        tasks: one task or several; the first one is the tool's.
+        limits: None: position, velocity and acceleration limits of the joints.
         dt: length of the control step [s].
-        frame: what moves, ``"tool"`` or ``"flange"``.
-        velocity: joint velocity of the step before, shape (n_joints,) [rad/s]; with it the limits of acceleration
-            are kept.
-        q_ref: posture to drift to where the task leaves freedom, shape (n_joints,) [rad].
-        posture_gain: how quickly, [1/s].
-        rows: ``(A, lower)`` with shapes (m, n_joints) and (m,): more inequalities ``A v >= lower`` on the joint
-            velocity, for ``"qp"`` only. They give way at a high price when they contradict the limits of the joints.
-        max_speed: the twist is scaled down to this weighted norm [m/s]; None: 0.6 for ``"dls"`` and ``"svd"``, which
-            need it, and 2.0 for ``"qp"``.
-        sew: where the elbow should be, for ``"qp"`` only.
-        singularity_bounds: keep the elbow 0.15 rad off its stretched position (on the side where it is), always, and
-            in ``"qp"`` the wrist 0.1 rad off its singular ones, where the task can spare it (METHODS A.8).
-        small_angle: ``"thesis"`` subtracts half the least singular value from d in ``"dls"``, as the thesis prints
-            it (METHODS A.8: that weakens the damping; for comparison only).
+        method: ``"qp"``, ``"dls"``, ``"dls_small_angle"`` or ``"svd"``.
+        velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; with it the acceleration limits are
+            kept.
+        rows: more inequalities of this step, for ``"qp"`` only.
 
     Returns:
         Joint velocity, shape (n_joints,) [rad/s].
 
     Raises:
-        UnknownNameError: when method, frame or small_angle is not known.
-        InputError: when a shape is wrong, a number is not finite, rows or sew are given to a method without them, or
-            the arm does not say where its shoulder, elbow and wrist are and they are needed.
+        UnknownNameError: when the method is not known.
+        InputError: when a shape is wrong, a number is not finite, or the method does not take such tasks or limits.
     """
-    solver = _solver(arm, method, dt, frame, posture_gain, max_speed, small_angle, singularity_bounds)
-    return solver.solve(q, twist, velocity=velocity, q_ref=q_ref, rows=rows, sew=sew)
-
-
-def solve_ik_step(arm: ArmModel, q: ArrayLike, twist: ArrayLike, **options: Any) -> IKStep:
-    """Do what :func:`solve_ik` does, and report what could not be done; same arguments."""
-    unknown = set(options) - set(_DEFAULTS)
-    if unknown:
-        raise UnknownNameError.among("option of solve_ik:", sorted(unknown)[0], _DEFAULTS)
-    given = {**_DEFAULTS, **options}
-    fixed = ("method", "dt", "frame", "posture_gain", "max_speed", "small_angle", "singularity_bounds")
-    solver = _solver(arm, *(given.pop(name) for name in fixed))
-    return solver.step(q, twist, **given)
-
-
-_DEFAULTS: dict[str, Any] = {
-    "method": "qp",
-    "dt": 0.01,
-    "frame": "tool",
-    "velocity": None,
-    "q_ref": None,
-    "posture_gain": 1.0,
-    "rows": None,
-    "max_speed": None,
-    "sew": None,
-    "singularity_bounds": False,
-    "small_angle": None,
-}
+    solver = _solver(arm, dt, method) if limits is None else IKSolver(arm, limits, dt=dt, method=method)
+    return solver.solve(q, tasks, velocity=velocity, rows=rows)
 
 
 @lru_cache(maxsize=32)
-def _solver(
-    arm: ArmModel,
-    method: str,
-    dt: float,
-    frame: str,
-    posture_gain: float,
-    max_speed: float | None,
-    small_angle: str | None,
-    singularity_bounds: bool,
-) -> IKSolver:
-    return IKSolver(
-        arm,
-        method,
-        dt=dt,
-        frame=frame,
-        posture_gain=posture_gain,
-        max_speed=max_speed,
-        small_angle=small_angle,
-        singularity_bounds=singularity_bounds,
-    )
+def _solver(arm: ArmModel, dt: float, method: str) -> IKSolver:
+    return IKSolver(arm, dt=dt, method=method)
+
+
+def quadratic_program(problem: IKProblem) -> Array:
+    """Minimise the weighted error of the tasks inside the box and under the rows."""
+    first = problem.tasks[0]
+    n = len(problem.box.lower)
+    hessian = first.jacobian.T.dot(first.jacobian)
+    linear = first.target.dot(first.jacobian)
+    for jacobian, target, _ in problem.tasks[1:]:
+        hessian += jacobian.T.dot(jacobian)
+        linear += target.dot(jacobian)
+    effort = _EFFORT
+    if problem.velocity is not None:
+        effort += _CHANGE
+        linear += (first.effort * _CHANGE) * problem.velocity
+    hessian += _scaled_eye(n, first.effort * effort)
+    matrix, least, light = _sorted_rows(problem.rows) if problem.rows else (None, None, ())
+    velocity = _least_cost(problem.box, matrix, least, hessian, linear)
+    for rows in light:  # a price is convex: where it is paid at all it stands in full
+        active = rows.matrix.dot(velocity) < rows.lower - _VIOLATED
+        if active.any():
+            part = rows.matrix[active]
+            weighted = rows.price / np.einsum("ij,ij->i", part, part)[:, None] * part
+            hessian += weighted.T.dot(part)
+            linear += rows.lower[active].dot(weighted)
+            velocity = _least_cost(problem.box, matrix, least, hessian, linear)
+    return velocity
+
+
+def _sorted_rows(rows: list[Rows]) -> tuple[Array | None, Array | None, Sequence[Rows]]:
+    """Return all stiff rows together, and the others."""
+    stiff = [part for part in rows if part.price == math.inf]
+    light = [part for part in rows if part.price < math.inf]
+    if not stiff:
+        return None, None, light
+    if len(stiff) == 1:
+        return stiff[0].matrix, stiff[0].lower, light
+    matrix = np.concatenate([part.matrix for part in stiff])
+    return matrix, np.concatenate([part.lower for part in stiff]), light
+
+
+def _least_cost(box: Box, matrix: Array | None, least: Array | None, hessian: Array, linear: Array) -> Array:
+    """Minimise v^T H v / 2 - f^T v inside the box and under the rows, exactly."""
+    free = _unconstrained(box, matrix, least, hessian, linear)
+    if free is not None:
+        return free
+    n = len(linear)
+    if matrix is None or least is None:
+        matrix, least = np.empty((0, n)), np.empty(0)
+    lower, upper = np.empty(n + len(least)), np.empty(n + len(least))  # daqp takes none that is read-only
+    lower[:n], lower[n:], upper[:n], upper[n:] = box.lower, least, box.upper, 1e30
+    velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, _plain(len(lower)))
+    if status <= 0 and len(least):
+        nearest, lower[n:] = _least_violation(box, matrix, least)
+        velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, _plain(len(lower)))
+        if status <= 0:
+            velocity, status = nearest, 1
+    if status <= 0:  # only lost digits can bring us here, since the box is never empty, and standing is safe
+        velocity = np.zeros(n)
+    velocity = np.maximum(velocity, box.lower)
+    return np.minimum(velocity, box.upper, out=velocity)
+
+
+def _least_violation(box: Box, matrix: Array, least: Array) -> tuple[Array, Array]:
+    """Return a velocity that violates contradictory rows least (sum of squares), and the bounds that it keeps.
+
+    Each row gets a slack variable. daqp's own soft constraints would need none, but where they meet active bounds
+    its answers violate rows that can be kept (version 0.11, in a third of random problems).
+    """
+    m, n = matrix.shape
+    lengths = np.maximum(np.sqrt(np.einsum("ij,ij->i", matrix, matrix)), _TINY_ROW)
+    hessian = np.diag(np.append(np.full(n, _EFFORT), np.ones(m)))
+    rows = np.hstack([matrix / lengths[:, None], np.eye(m)])
+    lower, upper = np.full(n + 2 * m, -1e30), np.full(n + 2 * m, 1e30)
+    lower[:n], upper[:n], lower[n + m :] = box.lower, box.upper, least / lengths
+    solution, _, status, _ = daqp.solve(hessian, np.zeros(n + m), rows, upper, lower, _plain(n + 2 * m))
+    velocity = np.clip(solution[:n] if status > 0 else np.zeros(n), box.lower, box.upper)
+    return velocity, np.minimum(least, matrix @ velocity - _ROUNDING * lengths)
+
+
+def _unconstrained(box: Box, matrix: Array | None, least: Array | None, hessian: Array, linear: Array) -> Array | None:
+    """Return the minimum without limits when it keeps them all: most steps need no more, in half of the time."""
+    factor, velocity = hessian.copy(), np.empty(len(linear))
+    if mujoco.mju_cholFactor(factor, _NULL) < len(linear):
+        return None
+    mujoco.mju_cholSolve(velocity, factor, linear)
+    for low, value, high in zip(box.lower.tolist(), velocity.tolist(), box.upper.tolist(), strict=True):
+        if not low <= value <= high:
+            return None
+    if matrix is not None and (matrix.dot(velocity) < least).any():
+        return None
+    return velocity
+
+
+@lru_cache(maxsize=64)
+def _scaled_eye(n: int, factor: float) -> Array:
+    return factor * np.eye(n)
+
+
+def _plain(n: int) -> NDArray[np.intc]:
+    """Return daqp's mark of plain inequalities; it writes into it."""
+    return np.zeros(n, dtype=np.intc)
+
+
+def damped_least_squares(problem: IKProblem) -> Array:
+    """Solve thesis Eq 3.8 and 3.9: one damping for all directions, as little as keeps the joints' speed in bounds."""
+    return _damped(problem, subtracted=0.0)
+
+
+def damped_with_small_angle(problem: IKProblem) -> Array:
+    """Do the same with the small-angle term that the thesis prints after Eq 3.9."""
+    return _damped(problem, subtracted=0.5)
+
+
+def _damped(problem: IKProblem, subtracted: float) -> Array:
+    scaled, target, _ = problem.tasks[0]
+    square = float(target.dot(target))
+    gram = scaled.dot(scaled.T)
+    if problem.posture is None and subtracted == 0.0 and _is_above(gram, max(square, _CLEAR)):
+        return _undamped(problem, gram)
+    squares, basis, _ = lapack.dsyev(gram)
+    least = math.sqrt(max(float(squares[0]), 0.0))
+    threshold = max(math.sqrt(square) - subtracted * least, 0.0)
+    if least >= threshold:
+        damping = 0.0
+    elif least >= 0.5 * threshold:
+        damping = least * (threshold - least)
+    else:
+        damping = 0.25 * threshold * threshold
+    along = target.dot(basis)
+    along /= np.maximum(squares + damping, _NULL)
+    result = basis.dot(along).dot(scaled)
+    result *= problem.arm.max_velocity
+    return _within_box(problem, result, problem.arm.max_velocity, squares, basis)
+
+
+def _is_above(gram: Array, bound: float) -> bool:
+    """Return whether all eigenvalues are above ``bound``: then, and only then, a Cholesky factor of the rest exists."""
+    rest = gram.copy()
+    rest.ravel()[::7] -= bound
+    return mujoco.mju_cholFactor(rest, _NULL) == 6
+
+
+def _undamped(problem: IKProblem, gram: Array) -> Array:
+    """Solve without damping; no joint can then be too fast, since the norm is at most 1 in scaled joints."""
+    jacobian, target, _ = problem.tasks[0]
+    along = np.empty(6)
+    mujoco.mju_cholFactor(gram, 0.0)
+    mujoco.mju_cholSolve(along, gram, target)
+    result = along.dot(jacobian)
+    result *= problem.arm.max_velocity
+    if problem.box.upper is problem.arm.max_velocity:  # no limit is near, so the box holds no more than that
+        return result
+    np.maximum(result, problem.box.lower, out=result)
+    return np.minimum(result, problem.box.upper, out=result)
+
+
+def filtered_svd(problem: IKProblem) -> Array:
+    """Damp only the directions in which the arm hardly moves (Maciejewski and Klein 1988)."""
+    jacobian, target, _ = problem.tasks[0]
+    squares, basis, _ = lapack.dsyev(jacobian.dot(jacobian.T))
+    squares = np.maximum(squares, 0.0)
+    damping = np.maximum(_FILTER * _FILTER - squares, 0.0)
+    along = target.dot(basis) / np.maximum(squares + damping, _NULL)
+    result = basis.dot(along).dot(jacobian)
+    return _within_box(problem, result, 1.0, squares, basis)
+
+
+def _within_box(problem: IKProblem, result: Array, scale: Array | float, squares: Array, basis: Array) -> Array:
+    """Add the drift to the posture in the null space, then keep the limits: direction first, then each joint."""
+    if problem.posture is not None:
+        jacobian = problem.tasks[0].jacobian
+        drift = problem.posture / scale
+        usable = squares > 1e-8
+        used = (basis.T @ (jacobian @ drift))[usable] / squares[usable]
+        result = result + scale * (drift - jacobian.T @ (basis[:, usable] @ used))
+    excess = float((np.abs(result) / problem.arm.max_velocity).max())
+    if excess > 1.0:
+        result = result / excess
+    return np.minimum(np.maximum(result, problem.box.lower), problem.box.upper)
+
+
+METHODS: Mapping[str, Callable[[IKProblem], Array]] = {
+    "dls": damped_least_squares,
+    "dls_small_angle": damped_with_small_angle,
+    "qp": quadratic_program,
+    "svd": filtered_svd,
+}
+"""All methods of :func:`solve_ik`."""

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import UnknownNameError, UnreachableError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik_problem import ROTATION_LENGTH
 from imitarm.kinematics.pose import Pose
 
 Array = NDArray[np.float64]
 
-ANGLE_LENGTH = 0.3  # [m/rad] an error of 1 rad counts as much as one of 0.3 m
 _TOLERANCE = 1e-7  # [m], weighted
 _STEPS = 120
 _LONGEST_STEP = 0.4  # [rad] of one joint in one step
@@ -86,7 +86,7 @@ def _error(arm: ArmModel, q: Array, pose: Pose, frame: str) -> Array:
 
 def _descend(arm: ArmModel, start: Array, pose: Pose, frame: str) -> tuple[Array, float]:
     """Return the posture that was reached and its weighted error [m]."""
-    weights = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
+    weights = np.array([1.0, 1.0, 1.0, ROTATION_LENGTH, ROTATION_LENGTH, ROTATION_LENGTH])
     q, best, least, since = start, start, math.inf, 0
     for _ in range(_STEPS):
         error = weights * _error(arm, q, pose, frame)

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik_problem import Rows
 from imitarm.kinematics.reach_of_links import meeting_links
 
 Array = NDArray[np.float64]
@@ -105,20 +106,20 @@ class SelfClearance:
         outer, inner, _, _, distances = self._found(q)
         return np.stack((outer, inner), axis=1), distances
 
-    def rows(self, q: ArrayLike) -> tuple[Array, Array] | None:
-        """Return inequalities ``A v >= lower`` on the joint velocity for ``solve_ik(..., rows=...)``.
+    def rows(self, q: ArrayLike) -> Rows | None:
+        """Return inequalities on the joint velocity for ``solve_ik(..., rows=...)``.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
 
         Returns:
-            ``A`` (k, n_joints) and ``lower`` (k,), k at most ``n_rows``; None when nothing is near.
+            at most ``n_rows`` rows; None when nothing is near.
         """
         outer, inner, centers, normals, distances = self._found(q)
         if not len(outer):
             return None
         rows = self.arm.cover.parting(self.arm.at(q).data, outer, inner, centers, normals)
-        return rows, -self._gain * (distances - self.clearance)
+        return Rows(rows, -self._gain * (distances - self.clearance))
 
     def watch(self, dt: float = 0.01) -> SelfWatch:
         """Return the same for a control loop with period ``dt`` [s], at a fifth of the price."""
@@ -175,10 +176,10 @@ class SelfWatch:
     def reset(self) -> None:
         """Look anew in the next step."""
         self._age = self._latest
-        self._rows: tuple[Array, Array] | None = None
+        self._rows: Rows | None = None
         self._at: Array = np.zeros(0)
 
-    def rows(self, q: Array, *, time_to_look: bool = True) -> tuple[Array, Array] | None:
+    def rows(self, q: Array, *, time_to_look: bool = True) -> Rows | None:
         """Return inequalities on the joint velocity as ``SelfClearance.rows`` does; None when nothing is near.
 
         Args:
@@ -190,5 +191,5 @@ class SelfWatch:
             self._rows, self._at, self._age = self._own.rows(q), q.copy(), 1
         if self._rows is None:
             return None
-        rows, lower = self._rows
-        return rows, lower - self._gain * rows.dot(q - self._at)
+        matrix, lower, price = self._rows
+        return Rows(matrix, lower - self._gain * matrix.dot(q - self._at), price)

@@ -20,10 +20,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError, UnreachableError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik import find_posture, solve_ik
+from imitarm.kinematics.ik import IKSolver
+from imitarm.kinematics.ik_problem import ROTATION_LENGTH
+from imitarm.kinematics.limits import JointLimits, singularity_limits
 from imitarm.kinematics.pose import Pose
-from imitarm.kinematics.posture import ANGLE_LENGTH
+from imitarm.kinematics.posture import find_posture
 from imitarm.kinematics.self_clearance import SelfClearance
+from imitarm.kinematics.tasks import TwistTask
 
 Array = NDArray[np.float64]
 
@@ -103,7 +106,7 @@ class _Search:
         except UnreachableError:
             return None
         jacobian = self.arm.tool_jacobian(q)
-        jacobian[3:] *= ANGLE_LENGTH
+        jacobian[3:] *= ROTATION_LENGTH
         free = float(np.linalg.svd(jacobian, compute_uv=False)[-1]) >= least
         return q if free and self.links.distance(q) >= self.links.clearance else None
 
@@ -112,5 +115,7 @@ class _Search:
         if self.arm.landmarks is None:
             return True
         still = np.zeros(self.arm.n_joints)
-        velocity = solve_ik(self.arm, q, np.zeros(6), velocity=still, singularity_bounds=True)
+        velocity = IKSolver(self.arm, [JointLimits(self.arm), *singularity_limits(self.arm)]).solve(
+            q, TwistTask(np.zeros(6)), velocity=still
+        )
         return float(np.abs(velocity).max()) <= _STILL

@@ -11,18 +11,20 @@ from numpy.typing import NDArray
 from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik_solver import ElbowTask, IKSolver
+from imitarm.kinematics.ik import IKSolver
+from imitarm.kinematics.ik_problem import ROTATION_LENGTH, Rows
+from imitarm.kinematics.limits import JointLimits, singularity_limits
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
-from imitarm.kinematics.posture import ANGLE_LENGTH
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.sew import one_angle
+from imitarm.kinematics.tasks import ElbowTask, Task, TwistTask
 from imitarm.retarget.arm_estimator import ArmEstimate
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.engagement import EngagementRule
 from imitarm.retarget.jerk_limit import JerkLimiter
 from imitarm.retarget.retargeter import Goal, Retargeter
 from imitarm.scene import Scene
-from imitarm.scene.barrier import clearance_rows
+from imitarm.scene.clearance_limit import ClearanceLimit
 
 Array = NDArray[np.float64]
 
@@ -37,7 +39,7 @@ _TURN_LENGTHS = {"hand": (0.1, 0.1, 0.1), "upright": (0.2, 0.2, 0.05), "fixed": 
 _HELD = 0.02  # [rad] a joint that is farther than this behind its command is held up by something
 _SLIP = 0.015  # [m] farther a hand does not lead the target from a tool that is held up
 _STANDS, _STUCK = 0.03, 0.05  # [m/s] a tool that is slower for so long [s] is stuck
-_METRES = np.array([1.0, 1.0, 1.0, ANGLE_LENGTH, ANGLE_LENGTH, ANGLE_LENGTH])
+_METRES = np.array([1.0, 1.0, 1.0, ROTATION_LENGTH, ROTATION_LENGTH, ROTATION_LENGTH])
 _STILL = 1e-3  # [rad/s] slower is at rest
 
 
@@ -110,11 +112,13 @@ class ModernRetargeter(Retargeter):
                 f"ModernRetargeter: needs 0 < gain <= 1/dt = {1 / dt:g}, lead from 0 to 1, elbow >= 0, max_speed > 0"
             )
         self._gain, self._lead = gain, lead
-        self._clearance = clearance
+        self._obstacles = ClearanceLimit(arm, clearance)
         known = arm.landmarks is not None  # else neither its elbow's angle nor its singularities are
         if turn_length is None:
             turn_length = _TURN_LENGTHS[(correspondence or Correspondence()).orientation]
-        self._solver = IKSolver(arm, dt=dt, max_speed=max_speed, singularity_bounds=known, turn_length=turn_length)
+        limits = [JointLimits(arm), *(singularity_limits(arm) if known else ())]
+        self._solver = IKSolver(arm, limits, dt=dt)
+        self._rotation_length, self._max_speed = turn_length, max_speed
         self._elbow = elbow if known else 0.0
         self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).watch(dt)
         self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
@@ -188,7 +192,7 @@ class ModernRetargeter(Retargeter):
         """Move the reference towards a target; not on against what holds the arm up."""
         error = self.arm.tool_pose(self._q).error_to(target)
         x, y, z, u, v, w = error.tolist()
-        weighted = math.hypot(x, y, z, ANGLE_LENGTH * u, ANGLE_LENGTH * v, ANGLE_LENGTH * w)
+        weighted = math.hypot(x, y, z, ROTATION_LENGTH * u, ROTATION_LENGTH * v, ROTATION_LENGTH * w)
         # far away it goes no faster than it can brake again, or it would swing about the target
         gain = min(self._gain, math.sqrt(2.0 * _BRAKING / max(weighted, 1e-9)))
         if elbow is not None:  # a tool that is behind needs all the joints
@@ -227,12 +231,14 @@ class ModernRetargeter(Retargeter):
 
     def _drive(self, twist: Array, elbow: ElbowTask | None, *, led: bool = True) -> None:
         """Move the reference by one step of inverse kinematics; an arm that nobody leads goes nowhere by itself."""
-        rows = clearance_rows(self.arm, self._q, self.scene, self._clearance)
+        obstacles = self._obstacles.rows(self._q, self.scene)
         own = None if self._own is None else self._own.rows(self._q, time_to_look=not self._seeing)
-        if own is not None:
-            rows = own if rows is None else (np.concatenate([rows[0], own[0]]), np.concatenate([rows[1], own[1]]))
-        if rows is not None and not led:  # what is too near already is left when the person leads on
-            rows = rows[0], np.minimum(rows[1], 0.0)
-        velocity = self._solver.solve(self._q, twist, velocity=self._velocity, rows=rows, sew=elbow)
+        rows = ([] if obstacles is None else [obstacles]) + ([] if own is None else [own])
+        if not led:  # what is too near already is left when the person leads on
+            rows = [Rows(part.matrix, np.minimum(part.lower, 0.0)) for part in rows]
+        tasks: list[Task] = [TwistTask(twist, "tool", self._rotation_length, self._max_speed)]
+        if elbow is not None:
+            tasks.append(elbow)
+        velocity = self._solver.solve(self._q, tasks, velocity=self._velocity, rows=rows)
         self._velocity = velocity
         self._q = self._q + self.dt * velocity

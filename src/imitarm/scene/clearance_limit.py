@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.rows import Rows
+from imitarm.kinematics.ik_problem import Rows
 from imitarm.scene.distances import near_pairs
 from imitarm.scene.scene import Scene
 from imitarm.validation import finite_number, instance

@@ -12,6 +12,7 @@ from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.skeleton import HandState, Skeleton
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import matrix_to_quaternion
+from imitarm.kinematics.tasks import TwistTask
 from imitarm.retarget.arm_estimator import ArmEstimate
 from imitarm.retarget.engagement import EngagementRule
 from imitarm.retarget.human_arm import hand_rotation
@@ -60,7 +61,7 @@ class IdealFollower(Retargeter):
         q, twist = self.latest.q, np.zeros(6)
         if goal is not None:
             twist = (_SHARE / self.dt) * self.arm.tool_pose(q).error_to(goal.target)
-        self._velocity = solve_ik(self.arm, q, twist, dt=self.dt, velocity=self._velocity)
+        self._velocity = solve_ik(self.arm, q, TwistTask(twist), dt=self.dt, velocity=self._velocity)
         return q + self.dt * self._velocity
 
 

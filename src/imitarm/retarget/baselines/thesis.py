@@ -21,6 +21,7 @@ from imitarm.kinematics.pose import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
+from imitarm.kinematics.tasks import TwistTask
 from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
 from imitarm.retarget.baselines.hand_curve import HandCurve, HandSample, Playback
 from imitarm.retarget.correspondence import Clutch, Correspondence
@@ -301,15 +302,9 @@ class ThesisRetargeter(Retargeter):
         if goal is None:
             return q
         error = self.arm.tool_pose(q).error_to(goal.target)
-        velocity = solve_ik(
-            self.arm,
-            q,
-            self._gain * error,
-            method="dls",
-            dt=self.dt,
-            max_speed=self._max_speed,
-            small_angle=self._small_angle,
-        )
+        method = "dls" if self._small_angle is None else "dls_small_angle"
+        task = TwistTask(self._gain * error, max_speed=self._max_speed)
+        velocity = solve_ik(self.arm, q, task, dt=self.dt, method=method)
         return np.clip(q + self.dt * velocity, self.arm.lower, self.arm.upper)
 
 

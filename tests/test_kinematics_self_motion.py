@@ -1,4 +1,4 @@
-"""What the spare motion must be, against NumPy's pseudo-inverse and finite differences."""
+"""What the self-motion must be, against NumPy's pseudo-inverse and finite differences."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.sew import sew_angle, sew_derivatives
-from imitarm.kinematics.spare_motion import spare_motion
+from imitarm.kinematics.tasks import self_motion
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
 WEIGHTS = np.array([[1], [1], [1], [0.3], [0.3], [0.3]])
@@ -35,7 +35,7 @@ def drawn(name, seed):
 @given(arms, seeds)
 def test_it_has_length_one_and_leaves_the_tool_where_it_is(name, seed):
     _, _, jacobian, gradient = drawn(name, seed)
-    direction, turns, _ = spare_motion(jacobian, gradient)
+    direction, turns, _ = self_motion(jacobian, gradient)
     assert np.linalg.norm(direction) == pytest.approx(1.0)
     least = np.linalg.svd(jacobian, compute_uv=False)[-1]
     allowed = DAMPING / least * np.linalg.norm(gradient) / turns  # what the damping may leave
@@ -46,7 +46,7 @@ def test_it_has_length_one_and_leaves_the_tool_where_it_is(name, seed):
 @given(arms, seeds)
 def test_it_changes_the_elbows_angle_as_fast_as_it_says(name, seed):
     arm, q, jacobian, gradient = drawn(name, seed)
-    direction, turns, _ = spare_motion(jacobian, gradient)
+    direction, turns, _ = self_motion(jacobian, gradient)
     h = 1e-5
     after, before = (sew_angle(*arm.sew_points(q + side * h * direction)) for side in (1.0, -1.0))
     assert turns > 0.0
@@ -60,7 +60,7 @@ def test_it_changes_the_elbows_angle_as_fast_as_it_says(name, seed):
 @given(arms, seeds)
 def test_what_the_tool_does_to_the_angle_is_by_the_pseudo_inverse(name, seed):
     _, _, jacobian, gradient = drawn(name, seed)
-    _, _, by_tool = spare_motion(jacobian, gradient)
+    _, _, by_tool = self_motion(jacobian, gradient)
     wanted, least = gradient @ np.linalg.pinv(jacobian), np.linalg.svd(jacobian, compute_uv=False)[-1]
     assert np.linalg.norm(by_tool - wanted) <= 1.01 * DAMPING / least**2 * np.linalg.norm(wanted) + 1e-9
 
@@ -72,7 +72,7 @@ def test_of_all_motions_that_leave_the_tool_none_changes_the_quantity_more(seed,
     rng = np.random.default_rng(seed)
     jacobian, gradient = rng.normal(size=(6, n)), rng.normal(size=n)
     assume(np.linalg.svd(jacobian, compute_uv=False)[-1] > 0.2)
-    swing = spare_motion(jacobian, gradient)
+    swing = self_motion(jacobian, gradient)
     assume(swing is not None and swing[1] > 0.1)
     direction, turns, _ = swing
     assert gradient @ direction == pytest.approx(turns, rel=1e-2)
@@ -87,11 +87,11 @@ def test_an_arm_of_six_joints_has_none(name, seed, missing):
     _, _, jacobian, gradient = drawn(name, seed)
     six = np.delete(jacobian, missing, axis=1)
     assume(np.linalg.svd(six, compute_uv=False)[-1] > 0.03)
-    assert spare_motion(six, np.delete(gradient, missing)) is None
+    assert self_motion(six, np.delete(gradient, missing)) is None
 
 
 @some
 @given(arms, seeds)
 def test_a_quantity_that_only_the_tool_changes_is_led_by_none(name, seed):
     _, _, jacobian, _ = drawn(name, seed)
-    assert spare_motion(jacobian, np.random.default_rng(seed).normal(size=6) @ jacobian) is None
+    assert self_motion(jacobian, np.random.default_rng(seed).normal(size=6) @ jacobian) is None

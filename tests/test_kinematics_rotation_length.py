@@ -1,16 +1,23 @@
-"""What an IKSolver is told once: how much a turn counts beside a way."""
+"""How much a rotation counts beside a displacement."""
 
 import numpy as np
 import pytest
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik_solver import IKSolver
+from imitarm.kinematics.ik import IKSolver
+from imitarm.kinematics.tasks import TwistTask
 
 
 @pytest.fixture(scope="module")
 def arm():
     return ArmModel.load("sawyer", tool="gripper")
+
+
+def missing(arm, q, task, velocity=None):
+    """What the tool lacks of its twist [m/s, rad/s]."""
+    weights = np.array([1.0, 1.0, 1.0, *[task.rotation_length] * 3])
+    return IKSolver(arm).step(q, task, velocity=velocity).missing[0] / weights
 
 
 def test_where_the_joints_cannot_do_both_the_turn_goes_the_sooner_the_less_it_counts(arm):
@@ -21,8 +28,8 @@ def test_where_the_joints_cannot_do_both_the_turn_goes_the_sooner_the_less_it_co
         q = arm.home + 0.3 * rng.normal(size=arm.n_joints)
         twist = np.concatenate([rng.normal(size=3), 3.0 * rng.normal(size=3)])
         for length, errors in missed.items():
-            solver = IKSolver(arm, turn_length=length, max_speed=100.0)
-            error = solver.step(q, twist, velocity=np.zeros(arm.n_joints)).error
+            task = TwistTask(twist, rotation_length=length, max_speed=100.0)
+            error = missing(arm, q, task, velocity=np.zeros(arm.n_joints))
             errors.append((float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))))
     ways, turns = zip(*(np.mean(errors, axis=0) for errors in missed.values()), strict=True)
     assert ways[0] < ways[1] < ways[2]
@@ -36,14 +43,14 @@ def test_where_no_limit_is_near_it_changes_nothing(arm):
         q = arm.home + 0.2 * rng.normal(size=arm.n_joints)
         twist = 0.05 * rng.normal(size=6)
         for length in (0.1, 0.3, 1.0):
-            error = IKSolver(arm, turn_length=length).step(q, twist).error
+            error = missing(arm, q, TwistTask(twist, rotation_length=length))
             np.testing.assert_allclose(error, 0.0, atol=1e-2 * np.linalg.norm(twist))
 
 
 @pytest.mark.parametrize("length", [0.0, -0.1, np.nan, np.inf])
 def test_a_length_that_can_not_weigh_is_refused(arm, length):
-    with pytest.raises(InputError, match="turn_length"):
-        IKSolver(arm, turn_length=length)
+    with pytest.raises(InputError, match="rotation_length"):
+        IKSolver(arm).solve(arm.home, TwistTask(np.zeros(6), rotation_length=length))
 
 
 def test_a_turn_that_counts_less_is_left_no_sooner_while_no_limit_is_near(arm):
@@ -52,8 +59,8 @@ def test_a_turn_that_counts_less_is_left_no_sooner_while_no_limit_is_near(arm):
     for _ in range(300):
         q, twist = rng.uniform(arm.lower, arm.upper), np.concatenate([np.zeros(3), 0.02 * rng.normal(size=3)])
         for length, shares in missed.items():
-            step = IKSolver(arm, turn_length=length).step(q, twist)
+            step = IKSolver(arm).step(q, TwistTask(twist, rotation_length=length))
             if not step.limited.any():
-                shares.append(np.linalg.norm(step.error[3:]) / np.linalg.norm(twist[3:]))
+                shares.append(np.linalg.norm(step.missing[0][3:] / length) / np.linalg.norm(twist[3:]))
     assert len(missed[0.1]) > 200
     assert np.percentile(missed[0.1], 90) < 1.2 * np.percentile(missed[0.3], 90)

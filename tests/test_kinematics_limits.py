@@ -7,18 +7,32 @@ from hypothesis import strategies as st
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.bounds import ELBOW_MARGIN, clearance_rows, velocity_box
+from imitarm.kinematics.ik import IKSolver
+from imitarm.kinematics.limits import ELBOW_MARGIN, ElbowSingularityLimit, JointLimits
+from imitarm.kinematics.tasks import TwistTask
 
 ARMS = {name: ArmModel.load(name) for name in ("sawyer", "panda")}
 SAWYER = ARMS["sawyer"]
 DT = 0.01
+STILL = TwistTask(np.zeros(6))
+
+
+def velocity_box(arm, q, dt, velocity=None):
+    return JointLimits(arm).box(np.asarray(q, dtype=float), dt, velocity)
+
+
+def bent_box(arm, q, dt, velocity=None):
+    """The box with the elbow's margin in it."""
+    return IKSolver(arm, [JointLimits(arm), ElbowSingularityLimit(arm)], dt=dt).problem(q, STILL, velocity).box
+
+
 seeds = st.integers(0, 2**32 - 1)
 
 
 @settings(deadline=None, max_examples=30)
 @given(seeds, st.sampled_from([0.001, 0.01, 0.05]), st.sampled_from(list(ARMS)))
 def test_the_box_is_never_empty_and_its_worst_corner_can_still_stop(seed, dt, name):
-    """METHODS A.9: walk on the box's own corners; no limit of position, velocity or acceleration is ever passed."""
+    """Walk on the box's own corners; no limit of position, velocity or acceleration is ever passed."""
     arm, rng = ARMS[name], np.random.default_rng(seed)
     q, velocity = rng.uniform(arm.lower, arm.upper), np.zeros(7)
     for _ in range(200):
@@ -53,18 +67,8 @@ def test_joints_without_limits_have_only_the_velocity(tmp_path):
     assert upper[0] == arm.max_velocity[0] == -lower[0]
 
 
-def test_a_moving_obstacle_pushes_its_rows():
-    jacobians = np.zeros((1, 3, 7))
-    still = clearance_rows(jacobians, np.array([[1.0, 0, 0]]), np.array([0.1]), clearance=0.02, gain=5.0)
-    coming = clearance_rows(
-        jacobians, np.array([[1.0, 0, 0]]), np.array([0.1]), clearance=0.02, gain=5.0, obstacle_velocity=[0.3, 0, 0]
-    )
-    assert still[1] == pytest.approx([-0.4])
-    assert coming[1] == pytest.approx([-0.1])
-
-
-def thesis_box(arm, q, dt, velocity):
-    """The bounds of METHODS A.9 as written, joint by joint, an independent statement."""
+def documented_box(arm, q, dt, velocity):
+    """The documented bounds joint by joint, an independent statement."""
     lower, upper = [], []
     for a, most, low, high, x, before in zip(
         arm.max_acceleration, arm.max_velocity, arm.lower, arm.upper, q, velocity, strict=True
@@ -86,20 +90,20 @@ def test_the_box_is_the_formula_wherever_the_arm_is(seed, name):
     q = rng.uniform(arm.lower, arm.upper) * (0.3 if seed % 2 else 1.0)  # far from all limits, or anywhere
     q = np.clip(q, arm.lower, arm.upper)
     velocity = rng.uniform(-1, 1, 7) * arm.max_velocity
-    assert np.allclose(velocity_box(arm, q, DT, velocity), thesis_box(arm, q, DT, velocity), atol=1e-12)
+    assert np.allclose(velocity_box(arm, q, DT, velocity), documented_box(arm, q, DT, velocity), atol=1e-12)
 
 
 @settings(deadline=None, max_examples=30)
 @given(seeds, st.sampled_from([0.001, 0.01, 0.05]), st.sampled_from(list(ARMS)))
 def test_the_elbow_keeps_its_side_and_its_margin(seed, dt, name):
-    """METHODS A.8: the hard bound is one more limit of position, so the box stays never-empty with it."""
+    """The hard bound is one more limit of position, so the box stays never-empty with it."""
     arm, rng = ARMS[name], np.random.default_rng(seed)
     elbow, straight = arm.landmarks.elbow, arm.landmarks.elbow_straight
     q, velocity = rng.uniform(arm.lower, arm.upper), np.zeros(7)
     side = 1.0 if q[elbow] >= straight else -1.0
     away = side * (q[elbow] - straight)
     for _ in range(200):
-        lower, upper = velocity_box(arm, q, dt, velocity, singularity_bounds=True)
+        lower, upper = bent_box(arm, q, dt, velocity)
         assert np.all(lower <= upper)
         towards = np.where(rng.random() < 0.5, upper, lower)
         towards[elbow] = (lower if side > 0.0 else upper)[elbow]  # the elbow always tries to stretch
@@ -113,26 +117,26 @@ def test_the_elbow_keeps_its_side_and_its_margin(seed, dt, name):
 
 
 def test_an_elbow_that_begins_stretched_can_only_bend_on():
-    lower, upper = velocity_box(SAWYER, np.zeros(7), DT, singularity_bounds=True)
+    lower, upper = bent_box(SAWYER, np.zeros(7), DT)
     assert lower[3] == 0.0 and upper[3] > 0.0
     bent = np.array([0, 0, 0, -0.01, 0, 0, 0.0])
-    lower, upper = velocity_box(SAWYER, bent, DT, singularity_bounds=True)
+    lower, upper = bent_box(SAWYER, bent, DT)
     assert upper[3] == 0.0 and lower[3] < 0.0
     free = velocity_box(SAWYER, bent, DT)
     assert np.array_equal(np.delete(lower, 3), np.delete(free[0], 3))
 
 
-def test_an_arm_without_an_elbow_has_no_singularity_bounds(tmp_path):
+def test_an_arm_without_an_elbow_has_no_singularity_limit(tmp_path):
     file = tmp_path / "turntable.xml"
     file.write_text(
         "<mujoco><worldbody><body name='plate'><joint name='turn'/><geom size='.1'/></body></worldbody></mujoco>"
     )
     with pytest.raises(InputError, match="add sites named"):
-        velocity_box(ArmModel.load(file), [0.0], DT, singularity_bounds=True)
+        ElbowSingularityLimit(ArmModel.load(file))
 
 
 def pink_box(arm, q, dt, velocity):
-    """The same limits as a known library states them (METHODS A.9): each is right alone, together they can be empty."""
+    """The same limits as a known library states them : each is right alone, together they can be empty."""
     a, most = arm.max_acceleration, arm.max_velocity
 
     def step(way, before):
@@ -143,7 +147,7 @@ def pink_box(arm, q, dt, velocity):
 
 
 def test_bounds_that_do_not_fit_together_leave_no_velocity_and_ours_always_do():
-    """METHODS A.9 and G: a joint led to its limit as fast as each box lets it."""
+    """A joint led to its limit as fast as each box lets it."""
     stuck = dict.fromkeys(("pink", "ours"), 0)
     for which, box in (("pink", pink_box), ("ours", velocity_box)):
         q, velocity = np.array(SAWYER.home), np.zeros(7)

@@ -1,0 +1,217 @@
+"""Limits of the joint velocity: what a control step must not exceed, as small objects that combine.
+
+A :class:`Limit` answers, at one control step, with a :class:`Box` (hard: always kept) or with :class:`Rows`
+(soft: linear inequalities that give way only when they contradict a box, or at a price).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik_problem import Box, IKProblem, Rows
+
+Array = NDArray[np.float64]
+
+ELBOW_MARGIN = 0.15  # [rad] distance that ElbowSingularityLimit keeps from the stretched elbow
+WRIST_MARGIN = 0.1  # [rad] distance that WristSingularityLimit keeps from the singular wrist
+_WRIST_PRICE = 0.1  # as much as the tool's rotation about that joint
+_RETURN_RATE = 5.0  # [1/s] how fast a wrist inside its margin leaves it
+_SIGN = np.array([[1.0], [-1.0]])
+
+
+class Limit(ABC):
+    """One restriction of the joint velocity. A limit of your own is one class with this one method.
+
+    Attributes:
+        soft: whether it answers with rows, which only the method ``"qp"`` can keep.
+    """
+
+    soft: ClassVar[bool] = False
+
+    @abstractmethod
+    def restrict(self, problem: IKProblem) -> Box | Rows | None:
+        """Return the restriction at one control step; None when nothing is near enough to restrict it."""
+
+
+class JointLimits(Limit):
+    r"""Position, velocity and acceleration limits of the joints, as a box that is never empty.
+
+    With D the distance to the upper position limit and a the acceleration limit, a joint that must still be able to
+    stop in time may move at
+
+    .. math:: v_b(D) = -a\,dt + \sqrt{a^2 dt^2 + 2 a D},
+
+    the solution of :math:`v^2/(2a) + v\,dt = D`. The upper bound is
+    :math:`\min(v_{max},\; v_p + a\,dt,\; \max(v_b(D),\, v_p - a\,dt))` with :math:`v_p` the previous velocity; the
+    lower bound is its mirror image. When :math:`v_p` kept this bound one step ago, braking with a keeps it now, so
+    the box always holds a velocity.
+
+    Args:
+        arm: whose limits.
+    """
+
+    def __init__(self, arm: ArmModel) -> None:
+        self.arm = arm
+        self._boxes: dict[float, _VelocityBox] = {}
+
+    def restrict(self, problem: IKProblem) -> Box:
+        """Return the bounds at one control step; a joint outside its position limits can only move back."""
+        return self.box(problem.q, problem.dt, problem.velocity)
+
+    def box(self, q: Array, dt: float, velocity: Array | None = None) -> Box:
+        """Return the bounds at one posture, not to be written to.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            dt: length of the control step [s].
+            velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: any is assumed.
+        """
+        known = self._boxes.get(dt)
+        if known is None:
+            known = self._boxes.setdefault(dt, _VelocityBox(self.arm, dt))
+        return known.at(q, velocity)
+
+
+class _VelocityBox:
+    """The bounds of :class:`JointLimits` for one control period."""
+
+    def __init__(self, arm: ArmModel, dt: float) -> None:
+        self._most, self._least = arm.max_velocity, -arm.max_velocity
+        self._least.setflags(write=False)
+        self._free = Box(self._least, self._most)
+        self._step = arm.max_acceleration * dt
+        self._squared, self._double = self._step * self._step, 2.0 * arm.max_acceleration
+        room = self._most * self._most / self._double + self._most * dt  # farther from a limit, v_b exceeds v_max
+        # both directions at once: row 0 upwards, row 1 downwards with signs changed
+        self._ends = np.stack((arm.upper, -arm.lower))
+        self._inner = list(zip((arm.lower + room).tolist(), (arm.upper - room).tolist(), strict=True))
+
+    def at(self, q: Array, velocity: Array | None) -> Box:
+        for value, (low, high) in zip(q.tolist(), self._inner, strict=True):
+            if not low <= value <= high:
+                return self._near_a_limit(q, velocity)
+        if velocity is None:
+            return self._free
+        lower = np.minimum(velocity, self._most)
+        lower -= self._step
+        upper = np.maximum(velocity, self._least)
+        upper += self._step
+        return Box(np.maximum(lower, self._least, out=lower), np.minimum(upper, self._most, out=upper))
+
+    def _near_a_limit(self, q: Array, velocity: Array | None) -> Box:
+        bound = np.maximum(self._ends - _SIGN * q, 0.0)
+        bound *= self._double
+        bound += self._squared
+        np.sqrt(bound, out=bound)
+        bound -= self._step
+        if velocity is not None:
+            before = _SIGN * np.minimum(np.maximum(velocity, self._least), self._most)
+            np.maximum(bound, before - self._step, out=bound)
+            np.minimum(bound, before + self._step, out=bound)
+        np.minimum(bound, self._most, out=bound)
+        return Box(-bound[1], bound[0])
+
+
+class ElbowSingularityLimit(Limit):
+    """Keeps the elbow 0.15 rad away from its stretched position, on the side where it is.
+
+    Where the upper arm and the forearm of an SRS arm are in line, the shoulder-wrist distance can't change any
+    faster: the arm is singular. The margin acts like one more position limit of the elbow joint (see
+    :class:`JointLimits`). An arm that starts inside the margin can only leave it.
+
+    Args:
+        arm: the arm; its file must mark shoulder, elbow and wrist.
+
+    Raises:
+        InputError: when the arm does not say where its elbow is.
+    """
+
+    def __init__(self, arm: ArmModel) -> None:
+        marked = arm.marked()
+        self._joint = joint = marked.elbow
+        self._straight = marked.elbow_straight
+        self._acceleration, self._most = float(arm.max_acceleration[joint]), float(arm.max_velocity[joint])
+        low, high = float(arm.lower[joint]), float(arm.upper[joint])
+        # on a side where the position limits leave no room for the margin, they alone are kept
+        self._sides = tuple(low < self._straight + side * ELBOW_MARGIN < high for side in (1.0, -1.0))
+        self._open = np.full(arm.n_joints, np.inf)
+        self._open.setflags(write=False)
+        self._braking_distance = self._most * self._most / (2.0 * self._acceleration)
+
+    def restrict(self, problem: IKProblem) -> Box | None:
+        """Return a bound of the elbow joint alone; None when it is farther away than it needs to brake."""
+        position = float(problem.q[self._joint])
+        side = -1.0 if position < self._straight else 1.0
+        if not self._sides[0 if side > 0.0 else 1]:
+            return None
+        distance = max(side * (position - self._straight) - ELBOW_MARGIN, 0.0)
+        if distance > self._braking_distance + self._most * problem.dt:
+            return None
+        step = self._acceleration * problem.dt
+        bound = math.sqrt(step * step + 2.0 * self._acceleration * distance) - step  # towards the stretched elbow
+        if problem.velocity is not None:
+            before = min(max(-side * float(problem.velocity[self._joint]), -self._most), self._most)
+            bound = max(bound, before - step)
+        if bound >= self._most:
+            return None
+        bounded = self._open.copy()
+        bounded[self._joint] = bound
+        return Box(-bounded, self._open) if side > 0.0 else Box(-self._open, bounded)
+
+
+class WristSingularityLimit(Limit):
+    r"""Softly keeps the wrist joint at least 0.1 rad away from its singular positions.
+
+    The wrist is singular where the axes before and after its joint are parallel, at every multiple of pi. With D the
+    distance to 0.1 rad from the nearest of them, the joint's velocity away from it must be at least
+    :math:`-v_b(D)` (see :class:`JointLimits`), or 5/s times what is missing once it is nearer. The price of a
+    violation is low enough for a hand that must rotate through to do so.
+
+    Args:
+        arm: the arm; its file must mark shoulder, elbow and wrist.
+
+    Raises:
+        InputError: when the arm does not say where its wrist is.
+    """
+
+    soft: ClassVar[bool] = True
+
+    def __init__(self, arm: ArmModel) -> None:
+        self._joint = arm.marked().wrist
+        self._acceleration = float(arm.max_acceleration[self._joint])
+        self._most = float(arm.max_velocity[self._joint])
+        self._rows = []
+        for side in (1.0, -1.0):
+            row = np.zeros((1, arm.n_joints))
+            row[0, self._joint] = side
+            row.setflags(write=False)
+            self._rows.append(row)
+
+    def restrict(self, problem: IKProblem) -> Rows | None:
+        """Return one row for the wrist joint; None when any velocity will do."""
+        position = float(problem.q[self._joint])
+        away = position - math.pi * round(position / math.pi)
+        distance = abs(away) - WRIST_MARGIN
+        if distance <= 0.0:
+            least = -_RETURN_RATE * distance if problem.moving else 0.0  # an arm told to stand still stays there
+        else:
+            step = self._acceleration * problem.dt
+            least = step - math.sqrt(step * step + 2.0 * self._acceleration * distance)
+            if least <= -self._most:
+                return None
+        return Rows(self._rows[0 if away >= 0.0 else 1], np.array([least]), _WRIST_PRICE)
+
+
+def singularity_limits(arm: ArmModel) -> tuple[Limit, ...]:
+    """Return the limits that keep an SRS arm away from its elbow and wrist singularities.
+
+    Raises:
+        InputError: when the arm does not say where its elbow and wrist are.
+    """
+    return ElbowSingularityLimit(arm), WristSingularityLimit(arm)

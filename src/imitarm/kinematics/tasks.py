@@ -1,0 +1,256 @@
+r"""Tasks of the inverse kinematics: what the joints should do, as small objects that combine.
+
+Each task asks for a velocity :math:`t` of some quantity that moves with :math:`J v`. The quadratic program minimises
+the sum of :math:`\tfrac12 |J v - t|^2` over all tasks, inside the limits.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple, Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik_problem import ROTATION_LENGTH, IKProblem, TaskRows
+from imitarm.kinematics.sew import one_angle
+
+Array = NDArray[np.float64]
+
+_BENT = 0.1  # squared sine of the angle at the elbow below which the elbow task fades
+_REFERENCE = 0.04  # squared length below which the direction that the SEW angle is measured from fades
+_QUICK = 0.5  # fraction of what the joints can change in a step by which the elbow's speed may change
+_DAMPING = 1e-7  # squared singular values below this belong to directions in which the arm can't move
+_LEAST = 1e-4  # squared: a quantity that changes less with the self-motion can't be led by it
+
+
+class Task(Protocol):
+    """One wanted motion. A task of your own is one class with this one method."""
+
+    def rows(self, problem: IKProblem) -> TaskRows | None:
+        """Return what is asked for at one control step; None: nothing.
+
+        Raises:
+            InputError: when a number of the task can't be used.
+        """
+
+
+class TwistTask(NamedTuple):
+    r"""Move the tool (or the flange) with a twist.
+
+    Rotations count as displacements: 1 rad as ``rotation_length``. A twist longer than ``max_speed``, so weighted, is
+    scaled down: damped least squares fed with an unclamped error stops short of its target, since its damping grows
+    with the error (thesis Eq 3.9).
+
+    Attributes:
+        twist: wanted velocity in the base frame, linear rows first, shape (6,) [m/s, rad/s].
+        frame: what moves, ``"tool"`` or ``"flange"``.
+        rotation_length: what 1 rad counts as, beside a metre, where the joints can't do all of the twist [m]; less
+            gives up rotation first. Three numbers: for rotations about the base's x, y and z.
+        max_speed: the twist is scaled down to this weighted norm [m/s]; None: the default of the solver's method.
+    """
+
+    twist: ArrayLike
+    frame: str = "tool"
+    rotation_length: float | tuple[float, float, float] = ROTATION_LENGTH
+    max_speed: float | None = None
+
+    def rows(self, problem: IKProblem) -> TaskRows:
+        """Return the weighted Jacobian (6, n_joints) and the clamped, weighted twist (6,)."""
+        weights, scale, effort, site = _scales(self.rotation_length, self.frame, problem.arm, problem.scaled)
+        target = np.asarray(self.twist, dtype=float)
+        if target.shape != (6,):
+            raise InputError(f"TwistTask: twist must be 6 finite numbers (linear, angular), got {self.twist!r}")
+        target = target * weights
+        square = float(target.dot(target))
+        if not math.isfinite(square):
+            raise InputError(f"TwistTask: twist must be 6 finite numbers (linear, angular), got {self.twist!r}")
+        most = problem.max_speed if self.max_speed is None else self.max_speed
+        if not most >= 0.0:
+            raise InputError(f"TwistTask: max_speed must be a speed [m/s], 0 or more, got {most}")
+        if square > most * most:
+            target *= most / math.sqrt(square)
+        return TaskRows(problem.memory.site_jacobian(site) * scale, target, effort)
+
+
+class JointVelocityTask(NamedTuple):
+    """Move the joints at given velocities, for example along a planned joint path.
+
+    Attributes:
+        velocity: wanted joint velocity, shape (n_joints,) [rad/s].
+        weight: beside a twist, whose weight is 1 [m^2].
+    """
+
+    velocity: ArrayLike
+    weight: float = 1.0
+
+    def rows(self, problem: IKProblem) -> TaskRows:
+        """Return a scaled identity (n_joints, n_joints) and the scaled velocity."""
+        velocity = joint_vector(self.velocity, len(problem.q), "JointVelocityTask: velocity")
+        root = _root(self.weight, "JointVelocityTask")
+        return TaskRows(_scaled_eye(len(velocity), root), root * velocity)
+
+
+class PostureTask(NamedTuple):
+    """Drift to a posture where the other tasks leave freedom: :math:`v = k (q_{ref} - q)`.
+
+    Attributes:
+        q: joint positions to drift to, shape (n_joints,) [rad].
+        gain: k [1/s].
+        weight: beside a twist, whose weight is 1 [m^2].
+    """
+
+    q: ArrayLike
+    gain: float = 1.0
+    weight: float = 1e-4
+
+    def drift(self, problem: IKProblem) -> Array:
+        """Return the wanted joint velocity inside the box, shape (n_joints,) [rad/s]."""
+        if not math.isfinite(self.gain):
+            raise InputError(f"PostureTask: gain must be a finite number [1/s], got {self.gain}")
+        drift = self.gain * (joint_vector(self.q, len(problem.q), "PostureTask: q") - problem.q)
+        return np.minimum(np.maximum(drift, problem.box.lower), problem.box.upper)
+
+    def rows(self, problem: IKProblem) -> TaskRows:
+        """Return a scaled identity (n_joints, n_joints) and the scaled drift."""
+        root = _root(self.weight, "PostureTask")
+        return TaskRows(_scaled_eye(len(problem.q), root), root * self.drift(problem))
+
+
+class ElbowTask(NamedTuple):
+    r"""Turn the elbow to an SEW angle while the tool does its task.
+
+    The elbow swings by the self-motion: the unit vector n along :math:`(I - J^+ J) J_\psi^T`, which leaves the tool
+    (the first task, with Jacobian J and target e) as it is. The task adds :math:`\tfrac{w}2\,(n^T v - s)^2` with
+
+    .. math:: s = c\,\min(1, 10\sin^2\!\beta)\;\frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
+
+    where :math:`\psi` is the arm's :func:`~imitarm.kinematics.sew.sew_angle` and :math:`\beta` the angle at its elbow.
+    The swing fades to none as the arm gets straight, and near the one direction in which the stereographic angle is
+    not defined. From one step to the next s changes by at most half of what the joints can change. As long as no limit
+    is active this takes nothing from the tool, whatever the weight. At the limits the weight decides.
+
+    Attributes:
+        angle: wanted SEW angle :math:`\psi_h` [rad].
+        weight: w beside the tool's task, whose weight is 1 [m^2]; 0 leaves the self-motion free.
+        confidence: c, 0 to 1: how surely the wanted angle is known; 0: no swing.
+        gain: k [1/s].
+        max_rate: the wanted rate of the angle is limited to this [rad/s].
+        convention: of the angle.
+    """
+
+    angle: float
+    weight: float = 0.1
+    confidence: float = 1.0
+    gain: float = 5.0
+    max_rate: float = 1.0
+    convention: str = "stereographic"
+
+    def rows(self, problem: IKProblem) -> TaskRows | None:
+        """Return one row along the self-motion; None where the angle is not defined or there is no self-motion."""
+        angle, weight, confidence, gain, max_rate, convention = self
+        if not (math.isfinite(angle) and weight >= 0.0 and confidence >= 0.0 and gain >= 0.0 and max_rate >= 0.0):
+            raise InputError(f"ElbowTask: needs a finite angle and other numbers that are not negative, got {self!r}")
+        if not problem.tasks:
+            raise InputError("ElbowTask: must follow a task for the tool, such as TwistTask, in the list of tasks")
+        shoulder, elbow, wrist = problem.memory.sites.take(_marked(problem.arm), axis=0).tolist()
+        now = one_angle(shoulder, elbow, wrist, convention)
+        if now is None:
+            return None
+        gradient = np.array(now.shoulder + now.elbow + now.wrist).dot(problem.memory.marked_jacobians())
+        motion = self_motion(problem.tasks[0].jacobian, gradient)
+        if motion is None:
+            return None
+        direction, change, by_tool = motion
+        factor = min(confidence, 1.0) * min(1.0, now.bend / _BENT) * min(1.0, now.reference / _REFERENCE)
+        rate = gain * math.remainder(angle - now.angle, math.tau)
+        speed = factor * (min(max(rate, -max_rate), max_rate) - float(by_tool.dot(problem.tasks[0].target))) / change
+        if problem.velocity is not None:
+            before = float(direction.dot(problem.velocity))
+            widths = zip((problem.box.upper - problem.box.lower).tolist(), direction.tolist(), strict=True)
+            most = 0.5 * _QUICK * min([width / max(abs(part), 1e-9) for width, part in widths])
+            speed = min(max(speed, before - most), before + most)
+        root = math.sqrt(weight)
+        return TaskRows((root * direction)[None], np.array([root * speed]))
+
+
+def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] | None:
+    r"""Return the joint motion that leaves the tool as it is and changes some quantity most.
+
+    With J the tool's Jacobian and g the quantity's gradient, it is along :math:`(I - J^+ J)\,g`; what the tool's own
+    motion e does to the quantity is :math:`g^T J^+ e`.
+
+    Args:
+        jacobian: of the tool, shape (m, n_joints).
+        gradient: of the quantity by the joints, shape (n_joints,).
+
+    Returns:
+        the motion as a unit vector (n_joints,), how fast it changes the quantity, and :math:`g^T J^+`, shape (m,);
+        None when no such motion changes it.
+    """
+    gram = jacobian.dot(jacobian.T)
+    gram += _scaled_eye(len(gram), _DAMPING)
+    by_tool = np.empty(len(gram))
+    mujoco.mju_cholFactor(gram, 0.0)
+    mujoco.mju_cholSolve(by_tool, gram, jacobian.dot(gradient))
+    direction = gradient - by_tool.dot(jacobian)
+    square = float(direction.dot(direction))
+    if square < _LEAST:
+        return None
+    length = math.sqrt(square)
+    return direction / length, length, by_tool
+
+
+def joint_vector(values: ArrayLike, n: int, what: str) -> Array:
+    """Return ``n`` finite numbers as an array.
+
+    Raises:
+        InputError: when they are not; the message begins with ``what``.
+    """
+    array = np.asarray(values, dtype=float)
+    if array.shape != (n,) or not math.isfinite(sum(array.tolist())):
+        raise InputError(f"{what} must be {n} finite numbers, got {values!r}")
+    return array
+
+
+@lru_cache(maxsize=64)
+def _marked(arm: ArmModel) -> NDArray[np.intp]:
+    """Return the indices of the sites that mark shoulder, elbow and wrist."""
+    return np.array(arm.marked().sites, dtype=np.intp)
+
+
+def _root(weight: float, task: str) -> float:
+    if not 0.0 <= weight < math.inf:
+        raise InputError(f"{task}: weight must be a finite number, 0 or more, got {weight}")
+    return math.sqrt(weight)
+
+
+@lru_cache(maxsize=64)
+def _scales(
+    rotation_length: float | tuple[float, float, float], frame: str, arm: ArmModel, scaled: bool
+) -> tuple[Array, Array, float, int]:
+    """Return the weights of a twist (6,), the factors of its Jacobian (6, n_joints), that of the effort, the site."""
+    try:
+        lengths = np.broadcast_to(np.asarray(rotation_length, dtype=float), 3)
+        usable = bool(np.isfinite(lengths).all() and lengths.min() > 0.0)
+    except (TypeError, ValueError):
+        usable = False
+    if not usable:
+        raise InputError(f"TwistTask: rotation_length must be one or three positive lengths [m], got {rotation_length}")
+    weights = np.concatenate([np.ones(3), lengths])
+    scale = np.outer(weights, arm.max_velocity if scaled else np.ones(arm.n_joints))
+    for array in (weights, scale):
+        array.setflags(write=False)
+    effort = min(1.0, float(lengths.min()) / ROTATION_LENGTH) ** 2
+    return weights, scale, effort, arm.site(frame)
+
+
+@lru_cache(maxsize=64)
+def _scaled_eye(n: int, factor: float) -> Array:
+    eye = factor * np.eye(n)
+    eye.setflags(write=False)
+    return eye
