@@ -214,12 +214,12 @@ def scene_at_a_time() -> Row:
     scene = Scene(None, tuple(Sphere(o.center, o.radius, velocity=(0.1, 0.0, 0.0)) for o in still.obstacles))  # type: ignore[attr-defined]
 
     def check() -> tuple[bool, str]:
-        moved = scene.after(0.5).obstacles[0].center - still.obstacles[0].center  # type: ignore[attr-defined]
+        moved = scene.at(0.5).obstacles[0].center - still.obstacles[0].center  # type: ignore[attr-defined]
         return bool(np.allclose(moved, [0.05, 0.0, 0.0])), "moves by velocity times time"
 
     return Row(
         "ten obstacles at another time",
-        lambda: scene.after(0.5),
+        lambda: scene.at(0.5),
         mink_step(),
         f"{named('mink')}, step",
         cost=0.9,  # a third of what rows of covering spheres took

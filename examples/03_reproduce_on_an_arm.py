@@ -62,7 +62,7 @@ def main() -> None:
 
     # `observe` answers what stands where at a time; here the scene as it is, with whatever moves moved on.
     # With link_clearance no link may come nearer than this either, whatever the plan of the tool says.
-    rollout = reproduce(policy, robot, scene.after, timeout=40.0, link_clearance=CLEARANCE, on_step=watch)
+    rollout = reproduce(policy, robot, scene.at, timeout=40.0, link_clearance=CLEARANCE, on_step=watch)
     rollout = task.judge(robot, rollout)  # the task's own verdict: is the dirt in the pan?
 
     adaptation = policy.adaptation

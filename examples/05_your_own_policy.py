@@ -96,7 +96,7 @@ def main() -> None:
             for barrier in (None, 0.01):
                 robot = SimulatedRobot(arm, scene=scene, q=find_posture(arm, start))
                 policy = make(skill, tool_radius=arm.tool_radius)
-                rollout = reproduce(policy, robot, scene.after, timeout=6.0, link_clearance=barrier)
+                rollout = reproduce(policy, robot, scene.at, timeout=6.0, link_clearance=barrier)
                 near = f"clearance {1e3 * rollout.min_clearance:.0f} mm, " if scene.obstacles else ""
                 held = "" if barrier is None else " with links kept clear"
                 print(f"  {key}{held}: {near}{rollout.trajectory.duration:.1f} s, {rollout.reason}")

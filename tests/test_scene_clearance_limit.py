@@ -79,7 +79,7 @@ def test_every_near_pair_has_its_row(arm, seed, spin):
     rows = ClearanceLimit(arm, 0.02, rate=5.0, influence=0.1).rows(q, scene)
     expected = all_rows(arm, q, scene, 0.02, 5.0, 0.1)
     assert len(expected[1]) > 10
-    np.testing.assert_allclose(sorted_rows(*rows), sorted_rows(*expected), atol=1e-8)
+    np.testing.assert_allclose(sorted_rows(rows.matrix, rows.lower), sorted_rows(*expected), atol=1e-8)
 
 
 @pytest.mark.parametrize("spin", [[0, 0, 0], [0.5, -0.8, 1.0]])

@@ -81,7 +81,7 @@ def try_scene(
         done = reproduce(
             policy,
             robot,
-            scene.after,
+            scene.at,
             dt=CONTROL_PERIOD,
             link_clearance=link_clearance,
             timeout=PATIENCE * policy.skill.duration_,
