@@ -13,7 +13,7 @@ from imitarm.capture import kinect
 from imitarm.capture.filters import SwapGuard
 from imitarm.capture.kinect import AzureKinectSource, KinectV2Source
 from imitarm.capture.skeleton import JOINT, JOINTS, HandState, Tracking
-from imitarm.capture.sources import live, open_source
+from imitarm.capture.sources import is_live, open_source
 from imitarm.errors import InputError, TaskFailedError
 from recording_samples import skeletons
 
@@ -94,7 +94,7 @@ def test_a_kinect_v2_gives_the_joints_hands_and_times_of_its_sdk(kinect_next):
             assert np.array_equal(seen.tracking, truth.tracking)
         assert {s.person for s in got} == {0} and got[0].hand_states == (HandState.OPEN, HandState.CLOSED)
         assert np.diff([s.time for s in got]) == pytest.approx(1 / 30, abs=1e-6)
-    assert kinect_next.closed == 1 and source.over and source.read(0.0) is None and live("kinect2")
+    assert kinect_next.closed == 1 and source.over and source.read(0.0) is None and is_live("kinect2")
 
 
 def test_a_hand_that_the_sdk_is_not_sure_of_is_unknown(kinect_next):
@@ -263,7 +263,7 @@ def test_an_azure_kinect_gives_our_joints_axes_and_metres(azure):
     with open_source("azure") as source:
         got = [source.read() for _ in TRUTH]
         assert azure.live == {"device", "tracker"}  # every picture and every frame was let go
-    assert azure.live == set() and live("azure")
+    assert azure.live == set() and is_live("azure")
     for seen, truth in zip(got, TRUTH, strict=True):
         assert np.allclose(seen.positions, truth.positions, atol=1e-9, equal_nan=True)
         assert np.array_equal(seen.tracking, truth.tracking)

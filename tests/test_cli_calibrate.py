@@ -103,7 +103,7 @@ def test_limbs_that_are_not_known_well_enough_are_not_written(inside, capsys):
         shaken.append(Skeleton(s.time, positions))
     SkeletonRecording(shaken).save("a.csv")
     assert main(["calibrate", "limbs", "a.csv"]) == 1
-    assert "mm only, 5 mm are needed" in capsys.readouterr().err
+    assert "mm, at most 5 mm are accepted" in capsys.readouterr().err
     SkeletonRecording(shaken[:3]).save("b.csv")
     assert main(["calibrate", "limbs", "b.csv"]) == 1
     assert "fully tracked in 3 of 3 frames" in capsys.readouterr().err
@@ -123,7 +123,7 @@ def test_a_live_person_is_told_what_to_do_and_tried_again(inside, monkeypatch, c
     left = answers(monkeypatch, "", "")
     assert main(["calibrate", "limbs", "webcam:0", "--seconds", "1"]) == 0
     text = capsys.readouterr().err
-    assert "facing it" in text and "Once more" in text and text.count("Press Enter to measure for 1 s") == 2
+    assert "facing it" in text and "Try again" in text and text.count("Press Enter to measure for 1 s") == 2
     assert not left and source.closed
 
 
@@ -185,7 +185,7 @@ def test_a_column_that_is_missing_is_named(inside, capsys):
     assert main(["calibrate", "sensor", "pairs.csv"]) == 2
     assert "has no column 'base_z'" in capsys.readouterr().err
     assert main(["calibrate", "sensor"]) == main(["calibrate", "sensor", "--points", "pairs.csv"]) == 2
-    assert "to be guided" in capsys.readouterr().err
+    assert "guided calibration" in capsys.readouterr().err
 
 
 def test_the_guided_way(inside, monkeypatch, capsys):
@@ -199,7 +199,7 @@ def test_a_hand_that_moves_or_is_not_seen_is_measured_again(inside, monkeypatch,
     places = [(POINTS[0], 0.05, Tracking.TRACKED), (POINTS[0], 0.0, Tracking.INFERRED), *POINTS]
     assert touching(monkeypatch, [""] * 7, places) == 0
     text = capsys.readouterr().err
-    assert "the hand moved by 5.0 cm; hold it still. Once more" in text
+    assert "the hand moved by 5.0 cm; hold it still. Try again" in text
     assert "the right hand was seen in 0 of" in text
 
 
@@ -215,7 +215,7 @@ def test_a_point_may_be_skipped_but_not_too_many(inside, monkeypatch, capsys):
     assert touching(monkeypatch, ["s", "s", "", "", ""], POINTS) == 2
     assert "3 points were measured, at least 4" in capsys.readouterr().err
     assert touching(monkeypatch, ["", "q"], POINTS) == 2
-    assert "given up" in capsys.readouterr().err
+    assert "stopped by the user" in capsys.readouterr().err
     assert touching(monkeypatch, [""], POINTS) == 2
     assert "input ended" in capsys.readouterr().err
 
@@ -226,7 +226,7 @@ def test_a_point_may_be_skipped_but_not_too_many(inside, monkeypatch, capsys):
 def test_the_clutch_by_options_and_by_answers(inside, monkeypatch, capsys):
     Calibration(lengths=None).save("calibration.json")
     assert main(["calibrate", "clutch", "--anchor", "shoulder", "--orientation", "fixed"]) == 2
-    assert "needs your arm's lengths; say 'imitarm calibrate limbs" in capsys.readouterr().err
+    assert "needs your arm's lengths; run 'imitarm calibrate limbs" in capsys.readouterr().err
     assert main(["calibrate", "clutch", "--scale", "0.5", "--orientation", "fixed"]) == 0
     assert (Calibration.load("calibration.json").scale, Calibration.load("calibration.json").orientation) == (
         0.5,
@@ -238,7 +238,7 @@ def test_the_clutch_by_options_and_by_answers(inside, monkeypatch, capsys):
         1.0,
         "upright",
     )
-    assert "'neither' is none of them" in capsys.readouterr().err
+    assert "'neither' is not a choice" in capsys.readouterr().err
     assert main(["calibrate", "clutch", "--scale", "1", "--anchor", "object"]) == 2
     assert main(["calibrate", "clutch", "--scale", "70", "--orientation", "hand"]) == 2
     assert "scale must be between" in capsys.readouterr().err

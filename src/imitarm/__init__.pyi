@@ -1,5 +1,5 @@
 from .benchmark.experiment import Experiment, Result
-from .capture import Skeleton, SkeletonSource
+from .capture import SOURCES, Skeleton, SkeletonSource
 from .control_loop import reproduce
 from .demonstrations import Finding, align, lint, read
 from .errors import ImitarmError, InfeasibleError, InputError, TaskFailedError, UnreachableError
@@ -38,6 +38,7 @@ __all__ = [
     "NOT_DOWN",
     "POLICIES",
     "RETARGETERS",
+    "SOURCES",
     "Adaptation",
     "ArmModel",
     "ArmState",

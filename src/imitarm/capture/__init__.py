@@ -1,5 +1,25 @@
-"""How a person becomes numbers: skeletons, and the sources they come from."""
+"""How a person becomes numbers: skeletons, and the sources they come from.
+
+``SOURCES`` is the registry: a new source is one class and one line here, or one line in the entry points of another
+package (group ``imitarm.sources``). It then appears in every command that takes a source, and in its ``--help``.
+"""
 
 from imitarm.capture.skeleton import Arm, HandState, Skeleton, SkeletonSource, Tracking
+from imitarm.registry import Registry
 
-__all__ = ["Arm", "HandState", "Skeleton", "SkeletonSource", "Tracking"]
+SOURCES: Registry[type[SkeletonSource]] = Registry(
+    "source",
+    "imitarm.sources",
+    {
+        "file": "imitarm.capture.recording:SkeletonRecording",
+        "synthetic": "imitarm.capture.synthetic:SyntheticSource",
+        "udp": "imitarm.capture.stream:UdpSource",
+        "video": "imitarm.capture.mediapipe:VideoSource",
+        "webcam": "imitarm.capture.mediapipe:WebcamSource",
+        "kinect2": "imitarm.capture.kinect:KinectV2Source",
+        "azure": "imitarm.capture.kinect:AzureKinectSource",
+    },
+)
+"""All sources by name; a user writes ``NAME`` or ``NAME:ARGUMENT``, and for ``file`` just the file's name."""
+
+__all__ = ["SOURCES", "Arm", "HandState", "Skeleton", "SkeletonSource", "Tracking"]

@@ -1,4 +1,4 @@
-"""Sources that filter another source: one person of several, with left and right kept apart."""
+"""Sources that filter another source: one person of several, left and right kept apart, in real time."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class PersonFilter(SkeletonSource):
     def __init__(self, source: SkeletonSource, *, person: int | None = None, patience: float = PATIENCE) -> None:
         if not patience >= 0.0:
             raise InputError(f"PersonFilter: patience must be at least 0 s, got {patience!r}")
-        self.name = source.name
+        self.name, self.live = source.name, source.live
         self.followed: int | None = None
         self.passed_over = 0
         self._source, self._only, self._patience = source, person, patience
@@ -248,7 +248,7 @@ class SwapGuard(SkeletonSource):
     """
 
     def __init__(self, source: SkeletonSource) -> None:
-        self.name = source.name
+        self.name, self.live = source.name, source.live
         self._source = source
         self._memory: dict[int, SideMemory] = {}
 
@@ -272,3 +272,43 @@ class SwapGuard(SkeletonSource):
         if skeleton is None:
             return None
         return self._memory.setdefault(skeleton.person, SideMemory()).update(skeleton)
+
+
+class RealtimeSource(SkeletonSource):
+    """A source that gives each skeleton no earlier than its time, counted from the first one.
+
+    Args:
+        source: gives skeletons as fast as they are asked for.
+    """
+
+    def __init__(self, source: SkeletonSource) -> None:
+        self.name, self.live = source.name, source.live
+        self._source = source
+        self._waiting: Skeleton | None = None
+        self._start: float | None = None  # on the monotonic clock, of time 0
+
+    @property
+    def over(self) -> bool:
+        """Whether the source is over."""
+        return self._waiting is None and self._source.over
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
+
+    def read(self, timeout: float = 1.0) -> Skeleton | None:
+        """Return the next skeleton; None when none is due within ``timeout`` seconds."""
+        until = clock.monotonic() + timeout
+        if self._waiting is None:
+            self._waiting = self._source.read(timeout)
+        skeleton = self._waiting
+        if skeleton is None:
+            return None
+        if self._start is None:
+            self._start = clock.monotonic() - skeleton.time
+        due = self._start + skeleton.time
+        clock.sleep(max(min(due, until) - clock.monotonic(), 0.0))
+        if due > until:
+            return None
+        self._waiting = None
+        return skeleton

@@ -33,6 +33,8 @@ class BodyCamera(SkeletonSource):
         name: for messages.
     """
 
+    live = True
+
     def __init__(self) -> None:
         self._waiting: deque[Skeleton] = deque()
         self._over, self._silent = False, 0.0
@@ -136,6 +138,7 @@ class KinectV2Source(BodyCamera):
     """
 
     name = "kinect2"
+    description = "all persons in front of a Kinect v2"
 
     def __init__(self) -> None:
         super().__init__()
@@ -221,6 +224,7 @@ class AzureKinectSource(BodyCamera):
     """
 
     name = "azure"
+    description = "all persons in front of an Azure Kinect"
 
     def __init__(self) -> None:
         super().__init__()

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.capture.mediapipe_environment import LineProcess, find_python
-from imitarm.capture.skeleton import JOINTS, SIDES, Skeleton, SkeletonSource, Tracking
+from imitarm.capture.skeleton import JOINTS, SIDES, Skeleton, SkeletonSource, Tracking, whole_number
 from imitarm.errors import InputError, TaskFailedError
 
 Array = NDArray[np.float64]
@@ -358,6 +358,42 @@ class MediaPipeSource(SkeletonSource):
         """Close, and return the error that says why."""
         self.close()
         return TaskFailedError(f"{self._shown_name}: {why}; {self.images} images were processed before")
+
+
+class VideoSource(MediaPipeSource):
+    """The person in a video file."""
+
+    argument = "FILE"
+    description = "the person in a video, by MediaPipe"
+    has_realtime = True
+
+    @classmethod
+    def open(cls, argument: str, *, realtime: bool = False) -> VideoSource:
+        """Open the video file that a user wrote after the colon.
+
+        Raises:
+            InputError: when there is no such file, it is not a video, or MediaPipe is not installed.
+        """
+        if not Path(argument).is_file():
+            raise InputError(f"source video:{argument}: there is no such file; check the path")
+        return cls(argument, realtime=realtime)
+
+
+class WebcamSource(MediaPipeSource):
+    """The person in front of a webcam."""
+
+    argument = "NUMBER"
+    description = "the person in front of a webcam, by MediaPipe; 0 is the first webcam"
+    live = True
+
+    @classmethod
+    def open(cls, argument: str, *, realtime: bool = False) -> WebcamSource:
+        """Open the webcam whose number a user wrote after the colon.
+
+        Raises:
+            InputError: when it is not a number, there is no such webcam, or MediaPipe is not installed.
+        """
+        return cls(whole_number("webcam", cls.argument, argument, 63))
 
 
 def _text(words: list[bytes]) -> str:

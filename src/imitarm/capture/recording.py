@@ -50,6 +50,10 @@ class SkeletonRecording(SkeletonSource):
         time_unit: as given.
     """
 
+    argument = "FILE"
+    description = "a recording: imitarm's own format, a Kinect SDK table, or motion capture"
+    has_realtime = True
+
     def __init__(
         self,
         skeletons: Iterable[Skeleton],
@@ -65,6 +69,11 @@ class SkeletonRecording(SkeletonSource):
         self.name = name
         self._realtime = realtime
         self.rewind()
+
+    @classmethod
+    def open(cls, argument: str, *, realtime: bool = False) -> SkeletonRecording:
+        """Read a recording; as :func:`read_recording`."""
+        return read_recording(argument, realtime=realtime)
 
     def __len__(self) -> int:
         return len(self.skeletons)

@@ -196,6 +196,17 @@ class Skeleton:
         )
 
 
+def whole_number(word: str, what: str, text: str, largest: int) -> int:
+    """Return the number that a user wrote after the colon of a source.
+
+    Raises:
+        InputError: when it is not a whole number from 0 to ``largest``.
+    """
+    if not text.isdecimal() or int(text) > largest:
+        raise InputError(f"source {word}:{text}: {what} must be a whole number from 0 to {largest}")
+    return int(text)
+
+
 class SkeletonSource(ABC):
     """Where skeletons come from: a recording, a camera, a stream, a synthetic person.
 
@@ -205,11 +216,42 @@ class SkeletonSource(ABC):
             for skeleton in source:
                 ...
 
+    A source of your own is a class that derives from this one and implements :meth:`read` and :attr:`over`::
+
+        class GloveSource(SkeletonSource):
+            argument, description, live = "PORT", "a data glove at a serial port", True
+
+    and a line in your package's ``pyproject.toml``, by which every command of imitarm accepts ``glove:PORT``::
+
+        [project.entry-points."imitarm.sources"]
+        glove = "my_package.glove:GloveSource"
+
     Attributes:
-        name: for messages and for what is recorded, for example the file's name.
+        name: for messages and for recordings, for example the file's name.
+        argument: what a user writes after the colon, for example ``"SEED"``; empty: there is no colon.
+        description: one line for ``--help``.
+        live: whether the source goes on until it is stopped.
+        has_realtime: whether :meth:`open` itself heeds ``realtime``; if not, the commands delay its skeletons.
     """
 
     name: str = "skeletons"
+    argument: str = ""
+    description: str = ""
+    live: bool = False
+    has_realtime: bool = False
+
+    @classmethod
+    def open(cls, argument: str, *, realtime: bool = False) -> SkeletonSource:
+        """Open the source for what a user wrote after the colon; by default it is passed to the constructor.
+
+        Args:
+            argument: what stands after the colon; empty when :attr:`argument` is.
+            realtime: for a source that is not live: give each skeleton when it is due.
+
+        Raises:
+            InputError: when the argument is wrong, or a device or a program is missing.
+        """
+        return cls(*((argument,) if cls.argument else ()))
 
     @abstractmethod
     def read(self, timeout: float = 1.0) -> Skeleton | None:

@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from imitarm.capture.skeleton import HandState, Skeleton, SkeletonSource, Tracking
+from imitarm.capture.skeleton import HandState, Skeleton, SkeletonSource, Tracking, whole_number
 from imitarm.transmission.datagram import Encoder, now_ns
 from imitarm.transmission.gate import Gate
 from imitarm.transmission.messages import SkeletonFrame
@@ -112,6 +112,10 @@ class UdpSource(SkeletonSource):
         InputError: when the port is taken, or the address is not one of this machine's.
     """
 
+    argument = "PORT"
+    description = "what 'imitarm capture --send' sends; udp:ADDRESS:PORT hears other machines too"
+    live = True
+
     def __init__(self, port: int, host: str = LOOPBACK, *, clock_ns: Callable[[], int] = now_ns) -> None:
         self._socket = listening((host, port))
         self.address: Address = self._socket.getsockname()
@@ -122,6 +126,17 @@ class UdpSource(SkeletonSource):
         self._sessions, self._shift = 1, 0.0
         self._time = 0.0  # of the last skeleton
         self._closed = False
+
+    @classmethod
+    def open(cls, argument: str, *, realtime: bool = False) -> UdpSource:
+        """Listen on the port, and address, that a user wrote after the colon.
+
+        Raises:
+            InputError: when the port is not a number, is taken, or the address is not one of this machine's.
+        """
+        host, colon, port = argument.rpartition(":")
+        number = whole_number("udp", cls.argument, port, 65535)
+        return cls(number, host) if colon else cls(number)
 
     @property
     def over(self) -> bool:

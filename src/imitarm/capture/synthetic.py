@@ -9,7 +9,7 @@ from functools import partial
 from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.motions import DRAWINGS, REACHES, Truth, drawing, reaching
 from imitarm.capture.person import Person
-from imitarm.capture.skeleton import Skeleton, SkeletonSource
+from imitarm.capture.skeleton import Skeleton, SkeletonSource, whole_number
 from imitarm.errors import InputError, UnknownNameError
 
 MOTIONS: dict[str, Callable[..., Truth]] = {
@@ -41,6 +41,10 @@ class SyntheticSource(SkeletonSource):
     Raises:
         InputError: when the duration is not positive, or longer than a day.
     """
+
+    argument = "SEED"
+    description = "a synthetic person in front of a simulated camera, which has the errors of a real one"
+    has_realtime = True
 
     def __init__(
         self,
@@ -78,6 +82,15 @@ class SyntheticSource(SkeletonSource):
         truth = MOTIONS[kind](Person.from_seed(seed), seed, duration=duration)
         name = f"synthetic:{seed}" if kind == "inside" else f"synthetic:{seed}:{kind}"
         return cls(truth, SkeletonCamera.from_seed(seed), duration, realtime=realtime, name=name)
+
+    @classmethod
+    def open(cls, argument: str, *, realtime: bool = False) -> SyntheticSource:
+        """Return the synthetic person whose seed a user wrote after the colon.
+
+        Raises:
+            InputError: when it is not a whole number.
+        """
+        return cls.from_seed(whole_number("synthetic", cls.argument, argument, 2**31 - 1), realtime=realtime)
 
     @property
     def over(self) -> bool:

@@ -1,4 +1,4 @@
-"""``imitarm calibrate``: the person's limbs, the sensor's place, the clutch; step by step, into one file."""
+"""``imitarm calibrate``: measure limbs, locate the sensor, choose scale and orientation; all in one file."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
-from imitarm.capture.sources import followed, live, open_source
-from imitarm.cli.gathering import add_side_and_person, gather, source_help
-from imitarm.cli.guiding import ask, choose, touched_points
+import numpy as np
+
+from imitarm.capture.skeleton import JOINT, SkeletonSource, Tracking
+from imitarm.capture.sources import followed, is_live, open_source
 from imitarm.cli.outputs import check_outputs
+from imitarm.cli.person import add_side_and_person, add_source, gather
 from imitarm.cli.robot_options import add_robot_options, load_robot
 from imitarm.cli.screen import remark, say, show_table
 from imitarm.errors import InputError, TaskFailedError
@@ -19,7 +21,9 @@ from imitarm.files.table import read_table
 from imitarm.retarget.calibration import ANCHORS, Anchor, Calibration, suggested_scale
 from imitarm.retarget.correspondence import Orientation
 from imitarm.retarget.limbs import ACCEPTED, LimbLengths, measure_limbs
-from imitarm.retarget.sensor import SensorFit, fit_sensor_to_base
+from imitarm.retarget.sensor import LEAST_PAIRS, SensorFit, fit_sensor_to_base
+
+Word = TypeVar("Word", bound=str)
 
 EPILOG = """\
 examples:
@@ -27,43 +31,50 @@ examples:
   imitarm calibrate sensor pairs.csv
   imitarm calibrate clutch --robot sawyer --anchor shoulder --orientation upright
 
-Each adds to the calibration file what it measures and leaves the rest of it as it is.
+Each step adds its result to the calibration file and leaves the rest of the file unchanged.
 """
 
 _PAIRS = ("sensor_x", "sensor_y", "sensor_z", "base_x", "base_y", "base_z")
 _ORIENTATIONS: dict[Orientation, str] = {
-    "hand": "the tool turns as the hand does",
-    "upright": "the tool turns with the hand about the vertical only",
-    "fixed": "the tool does not turn",
+    "hand": "the tool rotates as the hand does",
+    "upright": "the tool rotates with the hand about the vertical axis only",
+    "fixed": "the tool does not rotate",
 }
 _ANCHORS: dict[Anchor, str] = {
-    "shoulder": "your stretched arm is the robot's stretched arm: all of its workspace, coarser",
-    "object": "a centimetre is a centimetre: for work on things you both have before you",
+    "shoulder": "your stretched arm is the robot's stretched arm: the whole workspace, less precise",
+    "object": "1 cm of the hand is 1 cm of the tool: for objects that you and the robot both have in front of you",
 }
 _TRIES = 3
+_STILL = 0.015  # [m] largest standard deviation of a hand that is held still, with the camera's noise
+_SEEN = 0.5  # least fraction of frames with the hand
+_LEAST_FRAMES = 5
 _STEPS = (
-    "1. Stand 1.5 to 3 m before the sensor, facing it, alone in the picture.",
-    "2. Hold the {side} arm away from the body, the elbow bent, nothing before it.",
+    "1. Stand 1.5 to 3 m in front of the sensor, facing it, alone in view.",
+    "2. Hold the {side} arm away from the body, the elbow bent, with nothing between arm and sensor.",
     "3. Move it slowly while it is measured.",
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes."""
-    kinds = parser.add_subparsers(dest="what", metavar="WHAT", required=True, title="what")
-    limbs = kinds.add_parser("limbs", help="measure upper arm and forearm")
-    limbs.add_argument("source", metavar="SOURCE", help=source_help())
-    limbs.add_argument("--seconds", type=float, default=5.0, metavar="S", help="of a live source; default: 5")
-    sensor = kinds.add_parser("sensor", help="find where the sensor is, from points that were touched")
+    """Add the command's arguments."""
+    kinds = parser.add_subparsers(dest="what", metavar="WHAT", required=True, title="steps")
+    limbs = kinds.add_parser("limbs", help="measure the lengths of upper arm and forearm")
+    add_source(limbs)
+    limbs.add_argument(
+        "--seconds", type=float, default=5.0, metavar="S", help="duration, for a live source; default: 5"
+    )
+    sensor = kinds.add_parser(
+        "sensor", help="locate the sensor in the robot's base frame, from points that a hand touches"
+    )
     sensor.add_argument(
         "pairs", nargs="?", metavar="PAIRS", help=f"table of points in both frames: {', '.join(_PAIRS)} [m]"
     )
-    sensor.add_argument("--source", metavar="SOURCE", help="guided: measure the hand with this source")
+    add_source(sensor, "--source", "guided: measure the hand with this source; ")
     sensor.add_argument("--points", metavar="FILE", help="guided: points in the robot's base frame, x y z [m]")
-    sensor.add_argument("--seconds", type=float, default=1.0, metavar="S", help="guided: of each point; default: 1")
-    clutch = kinds.add_parser("clutch", help="choose scale and turning; asks for what is not given")
+    sensor.add_argument("--seconds", type=float, default=1.0, metavar="S", help="guided: for each point; default: 1")
+    clutch = kinds.add_parser("clutch", help="choose scale and orientation; asks for what is not given")
     add_robot_options(clutch)
-    clutch.add_argument("--scale", type=float, metavar="RHO", help="robot's motion over person's motion")
+    clutch.add_argument("--scale", type=float, metavar="RHO", help="motion of the tool over motion of the hand")
     clutch.add_argument("--anchor", choices=ANCHORS, help="suggest a scale: " + _listed(_ANCHORS))
     clutch.add_argument("--orientation", choices=get_args(Orientation), help=_listed(_ORIENTATIONS))
     for one in (limbs, sensor):
@@ -79,11 +90,11 @@ def _listed(choices: Mapping[Any, str]) -> str:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, say how well it is known, write.
+    """Measure, print the result and its accuracy, write it.
 
     Raises:
         InputError: when an option or a file is wrong, or the points can't be used.
-        TaskFailedError: when what was measured is not good enough to be kept.
+        TaskFailedError: when the measurement is not accurate enough.
     """
     out: Path = arguments.out
     read = (("source", "SOURCE"), ("pairs", "PAIRS"), ("points", "--points"), ("robot", "--robot"), ("tool", "--tool"))
@@ -100,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _limbs(arguments: argparse.Namespace, before: Calibration) -> Calibration:
-    going_on = live(arguments.source)
+    going_on = is_live(arguments.source)
     side = arguments.side
     with followed(open_source(arguments.source), person=arguments.person) as source:
         if going_on:
@@ -115,17 +126,17 @@ def _limbs(arguments: argparse.Namespace, before: Calibration) -> Calibration:
                 if lengths.accepted:
                     break
                 fault = (
-                    f"limb lengths: known to {1e3 * lengths.standard_error:.0f} mm only, "
-                    f"{1e3 * ACCEPTED:.0f} mm are needed; measure for longer, in better light"
+                    f"limb lengths: the standard error is {1e3 * lengths.standard_error:.0f} mm, at most "
+                    f"{1e3 * ACCEPTED:.0f} mm are accepted; measure for longer, in better light"
                 )
             except InputError as error:
                 fault = str(error)
             if left == 0:
                 raise TaskFailedError(f"{fault}. Nothing was written")
-            remark(f"{fault}. Once more:")
+            remark(f"{fault}. Try again:")
     _show_limbs(lengths, side)
     if before.lengths is not None and before.side != side:
-        remark(f"the {before.side} arm's lengths were in the file; it is now about the {side} arm")
+        remark(f"the {before.side} arm's lengths were in the file; they are replaced by those of the {side} arm")
     return replace(before, side=side, lengths=lengths)
 
 
@@ -147,7 +158,7 @@ def _show_limbs(lengths: LimbLengths, side: str) -> None:
 def _sensor(arguments: argparse.Namespace, before: Calibration) -> Calibration:
     guided = arguments.source is not None or arguments.points is not None
     if guided == (arguments.pairs is not None):
-        raise InputError("sensor: give either PAIRS, or --source and --points to be guided")
+        raise InputError("sensor: give either PAIRS, or --source and --points for a guided calibration")
     fit = _guided(arguments) if guided else fit_sensor_to_base(*_read_pairs(arguments.pairs))
     _show_sensor(fit)
     if not fit.accepted:
@@ -162,7 +173,7 @@ def _read_pairs(path: str) -> tuple[list[list[float]], list[list[float]]]:
 
 
 def _columns(path: str, names: Sequence[str]) -> list[list[float]]:
-    """Return columns of a table, by their names where it has some."""
+    """Return columns of a table: by their names if it has names, else in the given order."""
     table = read_table(path)
     if table.names is not None:
         lower = [name.lower() for name in table.names]
@@ -178,9 +189,9 @@ def _columns(path: str, names: Sequence[str]) -> list[list[float]]:
 
 
 def _guided(arguments: argparse.Namespace) -> SensorFit:
-    """Let the user touch the points, and those once more that do not fit."""
+    """Let the user touch the points, and touch those again that do not fit."""
     if arguments.source is None or arguments.points is None:
-        raise InputError("sensor: to be guided, give both --source and --points")
+        raise InputError("sensor: a guided calibration needs both --source and --points")
     points = _columns(arguments.points, ("x", "y", "z"))
     with followed(open_source(arguments.source, realtime=True), person=arguments.person) as source:
         seen = touched_points(source, points, arguments.side, arguments.seconds)
@@ -190,7 +201,7 @@ def _guided(arguments: argparse.Namespace) -> SensorFit:
             if fit.suspect is None:
                 break
             number = at[fit.suspect]
-            remark(f"point {number + 1} is {1e2 * fit.residuals[fit.suspect]:.1f} cm off; touch it once more")
+            remark(f"point {number + 1} is {1e2 * fit.residuals[fit.suspect]:.1f} cm off; touch it again")
             seen |= touched_points(source, points, arguments.side, arguments.seconds, only=number)
     return fit
 
@@ -201,8 +212,8 @@ def _show_sensor(fit: SensorFit) -> None:
         ["sensor", "in the robot's base frame"],
         [
             ("position", f"{x:.1f} {y:.1f} {z:.1f} cm"),
-            ("points missed by", f"{1e2 * fit.rms:.2f} cm (root mean square), at most {1e2 * fit.residuals.max():.2f}"),
-            ("rotation known to", f"{57.29578 * fit.angle_error:.2f} degrees (condition {fit.condition:.1f})"),
+            ("residuals of the points", f"{1e2 * fit.rms:.2f} cm (RMS), {1e2 * fit.residuals.max():.2f} at most"),
+            ("error of the rotation", f"{57.29578 * fit.angle_error:.2f} degrees (condition {fit.condition:.1f})"),
         ],
     )
     for note in fit.notes():
@@ -216,14 +227,14 @@ def _clutch(arguments: argparse.Namespace, before: Calibration) -> Calibration:
     scale: float | None = arguments.scale
     anchor: Anchor | None = arguments.anchor
     if scale is not None and anchor is not None:
-        raise InputError("clutch: --scale says it, --anchor suggests it; keep one")
+        raise InputError("clutch: --scale and --anchor both set the scale; give one of them")
     if scale is None:
         if anchor is None:
-            remark("When you take hold, the tool stays where it is and from then on follows your hand.")
-            anchor = choose("What should a motion of the hand be worth?", _ANCHORS)
+            remark("When you engage, the tool stays where it is; from then on it follows your hand.")
+            anchor = choose("How far should the tool move when the hand moves?", _ANCHORS)
         if anchor == "shoulder" and before.lengths is None:
             raise InputError(
-                f"{arguments.out}: a scale for the whole reach needs your arm's lengths; say 'imitarm calibrate limbs "
+                f"{arguments.out}: a scale for the whole reach needs your arm's lengths; run 'imitarm calibrate limbs "
                 "SOURCE' first, or give --scale"
             )
         scale = 1.0
@@ -231,13 +242,115 @@ def _clutch(arguments: argparse.Namespace, before: Calibration) -> Calibration:
             scale = suggested_scale(load_robot(arguments), before.lengths, anchor)
     orientation: Orientation | None = arguments.orientation
     if orientation is None:
-        orientation = choose("How should the tool turn?", _ORIENTATIONS)
+        orientation = choose("How should the tool rotate?", _ORIENTATIONS)
     after = replace(before, scale=float(scale), orientation=orientation)
     show_table(
         ["clutch", ""],
         [
             ("scale", f"{scale:.2f}: 10 cm of the hand are {10 * scale:.1f} cm of the tool"),
-            ("turning", _ORIENTATIONS[orientation]),
+            ("orientation", _ORIENTATIONS[orientation]),
         ],
     )
     return after
+
+
+# --- questions, and points that are touched
+
+
+def ask(question: str) -> str:
+    """Show a question and return the answer, in lower case.
+
+    Raises:
+        InputError: when nobody can answer, because input has ended.
+    """
+    remark(question)
+    try:
+        return input().strip().lower()
+    except EOFError as error:
+        raise InputError(
+            "input ended before the question was answered; run it in a terminal, or give options"
+        ) from error
+
+
+def choose(question: str, choices: Mapping[Word, str]) -> Word:
+    """Ask until the answer is one of the choices: its number, or the beginning of its name.
+
+    Raises:
+        InputError: when nobody can answer.
+    """
+    names = list(choices)
+    for i, name in enumerate(names, start=1):
+        question += f"\n  {i} {name}: {choices[name]}"
+    while True:
+        answer = ask(question)
+        fitting = [n for i, n in enumerate(names, start=1) if answer and (n.startswith(answer) or answer == str(i))]
+        if len(fitting) == 1:
+            return fitting[0]
+        question = f"{answer!r} is not a choice; type {', '.join(names)}, or a number"
+
+
+def touched_points(
+    source: SkeletonSource,
+    points: Sequence[Sequence[float]],
+    side: str,
+    seconds: float,
+    *,
+    only: int | None = None,
+) -> dict[int, list[float]]:
+    """Let the user put a hand on the robot's tool at one point after the other, and measure the hand's position there.
+
+    A hand that moved or was not seen is measured again.
+
+    Args:
+        source: sees the hand; live, or replayed in real time.
+        points: in the robot's base frame, shape (n, 3) [m].
+        side: of the hand.
+        seconds: of each measurement.
+        only: the one point to touch, from 0; None: all.
+
+    Returns:
+        position of the hand in the sensor's frame, shape (3,) [m], for each point that was not skipped, from 0.
+
+    Raises:
+        InputError: when the user gives up, the source is over, or fewer than four points are left.
+    """
+    wanted = range(len(points)) if only is None else [only]
+    if only is None:
+        if len(points) < LEAST_PAIRS:
+            raise InputError(f"sensor calibration: {len(points)} points, at least {LEAST_PAIRS} are needed; add more")
+        remark(f"{len(points)} points. At each: bring the robot's tool there, put the palm of your {side} hand on its")
+        remark("tip so that the sensor sees the hand, hold still, press Enter. 's' skips a point, 'q' quits.")
+    seen: dict[int, list[float]] = {}
+    for i in wanted:
+        place = " ".join(f"{100 * value:.1f}" for value in points[i])
+        while True:
+            answer = ask(f"Point {i + 1} of {len(points)}: tool at {place} cm, hand on it, Enter")
+            if answer == "q":
+                raise InputError("sensor calibration: stopped by the user; nothing was written")
+            if answer == "s":
+                break
+            hand, fault = _measured(source, side, seconds)
+            if hand is not None:
+                seen[i] = hand
+                break
+            if source.over:
+                raise InputError(f"sensor calibration: {source.name} is over at point {i + 1}; use a live source")
+            remark(f"{fault}. Try again:")
+    if only is None and len(seen) < LEAST_PAIRS:
+        raise InputError(f"sensor calibration: {len(seen)} points were measured, at least {LEAST_PAIRS} are needed")
+    return seen
+
+
+def _measured(source: SkeletonSource, side: str, seconds: float) -> tuple[list[float] | None, str]:
+    """Return the position of the hand (3,) [m], or None and the reason."""
+    while source.read(0.0) is not None:  # skeletons from before Enter
+        pass
+    taken, _ = gather(source, seconds, "measuring", live=True)
+    index = JOINT[f"hand_{side}"]
+    hands = np.array([s.positions[index] for s in taken if s.tracking[index] == Tracking.TRACKED])
+    if len(hands) < max(_LEAST_FRAMES, _SEEN * len(taken)):
+        return None, f"the {side} hand was seen in {len(hands)} of {len(taken)} frames; turn it to the sensor"
+    spread = float(np.sqrt(np.var(hands, axis=0).max()))
+    if spread > _STILL:
+        return None, f"the hand moved by {100 * spread:.1f} cm; hold it still"
+    return [float(x) for x in np.median(hands, axis=0)], ""

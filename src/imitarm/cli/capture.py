@@ -14,10 +14,10 @@ from imitarm.capture.filters import PersonFilter
 from imitarm.capture.issue import RecordingIssue
 from imitarm.capture.recording import SkeletonRecorder, SkeletonRecording
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
-from imitarm.capture.sources import live, open_source
+from imitarm.capture.sources import is_live, open_source
 from imitarm.capture.stream import SkeletonSender
-from imitarm.cli.gathering import add_side_and_person, gather, show_findings, source_help
 from imitarm.cli.outputs import check_outputs
+from imitarm.cli.person import add_side_and_person, add_source, gather, show_issues
 from imitarm.cli.screen import remark, say, show_table
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.transmission.sockets import parse_address
@@ -26,54 +26,52 @@ EPILOG = """\
 examples:
   imitarm capture kinect.csv --check
   imitarm capture wave.csv --trim 2.5 9 --repair --out wave_cut.csv
-  imitarm capture synthetic:7 --out made_up.csv
+  imitarm capture synthetic:7 --out synthetic.csv
   imitarm capture synthetic:7 --send 127.0.0.1:7400
 
-What comes is written at once: a program that is killed leaves FILE.part, which can be read. Ctrl-C ends a live source
+Each frame is written immediately: a program that is killed leaves FILE.part, which can be read. Ctrl-C ends a live source
 and keeps what was recorded. Exit status 2 when --check finds an error.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes."""
-    parser.add_argument("source", metavar="SOURCE", help=source_help())
+    """Add the command's arguments."""
+    add_source(parser)
     add_side_and_person(parser)
-    parser.add_argument("--seconds", type=float, metavar="S", help="how long; default: to the end, or till Ctrl-C")
-    parser.add_argument("--check", action="store_true", help="exit status 2 when there is an error among the findings")
-    parser.add_argument("--realtime", action="store_true", help="replay a recording at the pace it was recorded at")
+    parser.add_argument("--seconds", type=float, metavar="S", help="duration; default: to the end, or until Ctrl-C")
+    parser.add_argument("--check", action="store_true", help="exit with status 2 when an issue is an error")
+    parser.add_argument("--realtime", action="store_true", help="replay a recording at its own speed")
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=Path, metavar="FILE", help="record into this file; default: none")
-    output.add_argument("--force", action="store_true", help="replace a file that is there")
+    output.add_argument("--force", action="store_true", help="replace an existing file")
     output.add_argument(
         "--send",
         metavar="HOST:PORT",
-        help="send each skeleton there, at the pace it happened, for 'udp:PORT' to receive",
+        help="send each skeleton by UDP, at its own speed; 'udp:PORT' receives it",
     )
-    output.add_argument(
-        "--trim", type=float, nargs=2, metavar=("A", "B"), help="keep what is between A and B seconds from the start"
-    )
+    output.add_argument("--trim", type=float, nargs=2, metavar=("A", "B"), help="keep the part from A to B seconds")
     output.add_argument(
         "--repair",
         action="store_true",
-        help="keep one person, drop frames that are not later than the one before, exchange swapped sides back",
+        help="fix what needs no guess: several persons, wrong order, repeated frames, spikes, exchanged sides",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Capture, record, print what came; return 2 when it was to be checked and there is an error.
+    """Capture, record, check and print; return 2 when --check was given and an issue is an error.
 
     Raises:
-        InputError: when an option, the source or the place for the recording is wrong.
+        InputError: when an option, the source or the output file is wrong.
         TaskFailedError: when nobody was seen.
     """
     _check_options(arguments)
-    going_on = live(arguments.source)
+    going_on = is_live(arguments.source)
     with ExitStack() as stack:
         source = open_source(arguments.source, realtime=arguments.realtime or arguments.send is not None)
         recorded = source if isinstance(source, SkeletonRecording) else None
         source = stack.enter_context(_chosen(source, arguments.person))
         given: list[Callable[[Skeleton], object]] = []
-        if arguments.send is not None:  # first: who waits for it waits for nothing else
+        if arguments.send is not None:  # first, so that the receiver does not wait for the file
             sender = stack.enter_context(SkeletonSender(parse_address(arguments.send)))
             stack.callback(_tell_sent, sender, arguments.send)
             given.append(sender.send)
@@ -91,26 +89,26 @@ def run(arguments: argparse.Namespace) -> int:
         taken, _ = gather(source, arguments.seconds, "capturing", live=going_on, total=total, on_skeleton=give)
     if not taken:
         raise TaskFailedError(
-            f"{arguments.source}: nobody was seen, nothing is written; stand 1.5 to 3 m before the sensor"
+            f"{arguments.source}: nobody was seen, nothing is written; stand 1.5 to 3 m in front of the sensor"
         )
     captured = SkeletonRecording(taken, name=source.name) if recorded is None else recorded.with_skeletons(taken)
     recording = _finished(captured, arguments)
-    findings = check(recording, arguments.side)
+    issues = check(recording, arguments.side)
     _show(recording, arguments.side)
-    show_findings(findings)
+    show_issues(issues)
     if arguments.out is not None:
         say(f"wrote {arguments.out}")
-    return 2 if arguments.check and _has_error(findings) else 0
+    return 2 if arguments.check and _has_error(issues) else 0
 
 
 def _tell_sent(sender: SkeletonSender, address: str) -> None:
-    """Say how many skeletons went out."""
+    """Print how many skeletons were sent."""
     unheard = f"; nobody listened to {sender.failed} more" if sender.failed else ""
     remark(f"sent {sender.sent} skeletons to {address}{unheard}")
 
 
 def _check_options(arguments: argparse.Namespace) -> None:
-    """Find out before the work what would only fail after it."""
+    """Check options that would otherwise fail only after the work."""
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
     if arguments.trim is not None and not 0.0 <= arguments.trim[0] < arguments.trim[1] < np.inf:
@@ -119,7 +117,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
 
 
 def _chosen(source: SkeletonSource, person: int | None) -> SkeletonSource:
-    """Return all that a source sees, or one person of it; a recording says who is in it."""
+    """Return the source, or one person of it; when a recording lacks that person, the error says who is in it."""
     if person is None:
         return source
     if isinstance(source, SkeletonRecording):
@@ -128,7 +126,7 @@ def _chosen(source: SkeletonSource, person: int | None) -> SkeletonSource:
 
 
 def _finished(recording: SkeletonRecording, arguments: argparse.Namespace) -> SkeletonRecording:
-    """Return the recording cut and mended as asked, and written again where that changed it."""
+    """Return the recording, trimmed and repaired as asked; if that changed it, the output file is written again."""
     done = recording
     if arguments.trim is not None:
         done = done.trim(*arguments.trim)
@@ -142,7 +140,7 @@ def _finished(recording: SkeletonRecording, arguments: argparse.Namespace) -> Sk
 
 
 def _show(recording: SkeletonRecording, side: str) -> None:
-    """Print what was captured."""
+    """Print a summary of the recording."""
     arms = [skeleton.arm(side).confidence[:3].min() for skeleton in recording.skeletons]
     persons = recording.persons
     numbers = ", ".join(map(str, persons))
@@ -159,5 +157,5 @@ def _show(recording: SkeletonRecording, side: str) -> None:
     )
 
 
-def _has_error(findings: list[RecordingIssue]) -> bool:
-    return any(finding.severity == "error" for finding in findings)
+def _has_error(issues: list[RecordingIssue]) -> bool:
+    return any(issue.severity == "error" for issue in issues)

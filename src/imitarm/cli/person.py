@@ -1,52 +1,157 @@
-"""A person for a robot to follow, taken from a source: one person, in order, left and right kept apart."""
+"""What commands share that take a person's motion from a source: arguments, reading, and showing what is wrong."""
 
 from __future__ import annotations
 
 import argparse
+import time as clock
+from collections.abc import Callable, Sequence
 
 from imitarm.capture.checks import check, repaired
+from imitarm.capture.issue import SEVERITIES, RecordingIssue
 from imitarm.capture.motions import Truth
 from imitarm.capture.recording import SkeletonRecording, slowed
-from imitarm.capture.skeleton import Skeleton, SkeletonSource
-from imitarm.capture.sources import followed, live, open_source
+from imitarm.capture.skeleton import SIDES, Skeleton, SkeletonSource
+from imitarm.capture.sources import followed, is_live, open_source, source_words
 from imitarm.capture.synthetic import SyntheticSource
-from imitarm.cli.gathering import gather
-from imitarm.cli.screen import remark
+from imitarm.cli.screen import progress_bar, remark, say, show_table
 from imitarm.errors import InputError, TaskFailedError
+
+_COLOURS = {"error": "red", "warning": "yellow", "note": ""}
+_WAIT = 0.2  # [s] for one read of a silent source
+
+# --- arguments
+
+
+class _SourceArgument(argparse.Action):
+    """Stores the word that names a source; its help lists all sources, which are imported only to show it."""
+
+    @property
+    def help(self) -> str | None:
+        """Text for ``--help``."""
+        listed = "; ".join(f"{word}: {what}" for word, what in source_words().items())
+        return f"{self._before}{listed}".replace("%", "%%")
+
+    @help.setter
+    def help(self, before: str | None) -> None:
+        self._before = before or ""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        setattr(namespace, self.dest, values)
+
+
+def add_source(parser: argparse.ArgumentParser, name: str = "source", purpose: str = "") -> None:
+    """Add the argument that names a source of skeletons.
+
+    Args:
+        parser: of the command.
+        name: ``"source"``, or ``"--source"`` for an option.
+        purpose: what the source is for, at the beginning of the help.
+    """
+    parser.add_argument(name, metavar="SOURCE", action=_SourceArgument, help=purpose)
+
+
+def add_side_and_person(parser: argparse.ArgumentParser) -> None:
+    """Add the options that choose an arm and a person."""
+    parser.add_argument("--side", choices=SIDES, default="right", help="the person's arm; default: right")
+    parser.add_argument(
+        "--person", type=int, metavar="N", help="number of the person, if there are several; default: the first seen"
+    )
+
+
+# --- reading
+
+
+def gather(
+    source: SkeletonSource,
+    seconds: float | None,
+    what: str,
+    *,
+    live: bool,
+    total: float | None = None,
+    on_skeleton: Callable[[Skeleton], None] | None = None,
+) -> tuple[list[Skeleton], bool]:
+    """Read skeletons until the source is over, the time is up, or the user stops it; show the progress.
+
+    Args:
+        source: to read from.
+        seconds: how long, by the clock when live, else by the skeletons' times; None: to the end.
+        what: text of the progress bar, for example ``"capturing"``.
+        live: whether the source goes on until it is stopped.
+        total: expected duration, where it is known without ``seconds`` [s].
+        on_skeleton: called with each skeleton.
+
+    Returns:
+        the skeletons, and whether the user stopped it.
+    """
+    taken: list[Skeleton] = []
+    began = clock.monotonic()
+    expected = total if seconds is None else seconds
+    stopped = False
+    progress = progress_bar()
+    progress.disable = not progress.console.is_terminal
+    with progress:
+        task = progress.add_task(what, total=expected)
+        try:
+            while not source.over:
+                skeleton = source.read(_WAIT)
+                done = clock.monotonic() - began
+                if skeleton is not None:
+                    if not live:
+                        done = skeleton.time - (taken[0].time if taken else skeleton.time)
+                    if seconds is None or done <= seconds:
+                        taken.append(skeleton)
+                        if on_skeleton is not None:
+                            on_skeleton(skeleton)
+                if seconds is not None and done > seconds:
+                    break
+                waiting = live and not taken
+                progress.update(
+                    task,
+                    completed=done if expected is not None else None,
+                    description=f"{what}: waiting for a person" if waiting else f"{what}: {len(taken)} frames",
+                )
+        except KeyboardInterrupt:
+            stopped = True
+            remark(f"stopped; {len(taken)} frames are kept")
+    return taken, stopped
 
 
 def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton], list[str], Truth | None]:
-    """Take the person whom ``source``, ``person``, ``seconds``, ``trim`` and ``pace`` of the arguments name.
+    """Read the person that ``source``, ``person``, ``seconds``, ``trim`` and ``pace`` of the arguments name.
 
-    A recording is repaired first; whoever is seen elsewhere under the same number is passed over. What was done and
-    what is wrong is printed.
+    A recording is repaired first. What was changed and what is wrong is printed.
 
     Args:
         arguments: of the command.
-        side: of the arm that is followed.
+        side: of the arm that the robot follows.
 
     Returns:
-        the skeletons; what was done to them and is wrong with them, a sentence each; and where the person truly was,
-        when the source is a made-up one.
+        the skeletons; what was changed and what is wrong, a sentence each; and the person's true motion, when the
+        source is a synthetic one.
 
     Raises:
         InputError: when the source or an option is wrong.
         TaskFailedError: when fewer than two skeletons came.
     """
-    going_on = live(arguments.source)
-    if going_on and (arguments.trim is not None or arguments.pace != 1.0):
-        raise InputError("--trim, --pace: what is live can't be cut or slowed; record it by 'imitarm capture' first")
+    if is_live(arguments.source) and (arguments.trim is not None or arguments.pace != 1.0):
+        raise InputError("--trim, --pace: a live source can't be cut or slowed; record it by 'imitarm capture' first")
     source = open_source(arguments.source)
     truth = source.truth if isinstance(source, SyntheticSource) else None
     notes: list[str] = []
     if isinstance(source, SkeletonRecording):
-        source, notes = _mended(source, arguments.person)
-    if going_on and arguments.seconds is None:
+        source, notes = _repaired_person(source, arguments.person)
+    if source.live and arguments.seconds is None:
         remark("capturing; press Ctrl-C to end")
     with followed(source, person=arguments.person) as one:
-        taken, _ = gather(one, arguments.seconds, "capturing", live=going_on, total=_duration(source))
+        taken, _ = gather(one, arguments.seconds, "capturing", live=one.live, total=_duration(source))
     if one.passed_over:
-        notes.append(f"passed over {one.passed_over} frames that show somebody else")
+        notes.append(f"ignored {one.passed_over} frames that show another person")
     unit = source.time_unit if isinstance(source, SkeletonRecording) else 1.0
     recording = SkeletonRecording(taken, name=source.name, time_unit=unit)
     if arguments.trim is not None:
@@ -54,28 +159,43 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
     if len(recording) < 2:
         raise TaskFailedError(
             f"{arguments.source}: {len(recording)} frames show a person, at least 2 are needed; stand 1.5 to 3 m "
-            "before the sensor"
+            "in front of the sensor"
         )
-    notes += [str(finding) for finding in check(recording, side)]
+    notes += [str(issue) for issue in check(recording, side)]
     begin, pace = recording.skeletons[0].time, arguments.pace
     if pace != 1.0:
-        notes.append(f"slowed to {100 * pace:g} % of its pace")
+        notes.append(f"slowed to {100 * pace:g} % of its speed")
     for line in notes:
         remark(line)
     return slowed(recording.skeletons, pace), notes, None if truth is None else _slow(truth, begin, pace)
 
 
 def _slow(truth: Truth, begin: float, pace: float) -> Truth:
-    """Return a motion that is slowed from a moment on."""
+    """Return a motion that is slowed from a time on [s]."""
     return lambda time: truth(begin + pace * (time - begin))
 
 
-def _mended(recording: SkeletonRecording, person: int | None) -> tuple[SkeletonRecording, list[str]]:
-    """Return a recording of one person, mended; a note says what was."""
+def _repaired_person(recording: SkeletonRecording, person: int | None) -> tuple[SkeletonRecording, list[str]]:
+    """Return a repaired recording of one person, and what was changed and found while reading."""
     one = recording if person is None else recording.person(person)
-    mended, notes = repaired(one)
-    return mended, [*(f"repaired: {note}" for note in notes), *(str(finding) for finding in recording.issues)]
+    fixed, notes = repaired(one)
+    return fixed, [*(f"repaired: {note}" for note in notes), *(str(issue) for issue in recording.issues)]
 
 
 def _duration(source: SkeletonSource) -> float | None:
     return source.duration if isinstance(source, SkeletonRecording) else None
+
+
+# --- showing
+
+
+def show_issues(issues: Sequence[RecordingIssue]) -> None:
+    """Print the issues as a table, and the number of each severity."""
+    if issues:
+        show_table(
+            ["", "place", "code", "issue", "remedy"],
+            [(i.severity, i.place, i.code, i.message, i.remedy) for i in issues],
+            styles=[_COLOURS[i.severity] for i in issues],
+        )
+    counts = [(sum(issue.severity == severity for issue in issues), severity) for severity in SEVERITIES]
+    say(", ".join(f"{n} {what}{'' if n == 1 else 's'}" for n, what in counts))

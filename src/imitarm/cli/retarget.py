@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from imitarm.capture.motions import Truth
 from imitarm.capture.recording import slowed
 from imitarm.capture.skeleton import SIDES, Skeleton
-from imitarm.cli.gathering import source_help
 from imitarm.cli.outputs import check_outputs
-from imitarm.cli.person import person_of
+from imitarm.cli.person import add_source, person_of
 from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
 from imitarm.cli.screen import remark, say, show_table, watched, working
 from imitarm.cli.trial import provenance
@@ -56,7 +55,7 @@ PERIOD = 0.01  # [s] control period
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes."""
-    parser.add_argument("source", metavar="SOURCE", help=source_help())
+    add_source(parser)
     add_robot_options(parser)
     parser.add_argument("--method", choices=(*RETARGETERS, "all"), default="modern", help="default: modern")
     parser.add_argument(

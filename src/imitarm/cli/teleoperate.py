@@ -18,8 +18,8 @@ from rich.text import Text
 from imitarm.capture.skeleton import SIDES
 from imitarm.capture.sources import followed, open_source
 from imitarm.capture.stream import UdpSource
-from imitarm.cli.gathering import source_help
 from imitarm.cli.outputs import check_outputs
+from imitarm.cli.person import add_source
 from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.cli.serve import terminated_as_interrupted
@@ -53,7 +53,7 @@ _SHOWN_EVERY = 25  # steps between two looks at the status line
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes."""
-    parser.add_argument("source", metavar="SOURCE", help=source_help())
+    add_source(parser)
     person = parser.add_argument_group("the person")
     person.add_argument("--side", choices=SIDES, help="whose arm leads; default: as calibrated, else right")
     person.add_argument("--person", type=int, metavar="N", help="of several; default: the first who is seen")
