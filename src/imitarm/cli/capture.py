@@ -29,8 +29,8 @@ examples:
   imitarm capture synthetic:7 --out synthetic.csv
   imitarm capture synthetic:7 --send 127.0.0.1:7400
 
-Each frame is written immediately: a program that is killed leaves FILE.part, which can be read. Ctrl-C ends a live source
-and keeps what was recorded. Exit status 2 when --check finds an error.
+Each frame is written immediately: a program that is killed leaves FILE.part, which can be read. Ctrl-C ends a live
+source and keeps what was recorded. Exit status 2 when --check finds an error.
 """
 
 
