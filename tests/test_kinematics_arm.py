@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from arm_figures import LIMITS, chain, newton_euler, panda_flange, potential_energy, sawyer_flange
 from imitarm.errors import InputError, UnknownNameError
-from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.kinematics.pose import Pose
 
 ARMS = {name: ArmModel.load(name) for name in ("sawyer", "panda")}
@@ -312,3 +312,78 @@ def test_a_joint_past_its_limit_is_named():
 def test_an_unknown_body_is_answered_with_the_known_ones():
     with pytest.raises(UnknownNameError, match="right_l5"):
         ARMS["sawyer"].point_jacobian(ARMS["sawyer"].home, "elbow", [0, 0, 0])
+
+
+Q = np.full(7, 0.3)
+WORLD = ARMS["sawyer"].spec().compile()
+GOOD = {
+    "at": {"q": Q},
+    "forward_kinematics": {"q": Q},
+    "tool_pose": {"q": Q},
+    "tool_path": {"joints": np.full((2, 7), 0.3)},
+    "jacobian": {"q": Q},
+    "tool_jacobian": {"q": Q},
+    "point_jacobian": {"q": Q, "body": "right_hand", "point": np.zeros(3)},
+    "sew_points": {"q": Q},
+    "sew_jacobians": {"q": Q},
+    "collision_spheres": {"q": Q},
+    "sphere_jacobians": {"q": Q},
+    "gravity_torque": {"q": Q},
+    "inverse_dynamics": {"q": Q, "qd": Q, "qdd": Q},
+    "mass_matrix": {"q": Q},
+    "check_limits": {"q": 0.0 * Q - 0.1, "tolerance": 10.0},
+    "posture": {"model": WORLD, "q": Q, "prefix": ""},
+    "site": {"frame": "tool"},
+    "load": {
+        "name_or_path": "sawyer", "tool": "brush", "flange": "right_hand", "package_path": (), "discard_meshes": False,
+    },
+}  # fmt: skip
+CORRUPTED = [
+    None, np.nan, "nonsense", "", b"x", 3, -1.5, 1j, True, {}, [], [None], object(),
+    np.zeros(6), np.zeros((7, 7)), np.zeros((2, 3)), np.full(7, np.nan), np.full(3, np.inf), np.array(["a"] * 7),
+    [[1.0], [2.0, 3.0]], "\0", "x" * 5000,
+]  # fmt: skip
+ALLOWED = [  # what is right although it is in the list above
+    ("posture", "q", "None"), ("posture", "prefix", "''"), ("load", "tool", "None"), ("load", "flange", "None"),
+    ("load", "flange", "''"), ("load", "discard_meshes", "True"), ("load", "package_path", "[]"),
+    ("check_limits", "tolerance", "3"), ("load", "package_path", "''"), ("tool_path", "joints", repr(np.zeros((7, 7)))),
+]  # fmt: skip
+
+
+def test_all_public_methods_are_among_those_that_are_given_nonsense():
+    public = {name for name in dir(ArmModel) if not name.startswith("_") and callable(getattr(ArmModel, name))}
+    assert public == {*GOOD, "spec", "marked", "check_dynamics"}  # these three take nothing
+
+
+@pytest.mark.parametrize("method", GOOD)
+def test_every_argument_of_every_method_is_checked(method):
+    """No crash, no silent NaN, no foreign error: InputError, whatever is given."""
+    call = getattr(ARMS["sawyer"], method)
+    call(**GOOD[method])
+    for argument in GOOD[method]:
+        for value in CORRUPTED:
+            if (method, argument, repr(value)) in ALLOWED:
+                continue
+            with pytest.raises(InputError):
+                call(**{**GOOD[method], argument: value})
+                pytest.fail(f"{method}({argument}={value!r}) was taken")
+
+
+def test_a_point_that_moves_with_a_body_is_checked_before_it_reaches_the_engine():
+    """MuJoCo ends the process when it is given no name."""
+    for body, point in ((None, np.zeros(3)), ("right_hand", None), (3, np.zeros(3))):
+        with pytest.raises(InputError):
+            ARMS["sawyer"].point_jacobian(Q, body, point)
+
+
+def test_a_state_is_checked():
+    assert ArmState([0.0, 1.0], [0, 0], np.zeros(2), 0).q.dtype == float
+    for values in (
+        (Q, Q, np.zeros(6), 0.0),
+        (Q, np.full(7, np.nan), Q, 0.0),
+        (None, Q, Q, 0.0),
+        (Q, Q, Q, np.nan),
+        (Q, Q, Q, None),
+    ):
+        with pytest.raises(InputError):
+            ArmState(*values)

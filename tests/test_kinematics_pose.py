@@ -122,11 +122,11 @@ def test_a_trusted_pose_is_the_same_pose_and_never_changes_either(pose):
     ("position", "quaternion", "said"),
     [
         ([0, 0], [1, 0, 0, 0], "position must be 3"),
-        ([0, 0, np.nan], [1, 0, 0, 0], "position must be 3 finite"),
-        ([0, 0, 0], [1, 0, 0], "4 columns"),
+        ([0, 0, np.nan], [1, 0, 0, 0], r"position must be finite \[m\], but position\[2\] is nan"),
+        ([0, 0, 0], [1, 0, 0], "4 numbers"),
         ([0, 0, 0], [[1, 0, 0, 0]], "4 numbers"),
         ([0, 0, 0], [0.5, 0.5, 0, 0], "length 0.7071, not 1"),
-        ([0, 0, 0], [np.nan, 0, 0, 0], "not 1"),
+        ([0, 0, 0], [np.nan, 0, 0, 0], "quaternion must be finite"),
     ],
 )
 def test_what_is_no_pose_is_refused(position, quaternion, said):
@@ -189,3 +189,49 @@ def test_one_rotation_is_computed_as_many_are(seed, size):
     )
     m = p.quaternion_to_matrix(q)
     np.testing.assert_allclose(p.matrix_to_quaternion(m), p.matrix_to_quaternion(m[None])[0], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "said"),
+    [
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "not a rotation"),
+        (np.diag([1.1, 1.1, 1.1, 1.0]), "not a rotation"),
+        (np.eye(4) + 0.1 * np.eye(4, k=1), "not a rotation"),
+        (np.diag([1.0, 1.0, 1.0, 2.0]), "last row"),
+        (np.eye(3), r"shape \(4, 4\)"),
+        (np.full((4, 4), np.nan), "finite"),
+    ],
+)
+def test_a_matrix_that_is_no_pose_is_refused(matrix, said):
+    with pytest.raises(InputError, match=said):
+        p.Pose.from_matrix(matrix)
+
+
+NOT_POINTS = [None, "x", [1.0, 2.0], [[1.0, 2.0], [3.0, 4.0]], [np.nan, 0, 0], [np.inf, 0, 0], [None] * 3, {}, 1j, 3.0]
+
+
+@pytest.mark.parametrize("bad", NOT_POINTS, ids=repr)
+def test_every_method_refuses_what_it_can_not_use(bad):
+    pose = p.Pose.identity()
+    for call in (
+        lambda: pose.apply(bad),
+        lambda: pose @ bad,
+        lambda: pose.error_to(bad),
+        lambda: p.Pose(bad, [1, 0, 0, 0]),
+        lambda: p.Pose([0, 0, 0], bad),
+        lambda: p.Pose.from_matrix(bad),
+    ):
+        with pytest.raises(InputError):
+            call()
+
+
+def test_one_point_is_moved_as_many_are():
+    rng = np.random.default_rng(5)
+    q = p.quaternion_exp(rng.normal(size=(50, 3)))
+    v = rng.normal(size=(50, 3))
+    together = p.rotate(q, v), p.quaternion_to_matrix(q)
+    alone = [p.rotate(a, b) for a, b in zip(q, v, strict=True)], [p.quaternion_to_matrix(a) for a in q]
+    for many, single in zip(together, alone, strict=True):
+        np.testing.assert_allclose(many, single, atol=1e-15)
+    pose = p.Pose(v[0], q[0])
+    np.testing.assert_allclose(pose.apply(v), [pose.apply(point) for point in v], atol=1e-14)

@@ -63,3 +63,28 @@ def test_wrong_input_is_refused():
         find_posture(arm, arm.tool_pose(arm.home), frame="hand")
     with pytest.raises(InputError, match="must be 7 numbers"):
         find_posture(arm, arm.tool_pose(arm.home), q0=np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"pose": None},
+        {"pose": np.eye(4)},
+        {"q0": np.full(7, np.nan)},
+        {"q0": "home"},
+        {"frame": None},
+        {"restarts": -1},
+        {"restarts": 10**12},
+        {"restarts": 2.5},
+        {"seed": -1},
+        {"seed": None},
+    ],
+    ids=str,
+)
+def test_every_argument_is_checked(wrong):
+    arm = ArmModel.load("panda")
+    arguments = {"pose": arm.forward_kinematics(arm.home)} | wrong
+    with pytest.raises(InputError):
+        find_posture(arm, **arguments)
+    with pytest.raises(InputError):
+        find_posture(None, arm.forward_kinematics(arm.home))

@@ -52,3 +52,43 @@ def test_what_was_not_seen_is_left_out_and_nothing_seen_is_told():
 def test_a_motion_that_fits_at_no_scale_is_told_with_its_size():
     with pytest.raises(UnreachableError, match=r"19\.99 x 39\.97 x"):
         fit_motion(ARMS["panda"], circle(20.0), circle(20.0)[0])
+
+
+LINKS = ("0 0 1", 0.2), ("0 1 0", 0.15), ("0 1 0", 0.35), ("0 0 1", 0.3), ("0 1 0", 0.1), ("0 0 1", 0.1)
+STRETCHED = (
+    '<mujoco><compiler angle="radian"/><worldbody>'
+    + "".join(
+        f'<body pos="0 0 {height}"><joint axis="{axis}" range="-3 3"/><geom size=".02"/>' for axis, height in LINKS
+    )
+    + "</body>" * len(LINKS)
+    + '</worldbody><keyframe><key name="home" qpos="{}"/></keyframe></mujoco>'
+)
+
+
+@pytest.mark.parametrize("home", ["0 0 0 0 0 0", "0 1.57 0 0 0 0", "0.3 0.02 0.02 0 0 0"])
+def test_the_whole_workspace_is_searched_if_home_is_a_poor_place(tmp_path, home):
+    """The tool can't move in every direction at a stretched home, but the motion fits elsewhere."""
+    path = tmp_path / "stretched.xml"
+    path.write_text(STRETCHED.format(home))
+    arm = ArmModel.load(path)
+    motion = circle(0.1)
+    fit = fit_motion(arm, motion, motion[0])
+    assert fit.scale == 1.0
+    start = arm.tool_pose(fit.q)
+    for point in motion[::6]:
+        find_posture(arm, Pose(start.position + (point - motion[0]), start.quaternion), q0=fit.q)
+
+
+@pytest.mark.parametrize(
+    ("wrist", "start", "scale"),
+    [
+        (np.zeros((4, 2)), np.zeros(3), 1.0),
+        (None, np.zeros(3), 1.0),
+        (np.zeros((4, 3)), "x", 1.0),
+        (np.zeros((4, 3)), np.zeros(3), np.nan),
+        (np.zeros((4, 3)), np.zeros(3), 0.0),
+    ],
+)
+def test_what_is_no_motion_is_refused(wrist, start, scale):
+    with pytest.raises(InputError):
+        fit_motion(ARMS["panda"], wrist, start, scale=scale)

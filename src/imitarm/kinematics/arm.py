@@ -17,7 +17,7 @@ from imitarm.kinematics.arm_file import ArmFile, compiled, read_arm, without_geo
 from imitarm.kinematics.arm_kinematics import ArmKinematics
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.spheres import SphereCover
-from imitarm.validation import finite_number, flag, instance, text
+from imitarm.validation import finite_number, finite_vector, flag, instance, text
 
 Array = NDArray[np.float64]
 Columns = slice | NDArray[np.int32]
@@ -34,12 +34,21 @@ class ArmState:
         velocity: joint velocities, shape (n,) [rad/s].
         torque: torques of the joints' drives, shape (n,) [N m].
         time: time of the measurement [s].
+
+    Raises:
+        InputError: if a number is not finite or the lengths differ.
     """
 
     q: Array
     velocity: Array
     torque: Array
     time: float
+
+    def __post_init__(self) -> None:
+        n = len(self.q) if isinstance(self.q, np.ndarray | list | tuple) else 0
+        for name, unit in (("q", "rad"), ("velocity", "rad/s"), ("torque", "N m")):
+            object.__setattr__(self, name, finite_vector(getattr(self, name), n, f"ArmState: {name}", unit))
+        object.__setattr__(self, "time", finite_number(self.time, "ArmState: time", "s"))
 
 
 class ArmModel(ArmKinematics):

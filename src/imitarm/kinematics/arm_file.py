@@ -145,9 +145,13 @@ def read_arm(
     """
     path, folders = _located(source, ARMS, "robot"), [Path(folder) for folder in package_path]
     for folder in folders:
-        if not folder.expanduser().is_dir():
+        try:
+            is_folder = folder.expanduser().is_dir()
+        except (OSError, ValueError, RuntimeError):  # a name that no folder can have
+            is_folder = False
+        if not is_folder:
             raise InputError(
-                f"package path {str(folder)!r} is not a folder; give the folder that holds the ROS packages"
+                f"package path {str(folder)[:100]!r} is not a folder; give the folder that holds the ROS packages"
             )
     part = _read_part(path, discard_meshes, folders)
     spec, root, faults = part.spec, part.root, part.mass_faults

@@ -145,7 +145,7 @@ class ArmKinematics:
         Raises:
             UnknownNameError: if the frame is not known.
         """
-        if frame not in ("tool", "flange"):
+        if text(frame, "frame") not in ("tool", "flange"):
             raise UnknownNameError.among("frame", frame, ("tool", "flange"))
         return self._tool if frame == "tool" else self._flange
 

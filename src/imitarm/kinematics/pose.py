@@ -1,9 +1,11 @@
 """Positions and rotations: quaternions (w, x, y, z) as arrays, and the typed :class:`Pose`.
 
-All functions take and return arrays with any leading shape and are vectorised over it. Where a control step calls one
-with a single rotation, plain numbers are used: for an array of four the calls alone take longer.
-Rotation vectors (axis times angle) are in rad. Twists are ``(6,)``: linear velocity [m/s] first,
-then angular velocity [rad/s], both in the base frame.
+All functions take and return arrays with any leading shape and are vectorised over it. They compute and do not check;
+:class:`Pose` checks what it is built from. A single rotation is computed with plain numbers, because numpy takes longer
+for an array of four and control steps need many.
+
+Rotation vectors (axis times angle) are in rad. Twists have shape (6,): linear velocity [m/s] first, then angular
+velocity [rad/s], both in the base frame.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
+from imitarm.validation import finite_array, finite_vector, instance, real_array
 
 Array = NDArray[np.float64]
 
@@ -56,8 +59,8 @@ def quaternion_exp(rotation_vector: ArrayLike) -> Array:
     if v.ndim == 1:
         x, y, z = v.tolist()
         a = 0.5 * math.sqrt(x * x + y * y + z * z)
-        share = 0.5 * math.sin(a) / a if a > _SMALL_ANGLE else 0.5
-        return np.array([math.cos(a), share * x, share * y, share * z])
+        factor = 0.5 * math.sin(a) / a if a > _SMALL_ANGLE else 0.5
+        return np.array([math.cos(a), factor * x, factor * y, factor * z])
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * v], axis=-1)
 
@@ -68,10 +71,10 @@ def quaternion_log(q: ArrayLike) -> Array:
     if q.ndim == 1:
         w, x, y, z = q.tolist()
         s = math.sqrt(x * x + y * y + z * z)
-        share = 2.0 * math.atan2(s, abs(w)) / s if s > _SMALL_ANGLE else 2.0
-        share = share if w >= 0.0 else -share
-        return np.array([share * x, share * y, share * z])
-    q = np.where(q[..., :1] < 0.0, -q, q)  # q and -q are one rotation: take the short way
+        factor = 2.0 * math.atan2(s, abs(w)) / s if s > _SMALL_ANGLE else 2.0
+        factor = factor if w >= 0.0 else -factor
+        return np.array([factor * x, factor * y, factor * z])
+    q = np.where(q[..., :1] < 0.0, -q, q)  # q and -q are the same rotation: take the shorter arc
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, q[..., :1])
     scale = np.where(sine > _SMALL_ANGLE, angle / np.maximum(sine, _SMALL_ANGLE), 2.0)
@@ -80,13 +83,14 @@ def quaternion_log(q: ArrayLike) -> Array:
 
 def quaternion_to_matrix(q: ArrayLike) -> Array:
     """Return rotation matrices (..., 3, 3) of unit quaternions wxyz (..., 4)."""
-    w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    q = np.asarray(q, dtype=float)
+    w, x, y, z = q.tolist() if q.ndim == 1 else np.moveaxis(q, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.array(rows) if q.ndim == 1 else np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def matrix_to_quaternion(matrix: ArrayLike) -> Array:
@@ -134,6 +138,11 @@ def _largest_column(m: Array) -> Array:
 def rotate(q: ArrayLike, vectors: ArrayLike) -> Array:
     """Rotate ``vectors`` (..., 3) by unit quaternions wxyz ``q`` (..., 4)."""
     q, v = np.asarray(q, dtype=float), np.asarray(vectors, dtype=float)
+    if q.ndim == v.ndim == 1:
+        w, x, y, z = q.tolist()
+        a, b, c = v.tolist()
+        d, e, f = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+        return np.array([a + w * d + y * f - z * e, b + w * e + z * d - x * f, c + w * f + x * e - y * d])
     t = 2.0 * np.cross(q[..., 1:], v)
     return np.asarray(v + q[..., :1] * t + np.cross(q[..., 1:], t))
 
@@ -185,17 +194,17 @@ def mean_quaternion(quaternions: ArrayLike) -> Array:
 
 
 def checked_unit_quaternions(quaternions: ArrayLike, what: str) -> Array:
-    """Return ``quaternions`` (..., 4) scaled to length one, or say which are none.
+    """Return ``quaternions`` (..., 4) scaled to length one; refuse those whose length is not one.
 
     Args:
         quaternions: quaternions wxyz, shape (..., 4).
-        what: how to name them in the error.
+        what: the name of the argument in messages.
 
     Raises:
-        InputError: when the shape is wrong, or a length is not one within 1e-3.
+        InputError: if the shape is wrong, or a length is not one within 1e-3.
     """
-    q = np.array(quaternions, dtype=float)
-    if q.shape[-1:] != (4,):
+    q = real_array(quaternions, (..., None), what)
+    if q.shape[-1] != 4:
         raise InputError(f"{what}: quaternions need 4 columns (w, x, y, z), got shape {q.shape}")
     length = np.linalg.norm(q, axis=-1, keepdims=True)
     bad = ~(np.abs(length[..., 0] - 1.0) <= _UNIT_TOLERANCE)
@@ -211,7 +220,7 @@ def checked_unit_quaternions(quaternions: ArrayLike, what: str) -> Array:
 class Pose:
     """A position and a rotation: where a frame is, seen from another one.
 
-    A variable that holds a pose names both frames, ``tool_to_base`` maps tool coordinates to base coordinates:
+    The name of a pose names both frames: ``tool_to_base`` maps tool coordinates to base coordinates,
     ``p_base = R p_tool + position``.
 
     Attributes:
@@ -219,19 +228,22 @@ class Pose:
         quaternion: unit quaternion w, x, y, z, shape (4,).
 
     Raises:
-        InputError: when a shape is wrong, a number is not finite or the quaternion is not of length one.
+        InputError: if a shape is wrong, a number is not finite or the length of the quaternion is not one.
     """
 
     position: Array
     quaternion: Array
 
     def __post_init__(self) -> None:
-        position = np.array(self.position, dtype=float)
-        if position.shape != (3,) or not np.all(np.isfinite(position)):
-            raise InputError(f"Pose: position must be 3 finite numbers [m], got {self.position!r}")
-        quaternion = checked_unit_quaternions(self.quaternion, "Pose")
-        if quaternion.shape != (4,):
-            raise InputError(f"Pose: quaternion must be 4 numbers (w, x, y, z), got shape {quaternion.shape}")
+        position = np.array(finite_vector(self.position, 3, "Pose: position", "m"))
+        quaternion = finite_vector(self.quaternion, 4, "Pose: quaternion", "w x y z")
+        w, x, y, z = quaternion.tolist()
+        length = math.sqrt(w * w + x * x + y * y + z * z)
+        if abs(length - 1.0) > _UNIT_TOLERANCE:
+            raise InputError(
+                f"Pose: quaternion {quaternion.tolist()} has length {length:.4g}, not 1; normalise it first"
+            )
+        quaternion = quaternion / length
         position.setflags(write=False)
         quaternion.setflags(write=False)
         object.__setattr__(self, "position", position)
@@ -239,7 +251,7 @@ class Pose:
 
     @classmethod
     def trusted(cls, position: Array, quaternion: Array) -> Pose:
-        """Build from numbers that are known to be right and belong to nobody else: the checks take ten times as long.
+        """Build without checks from arrays that nobody else holds; for control steps, where the checks take too long.
 
         Args:
             position: shape (3,) [m]; from now on read-only.
@@ -259,9 +271,18 @@ class Pose:
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Pose:
-        """Build from a homogeneous transform, shape (4, 4)."""
-        m = np.asarray(matrix, dtype=float)
-        return cls(m[:3, 3], matrix_to_quaternion(m[:3, :3]))
+        """Build from a homogeneous transform, shape (4, 4).
+
+        Raises:
+            InputError: if the matrix is not a rotation and a displacement: mirrored, scaled or sheared.
+        """
+        m = finite_array(matrix, (4, 4), "matrix")
+        rotation = m[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _UNIT_TOLERANCE or np.linalg.det(rotation) < 0.0:
+            raise InputError("matrix: its upper left 3 x 3 is not a rotation (orthonormal, determinant 1)")
+        if np.abs(m[3] - [0.0, 0.0, 0.0, 1.0]).max() > _UNIT_TOLERANCE:
+            raise InputError(f"matrix: its last row must be 0 0 0 1, got {m[3].tolist()}")
+        return cls(m[:3, 3], matrix_to_quaternion(rotation))
 
     @property
     def rotation(self) -> Array:
@@ -276,29 +297,33 @@ class Pose:
         return m
 
     def inverse(self) -> Pose:
-        """Return the pose the other way round: ``tool_to_base.inverse()`` is ``base_to_tool``."""
+        """Return the inverse pose: ``tool_to_base.inverse()`` is ``base_to_tool``."""
         back = quaternion_conjugate(self.quaternion)
-        return Pose(-rotate(back, self.position), back)
+        return Pose.trusted(-rotate(back, self.position), back)
 
     def __matmul__(self, other: Pose) -> Pose:
         """Chain two poses: ``b_to_a @ c_to_b`` is ``c_to_a``."""
+        instance(other, Pose, "the right operand of @")
         q = quaternion_multiply(self.quaternion, other.quaternion)
         return Pose(self.position + rotate(self.quaternion, other.position), q)
 
     def apply(self, points: ArrayLike) -> Array:
         """Map ``points`` (..., 3) [m] through this pose."""
-        return rotate(self.quaternion, points) + self.position
+        given = finite_array(points, (..., 3), "points", "m")
+        return np.asarray(given @ self.rotation.T + self.position)
 
     def error_to(self, target: Pose) -> Array:
-        """Return the displacement (6,) that takes this pose to ``target``, in the common frame.
+        r"""Return the displacement that moves this pose to ``target``, in the common frame, shape (6,).
 
-        Linear part ``p_target - p`` [m], angular part ``log(R_target R^T)`` [rad] (METHODS A.3).
+        The linear part is :math:`p_{target} - p` [m], the angular part :math:`\log(R_{target} R^T)` [rad] (Lynch and
+        Park, Modern Robotics, 2017, section 3.2.3).
         """
+        instance(target, Pose, "target")
         (a, b, c, d), (w, x, y, z) = target.quaternion.tolist(), self.quaternion.tolist()
         real = a * w + b * x + c * y + d * z
         u, v, r = b * w - a * x + d * y - c * z, c * w - a * y + b * z - d * x, d * w - a * z + c * x - b * y
         sine = math.sqrt(u * u + v * v + r * r)
-        share = 2.0 * math.atan2(sine, abs(real)) / sine if sine > _SMALL_ANGLE else 2.0
-        share = share if real >= 0.0 else -share
+        factor = 2.0 * math.atan2(sine, abs(real)) / sine if sine > _SMALL_ANGLE else 2.0
+        factor = factor if real >= 0.0 else -factor
         (px, py, pz), (qx, qy, qz) = target.position.tolist(), self.position.tolist()
-        return np.array([px - qx, py - qy, pz - qz, share * u, share * v, share * r])
+        return np.array([px - qx, py - qy, pz - qz, factor * u, factor * v, factor * r])

@@ -1,4 +1,4 @@
-"""Finding a posture in which the tool has a given pose."""
+"""Finding a posture of an arm in which its tool has a given pose."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.errors import UnknownNameError, UnreachableError
+from imitarm.errors import UnreachableError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_problem import ROTATION_LENGTH
 from imitarm.kinematics.pose import Pose
+from imitarm.validation import finite_vector, instance, whole_number
 
 Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-7  # [m], weighted
 _STEPS = 120
 _LONGEST_STEP = 0.4  # [rad] of one joint in one step
-_DRIFT = 0.05  # share of the way to the reference posture that is gone in one step
+_DRIFT = 0.05  # fraction of the distance to the reference posture that one step covers
+_MOST_RESTARTS = 100_000
 
 
 def find_posture(
@@ -32,26 +34,30 @@ def find_posture(
 ) -> Array:
     r"""Find joint positions within the limits that bring the tool to ``pose``.
 
-    Levenberg-Marquardt steps :math:`J^T(JJ^T+\mu)^{-1}e` on the joints that are not pressed against a limit, with
-    a drift to the start in the null space; first from ``q0``, then from ``home``, then from random postures.
+    The method is Levenberg-Marquardt: steps :math:`J^T(JJ^T+\mu)^{-1}e` of the joints that are not at a limit, with
+    damping :math:`\mu` proportional to the squared error :math:`|e|^2` (Sugihara, IEEE T-RO 27(5), 2011), and a drift
+    towards the starting posture in the null space. It starts from ``q0``, then from ``home``, then from random ones.
 
     Args:
         arm: the arm.
-        pose: wanted pose in the base frame.
+        pose: desired pose in the base frame.
         q0: posture to start from and to stay near to, shape (n_joints,) [rad]; None: ``home``.
-        frame: what is to be there, ``"tool"`` or ``"flange"``.
-        restarts: how many random postures to try.
-        seed: of the random postures.
+        frame: the frame that is to have this pose, ``"tool"`` or ``"flange"``.
+        restarts: number of random postures to start from.
+        seed: seed of the random postures.
 
     Returns:
         shape (n_joints,) [rad]; position within 1e-6 m and rotation within 1e-6 rad.
 
     Raises:
         UnreachableError: naming the pose and how far off the best posture was.
-        UnknownNameError: when the frame is not known.
+        UnknownNameError: if the frame is not known.
+        InputError: if another argument can't be used.
     """
-    if frame not in {"tool", "flange"}:
-        raise UnknownNameError.among("frame", frame, ("tool", "flange"))
+    instance(arm, ArmModel, "arm").site(frame)
+    instance(pose, Pose, "pose")
+    whole_number(restarts, "restarts", at_least=0, at_most=_MOST_RESTARTS)
+    whole_number(seed, "seed", at_least=0)
     best, least = arm.home, math.inf
     for start in _starts(arm, q0, restarts, seed):
         q, error = _descend(arm, start, pose, frame)
@@ -64,14 +70,13 @@ def find_posture(
         f"{arm.name} can't bring its {frame} to position {np.round(pose.position, 4).tolist()} m, quaternion "
         f"{np.round(pose.quaternion, 4).tolist()}: the best posture within its limits is "
         f"{1e3 * float(np.linalg.norm(missing[:3])):.1f} mm and {math.degrees(float(np.linalg.norm(missing[3:]))):.1f} "
-        "degrees off; move the pose nearer to the arm or turn it"
+        "degrees off; move the pose nearer to the arm or rotate it"
     )
 
 
 def _starts(arm: ArmModel, q0: ArrayLike | None, restarts: int, seed: int) -> Iterator[Array]:
     if q0 is not None:
-        arm.forward_kinematics(q0)  # checks shape and numbers
-        yield np.clip(np.asarray(q0, dtype=float), arm.lower, arm.upper)
+        yield np.clip(finite_vector(q0, arm.n_joints, f"{arm.name}: q0", "rad"), arm.lower, arm.upper)
     yield np.array(arm.home)
     low, high = np.maximum(arm.lower, -math.pi), np.minimum(arm.upper, math.pi)
     random = np.random.default_rng(seed)
@@ -102,7 +107,7 @@ def _descend(arm: ArmModel, start: Array, pose: Pose, frame: str) -> tuple[Array
 
 
 def _step(arm: ArmModel, q: Array, jacobian: Array, error: Array, reference: Array) -> Array:
-    """One step with the joints that are free to make it: those pressed against a limit stay there."""
+    """Return one step; joints at a limit that it would exceed stay where they are."""
     free = np.ones(len(q), dtype=bool)
     step = np.zeros(len(q))
     damping = 1e-3 * float(error @ error) + 1e-12

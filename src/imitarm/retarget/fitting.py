@@ -1,17 +1,18 @@
-r"""Fitting: where a robot should begin, and how much smaller it should move, so that a recorded motion is in its reach.
+r"""Fitting: a start for the robot, and a scale, with which a recorded motion is within its reach.
 
-A motion that is still to come can't be fitted; a recording can. The tool will be at
+A live motion can't be fitted, because it is not known yet; a recording can. The tool will be at
 
 .. math:: p(t) = p_0 + \rho\,(W(t) - W_0)
 
-with W the person's wrist in the base's axes and :math:`W_0` where it is when the clutch engages. The middle of the
-motion is put near where the robot's tool is at home, and the scale is made smaller until the arm reaches the six
-outermost points of the motion and its start, with its tool turned as at home, well off its singularities and with its
-links off each other.
+where :math:`W` is the person's wrist along the axes of the base, :math:`W_0` the wrist when the clutch engages,
+:math:`p_0` the tool's start and :math:`\rho` the scale. The middle of the motion is placed near the tool's home
+position, then throughout the workspace. The scale is reduced until the arm reaches the start and the six outermost
+points of the motion, with the tool's orientation at home, away from singularities and with its links apart.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -27,18 +28,22 @@ from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.posture import find_posture
 from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.tasks import TwistTask
+from imitarm.validation import finite_number, instance, real_array
 
 Array = NDArray[np.float64]
 
-_SHRINK: Final = 0.85  # from one scale that is tried to the next
+_SHRINK: Final = 0.85  # factor from one scale that is tried to the next
 _SMALLEST: Final = 0.15
-_EASY, _POSSIBLE = 0.1, 0.05  # [m/rad] least singular value where an arm begins; where it goes
-_APART: Final = 0.02  # [m] to be kept between links
-_STILL: Final = 1e-3  # [rad/s] faster is not standing
+_EASY, _POSSIBLE = 0.1, 0.05  # [m/rad] smallest singular value: where an arm begins; where it passes
+_APART: Final = 0.02  # [m] between links
+_STILL: Final = 1e-3  # [rad/s] slower is standing still
 _GRID: Final = np.stack(
     np.meshgrid([0.0, 0.1, -0.1], [0.0, 0.15, -0.15], [0.0, 0.1, -0.1, 0.2], indexing="ij"), axis=-1
 ).reshape(-1, 3)
-_MIDDLES: Final = _GRID[np.argsort(np.linalg.norm(_GRID, axis=1), kind="stable")]  # [m] from the tool at home
+_NEAR_HOME: Final = _GRID[np.argsort(np.linalg.norm(_GRID, axis=1), kind="stable")]  # [m] from the tool at home
+_SAMPLES: Final = 512  # postures that show how far the tool gets
+_STEP: Final = 0.3  # spacing of the centres in the workspace, as a fraction of the reach
+_MOST_CENTRES: Final = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,68 +55,110 @@ class Fit:
 
 
 def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: float = 1.0) -> Fit:
-    """Find a start and a scale with which a recorded motion is in the arm's reach.
+    """Find a start and a scale with which a recorded motion is within the arm's reach.
 
     Args:
-        arm: the robot's.
-        wrist: the person's, along the axes of the base, shape (n, 3) [m].
-        start: where it is when the clutch engages, shape (3,) [m].
-        scale: the largest one to try.
+        arm: the robot's arm.
+        wrist: positions of the person's wrist along the axes of the base, shape (n, 3) [m]; rows with NaN are skipped.
+        start: position of the wrist when the clutch engages, shape (3,) [m].
+        scale: the largest scale to try.
 
     Returns:
-        The largest scale that was found to do, and a start.
+        The largest scale that was found, and a start.
 
     Raises:
-        InputError: when the wrist was never seen.
-        UnreachableError: when the motion does not fit at a seventh of its size.
+        InputError: if the wrist was never seen, or an argument can't be used.
+        UnreachableError: if the motion does not fit even at a seventh of its size.
     """
-    path, begin = np.asarray(wrist, dtype=float), np.asarray(start, dtype=float)
+    instance(arm, ArmModel, "arm")
+    path, begin = real_array(wrist, (None, 3), "wrist", "m"), real_array(start, (3,), "start", "m")
+    finite_number(scale, "scale", above=0.0)
     path = path[np.isfinite(path).all(axis=1)]
     if not len(path) or not np.isfinite(begin).all():
         raise InputError("fit: the wrist was never seen, so nothing can be fitted")
     middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
-    outermost = path[np.unique(np.concatenate([path.argmin(axis=0), path.argmax(axis=0)]))]
-    home, search = arm.tool_pose(arm.home), _Search(arm, SelfClearance(arm, _APART))
+    outermost = path[np.unique(np.concatenate([path.argmin(axis=0), path.argmax(axis=0)]))] - middle
+    search = _Search(arm, SelfClearance(arm, _APART))
+    reach, span = search.reach(), np.ptp(path, axis=0)
     tried = scale
     while tried >= _SMALLEST:
-        for shift in _MIDDLES:
-            centre = home.position + shift
-            first = search.posture(Pose(centre + tried * (begin - middle), home.quaternion), arm.home, _EASY)
-            if first is None or not search.stands(first):
-                continue
-            if all(
-                search.posture(Pose(centre + tried * (point - middle), home.quaternion), first, _POSSIBLE) is not None
-                for point in outermost
-            ):
-                return Fit(first, tried)
+        if tried * float(span.max()) <= 2.0 * reach:
+            for centre, near in search.centres():
+                q = search.start(centre, near, tried * (begin - middle), tried * outermost)
+                if q is not None:
+                    return Fit(q, tried)
         tried *= _SHRINK
-    span = np.ptp(path, axis=0)
     raise UnreachableError(
-        f"fit: a motion of {span[0]:.2f} x {span[1]:.2f} x {span[2]:.2f} m is not in reach of {arm.name} even at a "
-        f"scale of {_SMALLEST:g}; cut it, or choose another arm"
+        f"fit: a motion of {span[0]:.2f} x {span[1]:.2f} x {span[2]:.2f} m is not within reach of {arm.name} even at a "
+        f"scale of {_SMALLEST:g}; cut it (--trim), or choose a larger arm"
     )
 
 
-@dataclass(frozen=True, eq=False)
 class _Search:
-    """Looks for postures of an arm whose links stay off each other."""
+    """Looks for postures of an arm, with its tool oriented as at home, away from singularities and with links apart."""
 
-    arm: ArmModel
-    links: SelfClearance
+    def __init__(self, arm: ArmModel, links: SelfClearance) -> None:
+        self.arm, self.links, self.home = arm, links, arm.tool_pose(arm.home)
+        self._far: list[tuple[Array, Array]] | None = None
 
-    def posture(self, tool_to_base: Pose, near: Array, least: float) -> Array | None:
-        """Return a posture near another one, shape (n_joints,); None if none is so far from a singularity."""
+    def reach(self) -> float:
+        """Return how far from the middle of its workspace the tool gets, at most [m]."""
+        low, high = np.maximum(self.arm.lower, -np.pi), np.minimum(self.arm.upper, np.pi)
+        random = np.random.default_rng(0)
+        self._tips = self.arm.tool_path(random.uniform(low, high, size=(_SAMPLES, self.arm.n_joints)))[0]
+        return float(np.linalg.norm(self._tips - self._tips.mean(axis=0), axis=1).max())
+
+    def centres(self) -> Iterator[tuple[Array, Array]]:
+        """Yield places (3,) [m] for the middle of the motion, each with a posture near it: near home first."""
+        for shift in _NEAR_HOME:
+            yield self.home.position + shift, self.arm.home
+        if self._far is None:  # the same for all scales
+            self._far = list(self._reachable_centres())
+        yield from self._far
+
+    def start(self, centre: Array, near: Array, begin: Array, outermost: Array) -> Array | None:
+        """Return a posture in which the motion can begin, shape (n_joints,); None if part of it is out of reach.
+
+        Args:
+            centre: of the motion, shape (3,) [m].
+            near: a posture near it, shape (n_joints,) [rad].
+            begin: where the motion begins, from its centre, shape (3,) [m].
+            outermost: its outermost points, from its centre, shape (k, 3) [m].
+        """
+        first = self._posture(centre + begin, near, _EASY)
+        if first is None or not self._stands(first):
+            return None
+        passes = all(self._posture(centre + point, first, _POSSIBLE) is not None for point in outermost)
+        return first if passes else None
+
+    def _reachable_centres(self) -> Iterator[tuple[Array, Array]]:
+        """Yield reachable places throughout the workspace, those nearest to home first, each with a posture."""
+        low, high = self._tips.min(axis=0), self._tips.max(axis=0)
+        step = _STEP * 0.5 * float((high - low).max())
+        axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        # A place that no sampled posture comes near is outside the workspace.
+        inside = np.linalg.norm(grid[:, None] - self._tips, axis=2).min(axis=1) <= step
+        grid = grid[inside]
+        order = np.argsort(np.linalg.norm(grid - self.home.position, axis=1), kind="stable")
+        for centre in grid[order[:_MOST_CENTRES]]:
+            q = self._posture(centre, self.arm.home, _POSSIBLE)
+            if q is not None:
+                yield centre, q
+
+    def _posture(self, position: Array, near: Array, smallest: float) -> Array | None:
+        """Return a posture near another one, shape (n_joints,); None if there is none so far from a singularity."""
         try:
-            q = find_posture(self.arm, tool_to_base, q0=near, restarts=2)
+            q = find_posture(self.arm, Pose(position, self.home.quaternion), q0=near, restarts=2)
         except UnreachableError:
             return None
         jacobian = self.arm.tool_jacobian(q)
         jacobian[3:] *= ROTATION_LENGTH
-        free = float(np.linalg.svd(jacobian, compute_uv=False)[-1]) >= least
-        return q if free and self.links.distance(q) >= self.links.clearance else None
+        regular = float(np.linalg.svd(jacobian, compute_uv=False)[-1]) >= smallest
+        return q if regular and self.links.distance(q) >= self.links.clearance else None
 
-    def stands(self, q: Array) -> bool:
-        """Whether an arm that keeps off its singularities stands still there, and does not move off by itself."""
+    def _stands(self, q: Array) -> bool:
+        """Return whether an arm that avoids its singularities stands still there, and does not drift off."""
         if self.arm.landmarks is None:
             return True
         still = np.zeros(self.arm.n_joints)
