@@ -39,7 +39,7 @@ def test_packed_obstacles_give_what_each_one_gives(kinds, shape):
     for obstacle, d, g in zip(scene.obstacles, distance, gradient, strict=True):
         own_distance, own_gradient = obstacle.distance_and_gradient(points)
         np.testing.assert_allclose(d, own_distance, atol=1e-12)
-        np.testing.assert_allclose(g, own_gradient, atol=1e-7)
+        np.testing.assert_allclose(g, own_gradient, atol=1e-6)
 
 
 @pytest.mark.parametrize("spin", [0.0, 1.0])
@@ -54,7 +54,7 @@ def test_many_times_at_once_equal_one_after_the_other(spin):
             then = scene.at(3.0 + dt)
             expected = then.distances_and_gradients(points[min(k, len(points) - 1)])
             np.testing.assert_allclose(distance[:, k], expected[0], atol=1e-12)
-            np.testing.assert_allclose(gradient[:, k], expected[1], atol=1e-7)
+            np.testing.assert_allclose(gradient[:, k], expected[1], atol=1e-6)
 
 
 @pytest.mark.parametrize("spin", [0.0, 1.0])
@@ -70,7 +70,7 @@ def test_near_pairs_misses_none(spin):
     assert len(found) == len(expected)
     assert set(found) == expected
     np.testing.assert_allclose(pairs.distance, distance[pairs.obstacle, pairs.point], atol=1e-12)
-    np.testing.assert_allclose(pairs.normal.T, gradient[pairs.obstacle, pairs.point], atol=1e-7)
+    np.testing.assert_allclose(pairs.normal.T, gradient[pairs.obstacle, pairs.point], atol=1e-6)
     assert near_pairs(scene.packed, points[:3] + 50.0, reach[:3]) is None
 
 

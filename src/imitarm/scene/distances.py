@@ -32,7 +32,7 @@ TINY = 1e-9  # [m] a direction shorter than this is mostly rounding error; a fix
 DEPTH = 1e3  # [m] a half-space is a box of this half height without ends: same distance wherever an arm can be
 
 _MAX_NEWTON = 100  # many more steps than any point needs
-_NEWTON_TOLERANCE = 1e-4  # of the last step; the remaining error is its square, and enters the distance squared again
+_NEWTON_TOLERANCE = 1e-3  # of the last step; the remaining error is its square, and enters the distance squared again
 _FLOOR = 1e-12  # [fraction of the shortest semi-axis] changes a distance by less than that
 
 
@@ -59,7 +59,7 @@ class _Family(NamedTuple):
 
     kernel: Kernel
     members: slice  # their places in ``PackedObstacles._order``
-    parameters: tuple[Array, ...]  # of the formula, each of shape (..., number of members)
+    parameters: tuple[Array | None, ...]  # of the formula, each of shape (..., number of members)
 
 
 class _Frames(NamedTuple):
@@ -176,7 +176,7 @@ class PackedObstacles:
         )
 
     @cached_property
-    def _sorted(self) -> list[tuple[Kernel, Indices, tuple[Array, ...]]]:
+    def _sorted(self) -> list[tuple[Kernel, Indices, tuple[Array | None, ...]]]:
         """For each family its formula, its obstacles and the formula's parameters; every hull is its own family."""
         names = np.array([KINDS[kind] for kind in self.kinds], dtype=str)
         slabs = np.isin(names, _SLABS)
@@ -208,7 +208,7 @@ class PackedObstacles:
         return kept[1]
 
     @cached_property
-    def _single(self) -> tuple[Kernel, Array | None, Array, list[Array]]:
+    def _single(self) -> tuple[Kernel, Array | None, Array, list[Array | None]]:
         """For a pack of one: the formula, the rotation into the own frame, its centre (3, 1), the parameters.
 
         The rotation is None where there is none.
@@ -216,7 +216,7 @@ class PackedObstacles:
         frames = self._frames
         to_own = frames.to_own[0] if self.quaternions[0, 1:].any() else None
         family = self._families[0]
-        return family.kernel, to_own, frames.center[:, 0], [p[..., 0, None] for p in family.parameters]
+        return family.kernel, to_own, frames.center[:, 0], _every(family.parameters, 0)
 
 
 def checked_points(points: ArrayLike) -> Array:
@@ -335,14 +335,14 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
     q = every.reshape(3, -1).take(flat, axis=1)
     if len(packed._families) == 1:
         kernel, _, parameters = packed._families[0]
-        distance, normal = kernel(q, True, *[p.take(place, axis=-1) for p in parameters])
+        distance, normal = kernel(q, True, *_take(parameters, place))
     else:
         distance, normal = np.empty(len(flat)), np.empty((3, len(flat)))
         starts = np.searchsorted(place, [family.members.start for family in packed._families]).tolist()
         for (kernel, members, parameters), a, b in zip(packed._families, starts, [*starts[1:], len(flat)], strict=True):
             if a < b:
                 column = place[a:b] - members.start
-                distance[a:b], normal[:, a:b] = kernel(q[:, a:b], True, *[p.take(column, axis=-1) for p in parameters])
+                distance[a:b], normal[:, a:b] = kernel(q[:, a:b], True, *_take(parameters, column))
     near = (distance <= reach.take(point)).nonzero()[0]
     if not len(near):
         return None
@@ -356,6 +356,9 @@ def _evaluate(
     packed: PackedObstacles, points: ArrayLike, times: ArrayLike | None, gradient: bool
 ) -> tuple[Array, Array | None]:
     p = checked_points(points)
+    if times is None and len(packed) == 1:
+        single, normal = single_distance(packed, p, gradient)
+        return single[None], None if normal is None else normal[None]
     if times is None:
         shape = p.shape[:-1]
         distance, normals = _at_once(packed, p.reshape(-1, 3), None, gradient)
@@ -389,8 +392,7 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
         q.reshape(3, n, len(times), -1)[...] -= (frames.center + frames.velocity * times)[..., None]
     distance, gradients = np.empty((n, m)), np.empty((n, m, 3)) if gradient else None
     for kernel, members, parameters in packed._families:
-        columns = [p[..., None] for p in parameters]
-        part, normal = kernel(q[:, members], gradient, *columns)
+        part, normal = kernel(q[:, members], gradient, *_every(parameters, slice(None)))
         distance[packed._order[members]] = part
         if gradients is not None and normal is not None:
             for i, place in enumerate(range(members.start, members.stop)):
@@ -398,21 +400,31 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
     return distance, gradients
 
 
+def _every(parameters: tuple[Array | None, ...], members: int | slice) -> list[Array | None]:
+    """Return the parameters of chosen members with a last axis for the points."""
+    return [None if p is None else p[..., members, None] for p in parameters]
+
+
+def _take(parameters: tuple[Array | None, ...], members: Indices) -> list[Array | None]:
+    """Return the parameters of one member for each point."""
+    return [None if p is None else p.take(members, axis=-1) for p in parameters]
+
+
 def lengths(vectors: Array) -> Array:
     """Return the length (...) of each column of ``vectors`` (k, ...)."""
     return np.sqrt(np.add.reduce(vectors * vectors, axis=0))
 
 
-def _rounds(q: Array, gradient: bool, half: Array, radius: Array) -> tuple[Array, Array | None]:
+def _rounds(q: Array, gradient: bool, radius: Array, half: Array | None) -> tuple[Array, Array | None]:
     """Spheres and capsules: the distance to the nearest point of a segment along z, less the radius.
 
     Args:
         q: points in the own frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
-        half: half of the segment's length, shape (...) [m]; 0 for a sphere.
         radius: shape (...) [m].
+        half: half of the segment's length, shape (...) [m], 0 for a sphere; None when all are spheres.
     """
-    if half.any():
+    if half is not None:
         q[2] -= np.minimum(np.maximum(q[2], -half), half)
     core = lengths(q)
     distance = core - radius
@@ -426,12 +438,12 @@ def _rounds(q: Array, gradient: bool, half: Array, radius: Array) -> tuple[Array
     return distance, q
 
 
-def _prepare_rounds(_kinds: NDArray[np.str_], sizes: Array) -> tuple[Array, ...]:
-    return 0.5 * sizes[:, 1], sizes[:, 0].copy()
+def _prepare_rounds(kinds: NDArray[np.str_], sizes: Array) -> tuple[Array | None, ...]:
+    return sizes[:, 0].copy(), 0.5 * sizes[:, 1] if (kinds == "capsule").any() else None
 
 
 def _slabs(
-    q: Array, gradient: bool, half: Array, rounding: Array, turned: Array | None = None
+    q: Array, gradient: bool, half: Array, rounding: Array | None, turned: Array | None
 ) -> tuple[Array, Array | None]:
     """Boxes, cylinders and half-spaces: a box of half size ``half``, rounded by ``rounding``.
 
@@ -443,7 +455,7 @@ def _slabs(
         q: points in the own frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
         half: shape (3, ...) [m].
-        rounding: shape (...) [m].
+        rounding: shape (...) [m]; None for 0.
         turned: which ones are cylinders, shape (...); None for none.
     """
     a = np.abs(q)
@@ -455,7 +467,8 @@ def _slabs(
     core = lengths(out)
     largest = np.maximum.reduce(a, axis=0)
     distance = core + np.minimum(largest, 0.0)
-    distance -= rounding
+    if rounding is not None:
+        distance -= rounding
     if not gradient:
         return distance, None
     if np.minimum.reduce(core, axis=None, initial=1.0) >= TINY:
@@ -475,7 +488,7 @@ def _slabs(
     return distance, out
 
 
-def _prepare_slabs(kinds: NDArray[np.str_], sizes: Array) -> tuple[Array, ...]:
+def _prepare_slabs(kinds: NDArray[np.str_], sizes: Array) -> tuple[Array | None, ...]:
     half, rounding = np.zeros((3, len(kinds))), np.zeros(len(kinds))
     for i, (kind, size) in enumerate(zip(kinds, sizes, strict=True)):
         if kind == "box":
@@ -488,7 +501,7 @@ def _prepare_slabs(kinds: NDArray[np.str_], sizes: Array) -> tuple[Array, ...]:
             rounding[i] = size[0]
             half[2, i] = 0.5 * size[1]
     turned = kinds == "cylinder"
-    return (half, rounding, turned) if turned.any() else (half, rounding)
+    return half, rounding if rounding.any() else None, turned if turned.any() else None
 
 
 def _ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor: Array) -> tuple[Array, Array | None]:
@@ -509,18 +522,17 @@ def _ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor
     """
     y = np.maximum(np.abs(q), floor)  # off the plane of symmetry, where s and y vanish together
     scaled = semi_axes * y
-    s = np.maximum.reduce(scaled - beyond, axis=0)  # F >= 0 here by each term alone, and on the next line by their sum
-    np.maximum(s, lengths(scaled) - np.maximum.reduce(beyond, axis=0), out=s)
-    for step_number in range(_MAX_NEWTON):
-        inverse = 1.0 / (s + beyond)
-        terms = scaled * inverse
+    s = np.maximum.reduce(scaled - beyond, axis=0)  # each term alone says F >= 0 here
+    for _ in range(_MAX_NEWTON):
+        shifted = s + beyond
+        terms = scaled / shifted
         terms *= terms
         total = np.add.reduce(terms, axis=0)  # F + 1
-        terms *= inverse
+        terms /= shifted
         step = (np.sqrt(total) - 1.0) * total
         step /= np.add.reduce(terms, axis=0)
         s += step
-        if step_number and np.maximum.reduce(step / s, axis=None, initial=0.0) < _NEWTON_TOLERANCE:
+        if np.maximum.reduce(step / s, axis=None, initial=0.0) < _NEWTON_TOLERANCE:
             break
     normal = y / (s + beyond)
     normal /= lengths(normal)
@@ -529,7 +541,7 @@ def _ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor
     return distance, np.copysign(normal, q, out=normal) if gradient else None
 
 
-def _prepare_ellipsoids(_kinds: NDArray[np.str_], sizes: Array) -> tuple[Array, ...]:
+def _prepare_ellipsoids(_kinds: NDArray[np.str_], sizes: Array) -> tuple[Array | None, ...]:
     semi_axes = np.ascontiguousarray(sizes.T)
     shortest = semi_axes.min(axis=0)
     floor = np.zeros_like(semi_axes)
@@ -589,14 +601,14 @@ def _hull(polytope: Polytope) -> Kernel:
     return kernel
 
 
-def _prepare_cones(_kinds: NDArray[np.str_], sizes: Array) -> tuple[Array, ...]:
+def _prepare_cones(_kinds: NDArray[np.str_], sizes: Array) -> tuple[Array | None, ...]:
     radius, height, _ = np.ascontiguousarray(sizes.T)
     slant = np.hypot(radius, height)
     return radius, height, slant, np.stack([height, radius]) / slant
 
 
 _ROUND, _SLABS = ("sphere", "capsule"), ("box", "cylinder", "half_space")
-_FAMILIES: tuple[tuple[Kernel, tuple[str, ...], Callable[[NDArray[np.str_], Array], tuple[Array, ...]]], ...] = (
+_FAMILIES: tuple[tuple[Kernel, tuple[str, ...], Callable[[NDArray[np.str_], Array], tuple[Array | None, ...]]], ...] = (
     (_rounds, _ROUND, _prepare_rounds),
     (_slabs, _SLABS, _prepare_slabs),
     (_ellipsoids, ("ellipsoid",), _prepare_ellipsoids),
