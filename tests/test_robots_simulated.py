@@ -5,9 +5,9 @@ import pytest
 
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.pose import Pose, quaternion_exp
 from imitarm.robots import ROBOTS, SimulatedRobot
-from imitarm.scene import Box, Scene, Sphere
+from imitarm.scene import Box, HalfSpace, Scene, Sphere, Track
 
 DT = 0.01
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -125,6 +125,102 @@ def test_obstacles_move_with_their_velocity(arm):
     np.testing.assert_allclose(robot.scene.obstacles[0].center, [0.8, 0.6, 0.15], atol=1e-9)
     np.testing.assert_allclose(robot.data.body("obstacle/0").xpos, [0.8, 0.6, 0.15], atol=1e-3)
     assert robot.clearance() > start + 0.02
+
+
+def test_an_obstacle_follows_any_function_of_time(arm):
+    def circling(t):
+        return np.array([0.9 + 0.1 * np.cos(2 * t), 0.5 + 0.1 * np.sin(2 * t), 0.3])
+
+    def spinning(t):
+        return Pose(np.array([0.0, 0.9, 0.4]), quaternion_exp([0.0, 0.0, 3.0 * t]))
+
+    stick = Box(Pose.identity(), [0.3, 0.02, 0.02])
+    scene = Scene(None, (Sphere([0, 0, 2.0], 0.05, name="ball"), stick, Sphere([0.5, 2, 0], 0.1, velocity=[0.1, 0, 0])))
+    robot = SimulatedRobot(arm, scene=scene, motion={"ball": circling, 1: spinning})
+    for _ in range(3):
+        seen = robot.scene
+        assert seen.stamp == pytest.approx(robot.time)
+        np.testing.assert_allclose(seen.obstacles[0].center, circling(robot.time), atol=1e-9)
+        np.testing.assert_allclose(seen.obstacles[0].velocity, 0.2 * tangent(2 * robot.time), atol=1e-6)
+        np.testing.assert_allclose(seen.obstacles[1].pose.rotation, spinning(robot.time).rotation, atol=1e-9)
+        np.testing.assert_allclose(seen.obstacles[1].angular_velocity, [0, 0, 3.0], atol=1e-6)
+        np.testing.assert_allclose(seen.obstacles[2].center, [0.5 + 0.1 * robot.time, 2, 0], atol=1e-9)
+        np.testing.assert_allclose(robot.data.body("obstacle/0").xpos, circling(robot.time), atol=2e-3)
+        for _k in range(20):
+            robot.move(np.zeros(7), DT)
+    robot.reset()
+    np.testing.assert_allclose(robot.data.body("obstacle/0").xpos, circling(0.0), atol=1e-9)
+
+
+def tangent(angle):
+    return np.array([-np.sin(angle), np.cos(angle), 0.0])
+
+
+def test_an_obstacle_follows_a_recorded_track(arm):
+    track = Track([0.0, 0.1, 0.3], [[0.9, 0.5, 0.3], [0.9, 0.6, 0.3], [0.9, 0.6, 0.5]])
+    scene = Scene(None, (Sphere([0, 0, 2.0], 0.05),))
+    robot = SimulatedRobot(arm, scene=scene, motion={0: track})
+    for _ in range(20):
+        robot.move(np.zeros(7), DT)
+    np.testing.assert_allclose(robot.scene.obstacles[0].center, [0.9, 0.6, 0.4], atol=1e-9)
+    np.testing.assert_allclose(robot.scene.obstacles[0].velocity, [0, 0, 1.0], atol=1e-9)
+    for _ in range(20):
+        robot.move(np.zeros(7), DT)
+    np.testing.assert_allclose(robot.scene.obstacles[0].velocity, 0.0, atol=1e-9)
+
+
+def test_a_wrong_motion_is_refused(arm):
+    scene = Scene(None, (Sphere([0, 0, 2.0], 0.05, name="ball"),))
+    for motion, message in (
+        ({"bal": np.zeros}, "no obstacle 'bal'"),
+        ({3: np.zeros}, "no obstacle 3"),
+        ({"ball": [0, 0, 1]}, "must be a function of time"),
+        ({"ball": lambda t: [t, np.nan, 0]}, "position of obstacle 0 at 0 s"),
+        ({"ball": lambda t: "there"}, "position of obstacle 0"),
+    ):
+        with pytest.raises(InputError, match=message):
+            SimulatedRobot(arm, scene=scene, motion=motion)
+    for times, positions in (([0, 0], np.zeros((2, 3))), ([0, 1], np.zeros((3, 3))), ([0, np.nan], np.zeros((2, 3)))):
+        with pytest.raises(InputError, match="Track"):
+            Track(times, positions)
+
+
+@pytest.mark.parametrize("name, tool", [("sawyer", "gripper"), ("panda", "gripper"), ("sawyer", "brush")])
+def test_self_contact_is_a_contact(name, tool):
+    arm = ArmModel.load(name, tool=tool)
+    robot = SimulatedRobot(arm)
+    assert robot.scene.obstacles == ()
+    rng = np.random.default_rng(0)
+    for _ in range(500):  # a posture in which two links overlap
+        robot.reset(rng.uniform(arm.lower, arm.upper))
+        if robot.clearance() < -0.02:
+            break
+    folded = robot.state().q
+    robot.reset()
+    assert robot.clearance() == np.inf
+    assert not robot.contacts
+    while not robot.contacts and not robot.fault and robot.time < 20.0:
+        robot.move(np.clip(folded - robot.set_point, -0.5, 0.5), DT)
+    assert robot.contacts
+    first, second = next(iter(robot.contacts))
+    assert first != second
+    assert robot.report()["contact_steps"] > 0
+    assert robot.clearance() < np.inf
+
+
+def test_floor_and_pedestal_belong_to_the_scene_and_count_for_contact(arm):
+    robot = SimulatedRobot(arm)
+    assert [fixture.name for fixture in robot.scene.fixtures] == ["floor", "pedestal"]
+    assert {"floor", "pedestal"} <= {robot.model.geom(i).name for i in range(robot.model.ngeom)}
+    high = robot.tool_to_base.position[2] - 0.1
+    table = HalfSpace([0, 0, high], name="table top")
+    robot = SimulatedRobot(arm, scene=Scene(fixtures=[table]))
+    assert robot.scene.fixtures == (table,)
+    assert robot.clearance() == np.inf  # what is measured is the distance to obstacles
+    velocity = np.linalg.pinv(arm.tool_jacobian(arm.home)) @ [0, 0, -0.2, 0, 0, 0]
+    for _ in range(80):
+        robot.move(velocity, DT)
+    assert {second for _, second in robot.contacts} == {"table top"}
 
 
 def test_left_alone_a_guided_arm_stays_and_a_pull_leads_it(arm):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import mujoco
@@ -15,8 +16,18 @@ from imitarm.kinematics.pose import Pose, matrix_to_quaternion
 from imitarm.robots.clearance import ClearanceGauge
 from imitarm.robots.drives import Drives, add_drives
 from imitarm.robots.robot import Robot
-from imitarm.robots.world import COLLISION_GROUP, OBSTACLE, add_obstacles, arm_world
-from imitarm.scene import Scene
+from imitarm.robots.world import (
+    COLLISION_GROUP,
+    OBSTACLE,
+    add_fixtures,
+    add_obstacles,
+    arm_world,
+    fixture_names,
+    standard_fixtures,
+)
+from imitarm.scene import MovingScene, Scene
+from imitarm.scene.motion import Motion
+from imitarm.validation import instance
 
 Array = NDArray[np.float64]
 Control = Literal["position", "torque"]
@@ -33,8 +44,9 @@ class SimulatedRobot(Robot):
     Attributes:
         model: the compiled world.
         data: its state; read it, and let the robot change it.
-        scene_at_start: the scene at time 0; obstacles with a velocity move from there.
-        contacts: names of the pairs (arm geom, obstacle geom) that have touched since the last reset.
+        scene_at_start: the scene at time 0.
+        contacts: names of the pairs that have touched since the last reset: arm geom and obstacle, arm geom and
+            fixture, or two geoms of different links of the arm (a self-contact).
         contact_steps: number of physics steps with such a contact.
     """
 
@@ -43,6 +55,7 @@ class SimulatedRobot(Robot):
         arm: ArmModel,
         *,
         scene: Scene | None = None,
+        motion: Mapping[str | int, Motion] | None = None,
         world: mujoco.MjSpec | None = None,
         control: Control = "position",
         q: ArrayLike | None = None,
@@ -52,9 +65,12 @@ class SimulatedRobot(Robot):
 
         Args:
             arm: the arm with its tool.
-            scene: its obstacles become solid bodies; None for none.
+            scene: its obstacles and fixtures become solid bodies; None for none. Its ``stamp`` is the time of the
+                world's beginning. Without fixtures and ``world`` it gets a floor and a pedestal.
+            motion: for some obstacles, by name or index, where they are at each time on the scene's clock: any function
+                of time, or a recorded :class:`~imitarm.scene.motion.Track`. The others keep their velocities.
             world: a world that holds the arm, as :func:`~imitarm.robots.world.arm_world` returns it, with more
-                furniture; it is copied. None for a floor and a pedestal.
+                furniture; it is copied. None: built from the scene.
             control: ``"position"`` or ``"torque"``.
             q: joint angles to start at, shape (n_joints,) [rad]; None for ``arm.home``.
             timestep: of the physics and of the drives [s].
@@ -68,10 +84,15 @@ class SimulatedRobot(Robot):
         if not 0.0 < timestep <= 0.002:
             raise InputError(f"SimulatedRobot: timestep must be in (0, 0.002] s (500 Hz or faster), got {timestep!r}")
         arm.check_dynamics()
-        self.scene_at_start = scene if scene is not None else Scene()
+        scene = Scene() if scene is None else instance(scene, Scene, "SimulatedRobot: scene")
+        if world is None and not scene.fixtures:
+            scene = replace(scene, fixtures=standard_fixtures())
+        self._source = MovingScene(scene, {} if motion is None else motion)
+        self.scene_at_start = self._source.at(scene.stamp)
         self.control: Control = control
         self._q_start = _checked_start(arm, arm.home if q is None else q)
-        spec = arm_world(arm) if world is None else world.copy()
+        spec = arm_world(arm, fixtures=scene.fixtures) if world is None else world.copy()
+        add_fixtures(spec, scene.fixtures)
         add_obstacles(spec, self.scene_at_start)
         add_drives(spec, arm)
         spec.option.timestep = timestep
@@ -93,11 +114,23 @@ class SimulatedRobot(Robot):
         in_arm = np.isin(m.geom_bodyid, list(arm_bodies)) & ((m.geom_contype | m.geom_conaffinity) != 0)
         if (m.geom_group[in_arm] == COLLISION_GROUP).any():  # an arm from a foreign file may not know the group
             in_arm &= m.geom_group == COLLISION_GROUP
-        obstacles = [m.geom(f"{OBSTACLE}{i}").id for i in range(len(self.scene_at_start.obstacles))]
-        self._gauge = ClearanceGauge(m, np.flatnonzero(in_arm).tolist(), obstacles)
-        count = len(self.scene_at_start.obstacles)
+        scene = self.scene_at_start
+        obstacles = [m.geom(f"{OBSTACLE}{i}").id for i in range(len(scene.obstacles))]
+        self._fixtures = [m.geom(name).id for name in fixture_names(scene.fixtures)]
+        arm_geoms = np.flatnonzero(in_arm)
+        above = np.zeros(m.nbody, dtype=int)  # how many of the arm's joints move each body
+        for name in arm.joint_names:
+            above[m.joint(name).bodyid] += 1
+        for body in range(1, m.nbody):  # parents have smaller indices
+            above[body] += above[m.body_parentid[body]]
+        links = above[m.geom_bodyid[arm_geoms]].tolist()
+        self._gauge = ClearanceGauge(m, arm_geoms.tolist(), obstacles, self._fixtures, links)
+        self.data.qpos[:] = arm.posture(m, arm.home)
+        mujoco.mj_forward(m, self.data)
+        self._gauge.ignore_present_self_contacts(self.data)
+        count = len(scene.obstacles)
         self._mocap = np.array([m.body_mocapid[m.body(f"{OBSTACLE}{i}").id] for i in range(count)], dtype=int)
-        self._moving = any(obstacle.moves for obstacle in self.scene_at_start.obstacles)
+        self._moving = bool(self._source.motions) or any(obstacle.moves for obstacle in scene.obstacles)
 
     def reset(self, q: ArrayLike | None = None) -> ArmState:
         """Put everything back to time 0, and the arm at rest at ``q``.
@@ -127,8 +160,8 @@ class SimulatedRobot(Robot):
 
     @property
     def scene(self) -> Scene:
-        """The scene as it truly is now."""
-        return self.scene_at_start.at(self.scene_at_start.stamp + self.time)
+        """The scene as it truly is now, with true velocities; ``stamp`` is its time on the scene's clock."""
+        return self._source.at(self.scene_at_start.stamp + self.time)
 
     @property
     def tool_to_base(self) -> Pose:
@@ -161,7 +194,8 @@ class SimulatedRobot(Robot):
     def clearance(self) -> float:
         """Return the smallest distance from the arm or its tool to an obstacle [m].
 
-        It is measured between the simulator's geoms, negative when they overlap and inf without obstacles.
+        It is measured between the simulator's geoms, negative when they overlap and inf without obstacles. While two
+        links touch each other it is at most minus the depth of that contact.
         """
         return self._gauge.measure(self.data)[0]
 
@@ -170,15 +204,22 @@ class SimulatedRobot(Robot):
         return {"contacts": frozenset(self.contacts), "contact_steps": self.contact_steps}
 
     def nearest_pair(self) -> tuple[str, str] | None:
-        """Return the names of the arm geom and the obstacle that have the :meth:`clearance`; None without any."""
+        """Return the names of the two geoms that have the :meth:`clearance`, the arm's first; None without any."""
         pair = self._gauge.measure(self.data)[1]
         return None if pair is None else self._names(pair)
 
     def _names(self, pair: tuple[int, int]) -> tuple[str, str]:
-        arm_geom, obstacle = self.model.geom(pair[0]), self.model.geom(pair[1])
-        index = int(obstacle.name.removeprefix(OBSTACLE))
-        body = self.model.body(self.model.geom_bodyid[pair[0]]).name
-        return arm_geom.name or body, self.scene_at_start.name_of(index)
+        second = self.model.geom(pair[1]).name
+        if second.startswith(OBSTACLE):
+            name = self.scene_at_start.name_of(int(second.removeprefix(OBSTACLE)))
+        elif pair[1] in self._fixtures:
+            name = second
+        else:
+            name = self._arm_geom(pair[1])
+        return self._arm_geom(pair[0]), name
+
+    def _arm_geom(self, geom: int) -> str:
+        return str(self.model.geom(geom).name or self.model.body(self.model.geom_bodyid[geom]).name)
 
     def _send(self, previous: Array, velocity: Array, dt: float) -> None:
         n = self._steps(dt)
@@ -233,9 +274,9 @@ class SimulatedRobot(Robot):
             self.contact_steps += 1
             self.contacts.update(self._names(pair) for pair in touching)
         if self._moving:
-            now = self.scene.packed
-            self.data.mocap_pos[self._mocap] = now.positions
-            self.data.mocap_quat[self._mocap] = now.quaternions
+            positions, quaternions = self._source.poses(self.scene_at_start.stamp + self.time)
+            self.data.mocap_pos[self._mocap] = positions
+            self.data.mocap_quat[self._mocap] = quaternions
 
 
 def _checked_start(arm: ArmModel, q: ArrayLike) -> Array:

@@ -1,7 +1,8 @@
-"""A MuJoCo world around an arm: floor, pedestal, light, and the obstacles of a scene as solid bodies."""
+"""A MuJoCo world around an arm: light, and the fixtures and obstacles of a scene as solids."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -9,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.kinematics.pose import Pose
-from imitarm.scene import ConvexHull, Obstacle, Scene
+from imitarm.scene import ConvexHull, Cylinder, HalfSpace, Obstacle, Scene
+from imitarm.validation import finite_number
 
 if TYPE_CHECKING:
     from imitarm.kinematics.arm import ArmModel
@@ -20,17 +22,37 @@ COLLISION_GROUP = 3  # geoms of the arm and its tool that count for contact
 OBSTACLE = "obstacle/"  # bodies and geoms of obstacles are called so, followed by the index in the scene
 
 _COLORS = ((0.20, 0.42, 0.70), (0.78, 0.22, 0.20), (0.93, 0.58, 0.15), (0.45, 0.32, 0.60), (0.30, 0.55, 0.40))
-_FLOOR = (0.55, 0.57, 0.60, 1.0)
-_PEDESTAL = (0.28, 0.30, 0.33, 1.0)
+_FIXTURE_COLORS = {"floor": (0.55, 0.57, 0.60, 1.0), "pedestal": (0.28, 0.30, 0.33, 1.0), "": (0.80, 0.68, 0.52, 1.0)}
 
 
-def arm_world(arm: ArmModel, *, floor: float = -0.75, pedestal_radius: float = 0.12) -> mujoco.MjSpec:
-    """Return a world with the arm on a pedestal, base at the origin, ready for more furniture.
+def standard_fixtures(*, floor: float = -0.75, pedestal_radius: float = 0.12) -> tuple[Obstacle, ...]:
+    """Return what an arm stands on: a floor, and a pedestal below the base.
+
+    Args:
+        floor: height of the floor in the base frame [m]; at 0 or above there is no pedestal.
+        pedestal_radius: [m].
+
+    Raises:
+        InputError: when a number is not finite, or the radius is not positive.
+    """
+    height = finite_number(floor, "floor", "m")
+    ground = HalfSpace(np.array([0.0, 0.0, height]), name="floor")
+    if height >= 0.0:
+        return (ground,)
+    pose = Pose(np.array([0.0, 0.0, 0.5 * height]), np.array([1.0, 0.0, 0.0, 0.0]))
+    return ground, Cylinder(pose, pedestal_radius, -height, name="pedestal")
+
+
+def arm_world(
+    arm: ArmModel, *, floor: float = -0.75, pedestal_radius: float = 0.12, fixtures: Sequence[Obstacle] | None = None
+) -> mujoco.MjSpec:
+    """Return a world with the arm, its base at the origin, on what it stands on; more furniture can be added.
 
     Args:
         arm: the arm with its tool.
-        floor: height of the floor in the base frame [m]; at 0 or above there is no pedestal.
-        pedestal_radius: [m].
+        floor: as for :func:`standard_fixtures`.
+        pedestal_radius: as for :func:`standard_fixtures`.
+        fixtures: what the arm stands on, instead of the standard ones.
 
     Returns:
         A specification that :class:`~imitarm.robots.simulated.SimulatedRobot` takes as ``world``.
@@ -49,20 +71,30 @@ def arm_world(arm: ArmModel, *, floor: float = -0.75, pedestal_radius: float = 0
         height=384,
     )
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-    world = spec.worldbody
-    world.add_light(pos=[0.5, -1.0, 2.5], dir=[0.0, 0.35, -1.0], diffuse=[0.4, 0.4, 0.4])
-    world.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, pos=[0.0, 0.0, floor], size=[3.0, 3.0, 0.05], rgba=_FLOOR
-    )
-    if floor < 0.0:
-        world.add_geom(
-            name="pedestal",
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            pos=[0.0, 0.0, 0.5 * floor],
-            size=[pedestal_radius, -0.5 * floor, 0.0],
-            rgba=_PEDESTAL,
-        )
+    spec.worldbody.add_light(pos=[0.5, -1.0, 2.5], dir=[0.0, 0.35, -1.0], diffuse=[0.4, 0.4, 0.4])
+    standard = standard_fixtures(floor=floor, pedestal_radius=pedestal_radius)
+    add_fixtures(spec, standard if fixtures is None else fixtures)
     return spec
+
+
+def add_fixtures(spec: mujoco.MjSpec, fixtures: Sequence[Obstacle]) -> None:
+    """Add fixtures as solids that never move, each a geom of its name (``fixture/0`` and so on without one).
+
+    Args:
+        spec: the world; changed in place. A fixture whose name is a geom's already is there and is not added again.
+        fixtures: in the base frame, which is the world frame.
+    """
+    there = {geom.name for geom in spec.geoms}
+    for name, fixture in zip(fixture_names(fixtures), fixtures, strict=True):
+        if name not in there:
+            solid = fixture.solid()
+            color = _FIXTURE_COLORS.get(name, _FIXTURE_COLORS[""])
+            _add_geom(spec, spec.worldbody, name, fixture, color, pos=solid.position, quat=solid.quaternion)
+
+
+def fixture_names(fixtures: Sequence[Obstacle]) -> list[str]:
+    """Return the names of the geoms of fixtures in a world."""
+    return [fixture.name or f"fixture/{i}" for i, fixture in enumerate(fixtures)]
 
 
 def add_obstacles(spec: mujoco.MjSpec, scene: Scene) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from imitarm.scene.motion import MovingScene, Track
 from imitarm.scene.obstacle import (
     Box,
     Capsule,
@@ -29,9 +30,11 @@ __all__ = [
     "Cylinder",
     "Ellipsoid",
     "HalfSpace",
+    "MovingScene",
     "Obstacle",
     "Scene",
     "Sphere",
+    "Track",
     "load_scene",
     "save_scene",
 ]

@@ -138,19 +138,36 @@ class PackedObstacles:
         """Return the obstacles ``dt`` seconds later, each moved with its velocity and angular velocity [s]."""
         if self._still or dt == 0.0:
             return self
-        moved = object.__new__(PackedObstacles)
-        values = moved.__dict__
-        values.update(self.__dict__)  # the shapes stay, and what was worked out for them
-        values["positions"] = self.positions + dt * self.velocities
+        positions = self.positions + dt * self.velocities
         if self.rotating:
             turned = quaternion_multiply(quaternion_exp(dt * self.angular_velocities), self.quaternions)
-            values["quaternions"] = turned
-            values.pop("_frames", None)
-            values.pop("_single", None)
-        else:
-            frames = self._frames
-            values.pop("_single", None)
-            values["_frames"] = frames._replace(center=frames.center + dt * frames.velocity)
+            return self._copy(positions=positions, quaternions=turned)
+        frames = self._frames
+        return self._copy(positions=positions, _frames=frames._replace(center=frames.center + dt * frames.velocity))
+
+    def placed(
+        self, positions: Array, quaternions: Array, velocities: Array, angular_velocities: Array, stamp: float
+    ) -> PackedObstacles:
+        """Return the same shapes elsewhere and seen at ``stamp`` [s]; the other arguments are the attributes."""
+        moved = self._copy(
+            positions=positions,
+            quaternions=quaternions,
+            velocities=velocities,
+            angular_velocities=angular_velocities,
+            stamps=np.full(len(self), stamp),
+        )
+        for name in ("_still", "rotating"):
+            moved.__dict__.pop(name, None)
+        return moved
+
+    def _copy(self, **changes: object) -> PackedObstacles:
+        """Return a copy with other poses, which keeps what was worked out for the shapes."""
+        moved = object.__new__(PackedObstacles)
+        values = moved.__dict__
+        values.update(self.__dict__)
+        values.pop("_frames", None)
+        values.pop("_single", None)
+        values.update(changes)
         return moved
 
     @cached_property

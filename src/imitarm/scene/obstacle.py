@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
-from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply, rotate
+from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_exp, quaternion_multiply, rotate
 from imitarm.scene.distances import (
     TINY,
     PackedObstacles,
@@ -219,6 +219,27 @@ class Obstacle(ABC):
         turn = quaternion_exp(dt * self.angular_velocity) if self.angular_velocity.any() else None
         moved._move(dt * self.velocity, turn)
         return moved
+
+    def placed(self, position: Array, quaternion: Array, velocity: Array, angular_velocity: Array) -> Self:
+        """Return the obstacle elsewhere; itself when it is there already. The arguments must be valid.
+
+        Args:
+            position: of the own frame's origin, see :class:`~imitarm.scene.distances.PackedObstacles`, shape (3,) [m].
+            quaternion: own_to_base rotation wxyz, shape (4,).
+            velocity: shape (3,) [m/s].
+            angular_velocity: shape (3,) [rad/s].
+        """
+        before = self.solid()
+        stays = (position == before.position).all() and (quaternion == before.quaternion).all()
+        if stays and (velocity == self.velocity).all() and (angular_velocity == self.angular_velocity).all():
+            return self
+        placed = copy.copy(self)
+        placed.__dict__.pop("packed", None)
+        placed._set(velocity=velocity.copy(), angular_velocity=angular_velocity.copy())
+        turns = (quaternion != before.quaternion).any()
+        turn = quaternion_multiply(quaternion, quaternion_conjugate(before.quaternion)) if turns else None
+        placed._move(position - before.position, turn)
+        return placed
 
     @abstractmethod
     def solid(self) -> Solid:

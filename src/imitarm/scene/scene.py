@@ -10,13 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
+from imitarm.html_table import html_table
 from imitarm.kinematics.pose import Pose
 from imitarm.scene.distances import PackedObstacles, checked_points, distances, distances_and_gradients
 from imitarm.scene.obstacle import Array, Obstacle, pack
 from imitarm.validation import finite_number
 
+_LISTED = 4  # obstacles that a short repr names
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """A goal and obstacles at one time, all in the base frame.
 
@@ -27,6 +30,8 @@ class Scene:
         obstacles: any iterable of obstacles; kept as a tuple.
         stamp: the time for which the poses of the obstacles hold [s]. For a scene from a sensor this is when it was
             seen; :meth:`at` predicts from there.
+        fixtures: what the arm stands on and works at, such as floor, pedestal and table. They are part of a simulated
+            world and count for contact; planners keep no distance from them, because a tool must reach its table.
 
     Raises:
         InputError: when ``goal`` is not a pose, an obstacle is not an obstacle, or ``stamp`` is not a finite number.
@@ -35,19 +40,27 @@ class Scene:
     goal: Pose | None = None
     obstacles: tuple[Obstacle, ...] = field(default_factory=tuple)
     stamp: float = 0.0
+    fixtures: tuple[Obstacle, ...] = ()
 
     def __post_init__(self) -> None:
         if self.goal is not None and not isinstance(self.goal, Pose):
             raise InputError(f"Scene: goal must be a Pose or None, got {self.goal!r}")
-        try:
-            obstacles = tuple(self.obstacles)
-        except TypeError as error:
-            raise InputError(f"Scene: obstacles must be a list of obstacles, got {self.obstacles!r}") from error
-        for i, obstacle in enumerate(obstacles):
-            if not isinstance(obstacle, Obstacle):
-                raise InputError(f"Scene: obstacles[{i}] must be an obstacle such as Sphere or Box, got {obstacle!r}")
-        object.__setattr__(self, "obstacles", obstacles)
+        for key in ("obstacles", "fixtures"):
+            object.__setattr__(self, key, _checked_obstacles(getattr(self, key), key))
         object.__setattr__(self, "stamp", finite_number(self.stamp, "Scene: stamp", "s"))
+
+    @classmethod
+    def predicted(cls, seen: Scene, packed: PackedObstacles, stamp: float) -> Scene:
+        """Return ``seen`` with its obstacles where ``packed`` has them; for code that moves obstacles itself.
+
+        Args:
+            seen: the scene from which the shapes, the goal and the fixtures are taken.
+            packed: the obstacles of ``seen`` with other poses and velocities.
+            stamp: the time for which they hold [s].
+        """
+        scene = object.__new__(cls)
+        scene.__dict__.update(goal=seen.goal, stamp=stamp, fixtures=seen.fixtures, packed=packed, _seen=seen)
+        return scene
 
     @cached_property
     def packed(self) -> PackedObstacles:
@@ -69,18 +82,45 @@ class Scene:
         """
         time = finite_number(time, "Scene.at: time", "s")
         seen: Scene = self.__dict__.get("_seen", self)
-        moved = object.__new__(Scene)
-        moved.__dict__.update(goal=seen.goal, stamp=time, packed=seen.packed.after(time - seen.stamp), _seen=seen)
-        return moved
+        if seen is not self and seen.packed.velocities is not self.packed.velocities:
+            seen = self  # its obstacles were moved by something else
+        return Scene.predicted(seen, seen.packed.after(time - seen.stamp), time)
 
     def __getattr__(self, name: str) -> Any:
         """Build the obstacles of a predicted scene, the only attribute that may be missing."""
         seen: Scene | None = self.__dict__.get("_seen")
         if name != "obstacles" or seen is None:
             raise AttributeError(f"Scene has no attribute {name!r}")
-        obstacles = tuple(obstacle.after(self.stamp - seen.stamp) for obstacle in seen.obstacles)
+        packed = self.packed
+        rows = zip(
+            seen.obstacles,
+            packed.positions,
+            packed.quaternions,
+            packed.velocities,
+            packed.angular_velocities,
+            strict=True,
+        )
+        obstacles = tuple(obstacle.placed(*row) for obstacle, *row in rows)
         object.__setattr__(self, "obstacles", obstacles)
         return obstacles
+
+    def __repr__(self) -> str:
+        parts = [self.name_of(i) for i in range(len(self.obstacles))]
+        parts = parts if len(parts) <= _LISTED else [*parts[:_LISTED], f"{len(parts) - _LISTED} more"]
+        goal = "" if self.goal is None else f", goal {np.round(self.goal.position, 3).tolist()}"
+        return f"Scene({', '.join(parts) or 'no obstacles'}{goal}, stamp {self.stamp:g} s)"
+
+    def _repr_html_(self) -> str:
+        rows: dict[str, object] = {
+            "goal": "as learned" if self.goal is None else f"{np.round(self.goal.position, 3).tolist()} m",
+            "stamp": f"{self.stamp:g} s",
+        }
+        for i, obstacle in enumerate(self.obstacles):
+            place = f"at {np.round(self.packed.positions[i], 3).tolist()} m"
+            speed = float(np.linalg.norm(obstacle.velocity))
+            rows[self.name_of(i)] = f"{place}, {speed:.2g} m/s" if speed else place
+        rows["fixtures"] = ", ".join(fixture.name or fixture.kind for fixture in self.fixtures)
+        return html_table("Scene", rows)
 
     def distances(self, points: ArrayLike) -> Array:
         """Return the signed distance of every point to every obstacle.
@@ -175,3 +215,14 @@ class Scene:
                 f"Scene: the goal {np.round(self.goal.position, 4).tolist()} overlaps {self.name_of(worst)} by "
                 f"{depth:.1f} mm (tool radius {1e3 * tool_radius:g} mm); move the goal or the obstacle"
             )
+
+
+def _checked_obstacles(given: object, what: str) -> tuple[Obstacle, ...]:
+    try:
+        obstacles: tuple[Any, ...] = tuple(given)  # type: ignore[arg-type]
+    except TypeError as error:
+        raise InputError(f"Scene: {what} must be a list of obstacles, got {given!r}") from error
+    for i, obstacle in enumerate(obstacles):
+        if not isinstance(obstacle, Obstacle):
+            raise InputError(f"Scene: {what}[{i}] must be an obstacle such as Sphere or Box, got {obstacle!r}")
+    return obstacles
