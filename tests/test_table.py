@@ -69,7 +69,7 @@ def test_lines_are_those_of_an_editor(tmp_path):
         (b"  \n\n", "is empty"),
         (b"# only a remark\n", "no rows"),
         (b"x,y,z\n", "column names but no rows"),
-        (b"x,y,z\n1,2,3\n4,5\n", r"line 3: 2 values where 3 are expected; mend"),
+        (b"x,y,z\n1,2,3\n4,5\n", r"line 3: 2 values where 3 are expected; fix"),
         (b"x,y,z\n1,2,3\n4,5", r"line 3: 2 values .* cut off"),
         (b"1,2,3\n4,5,six\n", r"line 2, column 3: 'six' is not a number"),
         (b"1,2,3\n4,,6\n", r"line 2, column 2: a value is missing"),

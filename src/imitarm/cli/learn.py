@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from imitarm.cli.outputs import check_outputs
-from imitarm.cli.reading import add_reading_arguments, read_and_lint, show_findings
+from imitarm.cli.reading import add_reading_arguments, as_options, read_and_lint, show_findings
 from imitarm.cli.robot_options import load_optional_robot, robot_files
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.demonstrations import Alignment, compute_alignment, files_of
@@ -25,26 +25,28 @@ examples:
   imitarm learn pouring.npy --task pour --out pour.json --units cm --duration 10
   imitarm learn recordings/ --task insert --robot sawyer --components 8
 
-The demonstrations are read, checked (as by 'imitarm lint'), aligned and learnt. Nothing is written when a check
-finds an error.
+The demonstrations are read, checked (as by 'imitarm lint') and aligned, and a skill is learned from them. Nothing is
+written when a check finds an error.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes."""
+    """Add the arguments of the command."""
     add_reading_arguments(parser)
-    parser.add_argument("--repair", action="store_true", help="drop rows that are not finite or not later than before")
-    parser.add_argument("--allow-errors", action="store_true", help="learn in spite of errors that the check finds")
+    parser.add_argument("--repair", action="store_true", help="drop rows that are invalid or late")
+    parser.add_argument("--allow-errors", action="store_true", help="learn although the check finds errors")
     learning = parser.add_argument_group("learning")
-    learning.add_argument("--task", default="", metavar="NAME", help="what is shown, kept in the skill")
+    learning.add_argument("--task", default="", metavar="NAME", help="name of the task, kept in the skill")
     learning.add_argument("--align", choices=METHODS, default="dtw", help="how to align; default: dtw")
-    learning.add_argument("--samples", type=int, default=200, metavar="N", help="of each aligned one; default: 200")
+    learning.add_argument(
+        "--samples", type=int, default=200, metavar="N", help="samples of each aligned motion; default: 200"
+    )
     learning.add_argument(
         "--components", type=_components, default="auto", metavar="K", help="Gaussians; default: auto"
     )
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=Path, default=Path("skill.json"), metavar="FILE", help="default: skill.json")
-    output.add_argument("--force", action="store_true", help="replace a skill file that is there")
+    output.add_argument("--force", action="store_true", help="replace an existing skill file")
 
 
 def _components(text: str) -> int | Literal["auto"]:
@@ -65,10 +67,13 @@ def run(arguments: argparse.Namespace) -> int:
     check_outputs([("--out", arguments.out)], inputs, force=arguments.force)
     arm = load_optional_robot(arguments)
     raw, findings = read_and_lint(arguments, arm, task=arguments.task, repair=arguments.repair)
-    show_findings(raw, findings)
+    show_findings(raw, findings, every=arguments.all)
     if any(finding.severity == "error" for finding in findings) and not arguments.allow_errors:
-        raise InputError("not learnt: mend the errors above (--repair drops broken rows, --allow-errors goes on)")
-    demonstrations = [one.demonstration(arm) for one in raw]
+        raise InputError("not learned: fix the errors above (--repair drops invalid rows, --allow-errors ignores them)")
+    try:
+        demonstrations = [one.demonstration(arm) for one in raw]
+    except InputError as error:
+        raise InputError(as_options(str(error))) from error
     with working("aligning"):
         alignment = compute_alignment(demonstrations, n=arguments.samples, method=arguments.align)
     with working("learning: choosing the number of components"), warnings.catch_warnings(record=True) as caught:

@@ -1,4 +1,4 @@
-"""``imitarm lint``: say what is wrong with demonstrations."""
+"""``imitarm lint``: list what is wrong with demonstrations."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ examples:
   imitarm lint pouring.npy --units cm --duration 10
   imitarm lint recordings/ --robot sawyer --tool gripper
 
-Exit status 2 when there is an error among the findings; warnings and notes leave it 0.
+The exit status is 2 when there is an error among the findings; it is 0 when there are only warnings and notes.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes."""
+    """Add the arguments of the command."""
     add_reading_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings; return 2 when one is an error."""
     raw, findings = read_and_lint(arguments, load_optional_robot(arguments))
-    show_findings(raw, findings)
+    show_findings(raw, findings, every=arguments.all)
     return 2 if any(finding.severity == "error" for finding in findings) else 0

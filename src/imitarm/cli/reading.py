@@ -1,37 +1,60 @@
-"""The arguments with which commands read demonstrations, and reading them."""
+"""The arguments of commands that read demonstrations, and reading with them."""
 
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
 
 from imitarm.cli.robot_options import add_robot_options
 from imitarm.cli.screen import say, show_table
-from imitarm.demonstrations import Finding, RawDemonstration, files_of, lint, read_raw
-from imitarm.demonstrations.finding import SEVERITIES
-from imitarm.demonstrations.reader import LENGTH_UNITS, QUATERNION_ORDERS, TIME_UNITS
+from imitarm.demonstrations import READERS, Finding, RawDemonstration, files_of, lint, read_raw
+from imitarm.demonstrations.raw import SEVERITIES
+from imitarm.demonstrations.reading import LENGTH_UNITS, QUATERNION_ORDERS, TIME_UNITS
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 
 _COLOURS = {"error": "red", "warning": "yellow", "note": ""}
+_ARGUMENT = re.compile(
+    r"\b(?P<name>units|time_units|duration|rate|quaternion_order|repair|thin|arm)="
+    r"(?P<value>ArmModel\.load\((?P<arm>[^)]*)\)|'[^']*'|\"[^\"]*\"|[\w.]+)"
+)
 
 
 def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the files and all that they may leave unsaid."""
+    """Add the files, and all facts that they may not state themselves."""
     parser.add_argument(
-        "files", nargs="+", metavar="FILE", help="demonstrations (CSV, text, NPY, NPZ), or folders of them"
+        "files", nargs="+", metavar="FILE", help=f"demonstrations, or folders of them; formats: {', '.join(READERS)}"
     )
-    unsaid = parser.add_argument_group("what files may leave unsaid")
-    unsaid.add_argument("--units", choices=LENGTH_UNITS, help="of lengths; default: as the file says, else m")
-    unsaid.add_argument("--time-units", choices=TIME_UNITS, help="of time stamps; default: as the file says, else s")
+    unsaid = parser.add_argument_group("facts that files may not state")
+    unsaid.add_argument("--units", choices=LENGTH_UNITS, help="unit of lengths; default: as the file says, else m")
     unsaid.add_argument(
-        "--duration", type=float, metavar="S", help="seconds each motion took, if it has no time stamps"
+        "--time-units", choices=TIME_UNITS, help="unit of time stamps; default: as the file says, else s"
     )
-    unsaid.add_argument("--rate", type=float, metavar="HZ", help="samples a second, if it has no time stamps")
     unsaid.add_argument(
-        "--quaternion-order", choices=QUATERNION_ORDERS, default="wxyz", help="of unnamed columns; default: wxyz"
+        "--duration", type=float, metavar="S", help="length of each motion in seconds, if it has no time stamps"
     )
+    unsaid.add_argument("--rate", type=float, metavar="HZ", help="samples per second, if it has no time stamps")
+    unsaid.add_argument(
+        "--quaternion-order",
+        choices=QUATERNION_ORDERS,
+        help="of columns without names; default: as the file says, else wxyz",
+    )
+    parser.add_argument("--thin", action="store_true", help="drop rows that only repeat a held value")
+    parser.add_argument("--all", action="store_true", help="list every finding; default: one row for each kind")
     add_robot_options(parser, default=None)  # else recordings of another arm would be compared with Sawyer
+
+
+def as_options(text: str) -> str:
+    """Return a message with arguments of ``read`` written as command-line options: ``units="mm"`` as ``--units mm``."""
+
+    def option(match: re.Match[str]) -> str:
+        if match["name"] == "arm":
+            return f"--robot {(match['arm'] or match['value']).strip(chr(39) + chr(34))}"
+        name = "--" + match["name"].replace("_", "-")
+        return name if match["value"] == "True" else f"{name} {match['value'].strip(chr(39) + chr(34))}"
+
+    return re.sub(r"\btime_units\b", "--time-units", _ARGUMENT.sub(option, text))
 
 
 def read_and_lint(
@@ -42,8 +65,8 @@ def read_and_lint(
     Args:
         arguments: those of :func:`add_reading_arguments`.
         arm: the arm that was recorded.
-        task: what is shown.
-        repair: drop broken rows before checking.
+        task: name of the task.
+        repair: drop invalid rows before the checks.
 
     Raises:
         InputError: when there are no files, or an option is wrong for all of them.
@@ -60,6 +83,7 @@ def read_and_lint(
                 rate=arguments.rate,
                 quaternion_order=arguments.quaternion_order,
                 task=task,
+                thin=arguments.thin,
             )
             raw += [RawDemonstration.of(one.demonstration(arm, repair=True)) for one in read] if repair else read
         except InputError as error:
@@ -68,16 +92,42 @@ def read_and_lint(
     return raw, unreadable + (lint(raw, arm=arm) if raw else [])
 
 
-def show_findings(raw: Sequence[RawDemonstration], findings: Sequence[Finding]) -> None:
-    """Print the findings as a table, and how many there are of each kind."""
+def show_findings(raw: Sequence[RawDemonstration], findings: Sequence[Finding], *, every: bool = False) -> None:
+    """Print the findings as a table, and how many there are of each severity.
+
+    Args:
+        raw: the demonstrations that were read.
+        findings: about them.
+        every: print each finding; else those of one kind share a row that counts them.
+    """
+    groups = [[f] for f in findings] if every else _kinds(findings)
     if findings:
         show_table(
             ["", "demonstration", "place", "code", "finding", "remedy"],
-            [(f.severity, f.source or "all", f.place, f.code, f.message, f.remedy) for f in findings],
-            styles=[_COLOURS[f.severity] for f in findings],
+            [_row(group) for group in groups],
+            styles=[_COLOURS[group[0].severity] for group in groups],
         )
     counts = [(sum(f.severity == severity for f in findings), severity) for severity in SEVERITIES]
     say(", ".join(_number(n, what) for n, what in [(len(raw), "demonstration"), *counts]))
+
+
+def _kinds(findings: Sequence[Finding]) -> list[list[Finding]]:
+    """Return the findings in groups of one code; files that can't be read are grouped by their message."""
+    kinds: dict[tuple[str, ...], list[Finding]] = {}
+    for finding in findings:
+        message = finding.message if finding.code == "unreadable" else ""
+        kinds.setdefault((finding.severity, finding.code, message), []).append(finding)
+    return list(kinds.values())
+
+
+def _row(group: Sequence[Finding]) -> tuple[str, ...]:
+    first = group[0]
+    sources = list(dict.fromkeys(finding.source for finding in group))
+    where = first.source or "all"
+    if len(sources) > 1:
+        where += f" and {_number(len(sources) - 1, 'other')}"
+    message = first.message if len(group) == 1 else f"{len(group)} of this kind; the first: {first.message}"
+    return first.severity, where, first.place, first.code, as_options(message), as_options(first.remedy)
 
 
 def _number(n: int, what: str) -> str:

@@ -1,8 +1,17 @@
-"""Make demonstrations of one motion equally long and bring what belongs together to the same time.
+"""Align demonstrations: trim idle ends, and bring matching parts of all motions to the same time.
 
-People never show a motion twice at the same pace. Averaged at equal times, a bend that came early here and late
-there is smeared: the mean of unaligned demonstrations cuts corners and flattens peaks. Alignment changes *when* a
-demonstration is where, never *where* it goes.
+People never show a motion twice at the same pace. Averaged at equal times, a bend that comes early in one demonstration
+and late in another is smeared: the mean cuts corners and flattens peaks. Alignment changes when a demonstration reaches
+each point, never the points.
+
+Time is warped by dynamic time warping within a band. For two motions ``a``, ``b`` of n samples, the cheapest monotone
+path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` obeys
+
+    D(i, j) = c(i, j) + min(D(i-1, j-1) + c(i, j), D(i-1, j) + p, D(i, j-1) + p)
+
+(Sakoe and Chiba 1978, symmetric form: the diagonal counts twice). The price ``p`` of a step that is not diagonal keeps
+noise from bending time, and |i - j| stays within the band. All cells of one anti-diagonal are computed together, for
+all pairs of motions.
 """
 
 from __future__ import annotations
@@ -14,15 +23,34 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.demonstrations.idle import moving_rows
-from imitarm.demonstrations.warp import barycentre_warps, features, identity_warps
 from imitarm.errors import InputError, UnknownNameError
+from imitarm.kinematics.pose import (
+    continuous_signs,
+    mean_quaternion,
+    quaternion_conjugate,
+    quaternion_log,
+    quaternion_multiply,
+)
 from imitarm.trajectory import Demonstration, Trajectory
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Method = Literal["dtw", "resample"]
 
 METHODS = ("dtw", "resample")
+
+_BACK, _ASIDE = np.array([2, 1, 1, 0]), np.array([0, -1, 1, 0])  # steps: both, a only, b only, arrived
+_LEVER = 0.1  # [m] distance that counts as much as a rotation of 1 rad
+_SMOOTHING = 0.04  # half width of the window that smooths a warp, as a fraction of the duration
+_SLOWEST = 0.1  # lowest pace of a demonstration's clock, as a fraction of the common pace
+
+_WINDOW = 0.2  # [s] over which positions are averaged
+_LONGEST_WINDOW = 0.1  # of the duration, likewise when samples are noisy
+_STILL = 1e-4  # [m] within this distance the tool still stands, whatever its speed
+_STILL_ROTATION = 1e-3  # [rad]
+_MARGIN = 0.1  # [s] kept before and after the motion, so that none of a slow motion is lost
+_LEFT = 5.0  # times as far away the tool has left the place where it stood
+_NOISE_FACTOR = 4.0  # standard deviations of noise that count as standing
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,3 +162,257 @@ def _retimed(demonstration: Demonstration, warp: Array, times: Array) -> Demonst
     if joints is not None:
         joints = np.stack([np.interp(own, motion.times, column) for column in joints.T], axis=1)
     return demonstration.with_trajectory(Trajectory(times, *motion.at(own)), joints)
+
+
+def noise_level(values: Array) -> float:
+    """Return the standard deviation of white noise on smooth samples (n, d), from their third differences.
+
+    For white noise of deviation s the variance of a third difference is 20 s^2; the median keeps out what is left of
+    the motion itself. Fewer than 20 samples can't tell the two apart: 0.
+    """
+    if len(values) < 20:
+        return 0.0
+    third = np.diff(values, n=3, axis=0)
+    return float(np.max(1.4826 * np.median(np.abs(third), axis=0)) / np.sqrt(20.0))
+
+
+def turns(quaternions: Array) -> Array:
+    """Return the accumulated rotation (n, 3) [rad]: the sum of the rotation vectors of all steps."""
+    q = continuous_signs(quaternions)
+    steps = quaternion_log(quaternion_multiply(q[1:], quaternion_conjugate(q[:-1])))
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+def moving_rows(times: Array, positions: Array, quaternions: Array | None = None) -> tuple[int, int] | None:
+    """Return the first and the last row between which the tool moves; None when it never does.
+
+    The motion begins at the last row within 0.1 mm of the start before the tool is 0.5 mm away from it. Its speed does
+    not matter, so slow motion is never taken for standing. The end is found in the same way, backwards; 0.1 s more is
+    kept on both sides. With noisy samples, both distances are at least 4 standard deviations of the averaged noise.
+    Rotation on the spot counts as motion.
+
+    Args:
+        times: strictly increasing, shape (n,) [s].
+        positions: shape (n, 3) [m].
+        quaternions: wxyz, shape (n, 4), or None.
+    """
+    spans = [_moving(times, positions, _STILL)]
+    if quaternions is not None:
+        spans.append(_moving(times, turns(quaternions), _STILL_ROTATION))
+    found = [span for span in spans if span is not None]
+    return (min(first for first, _ in found), max(last for _, last in found)) if found else None
+
+
+def _moving(times: Array, values: Array, still: float) -> tuple[int, int] | None:
+    """Return the rows between which ``values`` (n, d) change, by more than ``still`` and the noise."""
+    noise, step = noise_level(values), float(np.median(np.diff(times)))
+    left = _LEFT * still
+    quiet = (_NOISE_FACTOR * noise / left) ** 2 * step  # an average over so long has noise below the larger distance
+    window = float(np.clip(quiet, _WINDOW, max(_WINDOW, _LONGEST_WINDOW * (times[-1] - times[0]))))
+    _, mean, n = smooth_slope(times, values, window)
+
+    def leaves(mean: Array, n: Array) -> tuple[int, int] | None:
+        distance = np.linalg.norm(mean - mean[0], axis=1)
+        blur = _NOISE_FACTOR * noise * np.sqrt(1.0 / n + 1.0 / n[0])
+        away = np.flatnonzero(distance > np.maximum(left, blur))
+        if not len(away):
+            return None
+        near = np.flatnonzero(distance[: away[0]] <= np.maximum(still, blur[: away[0]]))
+        return int(near[-1]), int(away[0])
+
+    start, end = leaves(mean, n), leaves(mean[::-1], n[::-1])
+    if start is None or end is None or start[1] > len(times) - 1 - end[1]:
+        return None
+    first = np.searchsorted(times, times[start[0]] - _MARGIN)
+    last = np.searchsorted(times, times[len(times) - 1 - end[0]] + _MARGIN, side="right") - 1
+    return int(first), int(last)
+
+
+def smooth_speed(times: Array, values: Array, window: float = _WINDOW) -> tuple[Array, Array]:
+    """Return speed (n,) [unit/s] and mean (n, d) of ``values`` (n, d) over a window [s] about each sample."""
+    slope, mean, _ = smooth_slope(times, values, window)
+    return np.linalg.norm(slope, axis=1), mean
+
+
+def smooth_slope(times: Array, values: Array, window: float = _WINDOW) -> tuple[Array, Array, Array]:
+    """Fit a straight line to the samples in a window about each sample.
+
+    Args:
+        times: strictly increasing, shape (n,) [s].
+        values: shape (n, d).
+        window: how long [s]; neighbours count however far they are.
+
+    Returns:
+        least-squares slopes (n, d) [unit/s], means (n, d), and the number of samples in each window (n,).
+    """
+    t = times - times[0]
+    here = np.arange(len(t))
+    first = np.minimum(np.searchsorted(t, t - 0.5 * window - 1e-9), np.maximum(here - 1, 0))
+    last = np.maximum(np.searchsorted(t, t + 0.5 * window + 1e-9), np.minimum(here + 2, len(t)))
+    n = (last - first).astype(float)
+    offset = values[0]
+    centred = values - offset
+
+    def windowed(column: Array) -> Array:
+        total = np.concatenate([np.zeros((1, *column.shape[1:])), np.cumsum(column, axis=0)])
+        return np.asarray(total[last] - total[first])
+
+    sum_t, sum_x = windowed(t), windowed(centred)
+    spread = np.maximum(windowed(t * t) - sum_t**2 / n, 1e-12)
+    slope = (windowed(t[:, None] * centred) - sum_t[:, None] * sum_x / n[:, None]) / spread[:, None]
+    return np.asarray(slope), np.asarray(sum_x / n[:, None] + offset), n
+
+
+def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, Indices]:
+    """Match motions ``a`` with motions ``b``, pair by pair.
+
+    Args:
+        a: shape (pairs, n, d).
+        b: shape (pairs, n, d), same n.
+        band: largest |i - j| that is allowed, in samples.
+        price: of a step that is not diagonal, in units of the cost.
+
+    Returns:
+        cost: D(n-1, n-1) of each pair, shape (pairs,).
+        path: index pairs (i, j) from the end to the start, which is repeated, shape (pairs, 2 n - 1, 2).
+    """
+    n = a.shape[1]
+    # one row an anti-diagonal i + j, one column an offset i - j; what is outside the grid or the band costs inf
+    diagonal, offset = np.arange(2 * n - 1)[:, None], np.arange(-band - 1, band + 2)
+    i, j = (diagonal + offset) // 2, (diagonal - offset) // 2
+    inside = ((diagonal + offset) % 2 == 0) & (i >= 0) & (i < n) & (j >= 0) & (j < n) & (np.abs(offset) <= band)
+    squares = np.sum(a**2, axis=2)[:, :, None] + np.sum(b**2, axis=2)[:, None] - 2.0 * a @ np.swapaxes(b, 1, 2)
+    cost = np.where(inside, np.maximum(squares, 0.0)[:, i.clip(0, n - 1), j.clip(0, n - 1)], np.inf)
+    cost = np.ascontiguousarray(np.moveaxis(cost, 1, 0))  # (2 n - 1, pairs, offsets)
+    total = np.full_like(cost, np.inf)
+    total[0] = cost[0]
+    for k in range(1, 2 * n - 1):
+        straight = np.minimum(total[k - 1, :, :-2], total[k - 1, :, 2:]) + price
+        if k > 1:
+            straight = np.minimum(straight, total[k - 2, :, 1:-1] + cost[k, :, 1:-1])
+        total[k, :, 1:-1] = cost[k, :, 1:-1] + straight
+    return total[-1, :, band + 1], _trace(total, cost, price)
+
+
+def _trace(total: Array, cost: Array, price: float) -> Indices:
+    """Walk back from the last pair of samples to the first, for all pairs of motions together."""
+    length, pairs, width = total.shape
+    every = np.arange(pairs)
+    diagonal, column = np.full(pairs, length - 1), np.full(pairs, width // 2)
+    path = np.zeros((pairs, length, 2), dtype=np.int64)
+    for step in range(length):
+        offset = column - width // 2
+        path[:, step, 0], path[:, step, 1] = (diagonal + offset) // 2, (diagonal - offset) // 2
+        one, two = np.maximum(diagonal - 1, 0), np.maximum(diagonal - 2, 0)
+        options = np.stack(
+            [
+                np.where(diagonal > 1, total[two, every, column] + cost[diagonal, every, column], np.inf),
+                total[one, every, column - 1] + price,
+                total[one, every, column + 1] + price,
+            ]
+        )
+        choice = np.where(diagonal > 0, np.argmin(options, axis=0), 3)
+        diagonal = diagonal - _BACK[choice]
+        column = column + _ASIDE[choice]
+    return path
+
+
+def identity_warps(n_demonstrations: int, n: int) -> Array:
+    """Return the warps that change nothing, shape (n_demonstrations, n)."""
+    return np.tile(np.linspace(0.0, 1.0, n), (n_demonstrations, 1))
+
+
+def features(trajectories: Sequence[Trajectory]) -> Array:
+    """Return what motions are compared by, shape (n_demonstrations, n, 3) or (..., 6) with rotations [m].
+
+    Each path is carried to the common start and goal, so that one which began elsewhere is not taken for one which
+    began earlier. Rotations count as rotation vectors from their mean, times a lever of 0.1 m.
+    """
+    parts = [to_common_ends(np.stack([trajectory.positions for trajectory in trajectories]))]
+    if trajectories[0].quaternions is not None:
+        parts.append(_LEVER * to_common_ends(rotation_paths(trajectories)))
+    return np.concatenate(parts, axis=2)
+
+
+def rotation_paths(trajectories: Sequence[Trajectory]) -> Array:
+    """Return the rotation vectors from the mean rotation of all, continuous beyond half a turn (m, n, 3) [rad]."""
+    q = np.stack([one.quaternions for one in trajectories if one.quaternions is not None])
+    first = quaternion_log(quaternion_multiply(q[:, 0], quaternion_conjugate(mean_quaternion(q))))
+    return np.stack([f + turns(one) for f, one in zip(first, q, strict=True)])
+
+
+def to_common_ends(values: Array) -> Array:
+    """Return motions (m, n, d) carried to the mean of their starts and the mean of their goals."""
+    fraction = np.linspace(0.0, 1.0, values.shape[1])[:, None]
+    start, goal = values[:, :1], values[:, -1:]
+    return np.asarray(values - (1.0 - fraction) * (start - start.mean(axis=0)) - fraction * (goal - goal.mean(axis=0)))
+
+
+def medoid(values: Array) -> int:
+    """Return the index of the motion that is nearest to all others, of (n_demonstrations, n, d)."""
+    flat = values.reshape(len(values), -1)
+    squares = np.sum(flat**2, axis=1)
+    distance = np.sqrt(np.maximum(squares[:, None] + squares - 2.0 * flat @ flat.T, 0.0))
+    return int(np.argmin(distance.sum(axis=1)))
+
+
+def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0, n_iterations: int = 8) -> Array:
+    """Return the warps that bring motions to their common barycentre.
+
+    Starting from the medoid, each motion is matched with the barycentre by :func:`dtw`, its matched times are
+    smoothed into a warp, and the barycentre becomes the mean of the warped motions (averaging as in Petitjean et al.
+    2011, with one smooth warp a motion in place of sets of matched samples). The warps are centred: at every moment
+    of the common motion their mean is that moment, so the common pace is the mean pace and not the medoid's.
+
+    Args:
+        values: what to compare by, shape (n_demonstrations, n, d), evenly spaced in time.
+        band: largest share of the duration by which a moment may be moved before centring.
+        stiffness: price of bending time, in mean squared deviations from the barycentre.
+        n_iterations: at most so many rounds.
+
+    Returns:
+        shape (n_demonstrations, n), from 0 to 1, strictly increasing.
+    """
+    m, n, _ = values.shape
+    even = np.linspace(0.0, 1.0, n)
+    warps = identity_warps(m, n)
+    barycentre = values[medoid(values)]
+    warped = values
+    for _ in range(n_iterations):
+        price = stiffness * float(np.median(np.sum((warped - barycentre) ** 2, axis=2)))
+        _, path = dtw(values, np.repeat(barycentre[None], m, axis=0), band=max(2, round(band * n)), price=price)
+        before, warps = warps, _centred(np.stack([_smooth_warp(one, n) for one in path]), even)
+        warped = _at(values, warps)
+        barycentre = warped.mean(axis=0)
+        if np.abs(warps - before).max() < 0.5 / n:
+            break
+    return warps
+
+
+def _at(values: Array, warps: Array) -> Array:
+    """Return motions (m, n, d) read at warped times (m, n)."""
+    even = np.linspace(0.0, 1.0, values.shape[1])
+    return np.stack(
+        [np.stack([np.interp(w, even, c) for c in v.T], axis=1) for v, w in zip(values, warps, strict=True)]
+    )
+
+
+def _smooth_warp(path: Indices, n: int) -> Array:
+    """Turn matched pairs (motion, barycentre) into a strictly increasing warp over the barycentre's n steps."""
+    length = int(np.argmax(path.sum(axis=1) == 0)) + 1
+    own, common = path[:length, 0], path[:length, 1]
+    mean = np.bincount(common, weights=own, minlength=n) / np.bincount(common, minlength=n)
+    bend = mean / (n - 1) - np.linspace(0.0, 1.0, n)  # 0 at both ends, and stays so: it is mirrored through them
+    half = max(1, round(_SMOOTHING * n))
+    padded = np.concatenate([-bend[half:0:-1], bend, -bend[-2 : -half - 2 : -1]])
+    kernel = np.hanning(2 * half + 3)[1:-1]
+    warp = np.linspace(0.0, 1.0, n) + np.convolve(padded, kernel / kernel.sum(), mode="valid")
+    steps = np.maximum(np.diff(warp), _SLOWEST / n)  # time never stands: every moment keeps a place
+    warp = np.concatenate([[0.0], np.cumsum(steps)])
+    return np.asarray(warp / warp[-1])
+
+
+def _centred(warps: Array, even: Array) -> Array:
+    """Change the common clock so that the mean of all warps is even time."""
+    back = np.interp(even, warps.mean(axis=0), even)
+    return np.stack([np.interp(back, even, warp) for warp in warps])

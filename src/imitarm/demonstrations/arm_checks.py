@@ -1,4 +1,4 @@
-"""Checks of one motion against the arm that is to do it: joint limits, joint speed, reach."""
+"""Checks of one motion against an arm: joint names and units, joint limits, joint speed, reach."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.demonstrations.finding import Finding, Usable
-from imitarm.demonstrations.idle import smooth_slope
+from imitarm.demonstrations.align import smooth_slope
+from imitarm.demonstrations.raw import Finding, Usable
 from imitarm.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_OVER = 0.01  # [rad] beyond a limit that measured joints may show
+_OVER = 0.01  # [rad] by which measured joints may exceed a limit
 _SPEED_WINDOW = 0.06  # [s] encoders have little noise
-_MARGIN = 5e-3  # [m] beyond the reach that measured positions may show
-_DEGREES = 2.5 * np.pi  # [rad] no arm turns a joint further, so these are degrees
+_MARGIN = 5e-3  # [m] by which measured positions may exceed the reach
+_DEGREES = 2.5 * np.pi  # [rad] no joint rotates farther, so these are degrees
 
 
 def check_arm(motion: Usable, arm: ArmModel) -> Iterator[Finding]:
-    """Find joints that are another arm's, in degrees, beyond limits or too fast, and positions out of reach."""
+    """Find joints of another arm, in degrees, beyond limits or too fast, and positions out of reach."""
     if motion.joints is None:
         yield from _check_reach(motion, arm)
         return
     try:
         q = motion.raw.joints_of(arm)[motion.rows]
     except InputError as error:
-        remedy = "name the arm that was recorded"
+        remedy = "give the arm that was recorded"
         yield motion.finding("error", "other-arm", str(error).removeprefix(f"{motion.raw.source}: "), remedy)
         return
     if np.abs(q).max() > _DEGREES:
@@ -40,7 +40,7 @@ def check_arm(motion: Usable, arm: ArmModel) -> Iterator[Finding]:
             "error",
             "joint-units",
             f"{arm.joint_names[joint]} is at {q[row, joint]:.4g} rad: these are degrees",
-            "convert the joints to rad, or name the columns like right_j0 [deg]",
+            "convert the joints to rad, or put the unit in the names: right_j0 [deg]",
             int(row),
         )
         return
@@ -52,7 +52,7 @@ def check_arm(motion: Usable, arm: ArmModel) -> Iterator[Finding]:
             "joint-limit",
             f"{arm.joint_names[joint]} is at {q[row, joint]:.3f} rad, {over[row, joint]:.3f} beyond its limit "
             f"[{arm.lower[joint]:.3f}, {arm.upper[joint]:.3f}]",
-            f"show it within the limits of {arm.name}, or name the arm that was recorded",
+            f"show the motion within the limits of {arm.name}, or give the arm that was recorded",
             int(row),
         )
     speed = np.abs(smooth_slope(motion.times, q, _SPEED_WINDOW)[0]) / arm.max_velocity
@@ -84,14 +84,14 @@ def _check_reach(motion: Usable, arm: ArmModel) -> Iterator[Finding]:
 
 
 def reach(arm: ArmModel, *, n_samples: int = 400, seed: int = 0) -> tuple[Array, float]:
-    """Return the shoulder of an arm and how far from it the tool's tip gets.
+    """Return the shoulder of an arm, and the largest distance of the tool's tip from it.
 
-    The shoulder is the point of the first joint's axis that is nearest to the second joint. The distance is the
-    largest that gradient ascent within the joint limits finds from seeded postures, so it is a close lower bound.
+    The shoulder is the point of the first joint's axis that is nearest to the axis of the second joint. The distance is
+    the largest one that gradient ascent within the joint limits finds from random postures: a close lower bound.
 
     Args:
         arm: with its tool.
-        n_samples: postures to choose starts from.
+        n_samples: number of random postures; ascent starts from the best four.
         seed: of these postures.
 
     Returns:

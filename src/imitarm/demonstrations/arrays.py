@@ -9,30 +9,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.demonstrations.columns import COUNTS, UNNAMED, in_space, unnamed_columns
 from imitarm.demonstrations.raw import RawDemonstration
-from imitarm.demonstrations.reader import Reader, ReadOptions
+from imitarm.demonstrations.reading import Reader, ReadOptions
+from imitarm.demonstrations.text_tables import COUNTS, UNNAMED, in_space, unnamed_columns
 from imitarm.errors import FileFormatError
 from imitarm.files.table import read_bytes
 
 Array = NDArray[np.float64]
 
 _NPY, _NPZ = b"\x93NUMPY", b"PK\x03\x04"
+_FEWEST_ROWS = 20  # of a demonstration; a stack with fewer rows than this and than demonstrations is transposed
 _FIELDS = ("times", "positions", "quaternions", "joints")
 
 
 class NumpyReader(Reader):
     """Arrays of numbers.
 
-    An array (n, columns) is one motion, (n_demonstrations, n, columns) are several; columns as in a plain table
-    without names. An .npz with an array ``positions`` is one set of motions with ``times``, ``quaternions`` and
-    ``joints`` beside it; any other .npz holds motions array by array.
+    An array (n, columns) is one motion, an array (n_demonstrations, n, columns) is several; the columns are those of a
+    text table without names. An .npz with an array ``positions`` holds one set of motions, with ``times``,
+    ``quaternions`` and ``joints`` beside it; in any other .npz each array holds motions.
     """
 
-    name = "NumPy arrays"
+    suffixes = (".npy", ".npz")
 
     def recognises(self, head: bytes) -> bool:
-        """Tell by the mark at the head of .npy and .npz files."""
+        """Return whether the file begins as .npy and .npz files do."""
         return head.startswith((_NPY, _NPZ))
 
     def read(self, path: str, options: ReadOptions) -> list[RawDemonstration]:
@@ -58,21 +59,21 @@ def _damaged(path: str, error: BaseException) -> FileFormatError:
 
 
 def _load(path: str, content: bytes) -> Any:
-    """Return the array of an .npy, or the arrays of an .npz by name, of a file that is already in memory."""
+    """Return the array of an .npy, or the arrays of an .npz by name, from the bytes of the file."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # NumPy warns of headers that old versions wrote
+            warnings.simplefilter("ignore")  # NumPy warns about headers that old versions wrote
             if content.startswith(_NPY):
                 _check_size(content)
                 return np.load(io.BytesIO(content), allow_pickle=False)
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
-    except Exception as error:  # damaged headers raise whatever zipfile, zlib and Python's own tokenizer raise
+    except Exception as error:  # damaged headers raise errors of zipfile, zlib and Python's tokenizer
         raise _damaged(path, error) from error
 
 
 def _check_size(content: bytes) -> None:
-    """Find a header that promises more than the file holds before anything of that size is allocated."""
+    """Refuse a header that promises more than the file holds, before that much memory is allocated."""
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -91,23 +92,43 @@ def _numbers(source: str, array: Any) -> Array:
 
 
 def _stack(source: str, array: Array, options: ReadOptions) -> list[RawDemonstration]:
+    _check_matrices(source, array)
     if array.ndim not in (2, 3) or array.shape[-1] not in UNNAMED:
         raise FileFormatError(
             f"{source}: shape {array.shape}, must be (n, columns) or (n_demonstrations, n, columns); columns: {COUNTS}"
         )
     if array.ndim == 2:
         return [unnamed_columns(source, array, options)]
+    if array.shape[1] < min(_FEWEST_ROWS, array.shape[0]):
+        raise FileFormatError(
+            f"{source}: shape {array.shape} would be {array.shape[0]} demonstrations of {array.shape[1]} rows each; "
+            "the order must be (n_demonstrations, n, columns): swap the first two axes, or save one motion as "
+            "(n, columns)"
+        )
     return [unnamed_columns(f"{source}[{i}]", motion, options) for i, motion in enumerate(array)]
 
 
+def _check_matrices(source: str, array: Array) -> None:
+    """Refuse stacks of rotation or transformation matrices, whose rows are not samples."""
+    square = array.ndim >= 3 and array.shape[-2:] in ((4, 4), (3, 4), (3, 3))
+    flat = array.ndim == 2 and array.shape[1] in (9, 12, 16) and len(array) > 1
+    if not square and not flat:
+        return
+    matrices = f"{array.shape[-2]} x {array.shape[-1]}" if square else f"{array.shape[1]} numbers each"
+    raise FileFormatError(
+        f"{source}: shape {array.shape} looks like a stack of matrices ({matrices}), not like rows of samples; save "
+        "positions T[:, :3, 3] and quaternions as the columns x y z qw qx qy qz"
+    )
+
+
 def _by_field(path: str, arrays: dict[str, Array], options: ReadOptions) -> list[RawDemonstration]:
-    """Put together the arrays ``positions``, ``times``, ``quaternions`` and ``joints`` of one archive."""
+    """Combine the arrays ``positions``, ``times``, ``quaternions`` and ``joints`` of one archive."""
     shape = arrays["positions"].shape
     if len(shape) not in (2, 3) or shape[-1] not in (2, 3):
         raise FileFormatError(f"{path}:positions: shape {shape}, must be (n, 3) or (n_demonstrations, n, 3)")
     lead = shape[:-1]
     wanted: dict[str, tuple[tuple[int, ...], ...]] = {
-        "times": (lead, lead[-1:]),  # one time axis may serve all motions
+        "times": (lead, lead[-1:]),  # all motions may share one time axis
         "quaternions": ((*lead, 4),),
         "joints": ((*lead, arrays["joints"].shape[-1]),) if "joints" in arrays else (),
     }
@@ -131,7 +152,7 @@ def _of_fields(source: str, fields: dict[str, Array], options: ReadOptions) -> R
         source,
         options.even_times(source, len(positions)) if times is None else options.seconds(source, times),
         in_space(options.metres(source, positions)),
-        options.wxyz(fields["quaternions"]) if "quaternions" in fields else None,
+        options.wxyz(source, fields["quaternions"]) if "quaternions" in fields else None,
         joints,
         () if joints is None else tuple(f"joint_{i + 1}" for i in range(joints.shape[1])),
         options.task,

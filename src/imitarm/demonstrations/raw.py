@@ -1,13 +1,16 @@
-"""What a file says about one motion before anybody has judged it."""
+"""A demonstration as it was recorded, with its faults; its valid rows; and what lint reports about it."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.demonstrations.align import moving_rows
 from imitarm.errors import FileFormatError, InputError
 from imitarm.trajectory import Demonstration, Trajectory
 
@@ -15,30 +18,74 @@ if TYPE_CHECKING:
     from imitarm.kinematics.arm import ArmModel
 
 Array = NDArray[np.float64]
+Severity = Literal["error", "warning", "note"]
 
-_LENGTH_TOLERANCE = 0.05  # files with two decimals hold quaternions this far from length one
-_ABSURD_DISTANCE = 1e5  # [m] no unit of length makes a reach of this
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+
+LENGTH_TOLERANCE = 0.05  # files with two decimals hold quaternions this far from length one
+_ABSURD_DISTANCE = 1e5  # [m] no unit of length turns a robot's reach into this
 _BOUND = 1e30  # larger numbers come from damaged files, and overflow when squared
-_MAX_DROPPED = 0.1  # share of rows that `repair` may drop before the file counts as broken
+_MAX_DROPPED = 0.1  # largest fraction of rows that `repair` may drop
+_SAMPLES = 100  # of each motion, when motions are compared
+_HELD = 0.2  # fraction of rows that repeat the row before, above which values count as held
+_FEWEST_HELD = 5  # number of separate repeats, likewise: one long pause is not a held value
+_QUANTA = 4.0  # steps of a held value are larger than this many least digits; rounded values step by one or two
+
+_GENERIC_JOINT = re.compile(r"(?:j|joint|q|a|axis)_?\d+", re.IGNORECASE)
+_NUMBER_AT_END = re.compile(r"(\d+)$")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fault of demonstrations, or one fact worth knowing before a skill is learned from them.
+
+    Attributes:
+        severity: ``"error"``: no good skill can be learned; ``"warning"``: check it; ``"note"``: for information.
+        code: short name that stays the same from version to version, such as ``"gap"``.
+        message: what is wrong, with figures.
+        source: the demonstration concerned; empty when it concerns all of them.
+        row: the first sample concerned, from 0; None when it concerns the whole motion.
+        line: the line of that sample in the text file, from 1; None when the file is not text.
+        remedy: what to do. Options are written as arguments of ``read``, for example ``units="mm"``.
+    """
+
+    severity: Severity
+    code: str
+    message: str
+    source: str = ""
+    row: int | None = None
+    line: int | None = None
+    remedy: str = ""
+
+    @property
+    def place(self) -> str:
+        """Where to look: ``line 12``, ``row 10`` or nothing."""
+        if self.line is not None:
+            return f"line {self.line}"
+        return "" if self.row is None else f"row {self.row}"
+
+    def __str__(self) -> str:
+        place = ", ".join(part for part in (self.source, self.place) if part)
+        return f"{self.severity} {self.code}: {place + ': ' if place else ''}{self.message}; {self.remedy}"
 
 
 @dataclass(frozen=True, eq=False)
 class RawDemonstration:
-    """One motion as it was recorded: in SI units, but with every fault it has.
+    """One motion as it was recorded: in SI units, with all its faults.
 
     :class:`~imitarm.trajectory.Demonstration` refuses times that do not increase, numbers that are not finite and
-    quaternions that are none; ``lint`` looks at this instead, to name them all.
+    quaternions whose length is not one. ``lint`` checks the raw demonstration instead, so that it can list them all.
 
     Attributes:
-        source: file, and the part of it.
+        source: the file, and the part of it.
         times: shape (n,) [s], in any order.
         positions: of the tool in the base frame, shape (n, 3) [m]; None when only joints were recorded.
         quaternions: wxyz of any length, shape (n, 4); None when not recorded.
         joints: shape (n, n_joints) [rad]; None when not recorded.
         joint_names: one name for each column of ``joints``.
-        task: what was shown.
+        task: name of the task.
         lines: line of the text file of each row, from 1, shape (n,); None when the file is not text.
-        notes: what the reader assumed or left out.
+        notes: what the reader left out or assumed.
     """
 
     source: str
@@ -53,7 +100,7 @@ class RawDemonstration:
 
     @classmethod
     def of(cls, demonstration: Demonstration) -> RawDemonstration:
-        """Look at a demonstration as if it had just been read."""
+        """Return a demonstration as if it had just been read."""
         motion = demonstration.trajectory
         return cls(
             demonstration.source,
@@ -72,41 +119,54 @@ class RawDemonstration:
         """Return the line of ``row`` in the text file, None when the file is not text."""
         return None if self.lines is None else int(self.lines[row])
 
+    def finding(self, severity: Severity, code: str, message: str, remedy: str, row: int | None = None) -> Finding:
+        """Return a finding about this demonstration, or about one of its rows."""
+        return Finding(severity, code, message, self.source, row, None if row is None else self.line(row), remedy)
+
     def where(self, row: int) -> str:
-        """Name the place of ``row`` for a message."""
+        """Return source and place of ``row``, for a message."""
         line = self.line(row)
         return f"{self.source}, row {row}" if line is None else f"{self.source}, line {line}"
 
     def joints_of(self, arm: ArmModel) -> Array:
-        """Return the joint angles (n, arm.n_joints) [rad] in the arm's order.
+        """Return the joint angles (n, arm.n_joints) [rad] in the order of the arm's joints.
 
-        Columns are chosen by the arm's joint names; when none of those is known, they are taken in order.
+        Columns are chosen by the arm's joint names. Generic names (``joint_1``, ``j1``, ``q1``) are sorted by their
+        numbers, which must follow one another.
 
         Raises:
-            InputError: when there are no joints, or not those of this arm.
+            InputError: when there are no joints, they are those of another arm, or their order is not known.
         """
         if self.joints is None:
             raise InputError(f"{self.source}: holds no joint angles")
-        if set(arm.joint_names) <= set(self.joint_names):
-            return self.joints[:, [self.joint_names.index(name) for name in arm.joint_names]]
-        if set(arm.joint_names) & set(self.joint_names) or self.joints.shape[1] != arm.n_joints:
+        names = self.joint_names
+        if set(arm.joint_names) <= set(names):
+            return self.joints[:, [names.index(name) for name in arm.joint_names]]
+        generic = all(_GENERIC_JOINT.fullmatch(name) for name in names)
+        if not generic or len(names) != arm.n_joints:
             raise InputError(
-                f"{self.source}: joints {', '.join(self.joint_names)} are not those of {arm.name} "
-                f"({', '.join(arm.joint_names)}); name the arm that was recorded"
+                f"{self.source}: joints {', '.join(names)} are not those of {arm.name} "
+                f"({', '.join(arm.joint_names)}); give the arm that was recorded, or name the columns as it does"
             )
-        return self.joints
+        numbers = [int(match[1]) for name in names if (match := _NUMBER_AT_END.search(name))]
+        if sorted(numbers) != list(range(min(numbers), min(numbers) + len(names))):
+            raise InputError(
+                f"{self.source}: the numbers of joints {', '.join(names)} do not follow one another; name them as "
+                f"{arm.name} does: {', '.join(arm.joint_names)}"
+            )
+        return self.joints[:, np.argsort(numbers)]
 
     def with_poses(self, arm: ArmModel | None) -> RawDemonstration:
-        """Return this with the tool's poses, computed from the joints when they were not recorded.
+        """Return this with the tool's poses; they are computed from the joints when they were not recorded.
 
         Raises:
-            InputError: when they are needed and the arm is not named, or is another one.
+            InputError: when the arm is needed and is not given, or is another one.
         """
         if self.positions is not None:
             return self
         if arm is None:
             raise InputError(
-                f"{self.source}: holds joint angles only; name the arm that was recorded, arm=ArmModel.load('sawyer')"
+                f"{self.source}: holds joint angles only; give the arm that was recorded, arm=ArmModel.load('sawyer')"
             )
         q = self.joints_of(arm)
         known = (np.abs(q) < _BOUND).all(axis=1)
@@ -115,44 +175,71 @@ class RawDemonstration:
         return replace(self, positions=positions, quaternions=quaternions, joints=q, joint_names=arm.joint_names)
 
     def not_finite(self) -> NDArray[np.bool_]:
-        """Tell which rows hold nan, inf or a number beyond all bounds (1e30), shape (n,)."""
+        """Return which rows hold nan, inf or a number above 1e30, shape (n,)."""
         columns = [self.times[:, None], self.positions, self.quaternions, self.joints]
         table = np.hstack([part for part in columns if part is not None])
         return np.asarray(~(np.abs(table) < _BOUND).all(axis=1))
 
     def late(self) -> NDArray[np.bool_]:
-        """Tell which rows are not later than all rows before them, shape (n,)."""
+        """Return which rows are not later than all rows before them, shape (n,)."""
         times = np.where(np.isfinite(self.times), self.times, -np.inf)
         before = np.concatenate([[-np.inf], np.maximum.accumulate(times)[:-1]])
         return np.asarray(np.isfinite(self.times) & (self.times <= before))
+
+    def held(self) -> NDArray[np.bool_]:
+        """Return which rows only repeat a held value, shape (n,); all False unless values are sampled and held.
+
+        A recorder that runs faster than its sensor repeats each value (sample and hold). Standing is not holding,
+        nor is rounding: the value must be held many times during the motion, and must change by more than its last
+        digits between.
+        """
+        masks = [_held(part) for part in (self.positions, self.quaternions, self.joints) if part is not None]
+        return max(masks, key=lambda mask: int(mask.sum()), default=np.zeros(len(self), dtype=bool))
+
+    def thinned(self) -> RawDemonstration:
+        """Return this without the rows that only repeat a held value; a note says how many were dropped."""
+        held = self.held()
+        if not held.any():
+            return self
+        keep = ~held
+        return replace(
+            self,
+            times=self.times[keep],
+            positions=None if self.positions is None else self.positions[keep],
+            quaternions=None if self.quaternions is None else self.quaternions[keep],
+            joints=None if self.joints is None else self.joints[keep],
+            lines=None if self.lines is None else self.lines[keep],
+            notes=(*self.notes, f"{held.sum()} of {len(self)} rows repeated a held value and were dropped"),
+        )
 
     def demonstration(self, arm: ArmModel | None = None, *, repair: bool = False) -> Demonstration:
         """Check everything and return it as a demonstration.
 
         Args:
-            arm: the arm that was recorded; needed when only joints were.
+            arm: the arm that was recorded; needed when only joints were recorded.
             repair: drop rows that are not finite or not later than the row before, and say so in ``source``.
 
         Raises:
-            FileFormatError: when a row can't be used; the message names file, line and remedy.
-            InputError: when only joints were recorded and ``arm`` is not named.
+            FileFormatError: when a row is invalid; the message names file, line and remedy.
+            InputError: when only joints were recorded and ``arm`` is not given.
         """
         raw = self.with_poses(arm)
-        broken, late = raw.not_finite(), raw.late()
-        bad = broken | late
+        invalid, late = raw.not_finite(), raw.late()
+        bad = invalid | late
         if bad.any() and not repair:
             row = int(np.flatnonzero(bad)[0])
-            what = "holds a number that is not finite" if broken[row] else "is not later than the row before"
-            raise FileFormatError(f"{raw.where(row)} {what}; mend the file or read it with repair=True")
+            what = "holds a number that is not finite" if invalid[row] else "is not later than the row before"
+            raise FileFormatError(f"{raw.where(row)} {what}; fix the file or read it with repair=True")
         keep = np.flatnonzero(~bad)
         if len(keep) < max(2, (1.0 - _MAX_DROPPED) * len(raw)):
-            raise FileFormatError(f"{raw.source}: {bad.sum()} of {len(raw)} rows can't be used; record it again")
+            raise FileFormatError(f"{raw.source}: {bad.sum()} of {len(raw)} rows are invalid; record it again")
         assert raw.positions is not None
         far = np.abs(raw.positions[keep]).max(axis=1) > _ABSURD_DISTANCE
         if far.any():
             row = int(keep[np.flatnonzero(far)[0]])
             raise FileFormatError(
-                f"{raw.where(row)}: position {raw.positions[row].tolist()} m is no place an arm can be; wrong columns?"
+                f"{raw.where(row)}: no robot reaches position {raw.positions[row].tolist()} m; check which columns "
+                "hold the position"
             )
         quaternions = None if raw.quaternions is None else _unit(raw, keep)
         source = raw.source + (f" ({bad.sum()} of {len(raw)} rows dropped)" if bad.any() else "")
@@ -165,14 +252,101 @@ class RawDemonstration:
         )
 
 
+def _held(values: Array) -> NDArray[np.bool_]:
+    """Return which rows of one recorded quantity (n, d) repeat a held value, shape (n,)."""
+    none = np.zeros(len(values), dtype=bool)
+    steps = np.abs(np.diff(values, axis=0))
+    same = np.asarray(~(steps > 0.0).any(axis=1))
+    changes = np.flatnonzero(~same)
+    if len(changes) <= _FEWEST_HELD:
+        return none
+    repeats = np.diff(changes) > 1  # between two changes the value was held
+    moving = same[changes[0] : changes[-1] + 1]
+    if repeats.sum() < max(_FEWEST_HELD, 0.1 * len(repeats)) or moving.mean() < _HELD:
+        return none
+    largest = steps[changes].max(axis=1)
+    if np.median(largest) <= _QUANTA * float(np.min(steps[steps > 0.0])):
+        return none
+    return np.concatenate([[False], same])
+
+
 def _unit(raw: RawDemonstration, keep: NDArray[np.int64]) -> Array:
-    """Return the quaternions of rows ``keep`` scaled to length one, or say which is none."""
+    """Return the quaternions of rows ``keep`` scaled to length one."""
     assert raw.quaternions is not None
     quaternions = raw.quaternions[keep]
     length = np.linalg.norm(quaternions, axis=1)
-    bad = np.flatnonzero(np.abs(length - 1.0) > _LENGTH_TOLERANCE)
+    bad = np.flatnonzero(np.abs(length - 1.0) > LENGTH_TOLERANCE)
     if len(bad):
         raise FileFormatError(
-            f"{raw.where(int(keep[bad[0]]))}: quaternion of length {length[bad[0]]:.3g}, must be 1; wrong columns?"
+            f"{raw.where(int(keep[bad[0]]))}: quaternion of length {length[bad[0]]:.3g}, must be 1; check which "
+            "columns hold it"
         )
     return np.asarray(quaternions / length[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class Usable:
+    """The valid rows of a raw demonstration: finite, each later than the one before, and not a repeated held value.
+
+    Attributes:
+        raw: the demonstration.
+        rows: the rows of ``raw`` that are used, shape (n,).
+        times: from the first valid row, shape (n,) [s].
+        positions: shape (n, 3) [m].
+        quaternions: of length one, shape (n, 4), or None.
+        joints: shape (n, n_joints) [rad], or None.
+    """
+
+    raw: RawDemonstration
+    rows: NDArray[np.int64]
+    times: Array
+    positions: Array
+    quaternions: Array | None
+    joints: Array | None
+
+    @classmethod
+    def of(cls, raw: RawDemonstration) -> Usable | None:
+        """Choose the valid rows; None when fewer than 5 are left or there are no positions."""
+        if raw.positions is None:
+            return None
+        bad = raw.not_finite() | raw.late() | raw.held()
+        quaternions = raw.quaternions
+        if quaternions is not None:
+            quaternions = np.where(bad[:, None], 0.0, quaternions)
+            length = np.linalg.norm(quaternions, axis=1)
+            bad |= length < 0.1
+            quaternions = quaternions / np.maximum(length, 0.1)[:, None]
+        rows = np.flatnonzero(~bad)
+        if len(rows) < 5:
+            return None
+        return cls(
+            raw,
+            rows,
+            raw.times[rows] - raw.times[rows[0]],
+            raw.positions[rows],
+            None if quaternions is None else quaternions[rows],
+            None if raw.joints is None else raw.joints[rows],
+        )
+
+    @property
+    def duration(self) -> float:
+        """From the first to the last valid row [s]."""
+        return float(self.times[-1])
+
+    @property
+    def name(self) -> str:
+        """The source without its folder."""
+        return PurePath(self.raw.source).name or "a demonstration"
+
+    def moving_part(self) -> Trajectory | None:
+        """Return the motion without idle ends, in 100 samples; None when the tool does not move."""
+        rows = moving_rows(self.times, self.positions, self.quaternions)
+        if rows is None or rows[1] <= rows[0]:
+            return None
+        keep = slice(rows[0], rows[1] + 1)
+        quaternions = None if self.quaternions is None else self.quaternions[keep]
+        return Trajectory(self.times[keep], self.positions[keep], quaternions).from_zero().resample(_SAMPLES)
+
+    def finding(self, severity: Severity, code: str, message: str, remedy: str, index: int | None = None) -> Finding:
+        """Return a finding about sample ``index`` of the valid ones."""
+        return self.raw.finding(severity, code, message, remedy, None if index is None else int(self.rows[index]))

@@ -1,63 +1,74 @@
-"""Checks of demonstrations against each other: kind, duration, plane, and the one that is unlike the rest."""
+"""Checks of demonstrations against each other: do they show the same motion, in the same way?
+
+Two demonstrations are enough to find that one runs backwards, stops early, ends elsewhere or goes another way round.
+The mean of such demonstrations is a motion that nobody has shown.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.demonstrations.finding import Finding, Usable
-from imitarm.demonstrations.idle import moving_rows
-from imitarm.demonstrations.warp import barycentre_warps, features
+from imitarm.demonstrations.align import barycentre_warps, features, rotation_paths, to_common_ends
+from imitarm.demonstrations.raw import Finding, Severity, Usable
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_log, quaternion_multiply
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 _DURATION_RATIO = 2.0
-_FLAT = 1e-3  # [m] standard deviation below which a direction counts as not moved in
+_FLAT = 1e-3  # [m] standard deviation below which there is no motion in a direction
 _OUTLIER_RATIO = 3.0  # times as far from the medoid as is usual
-_OUTLIER_SPREADS = 6.0  # and so many robust standard deviations further
+_OUTLIER_SPREADS = 6.0  # and so many robust standard deviations farther
 _OUTLIER_DISTANCE = 0.02  # [m] and at least so far
 _OUTLIER_ANGLE = 0.2  # [rad] likewise
-_SAMPLES = 100
+_APART = 0.02  # [m] smallest difference between demonstrations that is reported
+_ENDS_APART = 0.25  # of the size of the motion, likewise of starts and goals
+_PATHS_APART = 0.2  # of the size of the motion, likewise of paths between the same ends
+_ROTATIONS_APART = 0.6  # [rad] likewise of rotations
+_GROUP_RATIO = 2.5  # two groups are so many times farther apart than neighbours within a group
+_SHORT = {"goal": 0.12, "start": 0.2}  # fraction of the motion that an incomplete demonstration lacks, at least
+_DIFFERENT = 0.1  # of the size of the motion: smallest mean distance between a motion and a reversed one
+_ROTATED = 0.1  # [rad] smallest difference between demonstrations that only rotate
+_ON_PATH = 0.35  # an incomplete motion ends this much nearer to the path of another one than to its end
 
 
 def check_number(motions: Sequence[Usable]) -> Iterator[Finding]:
-    """Find that there is one only."""
+    """Find that there is only one demonstration."""
     if len(motions) == 1:
         yield motions[0].finding(
             "warning",
             "single",
-            "only one demonstration: how exact each part must be can't be learnt from it",
+            "only one demonstration: it does not show how exact each part of the motion must be",
             "show the motion three times or more",
         )
 
 
 def check_kinds(motions: Sequence[Usable]) -> Iterator[Finding]:
     """Find rotations, joints or a third dimension in some demonstrations only."""
-    for code, what, has, severity in (
-        ("mixed-rotations", "rotations", [m.quaternions is not None for m in motions], "error"),
-        ("mixed-joints", "joints", [m.joints is not None for m in motions], "note"),
-    ):
+    some: list[tuple[Severity, str, str, list[bool], str]] = [
+        ("error", "mixed-rotations", "rotations", [m.quaternions is not None for m in motions], "leave it out"),
+        (
+            "note",
+            "mixed-joints",
+            "joints",
+            [m.joints is not None for m in motions],
+            "none: skills ignore them",
+        ),
+    ]
+    for severity, code, what, has, remedy in some:
         if any(has) and not all(has):
-            without = motions[has.index(False)]
-            yield without.finding(
-                "error" if severity == "error" else "note",
-                code,
-                f"{sum(has)} of {len(has)} demonstrations have {what}, this one has none",
-                "leave it out, or record all alike" if severity == "error" else "nothing: joints are not learnt from",
-            )
+            message = f"{sum(has)} of {len(has)} demonstrations have {what}, this one has none"
+            yield motions[has.index(False)].finding(severity, code, message, remedy)
     flat = [bool(np.ptp(m.positions[:, 2]) == 0.0) for m in motions]
     deep = [float(np.ptp(m.positions[:, 2])) > _FLAT for m in motions]
     if any(flat) and any(deep):
-        yield motions[flat.index(True)].finding(
-            "warning",
-            "mixed-dimensions",
-            f"{sum(flat)} of {len(flat)} demonstrations are planar (z stands), the others are not",
-            "do not mix recordings with and without z",
-        )
+        message = f"{sum(flat)} of {len(flat)} demonstrations are planar (z does not change), the others are not"
+        remedy = "do not mix recordings with and without z"
+        yield motions[flat.index(True)].finding("warning", "mixed-dimensions", message, remedy)
 
 
 def check_durations(motions: Sequence[Usable]) -> Iterator[Finding]:
@@ -65,16 +76,13 @@ def check_durations(motions: Sequence[Usable]) -> Iterator[Finding]:
     durations = np.array([motion.duration for motion in motions])
     if durations.max() > _DURATION_RATIO * durations.min():
         slow = int(np.argmax(durations))
-        yield motions[slow].finding(
-            "warning",
-            "durations",
-            f"takes {durations[slow]:.2f} s, another one {durations.min():.2f} s",
-            "align makes them equal; check that all show the whole motion",
-        )
+        message = f"takes {durations[slow]:.2f} s, another one {durations.min():.2f} s"
+        remedy = "align makes them equal; check that all show the whole motion"
+        yield motions[slow].finding("warning", "durations", message, remedy)
 
 
 def check_plane(motions: Sequence[Usable]) -> Iterator[Finding]:
-    """Find directions that no demonstration moves in."""
+    """Find directions in which no demonstration moves."""
     positions = np.concatenate([motion.positions for motion in motions])
     deviations, directions = np.linalg.svd(positions - positions.mean(axis=0), full_matrices=False)[1:]
     deviations = deviations / np.sqrt(len(positions))
@@ -83,21 +91,174 @@ def check_plane(motions: Sequence[Usable]) -> Iterator[Finding]:
         normal = directions[-1] * np.sign(directions[-1][np.argmax(np.abs(directions[-1]))])
         shape = "in a plane, normal" if flat.sum() == 1 else "on a straight line, across"
         vector = " ".join(f"{x:.2f}" for x in normal + 0.0)
-        yield Finding(
-            "note",
-            "planar",
-            f"all motions lie {shape} ({vector}), within {1e3 * deviations[flat].max():.2g} mm",
-            remedy="nothing: that direction is kept constant when learning",
+        message = f"all motions lie {shape} ({vector}), within {1e3 * deviations[flat].max():.2g} mm"
+        yield Finding("note", "planar", message, remedy="none needed: that direction is kept constant when learning")
+
+
+def check_agreement(motions: Sequence[Usable]) -> Iterator[Finding]:
+    """Find demonstrations that run backwards, are incomplete, end elsewhere, or go another way than the others."""
+    trajectories = [one for motion in motions if (one := motion.moving_part()) is not None]
+    if len(trajectories) < len(motions) or len(motions) < 2:
+        return
+    scale = _Scale(1e3, "mm", _APART)
+    paths = np.stack([_by_length(one.positions) for one in trajectories])
+    size = float(np.median(np.linalg.norm(np.ptp(paths, axis=1), axis=1)))
+    if size < _FLAT:  # the tool only rotates
+        if any(one.quaternions is None for one in trajectories):
+            return
+        scale = _Scale(float(np.degrees(1.0)), "degrees", _ROTATED)
+        paths = np.stack([_by_length(path) for path in rotation_paths(trajectories)])
+        size = float(np.median(np.linalg.norm(np.ptp(paths, axis=1), axis=1)))
+    odd: set[int] = set()
+    for i, message, code, remedy in (
+        *_backwards(paths, size, motions, scale),
+        *_incomplete(paths, size, motions, scale),
+    ):
+        if i not in odd:
+            odd.add(i)
+            yield motions[i].finding("error", code, message, remedy)
+    rest = [i for i in range(len(motions)) if i not in odd]
+    if len(rest) >= 2:
+        yield from _groups([motions[i] for i in rest], [trajectories[i] for i in rest], size)
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """How differences are reported: a factor, its unit, and the smallest difference that counts [m] or [rad]."""
+
+    factor: float
+    unit: str
+    smallest: float
+
+
+def _by_length(positions: Array) -> Array:
+    """Return the path (n, 3) at equal distances along it, whatever its pace."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    even = np.linspace(0.0, length[-1], len(positions))
+    return np.stack([np.interp(even, length, column) for column in positions.T], axis=1)
+
+
+def _mean_distance(paths: Array, others: Array) -> Array:
+    """Return the mean distance between each of ``paths`` and each of ``others``, shape (m, m)."""
+    return np.asarray(np.linalg.norm(paths[:, None] - others[None], axis=3).mean(axis=2))
+
+
+def _backwards(
+    paths: Array, size: float, motions: Sequence[Usable], scale: _Scale
+) -> Iterator[tuple[int, str, str, str]]:
+    """Find motions that fit the most typical one much better when they are reversed."""
+    forward, backward = _mean_distance(paths, paths), _mean_distance(paths[:, ::-1], paths)
+    typical = int(np.argmin(forward.sum(axis=1)))
+    differs = forward[:, typical] > max(scale.smallest, _DIFFERENT * size)
+    for i in np.flatnonzero((backward < 0.5 * forward)[:, typical] & differs):
+        message = f"runs in the opposite direction to {motions[typical].name}"
+        yield int(i), message, "direction", "leave it out, or learn each direction as a skill of its own"
+
+
+def _incomplete(
+    paths: Array, size: float, motions: Sequence[Usable], scale: _Scale
+) -> Iterator[tuple[int, str, str, str]]:
+    """Find motions that stop, or begin, on the way of the most typical one."""
+    m, n, _ = paths.shape
+    for end, verb in (("goal", "stops"), ("start", "begins")):
+        along = paths if end == "goal" else paths[:, ::-1]  # towards the end in question
+        to_path = np.linalg.norm(along[:, None, -1:] - along[None], axis=3)  # of each end to each path (m, m, n)
+        nearest = np.argmin(to_path, axis=2)
+        apart = to_path[:, :, -1]
+        short = (
+            (apart > max(scale.smallest, _SHORT[end] * size))
+            & (to_path.min(axis=2) < _ON_PATH * apart)
+            & (nearest < (1.0 - _SHORT[end]) * (n - 1))
         )
+        for i in range(m):
+            whole = np.flatnonzero(short[i] & ~short.any(axis=1))
+            if len(whole) and 2 * short[i].sum() >= m - 1:
+                done = nearest[i, whole[0]] / (n - 1)
+                percent = 100.0 * (done if verb == "stops" else 1.0 - done)
+                message = f"{verb} at {percent:.0f} % of the path of {motions[whole[0]].name}, "
+                message += f"{scale.factor * apart[i, whole[0]]:.0f} {scale.unit} from its {end}"
+                yield i, message, "incomplete", "leave it out, or record the whole motion again"
+
+
+def _groups(motions: Sequence[Usable], trajectories: Sequence[Trajectory], size: float) -> Iterator[Finding]:
+    """Find demonstrations that fall apart in two groups: by starts, goals, paths between them, or rotations."""
+    has_rotations = all(one.quaternions is not None for one in trajectories)
+    if not has_rotations:
+        trajectories = [Trajectory(one.times, one.positions) for one in trajectories]
+    warps = barycentre_warps(features(trajectories), n_iterations=4)
+    warped = [one.at(warp * one.duration) for one, warp in zip(trajectories, warps, strict=True)]
+    positions = np.stack([p for p, _ in warped])
+    ways = to_common_ends(positions)
+    kinds: list[tuple[str, Severity, str, Array, float, float, str]] = [
+        ("ends", "warning", "starts", _largest(positions[:, :1]), _ENDS_APART * size, 1e3, "mm"),
+        ("ends", "warning", "goals", _largest(positions[:, -1:]), _ENDS_APART * size, 1e3, "mm"),
+        ("two-paths", "error", "paths between the same ends", _largest(ways), _PATHS_APART * size, 1e3, "mm"),
+    ]
+    if has_rotations:
+        rotations = np.stack([q for _, q in warped if q is not None])
+        apart = np.stack([_angles(rotations, q).max(axis=1) for q in rotations])
+        kinds.append(("two-rotations", "warning", "rotations", apart, _ROTATIONS_APART, np.degrees(1.0), "degrees"))
+    for code, severity, what, distance, floor, factor, unit in kinds:
+        split = _split(distance, floor if unit == "degrees" else max(_APART, floor))
+        if split is None:
+            continue
+        group, gap = split
+        few, many = sorted((np.flatnonzero(group), np.flatnonzero(~group)), key=len)
+        if code == "two-paths" and len(few) == 1 and len(motions) > 3:
+            continue  # one among many is an outlier
+        message = (
+            f"the {what} of {_names(motions, few)} and of {_names(motions, many)} are {factor * gap:.0f} {unit} apart"
+        )
+        remedy = "learn each group as a skill of its own: the mean of both is a motion that nobody has shown"
+        yield motions[few[0]].finding(severity, code, message, remedy)
+
+
+def _largest(paths: Array) -> Array:
+    """Return the largest distance between paths (m, n, 3) at equal times, shape (m, m)."""
+    return np.asarray(np.linalg.norm(paths[:, None] - paths[None], axis=3).max(axis=2))
+
+
+def _angles(rotations: Array, reference: Array) -> Array:
+    """Return the angles between rotations (m, n, 4) and reference rotations (n, 4), shape (m, n) [rad]."""
+    back = quaternion_conjugate(reference)
+    return np.stack([np.linalg.norm(quaternion_log(quaternion_multiply(q, back)), axis=1) for q in rotations])
+
+
+def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | None:
+    """Return one of two groups as a mask (m,), and the gap between both; None when there is one group.
+
+    The gap is the longest link of the minimum spanning tree. It must exceed ``floor``, and with more than two
+    demonstrations the next longest link by a factor: then neighbours are much nearer within the groups.
+    """
+    m = len(distance)
+    nearest, inside, links = distance[0].copy(), np.arange(m) == 0, []
+    while not inside.all():
+        new = int(np.argmin(np.where(inside, np.inf, nearest)))
+        links.append(float(nearest[new]))
+        inside[new] = True
+        nearest = np.minimum(nearest, distance[new])
+    links.sort()
+    if links[-1] <= floor or (m > 2 and links[-1] <= _GROUP_RATIO * links[-2] and not links[-2] > floor):
+        return None
+    group = np.arange(m) == 0
+    for _ in range(m):
+        group = (distance[group] < links[-1]).any(axis=0)
+    return group, links[-1]
+
+
+def _names(motions: Sequence[Usable], which: NDArray[np.int64]) -> str:
+    """Return up to three names, and how many more there are."""
+    names = [motions[i].name for i in which]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def check_outliers(motions: Sequence[Usable]) -> Iterator[Finding]:
-    """Find the demonstration whose path, once aligned, is unlike all others.
+    """Find the demonstration whose path, once aligned, differs from all others.
 
-    Distances are from the medoid, the demonstration that is nearest to all others; at least four are needed to say
-    what is usual.
+    Distances are measured from the medoid, the demonstration that is nearest to all others. At least four
+    demonstrations are needed to know what is usual.
     """
-    trajectories = [one for motion in motions if (one := _moving_part(motion)) is not None]
+    trajectories = [one for motion in motions if (one := motion.moving_part()) is not None]
     if len(trajectories) < len(motions) or len(motions) < 4:
         return
     if any(one.quaternions is None for one in trajectories):
@@ -105,30 +266,22 @@ def check_outliers(motions: Sequence[Usable]) -> Iterator[Finding]:
     warps = barycentre_warps(features(trajectories), n_iterations=4)
     warped = [one.at(warp * one.duration) for one, warp in zip(trajectories, warps, strict=True)]
     positions = np.stack([p for p, _ in warped])
-    distance = np.linalg.norm(positions[:, None] - positions[None], axis=3).mean(axis=2)
+    distance = _mean_distance(positions, positions)
     center = int(np.argmin(np.sum(distance, axis=1)))
     for i in _unlike(distance[center], center, _OUTLIER_DISTANCE):
         usual = float(np.median(np.delete(distance[center], center)))
-        yield motions[i].finding(
-            "warning",
-            "outlier",
-            f"is {1e3 * distance[center, i]:.0f} mm from the most typical one ({motions[center].raw.source}), "
-            f"usual are {1e3 * usual:.0f} mm",
-            "look at it; leave it out if it shows something else",
-        )
+        message = f"is {1e3 * distance[center, i]:.0f} mm from the most typical one ({motions[center].raw.source}), "
+        message += f"usual are {1e3 * usual:.0f} mm"
+        yield motions[i].finding("warning", "outlier", message, "check it; leave it out if it shows something else")
     rotations = [q for _, q in warped if q is not None]
     if len(rotations) < len(motions):
         return
-    back = quaternion_conjugate(rotations[center])
-    angle = np.array([np.linalg.norm(quaternion_log(quaternion_multiply(q, back)), axis=1).mean() for q in rotations])
+    angle = _angles(np.stack(rotations), rotations[center]).mean(axis=1)
     for i in _unlike(angle, center, _OUTLIER_ANGLE):
-        yield motions[i].finding(
-            "warning",
-            "rotation-outlier",
-            f"is turned by {np.degrees(angle[i]):.0f} degrees from the most typical one "
-            f"({motions[center].raw.source}), usual are {np.degrees(np.median(np.delete(angle, center))):.0f}",
-            "look at it; check the quaternion's order (wxyz or xyzw)",
-        )
+        message = f"is rotated by {np.degrees(angle[i]):.0f} degrees from the most typical one "
+        message += f"({motions[center].raw.source}), usual are {np.degrees(np.median(np.delete(angle, center))):.0f}"
+        remedy = "check it, and the order of its quaternions (wxyz or xyzw)"
+        yield motions[i].finding("warning", "rotation-outlier", message, remedy)
 
 
 def _unlike(distance: Array, center: int, floor: float) -> list[int]:
@@ -140,13 +293,4 @@ def _unlike(distance: Array, center: int, floor: float) -> list[int]:
     return [int(i) for i in np.flatnonzero(distance > limit)]
 
 
-def _moving_part(motion: Usable) -> Trajectory | None:
-    rows = moving_rows(motion.times, motion.positions, motion.quaternions)
-    if rows is None or rows[1] <= rows[0]:
-        return None
-    keep = slice(rows[0], rows[1] + 1)
-    quaternions = None if motion.quaternions is None else motion.quaternions[keep]
-    return Trajectory(motion.times[keep], motion.positions[keep], quaternions).from_zero().resample(_SAMPLES)
-
-
-SET_CHECKS = (check_number, check_kinds, check_durations, check_plane, check_outliers)
+SET_CHECKS = (check_number, check_kinds, check_durations, check_plane, check_agreement, check_outliers)

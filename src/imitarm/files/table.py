@@ -1,12 +1,14 @@
-"""Tables of numbers in text files: read with the line of every fault, written without ever leaving half a file.
+"""Tables of numbers in text files: errors name the line, and a write never leaves half a file.
 
-A table is lines of numbers, with or without a row of column names, set apart by comma, semicolon, tab or spaces.
-Lines that start with ``#`` or ``%`` are remarks; those before the numbers that read ``key: value`` are kept.
+A table is lines of numbers, separated by comma, semicolon, tab or spaces. A row of column names may come first.
+Lines that start with ``#`` or ``%`` are remarks. Remarks before the numbers are kept: they may hold ``key: value``
+pairs or the column names.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +20,7 @@ from imitarm.errors import FileFormatError, InputError
 
 Array = NDArray[np.float64]
 
-# how a file of another kind begins, so that the message can name it
+# the first bytes of files of other kinds, so that the message can name the kind
 SIGNATURES = {
     b"\x93NUMPY": "a NumPy array (.npy)",
     b"PK\x03\x04": "a zip archive (.npz, .xlsx or other)",
@@ -34,17 +36,23 @@ SIGNATURES = {
 }
 
 
+_NAME = re.compile(r"\"[^\"]*\"|[^\s\[(]*(?:\s*[\[(][^\])]*[\])])|[^\s\[(]+")
+
+
 @dataclass(frozen=True, eq=False)
 class Table:
-    """What a text file says.
+    """The content of a text file.
 
     Attributes:
-        path: the file, as it was named by the caller.
+        path: the file, as the caller named it.
         remarks: the ``key: value`` remarks before the numbers, keys in lower case.
-        names: the column names, None when the file has none.
-        values: the numbers, shape (n, columns); may hold nan and inf, which are the caller's to judge.
+        names: the column names, None when the file has none. They stand in a row of their own, or else in the last
+            remark before the numbers that has one word for each column.
+        values: the numbers, shape (n, columns). They may include nan and inf: the caller checks.
         lines: the line in the file of each row, from 1, shape (n,).
-        ends_in_newline: False when the last line was perhaps cut off.
+        ends_in_newline: False when the last line may have been cut off.
+        names_line: the line of ``names``, from 1; None when there are no names.
+        remark_lines: line number and text of each remark before the numbers, without the ``#``.
     """
 
     path: str
@@ -53,6 +61,13 @@ class Table:
     values: Array
     lines: NDArray[np.int64]
     ends_in_newline: bool
+    names_line: int | None = None
+    remark_lines: tuple[tuple[int, str], ...] = ()
+
+    @property
+    def named_by_row(self) -> bool:
+        """Whether the column names stand in a row of their own, not in a remark."""
+        return self.names is not None and self.names_line not in {number for number, _ in self.remark_lines}
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -96,8 +111,16 @@ def _text_of(path: str | Path, content: bytes) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
+def split_names(text: str) -> tuple[str, ...]:
+    """Split a line of column names. A unit in brackets belongs to the name before it: ``t (s) x (m)`` are two names."""
+    separator = _separator(text)
+    if separator is not None:
+        return tuple(_fields(text, separator))
+    return tuple(word.strip('"') for word in _NAME.findall(text))
+
+
 def _separator(line: str) -> str | None:
-    """Return what sets fields apart in ``line``; None means blanks."""
+    """Return the separator of fields in ``line``; None means blanks."""
     return next((s for s in ";\t," if s in line), None)
 
 
@@ -110,14 +133,14 @@ def _fields(line: str, separator: str | None) -> list[str]:
 
 def _number(field: str) -> float | None:
     try:
-        return None if "_" in field else float(field)  # float() alone would take 1_0 for ten
+        return None if "_" in field else float(field)  # float() alone reads 1_0 as ten
     except ValueError:
         return None
 
 
 def _row(path: str | Path, number: int, fields: Sequence[str], width: int, last: bool) -> list[float]:
     if len(fields) != width:
-        remedy = "the file was cut off: record it again or remove its last line" if last else "mend that line"
+        remedy = "the file was cut off: record it again or remove its last line" if last else "fix that line"
         raise FileFormatError(f"{path}, line {number}: {len(fields)} values where {width} are expected; {remedy}")
     numbers = [_number(field) for field in fields]
     values = [value for value in numbers if value is not None]
@@ -125,22 +148,19 @@ def _row(path: str | Path, number: int, fields: Sequence[str], width: int, last:
         column = numbers.index(None)
         field = fields[column]
         what = f"{field[:40]!r} is not a number" if field else "a value is missing"
-        hint = "use a decimal point" if field.replace(",", "", 1).lstrip("+-").isdigit() else "mend or remove that line"
+        hint = "use a decimal point" if field.replace(",", "", 1).lstrip("+-").isdigit() else "fix or remove that line"
         raise FileFormatError(f"{path}, line {number}, column {column + 1}: {what}; {hint}")
     return values
 
 
-def _remarks(lines: Sequence[str]) -> tuple[dict[str, str], str]:
-    """Return the ``key: value`` remarks, and the last remark that is none (perhaps column names)."""
-    remarks: dict[str, str] = {}
-    heading = ""
-    for line in lines:
-        key, colon, value = line.lstrip("#% ").partition(":")
-        if colon:
-            remarks[key.strip().lower()] = value.strip()
-        else:
-            heading = key
-    return remarks, heading
+def _names_in_remarks(remarks: Sequence[tuple[int, str]], width: int) -> tuple[int | None, tuple[str, ...] | None]:
+    """Return line and words of the last remark that has one word, and no number, for each of ``width`` columns."""
+    for number, text in reversed(remarks):
+        for part in (text, text.partition(":")[2]):  # "t x y z" as well as "columns: t x y z"
+            names = split_names(part)
+            if len(names) == width and ":" not in part and all(_number(name) is None for name in names):
+                return number, names
+    return None, None
 
 
 def read_table(path: str | Path) -> Table:
@@ -158,8 +178,8 @@ def parse_table(path: str | Path, content: bytes) -> Table:
     """Read a table of numbers from the content of a file, as :func:`read_table` does.
 
     Args:
-        path: where it is from, for messages.
-        content: all of the file, or what of it is wanted.
+        path: the name of the file, for messages.
+        content: the file's bytes, or the part of them to read.
 
     Raises:
         FileFormatError: as :func:`read_table`.
@@ -170,27 +190,32 @@ def parse_table(path: str | Path, content: bytes) -> Table:
     body = [(number, line) for number, line in written if line[0] not in "#%"]
     if not body:
         raise FileFormatError(f"{path}: holds no rows of numbers; record or export it again")
-    remarks, heading = _remarks([line for number, line in written if number < body[0][0]])
-    separator = _separator(body[0][1])
-    first = _fields(body[0][1], separator)
-    names: tuple[str, ...] | None = None
-    if all(_number(field) is None for field in first):
-        names, body = tuple(first), body[1:]
+    remark_lines = tuple((number, line.lstrip("#% \t")) for number, line in written if number < body[0][0])
+    pairs = [text.partition(":") for _, text in remark_lines]
+    remarks = {key.strip().lower(): value.strip() for key, colon, value in pairs if colon}
+    names_line: int | None
+    names: tuple[str, ...] | None
+    names_line, names = body[0][0], split_names(body[0][1])
+    if all(_number(name) is None for name in names):
+        width, body = len(names), body[1:]
         if not body:
             raise FileFormatError(f"{path}: has column names but no rows; record or export it again")
-    elif (fields := tuple(_fields(heading, _separator(heading)))) and len(fields) == len(first):
-        names = fields if all(_number(field) is None for field in fields) else None  # as numpy.savetxt writes them
-    rows = [_row(path, number, _fields(line, separator), len(first), number == len(stripped)) for number, line in body]
+    else:
+        width = len(_fields(body[0][1], _separator(body[0][1])))
+        names_line, names = _names_in_remarks(remark_lines, width)
+    separator = _separator(body[0][1])
+    rows = [_row(path, number, _fields(line, separator), width, number == len(stripped)) for number, line in body]
     lines = np.array([number for number, _ in body], dtype=np.int64)
-    return Table(str(path), remarks, names, np.array(rows), lines, text.endswith("\n"))
+    return Table(str(path), remarks, names, np.array(rows), lines, text.endswith("\n"), names_line, remark_lines)
 
 
 def write_table(
     path: str | Path, remarks: Mapping[str, str], names: Sequence[str], values: NDArray[np.float64]
 ) -> None:
-    """Write a table that :func:`read_table` gives back to the last bit.
+    """Write a table that :func:`read_table` reads back to the last bit.
 
-    It is written beside the place it belongs and then renamed: an older file stays whole until the new one is.
+    The table goes to a temporary file first, which is then renamed: an older file stays intact until the new one is
+    complete.
 
     Args:
         path: where to; an existing file is replaced.

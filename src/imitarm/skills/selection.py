@@ -19,6 +19,7 @@ _SAMPLES = 100  # per demonstration, for a motion whose path is up to 3 times it
 _MOST_SAMPLES = 1000
 _HELD_OUT = 1.02  # times the smallest held-out error
 _BIAS = 0.1  # of the smallest held-out error
+_LEVER = 0.1  # [m] distance that counts as much as a rotation of 1 rad, in motions that only rotate
 _SLACK_MM = 0.1  # below the repeatability of industrial arms
 _PATIENCE = 4  # stop after so many numbers in a row without a smaller held-out error
 _BETTER = 0.995  # times the smallest so far
@@ -116,10 +117,13 @@ def try_numbers_of_components(
     if len(tables) > 1:
         seen = np.concatenate([seen, owner != np.arange(len(tables))[:, None]])
     places = np.flatnonzero(np.flatnonzero(moves) <= 3)[1:]  # columns of Z that hold positions
+    lever = 1.0
+    if not len(places):  # the tool only rotates: its rotation vector counts instead
+        places, lever = np.arange(1, Z.shape[1]), _LEVER
     grid = np.linspace(Z[:, 0].min(), Z[:, 0].max(), n_samples)
     plain_mean = np.mean([_resampled(Z[owner == i], places, grid) for i in range(len(tables))], axis=0)
     still = float(np.sum(samples[:, 1:4][:, ~moves[1:4]].var(axis=0)))
-    size = 1e3 * scale[places]  # back to mm
+    size = 1e3 * lever * scale[places]  # back to mm
 
     def evaluate(k: int, cut: Array) -> Candidate:
         start = np.repeat(cut[None], len(seen), axis=0)

@@ -1,0 +1,303 @@
+"""Reading demonstrations: the options, the readers, and ``read``.
+
+A file becomes a :class:`~imitarm.demonstrations.raw.RawDemonstration` by the first reader in ``READERS`` that
+recognises its content. A raw demonstration becomes a :class:`~imitarm.trajectory.Demonstration` when nothing in it is
+invalid.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.demonstrations.raw import RawDemonstration
+from imitarm.errors import FileFormatError, InputError, UnknownNameError
+from imitarm.files.table import kind_of, read_bytes
+from imitarm.registry import Registry
+from imitarm.trajectory import Demonstration
+
+if TYPE_CHECKING:
+    from imitarm.kinematics.arm import ArmModel
+
+Array = NDArray[np.float64]
+Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+
+LENGTH_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+QUATERNION_ORDERS = {"wxyz": (0, 1, 2, 3), "xyzw": (3, 0, 1, 2)}
+
+_HEAD = 65536  # bytes of a file that a reader sees before it says whether it recognises the format
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """Facts that a file may not state itself.
+
+    Attributes:
+        units: unit of lengths, a key of ``LENGTH_UNITS``; None: as the file says, else m.
+        time_units: unit of time stamps, a key of ``TIME_UNITS``; None: as the file says, else s.
+        duration: of the motion [s], for files without time stamps.
+        rate: samples per second [Hz], for files without time stamps.
+        quaternion_order: ``"wxyz"`` or ``"xyzw"``, for quaternion columns without names; None: as the file says, else
+            wxyz.
+        task: name of the task; used where the file does not give one.
+
+    Raises:
+        InputError: when a value is invalid.
+    """
+
+    units: str | None = None
+    time_units: str | None = None
+    duration: float | None = None
+    rate: float | None = None
+    quaternion_order: str | None = None
+    task: str = ""
+
+    def __post_init__(self) -> None:
+        for kind, name, known in (
+            ("unit of length", self.units, LENGTH_UNITS),
+            ("unit of time", self.time_units, TIME_UNITS),
+            ("quaternion order", self.quaternion_order, QUATERNION_ORDERS),
+        ):
+            if name is not None and name not in known:
+                raise UnknownNameError.among(kind, name, known)
+        for what, value in (("duration", self.duration), ("rate", self.rate)):
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                raise InputError(f"{what} must be a positive number, got {value!r}")
+        if self.duration is not None and self.rate is not None:
+            raise InputError("give duration or rate, not both: each follows from the other")
+
+    def metres(self, source: str, positions: Array, said: str | None = None) -> Array:
+        """Return ``positions`` in metres; ``said`` is the unit that the file itself names.
+
+        Raises:
+            FileFormatError: when the file names an unknown unit.
+            InputError: when the option contradicts the file.
+        """
+        return positions * _factor(source, "units", self.units, said, LENGTH_UNITS, "m")
+
+    def seconds(self, source: str, times: Array, said: str | None = None) -> Array:
+        """Return time stamps (n,) in seconds; ``said`` is the unit that the file itself names.
+
+        Raises:
+            FileFormatError: when the file names an unknown unit.
+            InputError: when the option contradicts the file, or the file has time stamps and a duration or rate was
+                given too.
+        """
+        if self.duration is not None or self.rate is not None:
+            raise InputError(f"{source}: has time stamps of its own; leave out duration and rate")
+        return times * _factor(source, "time_units", self.time_units, said, TIME_UNITS, "s")
+
+    def even_times(self, source: str, n: int) -> Array:
+        """Return times (n,) [s] for a file without time stamps.
+
+        Raises:
+            FileFormatError: when neither duration nor rate was given.
+        """
+        if self.duration is not None:
+            return np.linspace(0.0, self.duration, n)
+        if self.rate is not None:
+            return np.arange(n) / self.rate
+        raise FileFormatError(
+            f"{source}: has no time stamps; give the length of the motion, duration=10.0 [s], or rate=100.0 [Hz]"
+        )
+
+    def wxyz(self, source: str, quaternions: Array, said: str | None = None) -> Array:
+        """Return unnamed quaternion columns (..., 4) in the order w, x, y, z; ``said`` is the order the file states.
+
+        Raises:
+            InputError: when the option contradicts the file.
+        """
+        if None not in (self.quaternion_order, said) and self.quaternion_order != said:
+            raise InputError(
+                f"{source}: says its order is {said}, which contradicts quaternion_order={self.quaternion_order!r}; "
+                "leave that out"
+            )
+        return quaternions[..., list(QUATERNION_ORDERS[self.quaternion_order or said or "wxyz"])]
+
+
+def _factor(
+    source: str, option: str, asked: str | None, said: str | None, known: dict[str, float], default: str
+) -> float:
+    if said is not None and said not in known:
+        raise FileFormatError(f"{source}: says its unit is {said!r}; known: {', '.join(known)}")
+    if asked is not None and said is not None and asked != said:
+        raise InputError(f"{source}: says its unit is {said}, which contradicts {option}={asked!r}; leave that out")
+    return known[asked or said or default]
+
+
+class Reader(ABC):
+    """Reads one file format.
+
+    A new format is one subclass and one line: in ``READERS`` for this package, in the entry points of any other
+    (group ``imitarm.readers``). It then works in ``read``, ``imitarm lint`` and ``imitarm learn``.
+
+    Attributes:
+        suffixes: endings of file names, lower case with the dot, such as ``(".csv", ".txt")``.
+    """
+
+    suffixes: ClassVar[tuple[str, ...]] = ()
+
+    @abstractmethod
+    def recognises(self, head: bytes) -> bool:
+        """Return whether a file has this format; ``head`` is its first 64 kB. The name of the file is not used."""
+
+    @abstractmethod
+    def read(self, path: str, options: ReadOptions) -> list[RawDemonstration]:
+        """Return the motions in a file of this format.
+
+        Raises:
+            FileFormatError: when the file is damaged; the message names file, place and remedy.
+            InputError: when the options do not fit the file.
+        """
+
+
+READERS: Registry[type[Reader]] = Registry(
+    "reader",
+    "imitarm.readers",
+    {
+        "NumPy arrays": "imitarm.demonstrations.arrays:NumpyReader",
+        "imitarm CSV": "imitarm.demonstrations.text_tables:ImitarmReader",
+        "text table": "imitarm.demonstrations.text_tables:TextTableReader",
+    },
+)
+"""The readers by name. Readers of other packages are asked first, then these, in this order."""
+
+
+def files_of(paths: Paths) -> list[str]:
+    """Return the files to read: a file itself, and of a folder the files whose suffix a reader knows.
+
+    Files of a folder come in natural order, ``demo_2`` before ``demo_10``; its subfolders are not entered.
+
+    Raises:
+        InputError: when there are no files, or a folder holds no such file.
+    """
+    if isinstance(paths, str | os.PathLike):
+        paths = [paths]
+    files: list[str] = []
+    for path in [os.fspath(path) for path in paths]:
+        if Path(path).is_dir():
+            suffixes = sorted({suffix for reader in READERS.values() for suffix in reader.suffixes})
+            inside = [p for p in Path(path).iterdir() if p.suffix.lower() in suffixes]
+            inside = [p for p in inside if p.is_file() and not p.name.startswith(".")]
+            if not inside:
+                raise InputError(f"{path}: the folder holds no demonstrations; known endings: {', '.join(suffixes)}")
+            files += [str(p) for p in sorted(inside, key=_natural)]
+        else:
+            files.append(path)
+    if not files:
+        raise InputError("no demonstrations to read: name at least one file or folder")
+    return files
+
+
+def read_raw(
+    paths: Paths,
+    *,
+    units: str | None = None,
+    time_units: str | None = None,
+    duration: float | None = None,
+    rate: float | None = None,
+    quaternion_order: str | None = None,
+    task: str = "",
+    thin: bool = False,
+) -> list[RawDemonstration]:
+    """Read files without checking the numbers in them; options as in :func:`read`.
+
+    Raises:
+        InputError: when a file can't be opened or an option does not fit it.
+        FileFormatError: when a file can't be understood; the message names file, place and remedy.
+    """
+    options = ReadOptions(units, time_units, duration, rate, quaternion_order, task)
+    raw = [one for path in files_of(paths) for one in _reader_of(path).read(path, options)]
+    return [one.thinned() for one in raw] if thin else raw
+
+
+def read(
+    paths: Paths,
+    *,
+    units: str | None = None,
+    time_units: str | None = None,
+    duration: float | None = None,
+    rate: float | None = None,
+    quaternion_order: str | None = None,
+    arm: ArmModel | None = None,
+    task: str = "",
+    repair: bool = False,
+    thin: bool = False,
+) -> list[Demonstration]:
+    """Read demonstrations from a file, several files or a folder. The content decides the format.
+
+    Args:
+        paths: a file, a folder, or several of them.
+        units: unit of lengths, ``"m"``, ``"cm"``, ``"mm"``, ``"in"`` or ``"ft"``; None: as the file says, else m.
+        time_units: unit of time stamps, ``"s"``, ``"ms"``, ``"us"``, ``"ns"``, ``"min"`` or ``"h"``; None: as the file
+            says, else s.
+        duration: length of each motion [s], for files without time stamps.
+        rate: samples per second [Hz], for files without time stamps.
+        quaternion_order: ``"wxyz"`` or ``"xyzw"``, for quaternion columns without names; None: as the file says, else
+            wxyz.
+        arm: the arm that was recorded, with its tool; needed for files that hold joint angles only.
+        task: name of the task; used where the file does not give one.
+        repair: drop rows that are not finite or not later than the row before, and say so in ``source``.
+        thin: drop rows that only repeat a held value (:meth:`RawDemonstration.held`).
+
+    Returns:
+        One demonstration for each motion, in the order of the files. Planar motions (x y) get z = 0.
+
+    Raises:
+        InputError: when a file can't be opened or an option does not fit it.
+        FileFormatError: when a file is damaged or can't be understood; the message names file, line and remedy.
+    """
+    raw = read_raw(
+        paths,
+        units=units,
+        time_units=time_units,
+        duration=duration,
+        rate=rate,
+        quaternion_order=quaternion_order,
+        task=task,
+        thin=thin,
+    )
+    return [one.demonstration(arm, repair=repair) for one in raw]
+
+
+def known_formats() -> str:
+    """Return the names of all readers with their suffixes, for messages."""
+    return ", ".join(f"{name} ({' '.join(reader.suffixes)})" for name, reader in READERS.items())
+
+
+def _reader_of(path: str) -> Reader:
+    """Return the reader that recognises the content of a file; the suffix must not contradict it."""
+    content = read_bytes(path)
+    suffix, kind = Path(path).suffix.lower(), kind_of(content)
+    recognised = [name for name in _in_order(READERS) if READERS[name]().recognises(content[:_HEAD])]
+    if not recognised:
+        raise FileFormatError(f"{path}: this is {kind or 'text'}; known formats: {known_formats()}")
+    by_suffix = [name for name, reader in READERS.items() if suffix in reader.suffixes]
+    if by_suffix and not set(by_suffix) & set(recognised):
+        raise FileFormatError(
+            f"{path}: named {suffix} ({by_suffix[0]}), but its content is {kind or 'text'} ({recognised[0]}); "
+            "give it the right name"
+        )
+    return READERS[recognised[0]]()
+
+
+def _in_order(names: Iterable[str]) -> Sequence[str]:
+    """Return readers of other packages first: they know one format, the text table takes any text."""
+    built_in = ("NumPy arrays", "imitarm CSV", "text table")
+    names = list(names)
+    return [*(name for name in names if name not in built_in), *(name for name in built_in if name in names)]
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key that takes the numbers in a name as numbers."""
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", path.name)]
