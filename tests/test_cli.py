@@ -155,7 +155,7 @@ def test_lint_shows_place_and_remedy(shown, capsys):
     text = capsys.readouterr().out
     assert "non-monotonic-stamps" in text
     assert "line 101" in text
-    assert "repair=True" in text
+    assert "--repair" in text
 
 
 def test_lint_against_an_arm(shown, tmp_path, capsys):
@@ -180,7 +180,7 @@ def test_learn_writes_a_skill(shown, tmp_path, capsys):
     assert skill.gmr_.has_orientation_
     assert skill.task_ == "reach"  # what the files say comes first
     assert len(skill.provenance_["sources"]) == 5
-    assert "moments moved by up to" in skill.provenance_["notes"][0]
+    assert "largest time shift" in skill.provenance_["notes"][0]
     text = capsys.readouterr().out
     assert "0 errors" in text
     assert f"wrote {out}" in text
@@ -211,7 +211,7 @@ def test_learn_refuses_what_lint_calls_an_error(shown, tmp_path, capsys):
     assert main(words) == 2
     captured = capsys.readouterr()
     assert "non-monotonic-stamps" in captured.out
-    assert "not learnt: mend the errors above" in captured.err
+    assert "not learned: fix the errors above" in captured.err
     assert not out.exists()
     assert main([*words, "--repair"]) == 0
     assert "(1 of 300 rows dropped)" in Skill.load(out).provenance_["sources"][1]

@@ -146,3 +146,17 @@ def test_an_archive_of_other_things(tmp_path):
         pass
     with pytest.raises((FileFormatError, InputError)):
         read(tmp_path / "b.npz", duration=1.0)
+
+
+@pytest.mark.parametrize("shape", [(40, 4, 4), (40, 3, 3), (40, 3, 4), (3, 40, 4, 4), (40, 16), (40, 12), (40, 9)])
+def test_stacks_of_matrices_are_refused_once_with_their_shape(tmp_path, shape):
+    np.save(tmp_path / "a.npy", np.ones(shape))
+    with pytest.raises(FileFormatError, match=r"shape \(.*\) looks like a stack of matrices .*x y z qw qx qy qz"):
+        read(tmp_path / "a.npy", duration=3.0)
+
+
+@pytest.mark.parametrize("shape", [(500, 5, 7), (200, 9, 3), (30, 12, 8)])
+def test_stacks_whose_axes_are_swapped_are_refused_once(tmp_path, shape):
+    np.save(tmp_path / "a.npy", np.ones(shape))
+    with pytest.raises(FileFormatError, match=rf"would be {shape[0]} demonstrations of {shape[1]} rows.*swap"):
+        read(tmp_path / "a.npy", duration=3.0)

@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _show(skill: Skill, alignment: Alignment) -> None:
-    """Print what was tried and what was learnt."""
+    """Print the numbers of components that were tried, and the skill."""
     gmr = skill.gmr_
     if gmr.selection_:
         show_table(
@@ -121,9 +121,9 @@ def _show(skill: Skill, alignment: Alignment) -> None:
         [
             ("demonstrations", str(skill.n_demonstrations_)),
             ("duration", f"{skill.duration_:.2f} s"),
-            ("moments moved to align", f"by up to {alignment.largest_shift.max():.2f} s"),
+            ("largest time shift in alignment", f"{alignment.largest_shift.max():.2f} s"),
             ("components", str(gmr.n_components_)),
-            ("orientation", "learnt" if gmr.has_orientation_ else "not in the demonstrations"),
+            ("orientation", "learned" if gmr.has_orientation_ else "not in the demonstrations"),
             ("start, goal", f"{start} cm, {goal} cm"),
             ("distance to the demonstrations", f"{rmse:.1f} mm (root mean square)"),
             ("tolerance along the motion", f"{spread.min():.1f} to {spread.max():.1f} mm"),

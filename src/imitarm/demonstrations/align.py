@@ -55,16 +55,16 @@ _NOISE_FACTOR = 4.0  # standard deviations of noise that count as standing
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Aligned demonstrations and what was changed to get them.
+    """Aligned demonstrations, and what was changed.
 
     Attributes:
         demonstrations: all with the same times, from 0 to ``duration``.
         duration: the median of the trimmed demonstrations' durations [s].
         kept_rows: first and last row of each demonstration that were kept, shape (n_demonstrations, 2).
         durations: of each trimmed demonstration, before [s], shape (n_demonstrations,).
-        warps: for each sample of the common motion, how far through its own trimmed duration each demonstration was,
-            0 to 1, strictly increasing, shape (n_demonstrations, n).
-        method: how it was done.
+        warps: for each sample of the common motion, the fraction of its own trimmed duration that each demonstration
+            has passed, 0 to 1, strictly increasing, shape (n_demonstrations, n).
+        method: ``"dtw"`` or ``"resample"``.
     """
 
     demonstrations: tuple[Demonstration, ...]
@@ -76,28 +76,28 @@ class Alignment:
 
     @property
     def largest_shift(self) -> Array:
-        """Most that a moment of each demonstration was moved in time [s], shape (n_demonstrations,)."""
+        """Largest time shift within each demonstration [s], shape (n_demonstrations,)."""
         even = np.linspace(0.0, 1.0, self.warps.shape[1])
         return np.asarray(np.abs(self.warps - even).max(axis=1) * self.duration)
 
     def notes(self) -> list[str]:
-        """Say in words what was changed, one line a demonstration."""
+        """Return what was changed, one line for each demonstration."""
         return [
-            f"{one.source}: {duration:.2f} s to {self.duration:.2f} s, moments moved by up to {shift:.2f} s"
+            f"{one.source}: {duration:.2f} s to {self.duration:.2f} s, largest time shift {shift:.2f} s"
             for one, duration, shift in zip(self.demonstrations, self.durations, self.largest_shift, strict=True)
         ]
 
 
 def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Method = "dtw") -> list[Demonstration]:
-    """Trim, re-time and resample demonstrations of one motion so that they can be learnt from together.
+    """Trim, re-time and resample demonstrations of one motion so that a skill can be learned from them.
 
-    Idle heads and tails are cut off, time starts at 0, and the common duration is the median. ``"dtw"`` then warps
-    each demonstration's time to a barycentre of them all (:func:`~imitarm.demonstrations.warp.barycentre_warps`);
-    ``"resample"`` only stretches it evenly. Positions, rotations and joints all follow the same warp.
+    Idle ends are cut off, time starts at 0, and the common duration is the median. ``"dtw"`` then warps the time of
+    each demonstration to a barycentre of them all (:func:`barycentre_warps`); ``"resample"`` only stretches it evenly.
+    Positions, rotations and joints all follow the same warp.
 
     Args:
         demonstrations: of one motion, at least one.
-        n: samples of each result.
+        n: number of samples of each result.
         method: ``"dtw"`` or ``"resample"``.
 
     Returns:
@@ -111,7 +111,7 @@ def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Meth
 
 
 def compute_alignment(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Method = "dtw") -> Alignment:
-    """Do what :func:`align` does and return also what was changed; arguments and errors are the same."""
+    """Align as :func:`align` does, and also return what was changed; arguments and errors are the same."""
     if method not in METHODS:
         raise UnknownNameError.among("method of alignment", method, METHODS)
     if n < 10:
@@ -155,7 +155,7 @@ def _trimmed(demonstration: Demonstration, rows: tuple[int, int]) -> Demonstrati
 
 
 def _retimed(demonstration: Demonstration, warp: Array, times: Array) -> Demonstration:
-    """Return the demonstration at ``times``; ``warp`` says how far through its own duration it is at each."""
+    """Return the demonstration at ``times``; ``warp`` is the fraction of its own duration that has passed at each."""
     motion = demonstration.trajectory
     own = warp * motion.duration
     joints = demonstration.joints
@@ -167,8 +167,8 @@ def _retimed(demonstration: Demonstration, warp: Array, times: Array) -> Demonst
 def noise_level(values: Array) -> float:
     """Return the standard deviation of white noise on smooth samples (n, d), from their third differences.
 
-    For white noise of deviation s the variance of a third difference is 20 s^2; the median keeps out what is left of
-    the motion itself. Fewer than 20 samples can't tell the two apart: 0.
+    For white noise of deviation s the variance of a third difference is 20 s^2; the median excludes what is left of
+    the motion itself. With fewer than 20 samples, noise and motion can't be separated: the result is 0.
     """
     if len(values) < 20:
         return 0.0
@@ -240,7 +240,7 @@ def smooth_slope(times: Array, values: Array, window: float = _WINDOW) -> tuple[
     Args:
         times: strictly increasing, shape (n,) [s].
         values: shape (n, d).
-        window: how long [s]; neighbours count however far they are.
+        window: length [s]; the next samples on both sides always count.
 
     Returns:
         least-squares slopes (n, d) [unit/s], means (n, d), and the number of samples in each window (n,).
@@ -264,12 +264,12 @@ def smooth_slope(times: Array, values: Array, window: float = _WINDOW) -> tuple[
 
 
 def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, Indices]:
-    """Match motions ``a`` with motions ``b``, pair by pair.
+    """Match the samples of motions ``a`` with those of motions ``b``, pair by pair.
 
     Args:
         a: shape (pairs, n, d).
         b: shape (pairs, n, d), same n.
-        band: largest |i - j| that is allowed, in samples.
+        band: largest allowed |i - j|, in samples.
         price: of a step that is not diagonal, in units of the cost.
 
     Returns:
@@ -277,7 +277,7 @@ def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, In
         path: index pairs (i, j) from the end to the start, which is repeated, shape (pairs, 2 n - 1, 2).
     """
     n = a.shape[1]
-    # one row an anti-diagonal i + j, one column an offset i - j; what is outside the grid or the band costs inf
+    # one row for each anti-diagonal i + j, one column for each offset i - j; cells outside grid or band cost inf
     diagonal, offset = np.arange(2 * n - 1)[:, None], np.arange(-band - 1, band + 2)
     i, j = (diagonal + offset) // 2, (diagonal - offset) // 2
     inside = ((diagonal + offset) % 2 == 0) & (i >= 0) & (i < n) & (j >= 0) & (j < n) & (np.abs(offset) <= band)
@@ -318,15 +318,15 @@ def _trace(total: Array, cost: Array, price: float) -> Indices:
 
 
 def identity_warps(n_demonstrations: int, n: int) -> Array:
-    """Return the warps that change nothing, shape (n_demonstrations, n)."""
+    """Return warps that change nothing, shape (n_demonstrations, n)."""
     return np.tile(np.linspace(0.0, 1.0, n), (n_demonstrations, 1))
 
 
 def features(trajectories: Sequence[Trajectory]) -> Array:
-    """Return what motions are compared by, shape (n_demonstrations, n, 3) or (..., 6) with rotations [m].
+    """Return the features by which motions are compared, shape (n_demonstrations, n, 3), or 6 with rotations [m].
 
-    Each path is carried to the common start and goal, so that one which began elsewhere is not taken for one which
-    began earlier. Rotations count as rotation vectors from their mean, times a lever of 0.1 m.
+    Each path is carried to the common start and goal: a motion that began elsewhere did not begin earlier. Rotations
+    count as rotation vectors from their mean, times a lever of 0.1 m.
     """
     parts = [to_common_ends(np.stack([trajectory.positions for trajectory in trajectories]))]
     if trajectories[0].quaternions is not None:
@@ -359,16 +359,16 @@ def medoid(values: Array) -> int:
 def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0, n_iterations: int = 8) -> Array:
     """Return the warps that bring motions to their common barycentre.
 
-    Starting from the medoid, each motion is matched with the barycentre by :func:`dtw`, its matched times are
-    smoothed into a warp, and the barycentre becomes the mean of the warped motions (averaging as in Petitjean et al.
-    2011, with one smooth warp a motion in place of sets of matched samples). The warps are centred: at every moment
-    of the common motion their mean is that moment, so the common pace is the mean pace and not the medoid's.
+    The first barycentre is the medoid. Each motion is matched with the barycentre by :func:`dtw`, its matched times are
+    smoothed into a warp, and the mean of the warped motions is the next barycentre (averaging as in Petitjean et al.
+    2011, with one smooth warp for each motion in place of sets of matched samples). The warps are centred: at every
+    time of the common motion their mean is that time, so the common pace is the mean pace and not the medoid's.
 
     Args:
-        values: what to compare by, shape (n_demonstrations, n, d), evenly spaced in time.
-        band: largest share of the duration by which a moment may be moved before centring.
+        values: features, shape (n_demonstrations, n, d), evenly spaced in time.
+        band: largest time shift before centring, as a fraction of the duration.
         stiffness: price of bending time, in mean squared deviations from the barycentre.
-        n_iterations: at most so many rounds.
+        n_iterations: largest number of rounds.
 
     Returns:
         shape (n_demonstrations, n), from 0 to 1, strictly increasing.
@@ -390,7 +390,7 @@ def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0
 
 
 def _at(values: Array, warps: Array) -> Array:
-    """Return motions (m, n, d) read at warped times (m, n)."""
+    """Return motions (m, n, d) at warped times (m, n)."""
     even = np.linspace(0.0, 1.0, values.shape[1])
     return np.stack(
         [np.stack([np.interp(w, even, c) for c in v.T], axis=1) for v, w in zip(values, warps, strict=True)]
@@ -398,7 +398,7 @@ def _at(values: Array, warps: Array) -> Array:
 
 
 def _smooth_warp(path: Indices, n: int) -> Array:
-    """Turn matched pairs (motion, barycentre) into a strictly increasing warp over the barycentre's n steps."""
+    """Return a strictly increasing warp over the n steps of the barycentre, from matched pairs (motion, barycentre)."""
     length = int(np.argmax(path.sum(axis=1) == 0)) + 1
     own, common = path[:length, 0], path[:length, 1]
     mean = np.bincount(common, weights=own, minlength=n) / np.bincount(common, minlength=n)
@@ -407,12 +407,12 @@ def _smooth_warp(path: Indices, n: int) -> Array:
     padded = np.concatenate([-bend[half:0:-1], bend, -bend[-2 : -half - 2 : -1]])
     kernel = np.hanning(2 * half + 3)[1:-1]
     warp = np.linspace(0.0, 1.0, n) + np.convolve(padded, kernel / kernel.sum(), mode="valid")
-    steps = np.maximum(np.diff(warp), _SLOWEST / n)  # time never stands: every moment keeps a place
+    steps = np.maximum(np.diff(warp), _SLOWEST / n)  # time never stands still
     warp = np.concatenate([[0.0], np.cumsum(steps)])
     return np.asarray(warp / warp[-1])
 
 
 def _centred(warps: Array, even: Array) -> Array:
-    """Change the common clock so that the mean of all warps is even time."""
+    """Change the common time so that the mean of all warps is even time."""
     back = np.interp(even, warps.mean(axis=0), even)
     return np.stack([np.interp(back, even, warp) for warp in warps])

@@ -1,4 +1,4 @@
-"""DemonstrationRecorder: writes a motion to a file as it happens, nothing is lost when the program is killed."""
+"""DemonstrationRecorder: write a motion to a file while it happens; nothing is lost when the program is killed."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ Array = NDArray[np.float64]
 
 
 class DemonstrationRecorder:
-    """Writes to ``PATH.part``, one whole sample a line, and makes a demonstration of it when it is closed.
+    """Writes each sample to a line of ``PATH.part``, and makes a demonstration file of it when closed.
 
     Each line is handed to the operating system before :meth:`write` returns: a program that is killed leaves
-    ``PATH.part``, which :meth:`Demonstration.load <imitarm.trajectory.Demonstration.load>` reads as it is. An older
-    file ``PATH`` stays whole until the new one is.
+    ``PATH.part``, which :meth:`Demonstration.load <imitarm.trajectory.Demonstration.load>` can read. An older file
+    ``PATH`` stays intact until the new one is complete.
 
     Args:
-        path: where to.
-        arm: that moves; its tool's poses are written, and its joints.
-        task: what is shown.
-        source: where it comes from.
-        replace: an existing file may be replaced.
+        path: the file to write.
+        arm: the arm that moves; the poses of its tool and its joints are written.
+        task: name of the task.
+        source: origin of the motion, for the file.
+        replace: whether an existing file may be replaced.
 
     Attributes:
-        path: where to.
-        n_samples: written so far.
+        path: the file to write.
+        n_samples: number of samples written so far.
 
     Raises:
-        InputError: when the file is there already and may not be replaced, another recorder has left or is writing
-            ``PATH.part``, or it can't be written.
+        InputError: when the file exists and may not be replaced, ``PATH.part`` exists (left by another recorder, or
+            being written), or the file can't be written.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class DemonstrationRecorder:
         return "\n".join([*(f"# {key}: {value}" for key, value in remarks.items()), ",".join(names), ""])
 
     def write(self, time: float, q: Array) -> None:
-        """Add a sample; one that is not later than the last is left out.
+        """Add a sample. A sample that is not later than the last one is left out.
 
         Args:
             time: [s].
@@ -78,7 +78,7 @@ class DemonstrationRecorder:
         self.n_samples += 1
 
     def close(self) -> None:
-        """Write the demonstration under its name; fewer than two samples make none, and leave no file.
+        """Write the demonstration to its file. With fewer than two samples, no file is written.
 
         A second call does nothing.
 
@@ -90,7 +90,7 @@ class DemonstrationRecorder:
     def _take(self, part: Path) -> bool:
         if self.n_samples >= 2:
             replace(Demonstration.load(part), source=self._source).save(self.path)
-        return False  # it was copied
+        return False  # the part file was copied, not renamed
 
     def __enter__(self) -> Self:
         return self

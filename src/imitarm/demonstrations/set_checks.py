@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 _DURATION_RATIO = 2.0
 _FLAT = 1e-3  # [m] standard deviation below which there is no motion in a direction
+_FEWEST = 4  # demonstrations that are needed to recognise an outlier
 _OUTLIER_RATIO = 3.0  # times as far from the medoid as is usual
 _OUTLIER_SPREADS = 6.0  # and so many robust standard deviations farther
 _OUTLIER_DISTANCE = 0.02  # [m] and at least so far
@@ -119,7 +120,10 @@ def check_agreement(motions: Sequence[Usable]) -> Iterator[Finding]:
             yield motions[i].finding("error", code, message, remedy)
     rest = [i for i in range(len(motions)) if i not in odd]
     if len(rest) >= 2:
-        yield from _groups([motions[i] for i in rest], [trajectories[i] for i in rest], size)
+        positions, rotations = _aligned([trajectories[i] for i in rest])
+        yield from _groups([motions[i] for i in rest], positions, rotations, size)
+        if len(rest) >= _FEWEST:
+            yield from _outliers([motions[i] for i in rest], positions, rotations)
 
 
 @dataclass(frozen=True)
@@ -180,22 +184,25 @@ def _incomplete(
                 yield i, message, "incomplete", "leave it out, or record the whole motion again"
 
 
-def _groups(motions: Sequence[Usable], trajectories: Sequence[Trajectory], size: float) -> Iterator[Finding]:
-    """Find demonstrations that fall apart in two groups: by starts, goals, paths between them, or rotations."""
-    has_rotations = all(one.quaternions is not None for one in trajectories)
-    if not has_rotations:
+def _aligned(trajectories: Sequence[Trajectory]) -> tuple[Array, Array | None]:
+    """Return positions (m, n, 3) and rotations (m, n, 4), or None, at corresponding times."""
+    if any(one.quaternions is None for one in trajectories):
         trajectories = [Trajectory(one.times, one.positions) for one in trajectories]
     warps = barycentre_warps(features(trajectories), n_iterations=4)
     warped = [one.at(warp * one.duration) for one, warp in zip(trajectories, warps, strict=True)]
-    positions = np.stack([p for p, _ in warped])
+    rotations = [q for _, q in warped if q is not None]
+    return np.stack([p for p, _ in warped]), np.stack(rotations) if rotations else None
+
+
+def _groups(motions: Sequence[Usable], positions: Array, rotations: Array | None, size: float) -> Iterator[Finding]:
+    """Find demonstrations that fall apart in two groups: by starts, goals, paths between them, or rotations."""
     ways = to_common_ends(positions)
     kinds: list[tuple[str, Severity, str, Array, float, float, str]] = [
         ("ends", "warning", "starts", _largest(positions[:, :1]), _ENDS_APART * size, 1e3, "mm"),
         ("ends", "warning", "goals", _largest(positions[:, -1:]), _ENDS_APART * size, 1e3, "mm"),
         ("two-paths", "error", "paths between the same ends", _largest(ways), _PATHS_APART * size, 1e3, "mm"),
     ]
-    if has_rotations:
-        rotations = np.stack([q for _, q in warped if q is not None])
+    if rotations is not None:
         apart = np.stack([_angles(rotations, q).max(axis=1) for q in rotations])
         kinds.append(("two-rotations", "warning", "rotations", apart, _ROTATIONS_APART, np.degrees(1.0), "degrees"))
     for code, severity, what, distance, floor, factor, unit in kinds:
@@ -204,7 +211,7 @@ def _groups(motions: Sequence[Usable], trajectories: Sequence[Trajectory], size:
             continue
         group, gap = split
         few, many = sorted((np.flatnonzero(group), np.flatnonzero(~group)), key=len)
-        if code == "two-paths" and len(few) == 1 and len(motions) > 3:
+        if code != "ends" and len(few) == 1 and len(motions) >= _FEWEST:
             continue  # one among many is an outlier
         message = (
             f"the {what} of {_names(motions, few)} and of {_names(motions, many)} are {factor * gap:.0f} {unit} apart"
@@ -252,20 +259,12 @@ def _names(motions: Sequence[Usable], which: NDArray[np.int64]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def check_outliers(motions: Sequence[Usable]) -> Iterator[Finding]:
+def _outliers(motions: Sequence[Usable], positions: Array, rotations: Array | None) -> Iterator[Finding]:
     """Find the demonstration whose path, once aligned, differs from all others.
 
     Distances are measured from the medoid, the demonstration that is nearest to all others. At least four
     demonstrations are needed to know what is usual.
     """
-    trajectories = [one for motion in motions if (one := motion.moving_part()) is not None]
-    if len(trajectories) < len(motions) or len(motions) < 4:
-        return
-    if any(one.quaternions is None for one in trajectories):
-        trajectories = [Trajectory(one.times, one.positions) for one in trajectories]
-    warps = barycentre_warps(features(trajectories), n_iterations=4)
-    warped = [one.at(warp * one.duration) for one, warp in zip(trajectories, warps, strict=True)]
-    positions = np.stack([p for p, _ in warped])
     distance = _mean_distance(positions, positions)
     center = int(np.argmin(np.sum(distance, axis=1)))
     for i in _unlike(distance[center], center, _OUTLIER_DISTANCE):
@@ -273,10 +272,9 @@ def check_outliers(motions: Sequence[Usable]) -> Iterator[Finding]:
         message = f"is {1e3 * distance[center, i]:.0f} mm from the most typical one ({motions[center].raw.source}), "
         message += f"usual are {1e3 * usual:.0f} mm"
         yield motions[i].finding("warning", "outlier", message, "check it; leave it out if it shows something else")
-    rotations = [q for _, q in warped if q is not None]
-    if len(rotations) < len(motions):
+    if rotations is None:
         return
-    angle = _angles(np.stack(rotations), rotations[center]).mean(axis=1)
+    angle = _angles(rotations, rotations[center]).mean(axis=1)
     for i in _unlike(angle, center, _OUTLIER_ANGLE):
         message = f"is rotated by {np.degrees(angle[i]):.0f} degrees from the most typical one "
         message += f"({motions[center].raw.source}), usual are {np.degrees(np.median(np.delete(angle, center))):.0f}"
@@ -293,4 +291,4 @@ def _unlike(distance: Array, center: int, floor: float) -> list[int]:
     return [int(i) for i in np.flatnonzero(distance > limit)]
 
 
-SET_CHECKS = (check_number, check_kinds, check_durations, check_plane, check_agreement, check_outliers)
+SET_CHECKS = (check_number, check_kinds, check_durations, check_plane, check_agreement)

@@ -1,8 +1,7 @@
 """Readers of text tables: imitarm's own CSV, and any other table of numbers.
 
-Columns with names may stand in any order; the names come from a row of their own or from a remark. Only when nothing in
-the file looks like column names does the number of columns decide. A name, a unit or a remark that is not understood is
-an error: nothing is guessed.
+Column names come from a row of their own or from a remark. Only when nothing in the file looks like names does the
+number of columns decide. A name, a unit or a remark that is not understood is an error: nothing is guessed.
 """
 
 from __future__ import annotations
@@ -22,29 +21,25 @@ from imitarm.trajectory import FORMAT, read_demonstration_table
 
 Array = NDArray[np.float64]
 
-# without names: the number of columns, and what they are ("q": the four numbers of a quaternion)
+# columns without names, by their number ("q": the four numbers of a quaternion)
 UNNAMED = {2: "xy", 3: "xyz", 4: "txyz", 7: "xyzq", 8: "txyzq"}
 COUNTS = "2 (x y), 3 (x y z), 7 (x y z and quaternion), with the time before them 4 or 8"
 
-_UNITS = {
+_UNIT_WORDS = {
     "length": {
-        **{"m": "m", "metre": "m", "metres": "m", "meter": "m", "meters": "m", "cm": "cm", "mm": "mm"},
-        **{"centimetre": "cm", "centimetres": "cm", "centimeter": "cm", "centimeters": "cm"},
-        **{"millimetre": "mm", "millimetres": "mm", "millimeter": "mm", "millimeters": "mm"},
-        **{"in": "in", "inch": "in", "inches": "in", "ft": "ft", "foot": "ft", "feet": "ft"},
+        **{"m": "m metre metres meter meters", "cm": "cm centimetre centimetres centimeter centimeters"},
+        **{"mm": "mm millimetre millimetres millimeter millimeters", "in": "in inch inches", "ft": "ft foot feet"},
     },
     "time": {
-        **{"s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "min": "min", "minute": "min"},
-        **{"ms": "ms", "msec": "ms", "msecs": "ms", "millis": "ms", "millisec": "ms", "milliseconds": "ms"},
-        **{"us": "us", "usec": "us", "usecs": "us", "micros": "us", "microsec": "us", "microseconds": "us"},
-        **{"ns": "ns", "nsec": "ns", "nsecs": "ns", "nanos": "ns", "nanosec": "ns", "nanosecs": "ns"},
-        **{"nanoseconds": "ns", "minutes": "min", "h": "h", "hr": "h", "hour": "h", "hours": "h"},
+        **{"s": "s sec secs second seconds", "ms": "ms msec msecs millis millisec milliseconds"},
+        **{"us": "us usec usecs micros microsec microseconds", "min": "min minute minutes", "h": "h hr hour hours"},
+        "ns": "ns nsec nsecs nanos nanosec nanosecs nanoseconds",
     },
-    "angle": {
-        **{"rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad"},
-        **{"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "º": "deg"},
-    },
-    "rotation": {"": "1", "-": "1", "1": "1"},  # a quaternion has no unit
+    "angle": {"rad": "rad rads radian radians", "deg": "deg degs degree degrees ° º"},
+    "rotation": {"1": "1 -"},  # a quaternion has no unit
+}
+_UNITS = {
+    kind: {word: unit for unit, words in units.items() for word in words.split()} for kind, units in _UNIT_WORDS.items()
 }
 _KINDS = {"t": "time", **dict.fromkeys("xyz", "length"), "joint": "angle"}
 
@@ -76,6 +71,8 @@ _NO_ANGLE = {  # words in the name of a joint's column that say what else it hol
 }
 _BRACKETS = re.compile(r"(?P<name>.*?)\s*(?:[\[(](?P<unit>[^\])]*)[\])]|\sin\s(?P<word>\w+))\s*")
 _NUMBERED = re.compile(r"(?:col(?:umn)?\s*)?\d+\s*[:=.)]\s*(?P<name>.+)", re.IGNORECASE)
+_ENCLOSED = re.compile(r"^[(\[{]([^()\[\]{}]*)[)\]}]$")
+_PROSE_UNIT = re.compile(r"\bin\s+((?!in\b|min\b|h\b)[^\W\d]+)")
 _ORDER = re.compile(r"\b(xyzw|wxyz)\b", re.IGNORECASE)
 _NATIVE_MARK = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s*[#%][^\n]*\n)*?\s*[#%]\s*format:\s*" + FORMAT.encode() + rb"\b")
 
@@ -85,8 +82,8 @@ class Column:
     """The meaning of one column name.
 
     Attributes:
-        what: ``t``, ``x``, ``y``, ``z``, ``qw`` to ``qz``, ``joint``, or empty when the name is not known.
-        unit: as written in the name, in lower case; None when the name has none.
+        what: ``t``, ``x``, ``y``, ``z``, ``qw`` to ``qz``, ``joint``; empty when the name is not known.
+        unit: as in the name, in lower case; None when the name has none.
         joint: the name of the joint, without words such as ``position.``.
         not_angle: what a joint's column holds that is not its angle, such as ``"velocities"``.
     """
@@ -99,7 +96,7 @@ class Column:
 
 @dataclass(frozen=True)
 class SaidUnits:
-    """The units, and the order of quaternions, that a file states outside its column names; None: it does not."""
+    """Units, and the order of quaternions, that a file states outside its column names; None: it states none."""
 
     length: str | None = None
     time: str | None = None
@@ -151,7 +148,7 @@ def named_columns(
     """Sort the columns of a table by their names.
 
     Args:
-        source: for messages.
+        source: name of the file, for messages.
         names: one for each column; joints are known by names such as ``right_j0`` or ``panda_joint1``.
         values: shape (n, len(names)).
         options: facts that the file may not state itself.
@@ -204,8 +201,7 @@ def unnamed_columns(
     """Sort the columns of a table without names by how many there are (see ``UNNAMED``).
 
     Raises:
-        FileFormatError: when that number has no meaning, or the file states an unknown unit.
-        InputError: when the options do not fit.
+        InputError: when that number has no meaning, or the options do not fit.
     """
     said = said or SaidUnits()
     layout = UNNAMED.get(values.shape[1])
@@ -213,11 +209,10 @@ def unnamed_columns(
         raise FileFormatError(
             f"{source}: {values.shape[1]} columns without names; known are {COUNTS}. Name them in a first line"
         )
-    start = int(layout[0] == "t")
-    n = len(values)
+    start, n = int(layout[0] == "t"), len(values)
     times = options.seconds(source, values[:, 0], said.time) if start else options.even_times(source, n)
-    n_axes = 2 if layout == "xy" else 3
-    positions = in_space(options.metres(source, values[:, start : start + n_axes], said.length))
+    axes = slice(start, start + (2 if layout == "xy" else 3))
+    positions = in_space(options.metres(source, values[:, axes], said.length))
     quaternions = None
     if layout.endswith("q"):
         quaternions = options.wxyz(source, values[:, start + 3 : start + 7], said.quaternion_order)
@@ -352,10 +347,8 @@ class TextTableReader(Reader):
         table = read_table(path)
         said = _said_units(table)
         names = _names_of(table)
-        if names is None:
-            raw = unnamed_columns(path, table.values, options, said)
-        else:
-            raw = named_columns(path, names, table.values, options, said)
+        raw = named_columns(path, names, table.values, options, said) if names else None
+        raw = raw or unnamed_columns(path, table.values, options, said)
         if raw.positions is None and options.units is not None:
             raise InputError(f"{path}: holds joint angles, no lengths; leave out units")
         limbs = {name.partition("_")[0] for name in raw.joint_names if re.fullmatch(r"(left|right)_.*", name)}
@@ -366,18 +359,20 @@ class TextTableReader(Reader):
 
 def _said_units(table: Table) -> SaidUnits:
     """Return what the remarks say of units (``# units: cm``, ``# time unit: ms``) and of the order of quaternions."""
-    found: dict[str, str] = {}
+    words: list[str] = []
     for key, value in table.remarks.items():
-        if re.fullmatch(r"((length|position|time|angle|joint)s?[ _])?units?", key) is None:
-            continue
-        words = [word for word in re.split(r"[\s,;]+", value.lower()) if word not in ("", "and", "si")]
-        words = [word for word in words if word != "in" or len(words) == 1]
-        for word in words:
-            kind = next((kind for kind in ("length", "time", "angle") if word in _UNITS[kind]), None)
-            if kind is None or found.setdefault(kind, _UNITS[kind][word]) != _UNITS[kind][word]:
-                known = ", ".join(dict.fromkeys(u for k in ("length", "time", "angle") for u in _UNITS[k].values()))
-                what = f"says its unit is {word!r}" if kind is None else f"says two units of {kind}"
-                raise FileFormatError(f"{table.path}: {what}; known: {known}")
+        if re.fullmatch(r"((length|position|time|angle|joint)s?[ _])?units?", key) is not None:
+            listed = [word for word in re.split(r"[\s,;]+", value.lower()) if word not in ("", "and", "si")]
+            words += [word for word in listed if word != "in" or len(listed) == 1]
+    known = {word: (kind, unit) for kind in _UNITS for word, unit in _UNITS[kind].items()}
+    prose = [word for _, text in table.remark_lines for word in _PROSE_UNIT.findall(text.lower()) if word in known]
+    found: dict[str, str] = {}
+    for word in [*words, *prose]:
+        kind, unit = known.get(word, ("", ""))
+        if not kind or found.setdefault(kind, unit) != unit:
+            units = ", ".join(dict.fromkeys(unit for kind, unit in known.values() if kind != "rotation"))
+            what = f"says two units of {kind}" if kind else f"says its unit is {word!r}"
+            raise FileFormatError(f"{table.path}: {what}; known: {units}")
     orders = {match.lower() for _, text in table.remark_lines for match in _ORDER.findall(text)}
     if len(orders) > 1:
         raise FileFormatError(f"{table.path}: its remarks say both wxyz and xyzw; keep one")
@@ -395,14 +390,16 @@ def _names_of(table: Table) -> tuple[str, ...] | None:
     width = table.values.shape[1]
     misfit: tuple[int, str] | None = None
     for number, text in reversed(table.remark_lines):
-        whole = text.strip(" \t()[]{}")
-        for part in dict.fromkeys((whole, whole.partition(":")[2].strip(" \t()[]{}"))):
+        for part in dict.fromkeys(_ENCLOSED.sub(r"\1", one.strip()) for one in (text, text.partition(":")[2])):
             names = split_names(part)
-            if len(names) == width and _looks_like_names(names):
-                return names
+            fits = len(names) == width and _looks_like_names(names)
             words = re.findall(r"[^\W\d][\w.]*", part)
-            if (run := _run_of_names(words, width)) is not None:
+            if fits and all(column_of(name).what for name in names):
+                return names
+            if (run := _run_of_names(words, width)) is not None and not _other_units(words, run, part):
                 return run
+            if fits and run is None:
+                return names
             if _looks_like_names(words):
                 misfit = misfit or (number, text)
     listed = [name for _, text in table.remark_lines if (name := _listed_name(text)) is not None]
@@ -437,10 +434,16 @@ def _run_of_names(words: Sequence[str], width: int) -> tuple[str, ...] | None:
     return tuple(long[0]) if len(long) == 1 else None
 
 
+def _other_units(words: Sequence[str], run: Sequence[str], text: str) -> bool:
+    """Whether the words beside the names hold a unit that :func:`_said_units` does not use."""
+    beside = {word.lower() for word in words} - {word.lower() for word in run} - set(_PROSE_UNIT.findall(text.lower()))
+    units = {word: unit for known in _UNITS.values() for word, unit in known.items()}
+    return any(units.get(word, "m") not in ("m", "s", "rad") for word in beside - {"in"})
+
+
 def _listed_name(text: str) -> str | None:
     """Return the name in a remark that gives one column: ``1: t [s]``, ``column 2: x``, or only ``x``."""
     match = _NUMBERED.fullmatch(text.strip())
     names = split_names(match["name"] if match is not None else text.strip())
-    if not names or (match is None and len(names) > 1) or not column_of(names[0]).what:
-        return None
-    return names[0]
+    alone = bool(names) and (match is not None or len(names) == 1)
+    return names[0] if alone and column_of(names[0]).what else None

@@ -1,4 +1,4 @@
-"""PartFile: a text file that grows line by line beside its name, and is given that name when it is whole."""
+"""PartFile: a text file that grows line by line as ``PATH.part``, and is renamed when it is complete."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from pathlib import Path
 from imitarm.errors import InputError
 
 PART = ".part"
-"""What is added to a file's name while it is being written."""
+"""The suffix that is added to a file's name while it is written."""
 
 
 class PartFile:
-    """What a recorder writes to: ``PATH.part``, until it is finished.
+    """A file for recorders: it is ``PATH.part`` until it is finished.
 
     Each text is handed to the operating system before :meth:`write` returns: a program that is killed leaves all of it
-    in ``PATH.part``. An older file ``PATH`` stays whole until the new one is.
+    in ``PATH.part``. An older file ``PATH`` stays intact until the new one is complete.
 
     Args:
-        path: where to in the end.
-        begin: what is written first.
-        replace: an existing file may be replaced.
+        path: the final name.
+        begin: the text that is written first.
+        replace: whether an existing file may be replaced.
 
     Attributes:
-        path: where to in the end.
-        part: where to until then.
+        path: the final name.
+        part: the name until the file is finished.
 
     Raises:
-        InputError: when the path is a folder, the file is there already and may not be replaced, another program has
-            left or is writing ``PATH.part``, or it can't be written.
+        InputError: when the path is a folder, the file exists and may not be replaced, ``PATH.part`` exists (left by
+            another program, or being written), or the file can't be written.
     """
 
     def __init__(self, path: str | Path, begin: str, *, replace: bool = False) -> None:
@@ -39,24 +39,24 @@ class PartFile:
         if self.path.is_dir():
             raise InputError(f"{path}: is a folder; name a file in it")
         if self.path.exists() and not replace:
-            raise InputError(f"{path}: is there already; name another file, or say that it may be replaced")
+            raise InputError(f"{path}: is there already; name another file, or allow it to be replaced")
         try:
             self._file: TextIOWrapper | None = self.part.open("x", encoding="utf-8", newline="\n")
             self._file.write(begin)
             self._file.flush()
         except FileExistsError as error:
             raise InputError(
-                f"{self.part}: was left by a recording that was not closed, or is being written; give it another "
-                "name to keep it, or remove it"
+                f"{self.part}: was left by a recording that was not closed, or is being written; rename it to "
+                "keep it, or remove it"
             ) from error
         except OSError as error:
             raise InputError(f"{self.part}: can't be written: {error.strerror or error}") from error
 
     def write(self, text: str) -> None:
-        """Add a text.
+        """Append a text.
 
         Raises:
-            InputError: when it is finished, or the disk is full.
+            InputError: when the file is finished, or the disk is full.
         """
         if self._file is None:
             raise InputError(f"{self.path}: this recorder is closed; make another one")
@@ -67,17 +67,18 @@ class PartFile:
             raise InputError(f"{self.part}: can't be written: {error.strerror or error}") from error
 
     def finish(self, take: Callable[[Path], bool], *, begin: str = "") -> None:
-        """Let all of it reach the disk, and give it its name or remove it.
+        """Write everything to the disk, then rename the file or remove it.
 
         A second call does nothing.
 
         Args:
-            take: is given ``part`` and makes ``path`` of it, or nothing; returns whether it renamed it. If not, it is
-                removed; if so, another recorder may have begun one of that name, which is left alone.
-            begin: replaces what was written first, and is as long.
+            take: called with ``part``; makes ``path`` from it, or nothing, and returns whether it renamed ``part``. If
+                it did not, ``part`` is removed. If it did, a file of that name belongs to another recorder by now and
+                is left alone.
+            begin: replaces the text that was written first; must have the same length.
 
         Raises:
-            InputError: when that is not possible; what was written stays in ``part``.
+            InputError: when this fails; what was written stays in ``part``.
         """
         if self._file is None:
             return

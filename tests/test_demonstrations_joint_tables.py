@@ -1,3 +1,5 @@
+"""Recordings of joint angles, such as Rethink's joint_recorder.py writes: the tool's poses follow from the arm."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -53,7 +55,7 @@ def test_the_column_that_is_not_used_is_noted(tmp_path, sawyer):
     (raw,) = read_raw(tmp_path / "a.csv")
     assert raw.positions is None
     assert raw.notes == ("columns not used: right_gripper",)
-    assert ("note", "not-used") in [(finding.severity, finding.code) for finding in lint([raw], arm=sawyer)]
+    assert ("note", "reader") in [(finding.severity, finding.code) for finding in lint([raw], arm=sawyer)]
 
 
 def test_columns_go_by_name_whatever_their_order(tmp_path, sawyer):
@@ -67,7 +69,7 @@ def test_columns_go_by_name_whatever_their_order(tmp_path, sawyer):
 
 def test_the_arm_must_be_named_and_the_right_one(tmp_path, sawyer):
     recording(tmp_path / "a.csv", sawyer)
-    with pytest.raises(InputError, match=r"joint angles only; name the arm that was recorded"):
+    with pytest.raises(InputError, match=r"joint angles only; give the arm that was recorded"):
         read(tmp_path / "a.csv")
     (finding, *_) = lint(read_raw(tmp_path / "a.csv"))
     assert (finding.severity, finding.code) == ("error", "no-positions")

@@ -4,7 +4,7 @@ import pytest
 
 from demonstration_samples import motion
 from imitarm.demonstrations import read, read_raw
-from imitarm.demonstrations.native import NativeReader
+from imitarm.demonstrations.text_tables import ImitarmReader
 from imitarm.errors import FileFormatError, InputError
 
 
@@ -16,7 +16,7 @@ def test_it_is_recognised_by_its_remark(tmp_path, newline, mark, first):
     motion(n=20, rotations=True).save(file)
     text = mark + first + file.read_text()
     file.write_bytes(text.replace("\n", newline).encode())
-    assert NativeReader().recognises(file.read_bytes())
+    assert ImitarmReader().recognises(file.read_bytes())
     assert len(read(file)) == 1
 
 
@@ -24,7 +24,7 @@ def test_it_is_recognised_by_its_remark(tmp_path, newline, mark, first):
     "head", [b"", b"t,x,y,z\n0,0,0,0\n", b"0 0 0\n# format: imitarm-demonstration\n", b"\x93NUMPY"]
 )
 def test_other_files_are_not(head):
-    assert not NativeReader().recognises(head)
+    assert not ImitarmReader().recognises(head)
 
 
 def test_faults_of_rows_are_left_to_lint(tmp_path):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from demonstration_samples import motion, phase_of
-from imitarm.demonstrations.warp import barycentre_warps, dtw, features, identity_warps, medoid
+from imitarm.demonstrations.align import barycentre_warps, dtw, features, identity_warps, medoid
 from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply
 from imitarm.trajectory import Trajectory
 

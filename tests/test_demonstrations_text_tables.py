@@ -1,0 +1,402 @@
+"""Which column of a text table holds what: by names in a row or a remark, else by their number; never by a guess."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from demonstration_samples import path, turn
+from imitarm.demonstrations import ReadOptions, read, read_raw
+from imitarm.demonstrations.text_tables import Column, SaidUnits, column_of, named_columns, unnamed_columns
+from imitarm.errors import FileFormatError, InputError
+from imitarm.kinematics.pose import quaternion_exp
+
+TABLE = np.arange(1.0, 25.0).reshape(3, 8)
+PHASE = np.linspace(0.0, 1.0, 30)
+POSES = np.column_stack([path(PHASE), turn(PHASE)])
+TILTED = quaternion_exp(np.outer(np.linspace(0.2, 1.5, 30), [0.6, -0.5, 0.4]))
+"""Rotations whose four numbers all differ: another order of them is another rotation."""
+
+
+def write(file, table, *, first="", separator=" "):
+    """Write a table below the text ``first``."""
+    rows = [separator.join(map(repr, row)) for row in np.asarray(table, dtype=float).tolist()]
+    file.write_text("\n".join([*([first] if first else []), *rows]) + "\n", encoding="utf-8")
+    return file
+
+
+# --- names
+
+
+@pytest.mark.parametrize(
+    ("name", "what", "unit"),
+    [
+        ("t", "t", None),
+        ("Time", "t", None),
+        ("timestamp_ns", "t", "ns"),
+        ("time [ms]", "t", "ms"),
+        ("header.stamp.nanosec", "t", "nanosec"),
+        ("x", "x", None),
+        ("Pose.Position.Y", "y", None),
+        ("/pose/position/y", "y", None),
+        ("pos_z", "z", None),
+        ("x [mm]", "x", "mm"),
+        ("z(cm)", "z", "cm"),
+        ("z in cm", "z", "cm"),
+        ("x_mm", "x", "mm"),
+        ("x/mm", "x", "mm"),
+        ("y mm", "y", "mm"),
+        ("qw", "qw", None),
+        ("orientation.x", "qx", None),
+        ("right_gripper", "", None),
+        ("force_x", "", None),
+        ("x_min", "", None),
+        ("vel_x", "", None),
+        ("velocity", "", None),
+    ],
+)
+def test_what_a_name_means(name, what, unit):
+    assert column_of(name) == Column(what, unit)
+
+
+@pytest.mark.parametrize(
+    ("name", "joint", "unit"),
+    [
+        ("right_j0", "right_j0", None),
+        ("panda_joint7", "panda_joint7", None),
+        ("joint_1 [deg]", "joint_1", "deg"),
+        ("joint_2_deg", "joint_2", "deg"),
+        ("joint_3 (°)", "joint_3", "°"),
+        ("position.right_j0", "right_j0", None),
+        ("joint_states.position.right_j0", "right_j0", None),
+        ("actual_panda_joint2", "panda_joint2", None),
+        ("joint_angle_3", "joint_3", None),
+    ],
+)
+def test_the_names_of_joint_angles(name, joint, unit):
+    assert column_of(name) == Column("joint", unit, joint)
+
+
+@pytest.mark.parametrize(
+    ("name", "quantity"),
+    [
+        ("velocity.right_j0", "velocities"),
+        ("right_j0_vel", "velocities"),
+        ("joint_speed_j1", "velocities"),
+        ("joint_1_dot", "velocities"),
+        ("effort.panda_joint1", "efforts"),
+        ("tau_j3", "efforts"),
+        ("torque joint 4", "efforts"),
+        ("cmd_joint_2", "commands"),
+        ("desired.right_j1", "commands"),
+        ("joint_3_target", "commands"),
+        ("current_joint1", "currents"),
+        ("joint_acc_j1", "accelerations"),
+        ("error_right_j6", "errors"),
+        ("joint_2_temperature", "other quantities"),
+    ],
+)
+def test_joint_columns_that_hold_no_angles(name, quantity):
+    column = column_of(name)
+    assert (column.what, column.not_angle) == ("", quantity)
+    names = ["t", *(name.replace(next(d for d in name if d.isdigit()), str(i)) for i in range(7))]
+    with pytest.raises(FileFormatError, match=rf"holds joint {quantity} \(.*not joint angles; record the angles"):
+        named_columns("f", names, TABLE, ReadOptions())
+
+
+def test_named_columns_in_any_order_and_with_units():
+    names = ["z [mm]", "force", "time_ms", "x [mm]", "y [mm]", "j2 [deg]", "right_j0 [deg]", "right_j1 [deg]"]
+    raw = named_columns("f", names, TABLE, ReadOptions())
+    assert np.allclose(raw.positions, TABLE[:, [3, 4, 0]] / 1000.0)
+    assert np.allclose(raw.times, TABLE[:, 2] / 1000.0)
+    assert np.allclose(raw.joints, np.radians(TABLE[:, 5:]))
+    assert raw.joint_names == ("j2", "right_j0", "right_j1")
+    assert raw.notes == ("columns not used: force",)
+
+
+def test_named_quaternions_need_no_order():
+    names = ["x", "y", "z", "qx", "qy", "qz", "qw", "t"]
+    raw = named_columns("f", names, TABLE, ReadOptions(quaternion_order="xyzw"))
+    assert np.array_equal(raw.quaternions, TABLE[:, [6, 3, 4, 5]])
+
+
+def test_angles_are_read_beside_velocities_and_efforts():
+    names = ["t", "position.j1", "position.j2", "velocity.j1", "velocity.j2", "effort.j1", "effort.j2", "z"]
+    raw = named_columns("f", names[:7], TABLE[:, :7], ReadOptions())
+    assert np.array_equal(raw.joints, TABLE[:, 1:3]) and raw.joint_names == ("j1", "j2")
+    assert "velocity.j1" in raw.notes[0] and "effort.j2" in raw.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "error", "message"),
+    [
+        ("x y x t a b c d", {}, FileFormatError, "columns 'x' and 'x' both hold x"),
+        ("x pos_x y t a b c d", {}, FileFormatError, "columns 'x' and 'pos_x' both hold x"),
+        ("x z t a b c d e", {}, FileFormatError, "xyz columns lack y"),
+        ("t x y z qw qx qy a", {}, FileFormatError, "quaternion columns lack qz"),
+        ("t a b c d e f g", {}, FileFormatError, "no column is named x y z or as a joint .* found t, a, b"),
+        ("x y z a b c d e", {}, FileFormatError, "no time stamps"),
+        ("t x_mm y_cm z_mm a b c d", {}, FileFormatError, "different units of length, cm and mm"),
+        ("t x_mm y_mm z a b c d", {}, FileFormatError, "column 'x_mm' has a unit, but column 'z' has none"),
+        ("t j0 j1_deg j2 a b c d", {}, FileFormatError, "column 'j1_deg' has a unit, but column 'j0' has none"),
+        ("t x_mm y_mm z_mm a b c d", {"units": "cm"}, InputError, "unit is mm, which contradicts units='cm'"),
+        ("t_ms x y z a b c d", {"time_units": "s"}, InputError, "unit is ms, which contradicts time_units='s'"),
+        ("t j0 j1 J0 b c d e", {}, FileFormatError, "columns 'j0' and 'J0' both hold joint j0"),
+        ("t j0 j1 position.j0 b c d e", {}, FileFormatError, "both hold joint j0; remove one"),
+        ("t right_j0 right_j1 right_j0 b c d e", {}, FileFormatError, "both hold joint right_j0"),
+    ],
+)
+def test_names_that_do_not_fit(names, options, error, message):
+    with pytest.raises(error, match=message):
+        named_columns("f", names.split(), TABLE, ReadOptions(**options))
+
+
+# --- units
+
+
+@pytest.mark.parametrize(
+    ("names", "column", "factor"),
+    [
+        (["t", "x [ft]", "y [ft]", "z [ft]"], 1, 0.3048),
+        (["t", "x (inch)", "y (inch)", "z (inch)"], 1, 0.0254),
+        (["t", "x [Millimeters]", "y [mm]", "z [mm]"], 1, 0.001),
+        (["time [min]", "x", "y", "z"], 0, 60.0),
+        (["time_h", "x", "y", "z"], 0, 3600.0),
+        (["t [\u00b5s]", "x", "y", "z"], 0, 1e-6),
+    ],
+)
+def test_units_in_names_are_converted(names, column, factor):
+    raw = named_columns("f", names, TABLE[:, :4], ReadOptions())
+    value = raw.times if column == 0 else raw.positions[:, 0]
+    assert np.allclose(value, factor * TABLE[:, column])
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "kind"),
+    [
+        ("x [dm]", "dm", "length"),
+        ("x [yd]", "yd", "length"),
+        ("x [s]", "s", "length"),
+        ("x (tool)", "tool", "length"),
+        ("x []", "", "length"),
+        ("t [ds]", "ds", "time"),
+        ("t [frames]", "frames", "time"),
+        ("t [mm]", "mm", "time"),
+        ("j1 [rev]", "rev", "angle"),
+        ("j1 [rad/s]", "rad/s", "angle"),
+        ("j1 [Nm]", "nm", "angle"),
+        ("qw [deg]", "deg", "rotation"),
+    ],
+)
+def test_an_unknown_unit_is_refused(name, unit, kind):
+    names = [name, *(other for other in ("t", "x", "y", "z", "qw", "qx", "qy", "qz") if other != name[: len(other)])]
+    table = np.ones((3, len(names)))
+    with pytest.raises(FileFormatError, match=rf"column '.*': '{unit}' is not a known unit of {kind} \(.*convert"):
+        named_columns("f", names, table, ReadOptions())
+
+
+def test_units_that_the_file_states_elsewhere(tmp_path):
+    raw = named_columns("f", list("txyzabcd"), TABLE, ReadOptions(), SaidUnits(length="cm"))
+    assert np.allclose(raw.positions, TABLE[:, 1:4] / 100.0)
+    with pytest.raises(FileFormatError, match="a remark says cm, a column name mm"):
+        named_columns("f", ["t", "x_mm", "y_mm", "z_mm"], TABLE[:, :4], ReadOptions(), SaidUnits(length="cm"))
+    file = write(tmp_path / "a.csv", TABLE[:, :4], first="# units: mm, ms\nt,x,y,z", separator=",")
+    (raw,) = read_raw(file)
+    assert np.allclose(raw.positions, TABLE[:, 1:4] / 1000.0) and np.allclose(raw.times, TABLE[:, 0] / 1000.0)
+    file = write(tmp_path / "a.csv", np.column_stack([TABLE[:, 0], TABLE[:, :2]]), first="# unit: deg\nt j1 j2")
+    assert np.allclose(read_raw(file)[0].joints, np.radians(TABLE[:, :2]))
+
+
+@pytest.mark.parametrize(
+    "remark",
+    ["all positions in mm", "x y z in mm", "each row holds x y z in mm", "x [mm] y [mm] z [mm]", "x, y, z, all in mm"],
+)
+def test_a_unit_in_a_sentence_is_used(tmp_path, remark):
+    (raw,) = read_raw(write(tmp_path / "a.txt", TABLE[:, :3], first=f"# {remark}"), rate=10.0)
+    assert np.allclose(raw.positions, TABLE[:, :3] / 1000.0)
+
+
+@pytest.mark.parametrize("remark", ["x, y, z (mm)", "x y z, mm", "positions in mm, no: in cm"])
+def test_a_unit_in_a_sentence_that_is_not_clear_is_refused(tmp_path, remark):
+    with pytest.raises(FileFormatError, match=r"has a unit, but column|looks like column names|two units"):
+        read_raw(write(tmp_path / "a.txt", TABLE[:, :3], first=f"# {remark}"), rate=10.0)
+
+
+@pytest.mark.parametrize(
+    "remark", ["units: yards", "unit: furlong", "length units: x", "units: mm, cm", "time unit: ds"]
+)
+def test_a_unit_in_a_remark_that_is_not_known_is_refused(tmp_path, remark):
+    file = write(tmp_path / "a.csv", TABLE[:, :4], first=f"# {remark}")
+    with pytest.raises(FileFormatError, match=r"says (its unit is|two units of length).*; known: m, cm"):
+        read_raw(file)
+
+
+def test_remarks_give_unit_and_task(tmp_path):
+    file = tmp_path / "a.csv"
+    file.write_text("# units: cm\n# task: pour\nt,x,y,z\n0,10,20,30\n1,20,20,30\n2,30,20,30\n")
+    (one,) = read(file, task="something else")
+    assert np.allclose(one.trajectory.positions[0], [0.1, 0.2, 0.3])
+    assert one.task == "pour"
+
+
+# --- time stamps in two columns
+
+
+@pytest.mark.parametrize(
+    ("whole", "fine", "factor"),
+    [
+        ("sec", "nanosec", 1e9),
+        ("secs", "nsecs", 1e9),
+        ("stamp.sec", "stamp.nanosec", 1e9),
+        ("header_stamp_sec", "header_stamp_nsec", 1e9),
+        ("time [s]", "usec", 1e6),
+        ("t", "millisec", 1e3),
+    ],
+)
+def test_seconds_and_the_rest_of_the_second_are_added(whole, fine, factor):
+    times = 17.0 + 0.25 * np.arange(9)
+    table = np.column_stack([times // 1, np.round(times % 1 * factor), np.ones((9, 3))])
+    for names in ([whole, fine, "x", "y", "z"], [whole, fine, "x", "y", "z"][::-1]):
+        ordered = table if names[0] == whole else table[:, ::-1]
+        assert np.allclose(named_columns("f", names, ordered, ReadOptions()).times, times)
+
+
+@pytest.mark.parametrize("bad", [{"sec": 0.5}, {"nanosec": 2e9}, {"nanosec": -1.0}])
+def test_two_time_columns_that_do_not_fit_are_refused(bad):
+    names = ["sec", "nanosec", "x", "y", "z"]
+    table = np.ones((4, 5))
+    for name, value in bad.items():
+        table[2, names.index(name)] = value
+    with pytest.raises(FileFormatError, match="'sec' and 'nanosec' both hold t, and are not whole seconds"):
+        named_columns("f", names, table, ReadOptions())
+    with pytest.raises(FileFormatError, match="both hold t"):
+        named_columns("f", ["time", "stamp", "x", "y", "z"], np.ones((4, 5)), ReadOptions())
+
+
+# --- without names
+
+
+@pytest.mark.parametrize("n_columns", [2, 3, 4, 7, 8])
+def test_without_names_the_number_of_columns_decides(n_columns):
+    table = TABLE[:, :n_columns]
+    start = int(n_columns in (4, 8))
+    options = ReadOptions(units="cm", quaternion_order="xyzw", duration=None if start else 4.0)
+    raw = unnamed_columns("f", table, options)
+    assert np.allclose(raw.times, table[:, 0] if start else [0.0, 2.0, 4.0])
+    expected = np.zeros((3, 3))
+    n_axes = min(3, n_columns - start)
+    expected[:, :n_axes] = table[:, start : start + n_axes] / 100.0
+    assert np.allclose(raw.positions, expected)
+    if n_columns >= 7:
+        assert np.array_equal(raw.quaternions, table[:, [start + 6, start + 3, start + 4, start + 5]])
+    else:
+        assert raw.quaternions is None
+
+
+def test_a_rate_gives_times():
+    raw = unnamed_columns("f", TABLE[:, :3], ReadOptions(rate=50.0))
+    assert np.allclose(raw.times, [0.0, 0.02, 0.04])
+
+
+def test_other_numbers_of_columns_are_refused():
+    with pytest.raises(FileFormatError, match=r"f: 5 columns without names; known are 2 .* Name them in a first line"):
+        unnamed_columns("f", TABLE[:, :5], ReadOptions())
+
+
+# --- names in remarks
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "# t x y z qx qy qz qw",
+        "# t x y z qx qy qz qw\n# made at the bench near the door by night",
+        "# columns: t x y z qx qy qz qw",
+        "# Columns = t, x, y, z, qx, qy, qz, qw",
+        "# t (s) x (m) y (m) z (m) qx qy qz qw",
+        "% time [s], x [m], y [m], z [m], qx, qy, qz, qw",
+        "# fields: [t, x, y, z, qx, qy, qz, qw]",
+        "# pose (t x y z qx qy qz qw)",
+        "# stamp position.x position.y position.z orientation.x orientation.y orientation.z orientation.w",
+        "# each row holds t x y z qx qy qz qw in the base frame",
+        "#t;x;y;z;qx;qy;qz;qw\n# units: m",
+        "# 1: t [s]\n# 2: x\n# 3: y\n# 4: z\n# 5: qx\n# 6: qy\n# 7: qz\n# 8: qw",
+        "# column 0: t time\n# column 1: x\n# column 2: y\n# column 3: z\n# column 4: qx\n"
+        "# column 5: qy\n# column 6: qz\n# column 7: qw",
+        "# t\n# x\n# y\n# z\n# qx\n# qy\n# qz\n# qw",
+        "# quaternions are xyzw",
+        "# order: XYZW",
+        "t (s) x (m) y (m) z (m) qx qy qz qw",
+        '"t" "x" "y" "z" "qx" "qy" "qz" "qw"',
+        "t,x,y,z,qx,qy,qz,qw",
+    ],
+)
+def test_names_in_a_row_or_a_remark_are_used(tmp_path, first):
+    table = np.column_stack([0.1 * np.arange(30), POSES[:, :3], TILTED[:, [1, 2, 3, 0]]])
+    (one,) = read(write(tmp_path / "a.txt", table, first=first))
+    assert np.allclose(one.trajectory.positions, POSES[:, :3])
+    assert np.allclose(np.abs(np.sum(one.trajectory.quaternions * TILTED, axis=1)), 1.0)
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "# t x y z qx qy qz",
+        "# t x y z quaternion (qx qy qz qw) force",
+        "# columns: x y z a b c d e f g",
+        "# time, position (x y z), orientation (x y z w)",
+        "# zeit links oben hinten eins zwei drei vier",
+        "# velocity.j0 velocity.j1 velocity.j2",
+        "# qx qy qz qw come last",
+        "# 1: t\n# 2: x\n# 3: y",
+    ],
+)
+def test_a_remark_that_looks_like_names_and_does_not_fit_is_refused(tmp_path, first):
+    table = np.column_stack([0.1 * np.arange(30), POSES[:, :3], TILTED[:, [1, 2, 3, 0]]])
+    with pytest.raises(FileFormatError, match=r"line \d: the remark '.*' looks like column names, .*name each column"):
+        read(write(tmp_path / "a.txt", table, first=first))
+
+
+def test_names_in_remarks_of_other_quantities_are_refused_too(tmp_path):
+    file = write(tmp_path / "a.txt", TABLE, first="# t " + " ".join(f"velocity.right_j{i}" for i in range(7)))
+    with pytest.raises(FileFormatError, match="holds joint velocities"):
+        read(file)
+    file = write(tmp_path / "a.txt", np.column_stack([np.arange(30.0), TILTED]), first="# t qw qx qy qz")
+    with pytest.raises(FileFormatError, match="no column is named x y z"):
+        read(file)
+
+
+@pytest.mark.parametrize("first", ["# recorded by Ann on Monday", "# robot: panda\n# date: 2024-05-01", "# v 2.1"])
+def test_other_remarks_are_no_names(tmp_path, first):
+    table = np.column_stack([0.1 * np.arange(30), POSES])
+    (one,) = read(write(tmp_path / "a.txt", table, first=first))
+    assert np.allclose(one.trajectory.quaternions, POSES[:, 3:])
+
+
+def test_the_order_of_quaternions_that_a_remark_states_is_not_to_be_contradicted(tmp_path):
+    file = write(tmp_path / "a.txt", np.column_stack([0.1 * np.arange(30), POSES]), first="# rotations wxyz")
+    assert np.allclose(read(file)[0].trajectory.quaternions, POSES[:, 3:])
+    with pytest.raises(InputError, match="its order is wxyz, which contradicts quaternion_order='xyzw'"):
+        read(file, quaternion_order="xyzw")
+
+
+# --- files
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+@pytest.mark.parametrize("heading", ["", "x y z qw qx qy qz"])
+def test_positions_and_quaternions_with_each_separator(tmp_path, separator, heading):
+    file = write(tmp_path / "a.txt", POSES, first=heading.replace(" ", separator), separator=separator)
+    (one,) = read(file, duration=3.0)
+    assert np.allclose(one.trajectory.positions, POSES[:, :3], rtol=0, atol=1e-15)
+    assert np.allclose(one.trajectory.quaternions, POSES[:, 3:])
+    assert one.trajectory.duration == 3.0
+
+
+def test_quaternions_of_few_digits_are_scaled_and_others_refused(tmp_path):
+    (one,) = read(write(tmp_path / "a.csv", np.round(POSES, 2)), rate=10.0)
+    assert np.allclose(np.linalg.norm(one.trajectory.quaternions, axis=1), 1.0)
+    invalid = POSES.copy()
+    invalid[12, 3:] = 0.0
+    with pytest.raises(FileFormatError, match=r"a\.csv, line 13: quaternion of length 0, must be 1"):
+        read(write(tmp_path / "a.csv", invalid), rate=10.0)
