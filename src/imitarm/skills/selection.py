@@ -19,6 +19,7 @@ _SAMPLES = 100  # per demonstration, for a motion whose path is up to 3 times it
 _MOST_SAMPLES = 1000
 _HELD_OUT = 1.02  # times the smallest held-out error
 _BIAS = 0.1  # of the smallest held-out error
+_NO_MOTION = 1e-6  # [m]
 _LEVER = 0.1  # [m] distance that counts as much as a rotation of 1 rad, in motions that only rotate
 _SLACK_MM = 0.1  # below the repeatability of industrial arms
 _PATIENCE = 4  # stop after so many numbers in a row without a smaller held-out error
@@ -165,9 +166,10 @@ def _enough(evaluated: Sequence[Candidate]) -> bool:
 
 def _samples_needed(tables: Sequence[Array]) -> tuple[int, float]:
     """Return how many samples per demonstration show the motion, and its extent [m], a diagonal."""
-    columns = np.arange(1, 4)
     grid = np.linspace(tables[0][0, 0], tables[0][-1, 0], 4 * _SAMPLES)
-    mean = np.mean([_resampled(table, columns, grid) for table in tables], axis=0)
+    mean = np.mean([_resampled(table, np.arange(1, table.shape[1]), grid) for table in tables], axis=0)
+    only_rotates = mean.shape[1] > 3 and np.ptp(mean[:, :3], axis=0).max() < _NO_MOTION
+    mean = _LEVER * mean[:, 3:] if only_rotates else mean[:, :3]
     extent = float(np.linalg.norm(np.ptp(mean, axis=0)))
     path = float(np.linalg.norm(np.diff(mean, axis=0), axis=1).sum())
     needed = _SAMPLES * path / (3.0 * extent) if extent > 0.0 else 0.0
