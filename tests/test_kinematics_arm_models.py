@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import struct
 
 import mujoco
@@ -523,3 +524,63 @@ def test_the_middle_of_the_ranges_is_kept_where_it_is_usable(load):
         head, separator, tail = text.partition(f"<joint name='a_axis{i + 1}'")
         text = head + separator + tail.replace("lower='-2.5' upper='2.5'", f"lower='{low}' upper='{high}'", 1)
     assert np.allclose(load(text).home, [-0.5, 1.0, 1.3])
+
+
+# sizes, and files that are damaged anywhere
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("value='2'", "value='1e300'"), ("radius='.03'", "radius='1e9'"), ("xyz='0 0 .22'", "xyz='0 0 3e7'")],
+)
+def test_sizes_that_no_robot_has_are_refused_with_their_line(load, old, new):
+    text = robot(SIX).replace(old, new, 1)
+    with pytest.raises(FileFormatError, match=r"'a_link1' \(line 3\) is .*no robot has"):
+        load(text)
+
+
+def test_a_wire_is_covered_by_few_spheres(load):
+    arm = load(robot(SIX.replace("radius='.03' length='.12'", "radius='1e-6' length='1.2'", 1)))
+    centers, radii = arm.collision_spheres(np.zeros(6))
+    wire = np.array(arm.sphere_bodies) == "a_link1"
+    assert wire.sum() <= 50
+    along = np.linspace([0, 0, -0.28], [0, 0, 0.92], 200)  # the wire's middle is 0.1 m above the link's frame at 0.22 m
+    gaps = np.linalg.norm(along[:, None] - centers[wire], axis=2) - radii[wire]
+    assert gaps.min(axis=1).max() <= 0.0
+
+
+VALUES = ("", "nan", "inf", "-1", "0", "1e308", "1e-308", "abc", "0 0 0", "base", "world", "1e400", "1,0,0", "1e9")
+
+
+def damaged(text, random):
+    """Change, remove or double something in a file."""
+    attributes = list(re.finditer(r"(\w+)=(['\"])(.*?)\2", text))
+    chosen, kind = attributes[random.integers(len(attributes))], random.random()
+    if kind < 0.6:
+        return text[: chosen.start(3)] + str(random.choice(VALUES)) + text[chosen.end(3) :]
+    if kind < 0.8:
+        return text[: chosen.start()] + text[chosen.end() :]
+    lines = text.split("\n")
+    lines.insert(random.integers(len(lines)), lines[random.integers(len(lines))])
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    "text", [robot(limb("a_", 4), GRIPPERS["one jaw named so"].replace("a_link6", "a_link4")), MJCF]
+)
+def test_a_damaged_file_is_refused_or_its_arm_has_finite_figures(load, text):
+    random = np.random.default_rng(0)
+    outcomes = {"refused": 0, "loaded": 0}
+    for _ in range(150):
+        try:
+            arm = load(damaged(text.replace("{}", ""), random), "arm.xml")
+        except InputError as error:
+            assert "arm.xml" in str(error)
+            outcomes["refused"] += 1
+            continue
+        outcomes["loaded"] += 1
+        arm.check_limits(arm.home)
+        assert np.isfinite(arm.forward_kinematics(arm.home).matrix).all()
+        assert np.isfinite(arm.jacobian(arm.home)).all()
+        assert np.isfinite(arm.max_velocity).all() and (arm.max_velocity > 0.0).all() and (arm.max_torque > 0.0).all()
+    assert min(outcomes.values()) > 10

@@ -45,43 +45,8 @@ _NAMES = {
     "material",
     "model",
 }
-_LANDMARKS = ("shoulder", "elbow", "wrist")  # sites that mark the three points
+_LARGEST = 1e6  # [m], [kg], [kg m^2]
 _PLACEHOLDER_MASS, _PLACEHOLDER_INERTIA = 1e-3, 1e-6  # [kg], [kg m^2] of a link whose own can't be used
-
-
-@dataclass(frozen=True)
-class Landmarks:
-    """Shoulder, elbow and wrist of an arm, and the joints that bend there, as the sites of these names define them.
-
-    The site ``elbow`` is on the link that the elbow's joint moves, the site ``wrist`` on the link that the bending
-    joint of the wrist moves.
-
-    Attributes:
-        sites: indices of the three sites.
-        elbow: index of the elbow's joint among the arm's.
-        wrist: index of the joint that bends the wrist among the arm's.
-        elbow_straight: position of the elbow's joint at which the arm is stretched and singular [rad], from the
-            file's ``<custom><numeric name="elbow_straight" data="..."/></custom>``, else 0.
-    """
-
-    sites: tuple[int, int, int]
-    elbow: int
-    wrist: int
-    elbow_straight: float
-
-    @classmethod
-    def find(cls, model: mujoco.MjModel, joints: NDArray[np.int_]) -> Landmarks | None:
-        """Return the landmarks of a model whose arm has ``joints``; None if a site or its joint is missing."""
-        sites = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) for name in _LANDMARKS]
-        if min(sites) < 0:
-            return None
-        bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
-        owners = [int(model.site_bodyid[site]) for site in sites]
-        if owners[1] not in bodies or owners[2] not in bodies:
-            return None
-        numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "elbow_straight")
-        straight = float(model.numeric_data[model.numeric_adr[numeric]]) if numeric >= 0 else 0.0
-        return cls((sites[0], sites[1], sites[2]), bodies.index(owners[1]), bodies.index(owners[2]), straight)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +194,7 @@ def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _P
     _name_all(spec)
     _part_contact_from_looks(spec)
     faults = _replace_unusable_masses(spec, path, root)
-    _check_finite(compiled(spec, path), path)
+    _check_sizes(compiled(spec, path), path, root)
     return _Part(spec, root, faults)
 
 
@@ -300,14 +265,24 @@ def _numbers(value: str) -> list[float]:
         return []
 
 
-def _check_finite(model: mujoco.MjModel, path: Path) -> None:
-    """Refuse a model with NaN, which files that are included may have brought in."""
-    for kind in ("body", "jnt", "geom", "site", "dof"):
-        for field in ("mass", "inertia", "pos", "quat", "ipos", "axis", "range", "size", "armature", "damping"):
+def _check_sizes(model: mujoco.MjModel, path: Path, root: XmlElement) -> None:
+    """Refuse a model with NaN, which included files may have brought in, or with sizes that no robot has."""
+    kinds = {"body": model.body, "jnt": model.joint, "geom": model.geom, "site": model.site}
+    for kind, item in kinds.items():
+        for field in ("mass", "inertia", "pos", "ipos", "axis", "size"):
             values = getattr(model, f"{kind}_{field}", None)
-            if values is not None and not np.isfinite(values).all():
-                what = {"jnt": "joint", "dof": "joint"}.get(kind, kind)
-                raise FileFormatError(f"{path}: {field} of a {what} is not finite; correct it in the files it includes")
+            if values is None or not len(values):
+                continue
+            bad = ~(np.abs(values.reshape(len(values), -1)) <= _LARGEST).all(axis=1)
+            if bad.any():
+                index = int(np.argmax(bad))
+                name = item(index).name or model.body(int(getattr(model, f"{kind}_bodyid")[index])).name
+                lines = [e.line for e in root.walk() if name and e.get("name") == name]
+                what = f"{'joint' if kind == 'jnt' else kind} {name!r}{f' (line {lines[0]})' if lines else ''}"
+                raise FileFormatError(
+                    f"{path}: {field} of {what} is {values[index]}, which no robot has; correct it (lengths are in "
+                    "metres, masses in kilograms)"
+                )
 
 
 def _name_all(spec: mujoco.MjSpec) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import threading
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError, UnknownNameError
-from imitarm.kinematics.arm_file import Landmarks
 from imitarm.kinematics.pose import Pose
 from imitarm.validation import finite_array, finite_vector, text
 
@@ -18,6 +18,42 @@ Array = NDArray[np.float64]
 Columns = slice | NDArray[np.int32]
 
 _FLOAT64 = np.dtype(np.float64)
+_LANDMARKS = ("shoulder", "elbow", "wrist")  # sites that mark the three points
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Shoulder, elbow and wrist of an arm, and the joints that bend there, as the sites of these names define them.
+
+    The site ``elbow`` is on the link that the elbow's joint moves, the site ``wrist`` on the link that the bending
+    joint of the wrist moves.
+
+    Attributes:
+        sites: indices of the three sites.
+        elbow: index of the elbow's joint among the arm's.
+        wrist: index of the joint that bends the wrist among the arm's.
+        elbow_straight: position of the elbow's joint at which the arm is stretched and singular [rad], from the
+            file's ``<custom><numeric name="elbow_straight" data="..."/></custom>``, else 0.
+    """
+
+    sites: tuple[int, int, int]
+    elbow: int
+    wrist: int
+    elbow_straight: float
+
+    @classmethod
+    def find(cls, model: mujoco.MjModel, joints: NDArray[np.int_]) -> Landmarks | None:
+        """Return the landmarks of a model whose arm has ``joints``; None if a site or its joint is missing."""
+        sites = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) for name in _LANDMARKS]
+        if min(sites) < 0:
+            return None
+        bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
+        owners = [int(model.site_bodyid[site]) for site in sites]
+        if owners[1] not in bodies or owners[2] not in bodies:
+            return None
+        numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "elbow_straight")
+        straight = float(model.numeric_data[model.numeric_adr[numeric]]) if numeric >= 0 else 0.0
+        return cls((sites[0], sites[1], sites[2]), bodies.index(owners[1]), bodies.index(owners[2]), straight)
 
 
 class ArmMemory:

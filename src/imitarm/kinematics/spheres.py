@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 COLLISION_GROUP = 3
 """Group of the geoms that count for contact; looks are in groups 0 to 2."""
 _SPACING = 0.9  # distance of neighbours on a round bar, in radii: spheres then stand out by a tenth
+_MOST_PIECES = 50  # of one bar
 _SMALLEST_CELL = 0.025  # [m] a plate thinner than this is not cut finer
 _LONGEST_ROW = 4  # cells along the longest edge of a plate
 
@@ -181,9 +182,14 @@ def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:
     return np.asarray((centers + offset) @ rotation.reshape(3, 3).T + model.geom_pos[geom]), radius
 
 
+def _pieces(half_length: float, radius: float) -> int:
+    """Return into how many pieces a round bar is cut; a thin wire gets fewer and larger spheres."""
+    return max(1, math.ceil(min(2.0 * half_length / (_SPACING * radius), _MOST_PIECES)))
+
+
 def _row(axis: int, half_length: float, radius: float) -> tuple[Array, float]:
     """Cover the capsule about a straight axis."""
-    n = max(1, math.ceil(2.0 * half_length / (_SPACING * radius))) + 1 if half_length > 0.0 else 1
+    n = _pieces(half_length, radius) + 1 if half_length > 0.0 else 1
     centers = np.zeros((n, 3))
     centers[:, axis] = np.linspace(-half_length, half_length, n) if n > 1 else 0.0
     gap = 2.0 * half_length / (n - 1) if n > 1 else 0.0
@@ -192,7 +198,7 @@ def _row(axis: int, half_length: float, radius: float) -> tuple[Array, float]:
 
 def _cylinder(half_length: float, radius: float) -> tuple[Array, float]:
     """Cover a cylinder about z: slices, each inside the sphere through its two rims."""
-    n = max(1, math.ceil(2.0 * half_length / (_SPACING * radius)))
+    n = _pieces(half_length, radius)
     centers = np.zeros((n, 3))
     centers[:, 2] = half_length * (2.0 * np.arange(n) + 1.0 - n) / n
     return centers, math.hypot(radius, half_length / n)
