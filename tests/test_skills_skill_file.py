@@ -3,7 +3,9 @@ from __future__ import annotations
 import json
 import os
 import pickle
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from imitarm.errors import FileFormatError, InputError
-from imitarm.skills import Skill
-from imitarm.skills.skill_file import VERSION, Fields, read_skill, write_skill
+from imitarm.skills import DMP, GMR, Skill
+from imitarm.skills.skill_file import VERSION, _checksum, dmp_fields, dmp_of, gmr_fields, gmr_of, read_skill
 from skill_samples import same, shown
 
 
@@ -172,9 +174,11 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(
     assert [p.name for p in tmp_path.iterdir()] == ["s.json"]
 
 
-def test_numbers_that_are_none_are_not_written(tmp_path: Path) -> None:
+def test_numbers_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
+    skill = Skill(3, n_basis=6).fit(shown(n=2))
+    skill.dmp_.goal_[0] = np.nan
     with pytest.raises(InputError, match="not finite"):
-        write_skill(tmp_path / "s.json", {"x": np.array([1.0, np.nan])})
+        skill.save(tmp_path / "s.json")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -186,26 +190,106 @@ def test_a_huge_file_is_not_read(tmp_path: Path) -> None:
         read_skill(path)
 
 
-def test_fields_answer_with_the_type_asked_for() -> None:
-    fields = Fields({"n": 3, "x": 1.5, "t": [[1, 2.0]], "s": "a", "l": ["a"], "b": True, "g": {"k": 1}}, "here")
-    assert fields.integer("n") == 3
-    assert fields.number("x") == 1.5
-    assert fields.number("n") == 3.0
-    np.testing.assert_array_equal(fields.array("t", 2), [[1.0, 2.0]])
-    assert (fields.text("s"), fields.texts("l"), fields.flag("b")) == ("a", ("a",), True)
-    assert fields.group("g").integer("k") == 1
-    assert not fields.has("nothing")
-    for wrong in (
-        lambda: fields.integer("x"),
-        lambda: fields.integer("b"),
-        lambda: fields.number("b"),
-        lambda: fields.number("s"),
-        lambda: fields.array("x", 1),
-        lambda: fields.text("n"),
-        lambda: fields.texts("s"),
-        lambda: fields.flag("n"),
-        lambda: fields.group("s"),
-        lambda: fields.text("nothing"),
-    ):
-        with pytest.raises(FileFormatError, match="here"):
-            wrong()
+@pytest.mark.parametrize("turn", [None, 1.0, 6.0])
+def test_a_regression_comes_back_to_the_last_bit(turn: float | None) -> None:
+    gmr = GMR(candidates=[3, 4]).fit(shown(n=3, turn=turn))
+    again = gmr_of(gmr_fields(gmr))
+    t = np.linspace(0.0, 2.0, 17)
+    np.testing.assert_array_equal(again.predict(t)[0], gmr.predict(t)[0])
+    np.testing.assert_array_equal(again.predict(t)[1], gmr.predict(t)[1])
+    if turn is not None:
+        np.testing.assert_array_equal(again.predict_orientation(t)[0], gmr.predict_orientation(t)[0])
+    assert again.selection_ == gmr.selection_
+    assert (again.n_demonstrations_, again.degenerate_axes_, again.converged_, again.lower_bound_) == (
+        gmr.n_demonstrations_,
+        gmr.degenerate_axes_,
+        gmr.converged_,
+        gmr.lower_bound_,
+    )
+
+
+@pytest.mark.parametrize("turn", [None, 6.0])
+def test_a_primitive_comes_back_to_the_last_bit(turn: float | None) -> None:
+    dmp = DMP("thesis", n_basis=15).fit(shown(n=1, turn=turn)[0].trajectory)
+    again = dmp_of(dmp_fields(dmp))
+    a, b = dmp.generate(goal=[0.1, 0.2, 0.3]), again.generate(goal=[0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(a.positions, b.positions)
+    if turn is not None:
+        assert a.quaternions is not None
+        assert b.quaternions is not None
+        np.testing.assert_array_equal(a.quaternions, b.quaternions)
+
+
+def rewritten(path: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """A file with other content and a checksum that fits it, in the same folder."""
+    whole = json.loads(path.read_text())
+    del whole["checksum"]
+    change(whole)
+    whole["checksum"] = _checksum(whole)
+    other = path.with_name("rewritten.json")
+    other.write_text(json.dumps(whole))
+    return other
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "message"),
+    [
+        ("dmp.duration", None, r"dmp\.duration: expected `float`, got `null`"),
+        ("dmp.duration", -1.0, "duration must be a finite number above 0"),
+        ("dmp.damping", 0.0, "stiffness and damping"),
+        ("dmp.start_velocity", [0.0], "start_velocity must be 3 numbers"),
+        ("dmp.weights", [[1.0, 2.0], [3.0]], "weights must be"),
+        ("dmp.weights.0.1", "1", r"dmp\.weights\[0\]\[1\]: expected `float`, got `str`"),
+        ("gmr.weights.0", True, r"gmr\.weights\[0\]: expected `float`, got `bool`"),
+        ("gmr.n_demonstrations", 2.5, r"gmr\.n_demonstrations: expected `int`, got `float`"),
+        ("gmr.n_demonstrations", -1, r"gmr\.n_demonstrations: expected `int` >= 0"),
+        ("gmr.converged", 1, r"gmr\.converged: expected `bool`, got `int`"),
+        ("gmr.ends", [[0.0]], "ends must be an array of shape"),
+        ("provenance.notes", "a", r"provenance\.notes: expected `array`, got `str`"),
+        ("task", 3, "task: expected `str`, got `int`"),
+        ("fit.distances", 3, "fit: object missing required field"),
+        ("fit.bias", [], r"fit\.bias: expected `float`, got `array`"),
+    ],
+)
+def test_a_wrong_field_is_named_with_its_place_and_a_remedy(
+    path: Path, where: str, value: object, message: str
+) -> None:
+    def change(whole: dict[str, Any]) -> None:
+        *groups, last = where.split(".")
+        group: Any = whole
+        for name in groups:
+            group = group[int(name) if name.isdigit() else name]
+        if where == "fit.distances":
+            del group["rms, largest, start, goal"]
+        else:
+            group[int(last) if last.isdigit() else last] = value
+
+    with pytest.raises(FileFormatError, match=rf"rewritten\.json.*{message}") as caught:
+        Skill.load(rewritten(path, change))
+    assert "\n" not in str(caught.value)
+
+
+def test_every_missing_field_is_named(path: Path) -> None:
+    whole = json.loads(path.read_text())
+    for group in ("gmr", "dmp", "provenance"):
+        for name in set(whole[group]) - {"orientation", "reference", "selection", "ends", "log_likelihood"}:
+            with pytest.raises(FileFormatError, match=f"{group}: object missing required field `{name}`"):
+                Skill.load(rewritten(path, lambda w, g=group, n=name: w[g].pop(n)))
+
+
+def test_a_file_of_version_1_is_read(skill: Skill, path: Path) -> None:
+    """Version 1 knew neither the mean ends nor the quality of the fit: the path then ends where the primitive does."""
+
+    def older(whole: dict[str, Any]) -> None:
+        whole["version"] = 1
+        del whole["fit"], whole["gmr"]["ends"]
+
+    again = Skill.load(rewritten(path, older))
+    assert again.fit_quality_ is None
+    assert same(skill, again)
+    times = np.linspace(0.0, skill.duration_, 20)
+    np.testing.assert_allclose(again.nominal(times).positions, skill.nominal(times).positions, rtol=0, atol=1e-12)
+
+
+def test_the_quality_of_the_fit_comes_back(skill: Skill, path: Path) -> None:
+    assert Skill.load(path).fit_quality_ == skill.fit_quality_

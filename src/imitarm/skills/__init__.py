@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from imitarm.skills.dmp import DMP, DMPState
 from imitarm.skills.dynamical_systems import GAINS, Gains
+from imitarm.skills.fit_quality import DemonstrationDistance, FitQuality, PoorFitWarning
 from imitarm.skills.gmm import DegenerateAxisWarning, GaussianMixture, ellipsoid_scale
 from imitarm.skills.gmr import GMR, SingleDemonstrationWarning, UnalignedWarning
 from imitarm.skills.quaternion_dmp import QuaternionDMP
@@ -16,8 +17,11 @@ __all__ = [
     "GMR",
     "DMPState",
     "DegenerateAxisWarning",
+    "DemonstrationDistance",
+    "FitQuality",
     "Gains",
     "GaussianMixture",
+    "PoorFitWarning",
     "QuaternionDMP",
     "RhythmicDMP",
     "SingleDemonstrationWarning",

@@ -324,13 +324,13 @@ class DMP:
         if plan is not None and done < len(plan.pushes):
             motion = plan.transition.dot(state.motion) + plan.pushes[done]  # dot: @ is slower on small arrays
         else:
-            one = propagator(self.gains_, h)
+            one = propagator(self.gains_, h, self.n_basis)
             y = target.at(np.exp(-DECAY * (state.fraction + one.instants)))
             motion = one.transition.dot(state.motion) + one.drive.dot(y)
         angular = None
         if coupling is not None:
             acceleration = _acceleration(coupling(state.motion[0], state.motion[1] / T)) * (T * T)
-            motion += propagator(self.gains_, h).push[:, None] * acceleration[:3]
+            motion += propagator(self.gains_, h, self.n_basis).push[:, None] * acceleration[:3]
             angular = acceleration[3:] if len(acceleration) == 6 else None
         rotation = state.rotation
         if rotation is not None and self.orientation_ is not None:
@@ -379,7 +379,7 @@ class DMP:
             if state.rotation is not None:
                 quaternions = np.stack([s.rotation.quaternion for s in states if s.rotation is not None])
             return Trajectory(times, np.stack([s.position for s in states]), quaternions)
-        one = propagator(self.gains_, 1.0 / n)
+        one = propagator(self.gains_, 1.0 / n, self.n_basis)
         positions = roll_out(one, state.motion, state.target.on_grid(n * one.n_parts))[0]
         if self.orientation_ is None or state.rotation is None:
             return Trajectory(times, positions)

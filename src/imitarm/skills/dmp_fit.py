@@ -14,7 +14,7 @@ from imitarm.skills.dynamical_systems import Gains, basis_on_grid, phase_basis, 
 
 Array = NDArray[np.float64]
 
-_FINE = 512  # steps of the grid on which responses are computed
+_FINE, _FINE_PER_BASIS = 512, 12  # steps of the grid on which responses are computed, at least
 _NOISE = 1e-4  # [m] the repeatability of industrial arms
 
 
@@ -42,20 +42,21 @@ class FittedWeights(NamedTuple):
 class _Responses:
     """Responses of the spring on the fine grid: to a start of 1, a rate of 1, a goal of 1, and each basis function."""
 
-    values: Array  # (_FINE + 1, 3 + N)
+    values: Array  # (n_steps + 1, 3 + N)
     rates: Array
     spline: CubicHermiteSpline
 
 
 @lru_cache(maxsize=8)
 def _responses(gains: Gains, n_basis: int) -> _Responses:
-    basis = basis_on_grid(n_basis, _FINE)[1]
+    fine = max(_FINE, _FINE_PER_BASIS * n_basis)
+    basis = basis_on_grid(n_basis, fine)[1]
     nothing = np.zeros(len(basis))
     inputs = np.column_stack([nothing, nothing, np.ones_like(nothing), basis])
     start = np.zeros((2, inputs.shape[1]))
     start[0, 0] = start[1, 1] = 1.0
-    z = roll_out(propagator(gains, 1.0 / _FINE), start, inputs)
-    return _Responses(z[0], z[1], CubicHermiteSpline(np.linspace(0.0, 1.0, _FINE + 1), z[0], z[1]))
+    z = roll_out(propagator(gains, 1.0 / fine, n_basis), start, inputs)
+    return _Responses(z[0], z[1], CubicHermiteSpline(np.linspace(0.0, 1.0, fine + 1), z[0], z[1]))
 
 
 def fit_weights(
@@ -145,11 +146,11 @@ def _progress(rate: Array) -> tuple[Array, float]:
     A motion without length gets a minimum-jerk profile.
     """
     speed = np.linalg.norm(rate, axis=1)
-    done = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))]) / _FINE
+    done = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))]) / (len(rate) - 1)
     length = float(done[-1])
     if length > 1e-9:
         return done / length, length
-    u = np.linspace(0.0, 1.0, _FINE + 1)
+    u = np.linspace(0.0, 1.0, len(rate))
     return u**3 * (10.0 + u * (6.0 * u - 15.0)), length
 
 

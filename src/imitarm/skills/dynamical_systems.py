@@ -26,7 +26,7 @@ _TINY = 1e-300  # far past the end all basis functions underflow to 0
 _CLOSED = 0.1  # net motion below this fraction of the path length gives no direction to rotate and stretch by
 _SAME_STEP = 1e-12  # steps that fill the duration to this fraction count as a whole number of steps
 _MOST_STEPS = 100_000  # of a motion whose steps are computed in advance
-_LONGEST_PART = 1.0 / 200.0  # of the duration; a motion in parts of this length ends within 1e-8 m of its goal
+_PARTS, _PARTS_PER_BASIS = 200, 5  # of the duration, at least; with so many a motion ends within 1e-8 m of its goal
 
 
 # ----- canonical system: the phase and the basis functions
@@ -132,7 +132,8 @@ class Propagator(NamedTuple):
     """One step of the spring: ``z_next = transition @ z + drive @ [y_0; ...; y_2m]``, with z = [x; tau x'].
 
     The step is divided into m equal parts, and the target ``y`` is given at the beginning, middle and end of each. A
-    part is exact when the target is a parabola within it, so the error falls with the fourth power of its length.
+    part is exact when the target is a parabola within it, so the error falls with the fourth power of its length. A
+    part is at most 1/200 of the duration, and at most a fifth of the distance between two basis functions.
 
     Attributes:
         transition: shape (2, 2).
@@ -153,10 +154,16 @@ class Propagator(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def propagator(gains: Gains, step: float) -> Propagator:
-    """Return the step of the spring; ``step`` is a fraction of the duration, above 0."""
+def propagator(gains: Gains, step: float, n_basis: int = 0) -> Propagator:
+    """Return one step of the spring.
+
+    Args:
+        gains: of the spring.
+        step: fraction of the duration, above 0.
+        n_basis: number of basis functions of the target.
+    """
     K, D = gains
-    m = max(1, int(np.ceil(step / _LONGEST_PART - 1e-9)))
+    m = max(1, int(np.ceil(step * max(_PARTS, _PARTS_PER_BASIS * n_basis) - 1e-9)))
     part = step / m
     # the state is extended by the target and its two derivatives, which makes the whole a linear system at rest
     A = np.zeros((5, 5))
@@ -261,7 +268,7 @@ class MovingTarget:
         plan = self._plans[step]
         if plan is None and 1.0 / step < _MOST_STEPS:
             n = round(1.0 / step)
-            one = propagator(gains, step)
+            one = propagator(gains, step, len(self.drive))
             m = one.n_parts
             if abs(n * step - 1.0) < _SAME_STEP:
                 y = self.on_grid(n * m)

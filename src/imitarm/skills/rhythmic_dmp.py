@@ -220,7 +220,7 @@ class RhythmicDMP:
         self._check(state)
         h = finite_number(dt, "RhythmicDMP.step: dt", "s", above=0.0, at_most=100.0 * state.period) / state.period
         h = max(h, 1e-100)
-        one = propagator(self.gains_, h)
+        one = propagator(self.gains_, h, self.n_basis)
         motion = one.transition @ state.motion + one.drive @ self._target(state, state.periods + one.instants)
         if coupling is not None:
             added = finite_vector(coupling(state.position, state.velocity), 3, "RhythmicDMP: acceleration of coupling")
@@ -267,7 +267,7 @@ class RhythmicDMP:
             T = finite_number(duration, "RhythmicDMP.generate: duration", "s", above=0.0)
         n = number_of_steps(T, dt, "RhythmicDMP.generate")
         h = T / n / state.period
-        one = propagator(self.gains_, h)
+        one = propagator(self.gains_, h, self.n_basis)
         target = self._target(state, np.linspace(0.0, n * h, 2 * n * one.n_parts + 1))
         x = roll_out(one, state.motion, target)[0]
         times = np.linspace(0.0, T, n + 1)

@@ -1,53 +1,64 @@
-"""A skill: a motion learnt from demonstrations, with how exact each part of it must be."""
+"""A skill: a motion learned from demonstrations, and how exact each part of it must be."""
 
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Self
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import imitarm
 from imitarm.errors import FileFormatError, InputError
+from imitarm.html_table import html_table
 from imitarm.kinematics.pose import Pose
 from imitarm.skills.dmp import DMP
 from imitarm.skills.dynamical_systems import Adjustment, Gains
+from imitarm.skills.fit_quality import FitQuality, PoorFitWarning, evaluate_fit
 from imitarm.skills.gmr import GMR
 from imitarm.skills.quaternion_dmp import with_other_ends
-from imitarm.skills.skill_content import dmp_content, gmr_content, read_dmp, read_gmr
-from imitarm.skills.skill_file import read_skill, write_skill
+from imitarm.skills.skill_file import dmp_of, fit_of, gmr_of, read_skill, write_skill
 from imitarm.trajectory import Demonstration, Trajectory
+from imitarm.validation import finite_array, finite_number, text
 
 Array = NDArray[np.float64]
 
-_SAMPLES = 400  # of the mean motion that the primitive is trained on
+_SAMPLES, _SAMPLES_PER_BASIS = 400, 5  # of the nominal path that the primitive is trained on, at least
+_NUMBERS_OF_BASIS = (40, 80, 160)  # that "auto" tries
+_CLOSE_ENOUGH = 1e-4, 0.002  # [m], or of the motion's extent: root mean square from the nominal path to the primitive
 
 
 class Skill:
-    """A motion learnt from demonstrations (thesis Chapter 5: GMM, then GMR, then DMP).
+    """A motion learned from demonstrations (thesis Chapter 5: GMM, then GMR, then DMP).
 
-    A :class:`~imitarm.skills.gmr.GMR` learns the mean motion and, as its covariance, how much demonstrations differ
-    at each instant. A :class:`~imitarm.skills.dmp.DMP` is trained on the mean: it reproduces the motion from another
-    start, to another goal, in another time. The covariance stays as the tolerance: where the person was exact, the
+    A :class:`~imitarm.skills.gmr.GMR` learns the mean motion, and as its covariance how much the demonstrations differ
+    at each time. A :class:`~imitarm.skills.dmp.DMP` is trained on the nominal path: it reproduces the motion from
+    another start, to another goal, in another time. The covariance is the tolerance: where the person was exact, the
     robot must be. A skill knows nothing of obstacles; policies do.
+
+    The nominal path and the primitive start and end exactly at the means of the demonstrated starts and goals.
 
     Args:
         n_components: number of Gaussians, or ``"auto"`` (see GMR).
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains` (see DMP).
-        n_basis: number of basis functions of the primitive.
+        n_basis: number of basis functions of the primitive, or ``"auto"``: 40, 80 or 160, the first that follows the
+            nominal path within 0.1 mm or 0.2 % of the motion's extent (root mean square).
         random_state: seed of everything random in learning.
 
     Attributes:
         gmr_: mean and covariance over time.
         dmp_: the primitive.
         task_: what was shown, for example ``"sweep"``.
-        duration_: [s].
-        start_: learnt start, tool_to_base; its rotation is the identity when none was learnt.
-        goal_: learnt goal, likewise.
+        duration_: learned duration [s].
+        start_: learned start, tool_to_base; its rotation is the identity when none was learned.
+        goal_: learned goal, likewise.
         n_demonstrations_: number of demonstrations.
-        provenance_: where it comes from: ``"imitarm"`` (version that learnt it), ``"sources"`` (one a demonstration),
+        fit_quality_: the distance to each demonstration, and whether the skill is faithful to them; None in a skill
+            from a file that does not contain it.
+        provenance_: its origin: ``"imitarm"`` (version that learned it), ``"sources"`` (one per demonstration),
             ``"notes"`` (for example what lint found), and ``"date"`` when one was given.
 
     Raises:
@@ -58,6 +69,7 @@ class Skill:
     dmp_: DMP
     task_: str
     n_demonstrations_: int
+    fit_quality_: FitQuality | None
     provenance_: dict[str, Any]
 
     def __init__(
@@ -65,11 +77,14 @@ class Skill:
         n_components: int | Literal["auto"] = "auto",
         *,
         gains: str | Gains = "critical",
-        n_basis: int = 40,
+        n_basis: int | Literal["auto"] = "auto",
         random_state: int = 0,
     ) -> None:
         self._gmr = GMR(n_components, random_state=random_state)
-        self._dmp = DMP(gains, n_basis=n_basis)
+        if isinstance(n_basis, str) and n_basis != "auto":
+            raise InputError(f"Skill: n_basis must be a whole number or 'auto', got {n_basis!r:.80}")
+        numbers = _NUMBERS_OF_BASIS if isinstance(n_basis, str) else (n_basis,)
+        self._primitives = [DMP(gains, n_basis=n) for n in numbers]
 
     def fit(
         self, demonstrations: Sequence[Demonstration], *, notes: Sequence[str] = (), date: str | None = None
@@ -77,25 +92,49 @@ class Skill:
         """Learn from demonstrations, aligned beforehand (``imitarm.demonstrations.align``).
 
         Args:
-            demonstrations: at least one; three or more tell how much a person varies.
-            notes: what is worth knowing later, for example what lint found.
-            date: when it was learnt; left out when None, so that the same input gives the same file.
+            demonstrations: at least one; three or more show how much a person varies.
+            notes: facts worth knowing later, for example what lint found.
+            date: when it was learned; left out when None, so that the same input gives the same file.
 
         Raises:
             InputError: as :meth:`GMR.fit` and :meth:`DMP.fit`.
+
+        Warns:
+            PoorFitWarning: when the skill does not reproduce the motion, see ``fit_quality_``.
         """
-        gmr = self._gmr.fit(demonstrations)
-        tasks = dict.fromkeys(d.task for d in demonstrations if isinstance(d, Demonstration) and d.task)
-        sources = [d.source for d in demonstrations if isinstance(d, Demonstration)]
-        provenance: dict[str, Any] = {"imitarm": imitarm.__version__, "sources": sources, "notes": list(notes)}
+        if isinstance(notes, str) or not isinstance(notes, Sequence) or not all(isinstance(n, str) for n in notes):
+            raise InputError(f"Skill.fit: notes must be a sequence of texts, got {notes!r:.80}")
+        provenance: dict[str, Any] = {"imitarm": imitarm.__version__, "sources": [], "notes": list(notes)}
         if date is not None:
-            provenance["date"] = date
-        self._take(gmr, self._dmp.fit(gmr.trajectory(_SAMPLES), exact_ends=True), " + ".join(tasks), provenance)
+            provenance["date"] = text(date, "Skill.fit: date")
+        gmr = self._gmr.fit(demonstrations)
+        shown = [d.trajectory if isinstance(d, Demonstration) else d for d in demonstrations]
+        provenance["sources"] = [d.source if isinstance(d, Demonstration) else "" for d in demonstrations]
+        tasks = dict.fromkeys(d.task for d in demonstrations if isinstance(d, Demonstration) and d.task)
+        dmp = self._primitive(gmr)
+        quality = evaluate_fit(gmr, dmp, shown, provenance["sources"])
+        self._take(gmr, dmp, " + ".join(tasks), provenance, quality)
+        if not quality.faithful:
+            warnings.warn(f"Skill.fit: {quality.problem}", PoorFitWarning, stacklevel=2)
         return self
 
-    def _take(self, gmr: GMR, dmp: DMP, task: str, provenance: Mapping[str, Any]) -> None:
+    def _primitive(self, gmr: GMR) -> DMP:
+        """Train the first primitive that follows the nominal path, or the last one."""
+        for dmp in self._primitives:
+            nominal = gmr.trajectory(max(_SAMPLES, _SAMPLES_PER_BASIS * dmp.n_basis))
+            dmp.fit(nominal, exact_ends=True)
+            if dmp is self._primitives[-1]:
+                break
+            done = dmp.generate(dt=nominal.duration / (len(nominal) - 1)).positions
+            error = np.sqrt(np.mean(np.sum((done - nominal.positions) ** 2, axis=1)))
+            extent = np.linalg.norm(np.ptp(nominal.positions, axis=0))
+            if error <= max(_CLOSE_ENOUGH[0], _CLOSE_ENOUGH[1] * extent):
+                break
+        return dmp
+
+    def _take(self, gmr: GMR, dmp: DMP, task: str, provenance: Mapping[str, Any], quality: FitQuality | None) -> None:
         self.gmr_, self.dmp_, self.task_, self.provenance_ = gmr, dmp, task, dict(provenance)
-        self.n_demonstrations_ = gmr.n_demonstrations_
+        self.n_demonstrations_, self.fit_quality_ = gmr.n_demonstrations_, quality
 
     def __repr__(self) -> str:
         if not hasattr(self, "gmr_"):
@@ -105,25 +144,44 @@ class Skill:
             f"{self.gmr_.n_components_} components, {'with' if self.gmr_.has_orientation_ else 'without'} orientation)"
         )
 
+    def _repr_html_(self) -> str:
+        if not hasattr(self, "gmr_"):
+            return html_table("Skill", {"fitted": "no"})
+        quality = self.fit_quality_
+        bias = problem = ""
+        if quality is not None:
+            bias = f"{1e3 * quality.bias:.2g} mm ({100.0 * quality.relative_bias:.2g} % of the motion's extent)"
+            problem = quality.problem
+        rows = {
+            "task": self.task_,
+            "demonstrations": self.n_demonstrations_,
+            "duration": f"{self.duration_:.4g} s",
+            "components": self.gmr_.n_components_,
+            "orientation": "learned" if self.gmr_.has_orientation_ else "not in the demonstrations",
+            "bias": bias,
+            "problem": problem,
+        }
+        return html_table("Skill", rows)
+
     def _fitted(self) -> DMP:
         if not hasattr(self, "dmp_"):
-            raise InputError("Skill: not learnt yet; call fit, or Skill.load")
+            raise InputError("Skill: not learned yet; call fit, or Skill.load")
         return self.dmp_
 
     @property
     def duration_(self) -> float:
-        """Learnt duration [s]."""
+        """Learned duration [s]."""
         return self._fitted().duration_
 
     @property
     def start_(self) -> Pose:
-        """Learnt start, tool_to_base."""
+        """Learned start, tool_to_base."""
         dmp = self._fitted()
         return _pose(dmp.start_, None if dmp.orientation_ is None else dmp.orientation_.start_)
 
     @property
     def goal_(self) -> Pose:
-        """Learnt goal, tool_to_base."""
+        """Learned goal, tool_to_base."""
         dmp = self._fitted()
         return _pose(dmp.goal_, None if dmp.orientation_ is None else dmp.orientation_.goal_)
 
@@ -133,11 +191,12 @@ class Skill:
         r"""Return the nominal path, which policies reproduce, at ``times`` [s] of the learned duration.
 
         It starts and ends exactly at ``start`` and ``goal``, for any number of samples. The learned path is
-        :meth:`~imitarm.skills.gmr.GMR.nominal`. Other ends change it as in the primitive's adjustment ``"progress"``:
+        :meth:`~imitarm.skills.gmr.GMR.nominal`. Another start or goal changes it as the primitive's adjustment
+        ``"progress"`` does:
 
         .. math:: x(t) = x_0(t) + (1 - p(t)) \delta_{start} + p(t) \delta_{goal}
 
-        with p the fraction of the path that is done. The rotation changes likewise, along a minimum-jerk profile.
+        with p the fraction of the path that is done. The rotation changes along a minimum-jerk profile.
 
         Args:
             times: strictly increasing, from 0 to the learned duration, shape (n,) [s].
@@ -148,7 +207,7 @@ class Skill:
             InputError: when not fitted, or a start, a goal or a time is not valid.
         """
         state = self._fitted().begin(start, goal)
-        t = np.asarray(times, dtype=float)
+        t = finite_array(times, (None,), "Skill.nominal: times", "s")
         positions, quaternions = self.gmr_.nominal(t)
         moved = np.stack([state.target.start - self.dmp_.start_, state.target.goal - self.dmp_.goal_])
         if moved.any():
@@ -168,14 +227,14 @@ class Skill:
         *,
         adjustment: Adjustment = "progress",
     ) -> Trajectory:
-        """Return the motion, ``round(duration / dt) + 1`` samples, with quaternions when rotation was learnt.
+        """Return the primitive's motion, ``round(duration / dt) + 1`` samples, with the rotation when it was learned.
 
         Args:
-            start: a Pose, or a position (3,) [m] with the learnt rotation; None: as learnt.
+            start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
             goal: likewise.
-            duration: [s]; None: as learnt.
+            duration: [s]; None: as learned.
             dt: step [s], stretched so that a whole number of steps fills the duration.
-            adjustment: how the motion gives way to other ends (see :class:`~imitarm.skills.dmp.DMP`).
+            adjustment: how the motion is changed for another start or goal (see :class:`~imitarm.skills.dmp.DMP`).
 
         Raises:
             InputError: when not fitted, or an argument is out of range.
@@ -187,60 +246,63 @@ class Skill:
 
         Args:
             times: since the start of a motion that takes ``duration``.
-            duration: [s]; None: as learnt.
-        """
-        T = self.duration_
-        scale = 1.0 if duration is None else T / duration
-        return self.gmr_.predict(np.asarray(times, dtype=float) * scale)[1]
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a skill file (:mod:`imitarm.skills.skill_file`): JSON, human-readable, checked when read.
+            duration: [s]; None: as learned.
 
         Raises:
-            InputError: when not learnt yet, or the file can't be written.
+            InputError: when not fitted, or an argument is not valid.
         """
-        self._fitted()
-        write_skill(
-            path,
-            {
-                "task": self.task_,
-                "provenance": self.provenance_,
-                "gmr": gmr_content(self.gmr_),
-                "dmp": dmp_content(self.dmp_),
-            },
-        )
+        T = self.duration_
+        t = finite_array(np.atleast_1d(times), (None,), "Skill.tolerance: times", "s")
+        if duration is not None:
+            t = t * (T / finite_number(duration, "Skill.tolerance: duration", "s", above=0.0))
+        return self.gmr_.predict(t)[1]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a skill file (:mod:`imitarm.skills.skill_file`): JSON, human-readable, checked when it is read.
+
+        Args:
+            path: of the file; an existing file is replaced.
+
+        Raises:
+            InputError: when not learned yet, or the file can't be written.
+        """
+        dmp = self._fitted()
+        path = _checked(path, "save")
+        write_skill(path, self.task_, self.provenance_, self.gmr_, dmp, self.fit_quality_)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Skill:
         """Read a skill file.
 
+        Args:
+            path: of the file.
+
         Raises:
             InputError: when there is no such file or it can't be read.
-            FileFormatError: when it is no skill file, was cut or altered, or is of a newer version.
+            FileFormatError: when it is not a skill file, was cut or altered, or has a newer version.
         """
-        fields = read_skill(path)
+        document = read_skill(_checked(path, "load"))
+        provenance = {k: v for k, v in msgspec.to_builtins(document.provenance).items() if v is not None}
         try:
-            gmr, dmp = read_gmr(fields.group("gmr")), read_dmp(fields.group("dmp"))
+            gmr, dmp = gmr_of(document.gmr), dmp_of(document.dmp)
             if gmr.has_orientation_ != (dmp.orientation_ is not None):
-                raise FileFormatError("rotation was learnt by one of gmr and dmp only")
-            provenance = fields.group("provenance")
-            origin: dict[str, Any] = {
-                "imitarm": provenance.text("imitarm"),
-                "sources": list(provenance.texts("sources")),
-                "notes": list(provenance.texts("notes")),
-            }
-            if provenance.has("date"):
-                origin["date"] = provenance.text("date")
-            task = fields.text("task")
-            if not fields.group("gmr").has("ends"):  # a file of before: the primitive's ends are the nominal path's
-                gmr.ends_ = _ends_of(dmp, gmr)
-        except FileFormatError:
-            raise
+                raise InputError("rotation was learned by one of gmr and dmp only")
+            quality = None
+            if document.fit is not None:
+                quality = fit_of(document.fit, document.provenance.sources, gmr.n_components_)
         except InputError as error:
             raise FileFormatError(f"{os.fspath(path)}: {error}") from error
+        if document.gmr.ends is None:  # version 1: the nominal path ends where the primitive does
+            gmr.ends_ = _ends_of(dmp, gmr)
         skill = cls(gmr.n_components_, gains=dmp.gains_, n_basis=dmp.n_basis)
-        skill._take(gmr, dmp, task, origin)
+        skill._take(gmr, dmp, document.task, provenance, quality)
         return skill
+
+
+def _checked(path: str | os.PathLike[str], what: str) -> str | os.PathLike[str]:
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"Skill.{what}: path must be text or a pathlib.Path, got {path!r:.80}")
+    return path
 
 
 def _pose(position: Array, quaternion: Array | None) -> Pose:

@@ -1,9 +1,9 @@
-"""The skill file: JSON that a person can read, checked when it is read, and never executed.
+"""The skill file: JSON that a person can read. It is checked when it is read, and nothing in it is ever executed.
 
-Layout: ``format``, ``version``, what the numbers mean (``units``, ``frames``), where they come from (``task``,
-``provenance``), the numbers (``gmr``, ``dmp``), and last a ``checksum``: SHA-256 of everything else in canonical
-form (sorted keys, no spaces), so that layout may be changed but not one digit. Floats are written with all their
-digits and come back exactly. Nothing in the file names a class or is run.
+Layout: ``format``, ``version``, the meaning of the numbers (``units``, ``frames``), their origin (``task``,
+``provenance``), the numbers (``gmr``, ``dmp``, ``fit``), and last a ``checksum``: SHA-256 of everything else in
+canonical form (sorted keys, no spaces), so the layout may change but no digit may. Floats are written with all their
+digits and come back exactly. The classes below are the schema: they define what is written and what is accepted.
 """
 
 from __future__ import annotations
@@ -11,169 +11,310 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from imitarm.errors import FileFormatError, InputError
-
-Array = NDArray[np.float64]
+from imitarm.files.document import as_document, write_text
+from imitarm.skills.dmp import DMP
+from imitarm.skills.dynamical_systems import Gains
+from imitarm.skills.fit_quality import DemonstrationDistance, FitQuality
+from imitarm.skills.gmr import GMR
+from imitarm.skills.quaternion_dmp import QuaternionDMP
+from imitarm.skills.rotation_reference import RotationReference
+from imitarm.skills.selection import Candidate
 
 FORMAT = "imitarm skill"
-VERSION = 1
+VERSION = 2  # 2 added ends and fit; files of version 1 are read as well
 _LARGEST = 64 * 2**20  # [bytes] a skill takes about 50 kB
-_ABOUT = {
-    "units": {"time": "s", "length": "m", "angle": "rad"},
-    "frames": {
-        "positions": "tool tip in the robot's base frame",
-        "quaternions": "tool_to_base, in the order w, x, y, z",
-        "rotation vectors": "base frame, from the reference rotation",
-        "columns of gmr": "t, x, y, z, then the rotation vector where rotation was learnt",
-    },
+_REMEDY = "the file was altered after it was written; use the original, or learn the skill again"
+_UNITS = {"time": "s", "length": "m", "angle": "rad"}
+_FRAMES = {
+    "positions": "tool tip in the robot's base frame",
+    "quaternions": "tool_to_base, in the order w, x, y, z",
+    "rotation vectors": "base frame, from the reference rotation",
+    "columns of gmr": "t, x, y, z, then the rotation vector where rotation was learned",
 }
 
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+Row = list[float]
+Table = list[Row]
 
-class Fields:
-    """Part of a file that is being read; every answer has the type that was asked for.
 
-    Args:
-        values: the JSON object.
-        place: where it is, for messages.
+class Provenance(msgspec.Struct, omit_defaults=True):
+    """Where a skill comes from, see ``Skill.provenance_``."""
+
+    imitarm: str
+    sources: list[str]
+    notes: list[str]
+    date: str | None = None
+
+
+class ReferenceFields(msgspec.Struct):
+    """A :class:`RotationReference`."""
+
+    times: Row
+    quaternions: Table
+
+
+class SelectionFields(msgspec.Struct, omit_defaults=True):
+    """The numbers of components that were tried."""
+
+    rows: Table = msgspec.field(name="n_components, bic, aic, bias_rmse_mm")
+    held_out_rmse_mm: Row | None = None
+
+
+class GmrFields(msgspec.Struct, omit_defaults=True):
+    """A :class:`GMR`: its attributes without their underscore."""
+
+    duration: float
+    n_demonstrations: Count
+    weights: Row
+    means: Table
+    covariances: list[Table]
+    degenerate_axes: list[Count]
+    converged: bool
+    log_likelihood: float | None = None
+    ends: Table | None = None
+    reference: ReferenceFields | None = None
+    selection: SelectionFields | None = None
+
+
+class OrientationFields(msgspec.Struct):
+    """A :class:`QuaternionDMP`."""
+
+    knots: Row
+    coefficients: Table
+
+
+class DmpFields(msgspec.Struct, omit_defaults=True):
+    """A :class:`DMP`: its attributes without their underscore."""
+
+    duration: float
+    stiffness: float
+    damping: float
+    start: Row
+    goal: Row
+    start_velocity: Row
+    path_length: float
+    weights: Table
+    progress_weights: Row
+    orientation: OrientationFields | None = None
+
+
+class FitFields(msgspec.Struct, omit_defaults=True):
+    """A :class:`FitQuality`; a row of distances for each source [m]."""
+
+    distances: Table = msgspec.field(name="rms, largest, start, goal")
+    extent: float
+    bias: float
+    primitive_bias: float
+    rotation_extent: float
+    rotation_bias: float
+    period: float | None = None
+
+
+class SkillDocument(msgspec.Struct, omit_defaults=True):
+    """A skill file without its checksum."""
+
+    format: str
+    version: int
+    units: dict[str, str]
+    frames: dict[str, str]
+    task: str
+    provenance: Provenance
+    gmr: GmrFields
+    dmp: DmpFields
+    fit: FitFields | None = None
+
+
+# ----- from objects to fields and back
+
+
+def gmr_fields(gmr: GMR) -> GmrFields:
+    """Return the fields of a regression."""
+    reference = selection = None
+    if gmr.reference_ is not None:
+        reference = ReferenceFields(gmr.reference_.times.tolist(), gmr.reference_.quaternions.tolist())
+    if gmr.selection_:
+        rows = [[c.n_components, c.bic, c.aic, c.bias_rmse_mm] for c in gmr.selection_]
+        errors = [c.held_out_rmse_mm for c in gmr.selection_]
+        selection = SelectionFields(rows, None if np.isnan(errors[0]) else errors)
+    return GmrFields(
+        gmr.duration_,
+        gmr.n_demonstrations_,
+        gmr.weights_.tolist(),
+        gmr.means_.tolist(),
+        gmr.covariances_.tolist(),
+        list(gmr.degenerate_axes_),
+        gmr.converged_,
+        None if np.isnan(gmr.lower_bound_) else gmr.lower_bound_,
+        gmr.ends_.tolist(),
+        reference,
+        selection,
+    )
+
+
+def gmr_of(fields: GmrFields) -> GMR:
+    """Build a regression from its fields.
 
     Raises:
-        FileFormatError: from every method, when a field is missing or of another kind.
+        InputError: when a field is out of range.
     """
-
-    def __init__(self, values: object, place: str) -> None:
-        if not isinstance(values, Mapping):
-            raise FileFormatError(f"{place}: should be a group of named fields, is {type(values).__name__}")
-        self._values = values
-        self._place = place
-
-    def _get(self, name: str) -> Any:
-        if name not in self._values:
-            raise FileFormatError(f"{self._place}: field {name!r} is missing")
-        return self._values[name]
-
-    def has(self, name: str) -> bool:
-        """Tell whether a field is there and not null."""
-        return self._values.get(name) is not None
-
-    def group(self, name: str) -> Fields:
-        """Return a group of fields."""
-        return Fields(self._get(name), f"{self._place}, {name}")
-
-    def text(self, name: str) -> str:
-        """Return a string."""
-        value = self._get(name)
-        if not isinstance(value, str):
-            raise FileFormatError(f"{self._place}: {name!r} should be text, is {value!r:.80}")
-        return value
-
-    def texts(self, name: str) -> tuple[str, ...]:
-        """Return a list of strings."""
-        value = self._get(name)
-        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-            raise FileFormatError(f"{self._place}: {name!r} should be a list of text")
-        return tuple(value)
-
-    def integer(self, name: str) -> int:
-        """Return a whole number from 0 to 2^53."""
-        value = self._get(name)
-        if type(value) is not int or not 0 <= value <= 2**53:
-            raise FileFormatError(f"{self._place}: {name!r} should be a whole number, is {value!r:.80}")
-        return value
-
-    def flag(self, name: str) -> bool:
-        """Return true or false."""
-        value = self._get(name)
-        if not isinstance(value, bool):
-            raise FileFormatError(f"{self._place}: {name!r} should be true or false, is {value!r:.80}")
-        return value
-
-    def number(self, name: str) -> float:
-        """Return a finite number."""
-        return float(self.array(name, 0))
-
-    def array(self, name: str, n_dims: int) -> Array:
-        """Return an array of finite numbers."""
-        value = self._get(name)
-        if not _all_numbers(value):
-            raise FileFormatError(f"{self._place}: {name!r} should hold numbers and nothing else")
-        try:
-            array = np.array(value, dtype=float)
-        except (ValueError, OverflowError) as error:
-            raise FileFormatError(f"{self._place}: {name!r} is not a regular table of numbers ({error})") from error
-        if array.ndim != n_dims or not np.all(np.isfinite(array)):
-            raise FileFormatError(f"{self._place}: {name!r} should be a finite array with {n_dims} dimensions")
-        return array
+    reference = None
+    if fields.reference is not None:
+        reference = RotationReference(np.array(fields.reference.times), np.array(fields.reference.quaternions))
+    selection: list[Candidate] = []
+    if fields.selection is not None:
+        rows = fields.selection.rows
+        errors = fields.selection.held_out_rmse_mm or [np.nan] * len(rows)
+        if len(errors) != len(rows) or any(len(row) != 4 for row in rows):
+            raise InputError("gmr.selection: rows of 4 numbers needed, with one error each")
+        selection = [Candidate(int(k), bic, aic, e, bias) for (k, bic, aic, bias), e in zip(rows, errors, strict=True)]
+    return GMR.from_mixture(
+        fields.weights,
+        fields.means,
+        fields.covariances,
+        duration=fields.duration,
+        n_demonstrations=fields.n_demonstrations,
+        reference=reference,
+        ends=fields.ends,
+        selection=selection,
+        degenerate_axes=fields.degenerate_axes,
+        converged=fields.converged,
+        lower_bound=np.nan if fields.log_likelihood is None else fields.log_likelihood,
+    )
 
 
-def _all_numbers(value: object) -> bool:
-    if isinstance(value, list):
-        return all(_all_numbers(v) for v in value)
-    return type(value) in {int, float}
+def dmp_fields(dmp: DMP) -> DmpFields:
+    """Return the fields of a primitive."""
+    orientation = None
+    if dmp.orientation_ is not None:
+        orientation = OrientationFields(dmp.orientation_.knots_.tolist(), dmp.orientation_.coefficients_.tolist())
+    return DmpFields(
+        dmp.duration_,
+        dmp.gains_.stiffness,
+        dmp.gains_.damping,
+        dmp.start_.tolist(),
+        dmp.goal_.tolist(),
+        dmp.start_velocity_.tolist(),
+        dmp.path_length_,
+        dmp.weights_.tolist(),
+        dmp.progress_weights_.tolist(),
+        orientation,
+    )
 
 
-def write_skill(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
-    """Write ``content`` (plain values and arrays), aside first and then renamed.
+def dmp_of(fields: DmpFields) -> DMP:
+    """Build a primitive from its fields.
 
     Raises:
-        InputError: when a number is not finite, or the file can't be written; what was there before stays as it was.
+        InputError: when a field is out of range.
     """
-    target = Path(path)
-    whole = {"format": FORMAT, "version": VERSION, **_ABOUT, **{k: _plain(v) for k, v in content.items()}}
+    gains = Gains(fields.stiffness, fields.damping)
+    orientation = None
+    if fields.orientation is not None:
+        orientation = QuaternionDMP.from_spline(fields.orientation.knots, fields.orientation.coefficients, gains)
+    return DMP.from_weights(
+        fields.weights,
+        fields.progress_weights,
+        gains=gains,
+        start=fields.start,
+        goal=fields.goal,
+        start_velocity=fields.start_velocity,
+        duration=fields.duration,
+        path_length=fields.path_length,
+        orientation=orientation,
+    )
+
+
+def fit_fields(fit: FitQuality) -> FitFields:
+    """Return the fields of a fit's quality."""
+    return FitFields(
+        [[d.rms, d.largest, d.start, d.goal] for d in fit.distances],
+        fit.extent,
+        fit.bias,
+        fit.primitive_bias,
+        fit.rotation_extent,
+        fit.rotation_bias,
+        fit.period,
+    )
+
+
+def fit_of(fields: FitFields, sources: list[str], n_components: int) -> FitQuality:
+    """Build a fit's quality from its fields.
+
+    Raises:
+        InputError: when there is not one row of distances for each source.
+    """
+    if len(fields.distances) != len(sources) or any(len(row) != 4 for row in fields.distances):
+        raise InputError(f"fit: one row of 4 distances needed for each of {len(sources)} sources")
+    distances = tuple(DemonstrationDistance(s, *row) for s, row in zip(sources, fields.distances, strict=True))
+    rest = {name: getattr(fields, name) for name in fields.__struct_fields__ if name != "distances"}
+    return FitQuality(distances, n_components, **rest)
+
+
+# ----- from fields to a file and back
+
+
+def write_skill(
+    path: str | os.PathLike[str], task: str, provenance: Mapping[str, Any], gmr: GMR, dmp: DMP, fit: FitQuality | None
+) -> None:
+    """Write a skill file. An existing file stays whole until the new one is.
+
+    Raises:
+        InputError: when a number is not finite, or the file can't be written.
+    """
+    document = SkillDocument(
+        FORMAT,
+        VERSION,
+        _UNITS,
+        _FRAMES,
+        task,
+        Provenance(**provenance),
+        gmr_fields(gmr),
+        dmp_fields(dmp),
+        None if fit is None else fit_fields(fit),
+    )
+    whole = msgspec.to_builtins(document)
     try:
         whole["checksum"] = _checksum(whole)
     except ValueError as error:
-        raise InputError(f"can't write skill file {target}: it holds a number that is not finite") from error
-    text = "".join(_lines(whole, "")) + "\n"
-    aside: Path | None = None
-    try:
-        with tempfile.NamedTemporaryFile(
-            "w", dir=target.parent, prefix=f".{target.name}.", suffix=".part", delete=False, encoding="utf-8"
-        ) as file:
-            aside = Path(file.name)
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        aside.chmod(0o666 & ~_umask())
-        aside.replace(target)
-    except OSError as error:
-        if aside is not None:
-            aside.unlink(missing_ok=True)
-        raise InputError(f"can't write skill file {target}: {error.strerror or error}") from error
+        raise InputError(f"can't write skill file {path}: it holds a number that is not finite") from error
+    write_text(path, "".join(_lines(whole, "")) + "\n")
 
 
-def read_skill(path: str | os.PathLike[str]) -> Fields:
+def read_skill(path: str | os.PathLike[str]) -> SkillDocument:
     """Read and check a skill file.
 
     Raises:
         InputError: when there is no such file or it can't be read.
-        FileFormatError: when it is no skill file, was cut or altered, or is of a version not known here.
+        FileFormatError: when it is not a skill file, was cut or altered, or has an unknown version.
     """
     source = Path(path)
     try:
         if source.stat().st_size > _LARGEST:
-            raise FileFormatError(f"{source}: larger than {_LARGEST // 2**20} MB, so it is no skill file")
+            raise FileFormatError(f"{source}: larger than {_LARGEST // 2**20} MB, so it is not a skill file")
         data = source.read_bytes()
-    except OSError as error:
-        raise InputError(f"can't read skill file {source}: {error.strerror or error}") from error
+    except (OSError, ValueError) as error:
+        if isinstance(error, FileFormatError):
+            raise
+        raise InputError(f"can't read skill file {source}: {getattr(error, 'strerror', None) or error}") from error
     try:
         whole = json.loads(data.decode("utf-8"), object_pairs_hook=_without_repeats, parse_constant=_refuse)
     except (ValueError, RecursionError) as error:  # bad UTF-8, bad JSON, a number of thousands of digits
         raise FileFormatError(
-            f"{source}: not readable as JSON ({error}); the file was cut or altered, or is no skill file"
+            f"{source}: not readable as JSON ({error}); the file was cut or altered, or is not a skill file"
         ) from error
     if not isinstance(whole, dict) or whole.get("format") != FORMAT:
-        raise FileFormatError(f"{source}: no skill file (its 'format' is not {FORMAT!r})")
+        raise FileFormatError(f"{source}: not a skill file (its 'format' is not {FORMAT!r})")
     version = whole.get("version")
     if type(version) is not int or version < 1:
-        raise FileFormatError(f"{source}: its 'version' should be a whole number, is {version!r:.80}")
+        raise FileFormatError(f"{source}, version: must be a whole number above 0, is {version!r:.80}; {_REMEDY}")
     if version > VERSION:
         raise FileFormatError(
             f"{source}: written in version {version} of the format; this imitarm reads versions up to {VERSION}. "
@@ -183,24 +324,21 @@ def read_skill(path: str | os.PathLike[str]) -> Fields:
     try:
         expected = _checksum(whole)
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{source}: holds what no skill file holds ({error})") from error
+        raise FileFormatError(f"{source}: holds a value that is not allowed in a skill file ({error})") from error
     if checksum != expected:
-        raise FileFormatError(
-            f"{source}: the checksum does not fit the content, so the file was altered after it was written; "
-            "use the original, or learn the skill again"
-        )
-    return Fields(whole, str(source))
+        raise FileFormatError(f"{source}: the checksum does not fit the content; {_REMEDY}")
+    return as_document(whole, SkillDocument, source, _REMEDY)
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     names = dict(pairs)
     if len(names) < len(pairs):
-        raise ValueError("a field stands there twice")
+        raise ValueError("a field occurs twice")
     return names
 
 
 def _refuse(constant: str) -> float:
-    raise ValueError(f"{constant} is no number")
+    raise ValueError(f"{constant} is not a number")
 
 
 def _checksum(whole: Mapping[str, Any]) -> str:
@@ -208,19 +346,8 @@ def _checksum(whole: Mapping[str, Any]) -> str:
     return "sha256:" + hashlib.sha256(canonical.encode("ascii")).hexdigest()
 
 
-def _plain(value: Any) -> Any:
-    """Return arrays and NumPy numbers as lists and Python numbers."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return value
-
-
 def _lines(value: Any, indent: str) -> Iterator[str]:
-    """Write groups one field a line, and tables one row a line."""
+    """Write groups one field per line, and tables one row per line."""
     deeper = indent + "  "
     if isinstance(value, dict) and value:
         items = [(f"{deeper}{json.dumps(k)}: ", v) for k, v in value.items()]
@@ -236,9 +363,3 @@ def _lines(value: Any, indent: str) -> Iterator[str]:
         yield from _lines(v, deeper)
         yield ",\n" if i < len(items) - 1 else "\n"
     yield indent + closing
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

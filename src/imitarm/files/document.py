@@ -1,0 +1,69 @@
+"""Documents on disk: text that is written whole or not at all, and contents that are checked against a schema."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from imitarm.errors import FileFormatError, InputError
+
+Document = TypeVar("Document")
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text file. It is written beside its place and then renamed, so an existing file stays whole until then.
+
+    Args:
+        path: of the file; an existing file is replaced.
+        text: its content, written as UTF-8.
+
+    Raises:
+        InputError: when the file can't be written; what was there before is unchanged.
+    """
+    target = Path(path)
+    aside: Path | None = None
+    try:
+        prefix = f".{target.name}."
+        with tempfile.NamedTemporaryFile(
+            "w", dir=target.parent, prefix=prefix, suffix=".part", delete=False, encoding="utf-8", newline="\n"
+        ) as file:
+            aside = Path(file.name)
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.chmod(0o666 & ~_umask())
+        aside.replace(target)
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        if aside is not None:
+            aside.unlink(missing_ok=True)
+        raise InputError(f"can't write {target}: {getattr(error, 'strerror', None) or error}") from error
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def as_document(content: Any, kind: type[Document], path: str | os.PathLike[str], remedy: str) -> Document:
+    """Return plain values (dictionaries, lists, numbers, texts) as an object of a ``msgspec.Struct``.
+
+    Args:
+        content: what a JSON or YAML reader returned.
+        kind: the Struct that describes the fields and their types.
+        path: of the file, for messages.
+        remedy: what to do about a wrong field, for messages.
+
+    Raises:
+        FileFormatError: when a field is missing or of another type; the message names the field.
+    """
+    try:
+        return msgspec.convert(content, kind)
+    except msgspec.ValidationError as error:
+        problem, _, place = str(error).partition(" - at `$")
+        where = place.rstrip("`").lstrip(".") or "top level"
+        raise FileFormatError(f"{os.fspath(path)}, {where}: {problem[:1].lower()}{problem[1:]}; {remedy}") from error
