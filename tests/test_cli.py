@@ -15,6 +15,7 @@ from imitarm.cli import COMMANDS, main
 from imitarm.errors import InputError, UnreachableError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.skills import Skill
+from imitarm.trajectory import Demonstration, Trajectory
 
 
 @pytest.fixture
@@ -207,7 +208,7 @@ def test_learn_refuses_what_lint_calls_an_error(shown, tmp_path, capsys):
     lines = (shown / "demo_1.csv").read_text().splitlines()
     lines[100] = lines[99]
     (shown / "demo_1.csv").write_text("\n".join(lines) + "\n")
-    words = ["learn", str(shown), "--components", "4", "--out", str(out)]
+    words = ["learn", str(shown), "--components", "5", "--out", str(out)]
     assert main(words) == 2
     captured = capsys.readouterr()
     assert "non-monotonic-stamps" in captured.out
@@ -229,14 +230,14 @@ def test_learn_in_spite_of_an_error(shown, tmp_path, capsys):
 
 def test_learn_tells_what_the_learner_warns_of(tmp_path, capsys):
     motion().save(tmp_path / "one.csv")
-    assert main(["learn", str(tmp_path / "one.csv"), "--components", "3", "--out", str(tmp_path / "s.json")]) == 0
+    assert main(["learn", str(tmp_path / "one.csv"), "--components", "6", "--out", str(tmp_path / "s.json")]) == 0
     assert "warning: only one demonstration" in capsys.readouterr().err
 
 
 def test_learn_does_not_overwrite_unasked(shown, tmp_path, capsys):
     out = tmp_path / "s.json"
     out.write_text("precious")
-    words = ["learn", str(shown), "--components", "3", "--out"]
+    words = ["learn", str(shown), "--components", "6", "--out"]
     assert main([*words, str(out)]) == 2
     assert "replace it with --force" in capsys.readouterr().err
     assert out.read_text() == "precious"
@@ -250,6 +251,38 @@ def test_learn_does_not_overwrite_unasked(shown, tmp_path, capsys):
     assert "is the file of FILE, too" in capsys.readouterr().err and one.read_bytes() == before
     assert main([*words, str(out), "--force"]) == 0
     assert Skill.load(out).n_demonstrations_ == 5
+
+
+def test_learn_reports_the_distance_to_each_demonstration(shown, tmp_path, capsys):
+    assert main(["learn", str(shown), "--components", "6", "--out", str(tmp_path / "s.json")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    quality = Skill.load(tmp_path / "s.json").fit_quality_
+    for d in quality.distances:
+        (row,) = [line for line in lines if d.source in line and "mm" not in line and "│" in line]
+        cells = [cell.strip() for cell in row.strip("│").split("│")]
+        assert cells == [d.source, *(f"{1e3 * x:.1f}" for x in (d.rms, d.largest, d.start, d.goal))]
+    assert any("distance to their average (bias)" in line for line in lines)
+
+
+def test_learn_does_not_report_a_poor_fit_as_success(tmp_path, capsys):
+    t = np.linspace(0.0, 40.0, 400)
+    for i in range(3):
+        angle = 2.0 * np.pi * 12.0 * t / 40.0
+        x = np.column_stack([0.4 + 0.05 * np.cos(angle), 0.05 * np.sin(angle) + 0.001 * i, 0.2 + 0.0 * t])
+        Demonstration(Trajectory(t, x), task="stir").save(tmp_path / f"{i}.csv")
+    out = tmp_path / "s.json"
+    words = ["learn", *(str(tmp_path / f"{i}.csv") for i in range(3)), "--out", str(out)]
+    assert main([*words, "--components", "10"]) == 1
+    error = capsys.readouterr().err
+    assert "does not reproduce the motion" in error
+    assert "use more than 10 components" in error
+    assert "the motion repeats every 3.3" in error
+    assert not out.exists()
+    assert main([*words, "--components", "10", "--allow-errors"]) == 0
+    assert not Skill.load(out).fit_quality_.faithful
+    assert main([*words, "--force"]) == 0
+    assert Skill.load(out).fit_quality_.faithful
+    assert "note: the motion repeats every 3.3" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", ["0", "-1", "many", "2.5"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -16,8 +17,10 @@ from imitarm.cli.robot_options import load_optional_robot, robot_files
 from imitarm.cli.screen import remark, say, show_table, working
 from imitarm.demonstrations import Alignment, compute_alignment, files_of
 from imitarm.demonstrations.align import METHODS
-from imitarm.errors import InputError
-from imitarm.skills import Skill
+from imitarm.errors import InputError, TaskFailedError
+from imitarm.skills import FitQuality, PoorFitWarning, Skill
+from imitarm.skills.selection import NUMBERS
+from imitarm.trajectory import Demonstration
 
 EPILOG = """\
 examples:
@@ -25,24 +28,25 @@ examples:
   imitarm learn pouring.npy --task pour --out pour.json --units cm --duration 10
   imitarm learn recordings/ --task insert --robot sawyer --components 8
 
-The demonstrations are read, checked (as by 'imitarm lint') and aligned, and a skill is learned from them. Nothing is
-written when a check finds an error.
+The demonstrations are read, checked (as by 'imitarm lint') and aligned, then the skill is learned and compared with
+them. Nothing is written when a check finds an error (exit status 2), or when the skill does not reproduce the motion
+(exit status 1).
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
+    """Add the options of the command."""
     add_reading_arguments(parser)
-    parser.add_argument("--repair", action="store_true", help="drop rows that are invalid or late")
-    parser.add_argument("--allow-errors", action="store_true", help="learn although the check finds errors")
+    parser.add_argument("--repair", action="store_true", help="drop rows with invalid numbers or times")
+    parser.add_argument("--allow-errors", action="store_true", help="learn, and write the skill, in spite of errors")
     learning = parser.add_argument_group("learning")
-    learning.add_argument("--task", default="", metavar="NAME", help="name of the task, kept in the skill")
-    learning.add_argument("--align", choices=METHODS, default="dtw", help="how to align; default: dtw")
+    learning.add_argument("--task", default="", metavar="NAME", help="name of what is shown, stored in the skill")
+    learning.add_argument("--align", choices=METHODS, default="dtw", help="method of alignment; default: dtw")
     learning.add_argument(
-        "--samples", type=int, default=200, metavar="N", help="samples of each aligned motion; default: 200"
+        "--samples", type=int, metavar="N", help="per aligned demonstration; default: 200, more for long paths"
     )
     learning.add_argument(
-        "--components", type=_components, default="auto", metavar="K", help="Gaussians; default: auto"
+        "--components", type=_components, default="auto", metavar="K", help="number of Gaussians; default: auto"
     )
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=Path, default=Path("skill.json"), metavar="FILE", help="default: skill.json")
@@ -58,10 +62,11 @@ def _components(text: str) -> int | Literal["auto"]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, check, align, learn, save; return 2 when the check finds an error.
+    """Read, check and align the demonstrations, learn the skill, evaluate it, and save it.
 
     Raises:
-        InputError: when an option, a file or the place for the skill is wrong.
+        InputError: when an option, a file or the path of the skill is not valid, or the check finds an error.
+        TaskFailedError: when the skill does not reproduce the motion.
     """
     inputs = [*(("FILE", file) for file in files_of(arguments.files)), *robot_files(arguments)]
     check_outputs([("--out", arguments.out)], inputs, force=arguments.force)
@@ -75,23 +80,43 @@ def run(arguments: argparse.Namespace) -> int:
     except InputError as error:
         raise InputError(as_options(str(error))) from error
     with working("aligning"):
-        alignment = compute_alignment(demonstrations, n=arguments.samples, method=arguments.align)
+        n = arguments.samples if arguments.samples is not None else _samples_needed(demonstrations)
+        alignment = compute_alignment(demonstrations, n=n, method=arguments.align)
     with working("learning: choosing the number of components"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         notes = [str(finding) for finding in findings] + alignment.notes()
         skill = Skill(arguments.components).fit(
             alignment.demonstrations, notes=notes, date=datetime.now(UTC).date().isoformat()
         )
-    for text in dict.fromkeys(str(warning.message) for warning in caught):
-        remark(f"warning: {text}")
+    for message in dict.fromkeys(str(w.message) for w in caught if not issubclass(w.category, PoorFitWarning)):
+        remark(f"warning: {message}")
+    quality = skill.fit_quality_
+    assert quality is not None
+    _show(skill, alignment, quality)
+    if quality.suggestion and skill.gmr_.n_components_ > max(NUMBERS):
+        remark(f"note: {quality.suggestion}")
+    if not quality.faithful:
+        problem = f"the skill does not reproduce the motion: {quality.problem}"
+        if not arguments.allow_errors:
+            raise TaskFailedError(f"nothing written: {problem}; --allow-errors writes it anyway")
+        remark(f"warning: {problem}")
     skill.save(arguments.out)
-    _show(skill, alignment)
     say(f"wrote {arguments.out}")
     return 0
 
 
-def _show(skill: Skill, alignment: Alignment) -> None:
-    """Print the numbers of components that were tried, and the skill."""
+def _samples_needed(demonstrations: Sequence[Demonstration]) -> int:
+    """Return 200, and in proportion more for paths longer than 6 times their extent, up to 2000."""
+    most = 1.0
+    for one in demonstrations:
+        motion = one.trajectory.resample(400)
+        extent = float(np.linalg.norm(np.ptp(motion.positions, axis=0)))
+        most = max(most, motion.path_length / (6.0 * extent) if extent > 0.0 else 1.0)
+    return int(min(200.0 * most, 2000.0))
+
+
+def _show(skill: Skill, alignment: Alignment, quality: FitQuality) -> None:
+    """Print the numbers of components that were tried, the distance to each demonstration, and the skill."""
     gmr = skill.gmr_
     if gmr.selection_:
         show_table(
@@ -108,14 +133,21 @@ def _show(skill: Skill, alignment: Alignment) -> None:
             ],
             title="number of components",
         )
+    show_table(
+        ["demonstration", "root mean square [mm]>", "largest [mm]>", "at start [mm]>", "at goal [mm]>"],
+        [
+            (d.source or str(i + 1), *(f"{1e3 * x:.1f}" for x in (d.rms, d.largest, d.start, d.goal)))
+            for i, d in enumerate(quality.distances)
+        ],
+        title="distance from the skill to each demonstration",
+    )
     times = np.linspace(0.0, gmr.duration_, 200)
     spread = 1e3 * np.sqrt(np.trace(skill.tolerance(times), axis1=1, axis2=2))
-    positions = np.stack([one.trajectory.positions for one in alignment.demonstrations])
-    mean = np.asarray(gmr.predict(alignment.demonstrations[0].trajectory.times)[0])
-    rmse = 1e3 * np.sqrt(np.mean(np.sum((positions - mean) ** 2, axis=2)))
     start, goal = (
         " ".join(f"{100 * x:.1f}" for x in pose.position.round(3) + 0.0) for pose in (skill.start_, skill.goal_)
     )
+    rms = np.sqrt(np.mean([d.rms**2 for d in quality.distances]))
+    bias, turns = max(quality.bias, quality.primitive_bias), gmr.has_orientation_
     show_table(
         ["skill", skill.task_ or "unnamed"],
         [
@@ -123,9 +155,11 @@ def _show(skill: Skill, alignment: Alignment) -> None:
             ("duration", f"{skill.duration_:.2f} s"),
             ("largest time shift in alignment", f"{alignment.largest_shift.max():.2f} s"),
             ("components", str(gmr.n_components_)),
-            ("orientation", "learned" if gmr.has_orientation_ else "not in the demonstrations"),
+            ("orientation", "learned" if turns else "not in the demonstrations"),
             ("start, goal", f"{start} cm, {goal} cm"),
-            ("distance to the demonstrations", f"{rmse:.1f} mm (root mean square)"),
+            ("distance to the demonstrations", f"{1e3 * rms:.1f} mm (root mean square)"),
+            ("distance to their average (bias)", f"{1e3 * bias:.1f} mm, {100 * quality.relative_bias:.1f} % of extent"),
+            *([("bias of the rotation", f"{np.rad2deg(quality.rotation_bias):.2f} degrees")] if turns else []),
             ("tolerance along the motion", f"{spread.min():.1f} to {spread.max():.1f} mm"),
         ],
     )

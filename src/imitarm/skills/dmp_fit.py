@@ -15,6 +15,7 @@ from imitarm.skills.dynamical_systems import Gains, basis_on_grid, phase_basis, 
 Array = NDArray[np.float64]
 
 _FINE, _FINE_PER_BASIS = 512, 12  # steps of the grid on which responses are computed, at least
+_START = 0.05  # of the duration: the part of a noisy motion that shows its velocity at the start
 _NOISE = 1e-4  # [m] the repeatability of industrial arms
 
 
@@ -86,7 +87,7 @@ def fit_weights(
     """
     responses = _responses(gains, n_basis)
     R = responses.spline(fraction)
-    rate = start_rate(fraction, x)
+    rate = start_rate(fraction, x, 0.0 if exact_ends else _START)
     ends = np.stack([x[0], rate, x[-1]])
     if not exact_ends:
         beside = _beside(R, x - R[:, :3] @ ends, n_basis, regularisation)
@@ -154,13 +155,18 @@ def _progress(rate: Array) -> tuple[Array, float]:
     return u**3 * (10.0 + u * (6.0 * u - 15.0)), length
 
 
-def start_rate(fraction: Array, x: Array) -> Array:
+def start_rate(fraction: Array, x: Array, part: float = _START) -> Array:
     """Return the velocity at the first sample, in m per duration, shape (3,).
 
-    It is the slope of a parabola through the first twentieth of the motion. It is 0 unless it exceeds three standard
-    errors and a tenth of the mean speed: a motion that begins at rest begins exactly at rest.
+    It is the slope of a parabola through the first samples. It is 0 unless it exceeds three standard errors and a tenth
+    of the mean speed: a motion that begins at rest begins exactly at rest.
+
+    Args:
+        fraction: of the duration, from 0 to 1, shape (n,).
+        x: positions, shape (n, 3) [m].
+        part: fraction of the duration that the parabola covers; at least 6 samples are used.
     """
-    n = max(6, int(np.searchsorted(fraction, 0.05, side="right")))
+    n = max(6, int(np.searchsorted(fraction, part, side="right")))
     if len(fraction) < n:
         return np.zeros(3)
     table = fraction[:n, None] ** np.arange(3)

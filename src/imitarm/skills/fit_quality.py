@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 
 LARGEST_BIAS = 0.05  # of the motion's extent: a skill with a larger bias does not reproduce the motion
 _NO_BIAS = 0.0005, float(np.deg2rad(1.0))  # [m], [rad] a bias that is never too large: motions that hardly move
+_ROUNDING = 1e-9  # [m]
 _FEWEST, _MOST = 200, 2000  # times at which a fit is compared
 _REPEATS = 0.1  # of the difference between unrelated positions: a motion repeats when it differs less a period later
 
@@ -76,7 +77,9 @@ class FitQuality:
     def relative_bias(self) -> float:
         """The larger of both biases of the position, as a fraction of the motion's extent."""
         largest = max(self.bias, self.primitive_bias)
-        return largest / self.extent if self.extent > 0.0 else float(np.inf if largest > 0.0 else 0.0)
+        if largest <= _ROUNDING:
+            return 0.0
+        return largest / self.extent if self.extent > 0.0 else float(np.inf)
 
     @property
     def faithful(self) -> bool:
@@ -86,9 +89,10 @@ class FitQuality:
     @property
     def problem(self) -> str:
         """What is wrong with the fit and what to do about it; empty when the skill is faithful."""
-        texts = []
+        texts: list[str] = []
+        allowed = max(LARGEST_BIAS * self.extent, _NO_BIAS[0])
         for name, bias in (("nominal path", self.bias), ("movement primitive", self.primitive_bias)):
-            if bias > max(LARGEST_BIAS * self.extent, _NO_BIAS[0]):
+            if bias > allowed and not texts:
                 texts.append(
                     f"the {name} is {1e3 * bias:.1f} mm (root mean square) from the average of the demonstrations, "
                     f"{self._percent(bias, self.extent)} of the motion's extent"
