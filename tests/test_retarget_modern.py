@@ -342,7 +342,7 @@ def test_a_tool_that_is_to_stay_upright_tilts_little(kind):
         tilts = {}
         for lengths_of_turn in (None, 0.05):
             correspondence = Correspondence(lengths=lengths(person), orientation="upright")
-            retargeter = ModernRetargeter(ARMS["sawyer"], correspondence, turn_length=lengths_of_turn)
+            retargeter = ModernRetargeter(ARMS["sawyer"], correspondence, rotation_length=lengths_of_turn)
             _, turned = ARMS["sawyer"].tool_path(retargeter.run(frames).joints)
             down = rotate(turned, np.array([0.0, 0.0, 1.0]))
             tilts[lengths_of_turn] = np.degrees(np.arccos(np.clip(down @ down[0], -1.0, 1.0)))

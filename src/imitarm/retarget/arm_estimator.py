@@ -1,4 +1,4 @@
-"""ArmEstimator: from noisy skeletons to one steady estimate of a person's arm; what all methods begin with."""
+"""ArmEstimator: one steady estimate of a person's arm from noisy skeletons; shared by all methods."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from imitarm.retarget.smoothing import GAP, Anchoring, Hampel, OneEuro, OneEuroR
 
 Array = NDArray[np.float64]
 
-_LEARNING_FRAMES = 60  # lengths that were not given are learnt from so many, then kept
-_GRIP_FRAMES = 3  # a hand state counts when so many frames in a row have it
-_FILTER = (3.0, 25.0, 10.0)  # [Hz, Hz per m/s, Hz] of the points; a slower speed estimate makes the robot late
-_DOUBTFUL = 0.02  # [m] an elbow that is taken to be so far from where it is measured counts half
-_JUMP = 0.12  # [m] what a hand may go within half the outlier filter's window without being one
+_LEARNING_FRAMES = 60  # frames from which lengths that were not given are measured
+_GRIP_FRAMES = 3  # consecutive frames that must agree on a hand state
+_FILTER = (3.0, 25.0, 10.0)  # [Hz, Hz per m/s, Hz] for the points; a slower speed estimate would make the robot lag
+_DOUBTFUL = 0.02  # [m] offset of the elbow from its measured position at which its weight is halved
+_JUMP = 0.12  # [m] that a hand may move within half the outlier filter's window without being an outlier
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +37,10 @@ class ArmEstimate:
         elbow: position, shape (3,) [m].
         wrist: position, shape (3,) [m].
         velocities: of these three, shape (3, 3) [m/s].
-        hand: rotation of the hand, wxyz, shape (4,): its x along the hand, its z away from the palm's back.
+        hand: rotation of the hand, quaternion wxyz, shape (4,): x along the hand, z out of the back of the hand.
         angular_velocity: of the hand, shape (3,) [rad/s].
         confidence: of elbow, wrist and hand rotation, each 0 to 1.
-        closed: whether the hand is closed; None while that is not known.
+        closed: whether the hand is closed; None while that is unknown.
     """
 
     time: float
@@ -60,22 +60,22 @@ class ArmEstimate:
 
     @property
     def upper_arm(self) -> Array:
-        """Direction from the shoulder to the elbow, a unit vector (3,)."""
-        way = self.elbow - self.shoulder
-        return way / max(math.sqrt(float(way.dot(way))), 1e-9)
+        """Direction from the shoulder to the elbow, a unit vector, shape (3,)."""
+        bone = self.elbow - self.shoulder
+        return bone / max(math.sqrt(float(bone.dot(bone))), 1e-9)
 
 
 class ArmEstimator:
-    """Turns skeletons into :class:`ArmEstimate`: outliers out, limbs corrected, smoothed, hand turned.
+    """Turns skeletons into an :class:`ArmEstimate`: outliers removed, bone lengths corrected, smoothed.
 
-    All methods share it, so that none can win by better plumbing (METHODS B).
+    All methods share it, so that they differ only in the method.
 
     Args:
-        correspondence: which arm, and where the sensor is.
-        smoothing: One-Euro filters on, and jumps that come with a change of tracking taken out
-            (:class:`~imitarm.retarget.smoothing.Anchoring`); off, the corrected points are given as they are.
-        limbs: how the bones get their lengths: ``"fit"`` by the least change of all three points,
-            ``"direction"`` as the thesis does, from the shoulder outwards.
+        correspondence: which arm, and the pose of the sensor.
+        smoothing: filter by One-Euro, and remove jumps that come with a change of tracking
+            (:class:`~imitarm.retarget.smoothing.Anchoring`); off: return the corrected points unfiltered.
+        limbs: how bone lengths are corrected: ``"fit"`` by the smallest change of all three points, ``"direction"`` as
+            in the thesis, from the shoulder outwards.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class ArmEstimator:
         self._smoothing = smoothing
         self._rotation = correspondence.sensor_to_base.rotation
         self._origin = correspondence.sensor_to_base.position
-        self._filter, self._turn = OneEuro(*_FILTER), OneEuroRotation()
+        self._filter, self._rotation_filter = OneEuro(*_FILTER), OneEuroRotation()
         self._guard, self._anchoring = Hampel(least=_JUMP), Anchoring()
         self.reset()
 
@@ -104,11 +104,11 @@ class ArmEstimator:
         self._grips: deque[HandState] = deque(maxlen=_GRIP_FRAMES)
         self._learning: list[Skeleton] = []
         self.lengths: LimbLengths | None = self.correspondence.lengths
-        for one in (self._filter, self._turn, self._guard, self._anchoring):
+        for one in (self._filter, self._rotation_filter, self._guard, self._anchoring):
             one.reset()
 
     def update(self, skeleton: Skeleton) -> ArmEstimate | None:
-        """Take in the next skeleton; None when its arm is lost, impossible, not newer, or of unknown length yet."""
+        """Return the estimate from the next skeleton; None when it is not newer or shows no usable arm."""
         if skeleton.time <= self._time:
             return None
         self._time = skeleton.time
@@ -128,17 +128,17 @@ class ArmEstimator:
         bones = self._bones(points[:3], arm.confidence[:3], period, self.lengths)
         rotation, hand_known = self._hand_rotation(points, confidence, bones[2] - bones[1])
         hand = matrix_to_quaternion(rotation)
-        velocities, turning = np.zeros((3, 3)), np.zeros(3)
+        velocities, angular_velocity = np.zeros((3, 3)), np.zeros(3)
         if self._smoothing:
             bones = self._filter.filter(arm.time, bones, arm.confidence[:3, None])
-            hand = self._turn.filter(arm.time, hand, 1.0 if hand_known else 0.5)
-            velocities, turning = self._filter.velocity, self._turn.velocity
+            hand = self._rotation_filter.filter(arm.time, hand, 1.0 if hand_known else 0.5)
+            velocities, angular_velocity = self._filter.velocity, self._rotation_filter.velocity
         known = (confidence[1], min(confidence[2], confidence[0]), hand_known)
         closed = self._grip(arm.hand_state)
-        return ArmEstimate(arm.time, bones[0], bones[1], bones[2], velocities, hand, turning, known, closed)
+        return ArmEstimate(arm.time, bones[0], bones[1], bones[2], velocities, hand, angular_velocity, known, closed)
 
     def _bones(self, points: Array, confidence: Array, period: float, lengths: LimbLengths) -> Array:
-        """Return shoulder, elbow and wrist with the bones' lengths between them, shape (3, 3) [m]."""
+        """Return shoulder, elbow and wrist with the true bone lengths between them, shape (3, 3) [m]."""
         if self._smoothing:
             velocity = self._filter.velocity if period <= GAP else np.zeros((3, 3))
             points = self._anchoring.anchor(points, confidence.tolist(), velocity, period)
@@ -148,9 +148,10 @@ class ArmEstimator:
         return np.array([points[0], *correct_limbs(points[0], points[1], points[2], lengths)])
 
     def _believed(self, confidence: Array) -> Array:
-        """Return how far the three points are believed: the elbow the less the farther off it was guessed.
+        """Return the weights of the three points; that of the elbow decreases with the error of its inferred position.
 
-        Else it would pull the wrist with it, by the length of the forearm, and the tool follows the wrist.
+        Otherwise the elbow would pull the wrist along, through the length of the forearm, and the tool follows the
+        wrist.
         """
         shift = self._anchoring.shift(1)
         if shift == 0.0:
@@ -164,14 +165,14 @@ class ArmEstimator:
         self._learning.append(skeleton)
         try:
             self.lengths = measure_limbs(self._learning, self.correspondence.side)
-        except InputError:  # not enough frames yet, or not an arm
+        except InputError:  # too few frames so far, or not an arm
             self._learning = self._learning[-_LEARNING_FRAMES:]
             return
         if len(self._learning) >= _LEARNING_FRAMES:
             self._learning = []
 
     def _hand_rotation(self, points: Array, confidence: list[float], forearm: Array) -> tuple[Array, float]:
-        """Return the hand's rotation in the base frame, and how far it is believed; carried along where not seen."""
+        """Return the hand's rotation in the base frame and its confidence; moved with the forearm when not seen."""
         length = math.sqrt(float(forearm.dot(forearm)))
         fore = forearm / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
         seen = min(confidence[2], confidence[4], confidence[5]) >= 1.0
@@ -183,7 +184,7 @@ class ArmEstimator:
         return rotation, known
 
     def _grip(self, state: HandState) -> bool | None:
-        """Return whether the hand is closed, once several frames in a row say so."""
+        """Return whether the hand is closed, once several frames in a row agree."""
         self._grips.append(state)
         if len(self._grips) == _GRIP_FRAMES and len(set(self._grips)) == 1 and state in _GRIP:
             self._closed = _GRIP[state]

@@ -1,4 +1,4 @@
-r"""What of a person's arm stands for what of the robot's: which side, which frames, what scale, what turns."""
+"""Correspondence: which arm of the person leads, how the frames are related, the scale, and what rotates."""
 
 from __future__ import annotations
 
@@ -18,27 +18,29 @@ Array = NDArray[np.float64]
 Orientation = Literal["hand", "upright", "fixed"]
 
 FACING = Pose(np.zeros(3), matrix_to_quaternion(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])))
-"""``sensor_to_base`` of a person who faces the sensor and stands, in mind, where the robot stands: the person's
-forward is the robot's x, the person's left its y, up its z."""
+"""``sensor_to_base`` for a person who faces the sensor and imagines to stand where the robot stands: the person's
+forward is the robot's x, the person's left is its y, up is its z."""
 
 
 @dataclass(frozen=True, eq=False)
 class Correspondence:
-    r"""What of a person's arm stands for what of the robot's.
+    r"""How the person's arm motion is mapped to the robot's tool.
 
-    While the clutch is engaged the tool follows the hand relative to where both were when it engaged (METHODS A.5):
+    While the person leads, the tool follows the hand relative to where both were when the person began to lead
+    (docs/retargeting.md):
 
     .. math:: p_d = p_{home} + \rho\, R\,(W - W_0), \qquad R_d = R\,(R_H R_{H,0}^T)\,R^T R_{home}
 
-    with :math:`R` the rotation from sensor to base, :math:`\rho` the scale, W the wrist and :math:`R_H` the hand.
+    with :math:`R` the rotation from sensor to base, :math:`\rho` the scale, W the wrist and :math:`R_H` the hand's
+    rotation.
 
     Attributes:
         side: which arm of the person, ``"left"`` or ``"right"``.
-        sensor_to_base: where the sensor is, seen from the robot's base; for relative motion only its rotation counts.
-        lengths: of the person's arm; None: they are learnt from the first frames.
-        scale: robot's motion over person's motion, rho.
-        orientation: what of the hand's turning the tool follows: ``"hand"`` all of it, ``"upright"`` only the turn
-            about the vertical, so that a tool that looks down goes on looking down, ``"fixed"`` none.
+        sensor_to_base: pose of the sensor in the robot's base frame; only its rotation matters for relative motion.
+        lengths: of the person's arm; None: they are measured in the first frames.
+        scale: robot's motion over the person's, rho.
+        orientation: how the tool rotates: ``"hand"`` as the hand does; ``"upright"`` only about the vertical, so that a
+            tool that points down keeps pointing down; ``"fixed"`` not at all.
 
     Raises:
         InputError: when a value is not usable.
@@ -71,13 +73,13 @@ class Correspondence:
 
 @dataclass(frozen=True, eq=False)
 class Clutch:
-    """Where hand and tool were when the person took hold, so that nothing jumps; see :class:`Correspondence`.
+    """The poses of hand and tool when the person began to lead; see :class:`Correspondence`.
 
     Attributes:
-        correspondence: what follows what.
-        wrist: in the base frame when engaged, shape (3,) [m].
-        hand: rotation in the base frame when engaged, shape (4,) wxyz.
-        home: ``tool_to_base`` when engaged.
+        correspondence: between the person's arm and the robot's.
+        wrist: position in the base frame at that time, shape (3,) [m].
+        hand: rotation in the base frame at that time, quaternion wxyz, shape (4,).
+        home: pose of the tool in the base frame at that time.
     """
 
     correspondence: Correspondence
@@ -86,15 +88,15 @@ class Clutch:
     home: Pose
 
     def target(self, wrist: Array, hand: Array) -> Pose:
-        """Return ``tool_to_base`` as it should be for a wrist (3,) [m] and a hand (4,) wxyz in the base frame."""
+        """Return the desired tool pose for a wrist (3,) [m] and a hand (4,) wxyz, all in the base frame."""
         position = self.home.position + self.correspondence.scale * (wrist - self.wrist)
         kind = self.correspondence.orientation
         if kind == "fixed":
             return Pose.trusted(position, self.home.quaternion)
         if kind == "upright":
             return Pose.trusted(position, _about_vertical(hand, self.hand, self.home.quaternion))
-        turn = quaternion_multiply(hand, self.hand * _CONJUGATE)
-        quaternion = quaternion_multiply(turn, self.home.quaternion)
+        rotation = quaternion_multiply(hand, self.hand * _CONJUGATE)
+        quaternion = quaternion_multiply(rotation, self.home.quaternion)
         return Pose.trusted(position, quaternion / math.sqrt(float(quaternion.dot(quaternion))))
 
 
@@ -102,14 +104,14 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _about_vertical(hand: Array, before: Array, home: Array) -> Array:
-    """Return ``home`` turned as the hand has turned about the base's z since ``before``; all are quaternions (4,).
+    """Return ``home`` rotated as the hand has rotated about the base's z since ``before``; quaternions, shape (4,).
 
-    That is the twist of the swing-twist decomposition; in plain floats, since only two of the turn's numbers count.
+    This is the twist of the swing-twist decomposition, in plain floats, because only two of its numbers are not zero.
     """
     (a, b, c, d), (e, f, g, h), (w, x, y, z) = hand.tolist(), before.tolist(), home.tolist()
     real, up = a * e + b * f + c * g + d * h, d * e - a * h + c * f - b * g
     length = math.sqrt(real * real + up * up)
-    if length < 1e-9:  # upside down: no turn about the vertical is nearer than another
+    if length < 1e-9:  # upside down: the heading is undefined
         return home
     real, up = real / length, up / length
     return np.array([real * w - up * z, real * x - up * y, real * y + up * x, real * z + up * w])

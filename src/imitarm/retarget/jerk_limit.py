@@ -1,4 +1,4 @@
-"""JerkLimiter: the last stage before the robot; what leaves it keeps every limit of the joints."""
+"""JerkLimiter: the last stage before the robot; its output keeps every joint limit."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ Array = NDArray[np.float64]
 class JerkLimiter:
     r"""Follows a reference of the joints with limited position, velocity, acceleration and jerk.
 
-    A critically damped follower with feed-forward,
-    :math:`a_d = \omega^2 (q_r - q) + 2\omega (v_r - v)`, whose acceleration is cut to
-    :math:`|a| \le a_{max}` and to :math:`|a - a_p| \le j\,dt`. The velocity :math:`v + a\,dt` that follows is then
-    cut to what the joints may have: with D the way left to a limit and the set-point moving by the mean of two
-    velocities, a joint that must be able to stop has at most
+    A critically damped follower with feed-forward, :math:`a_d = \omega^2 (q_r - q) + 2\omega (v_r - v)`. Its
+    acceleration is clipped to :math:`|a| \le a_{max}` and to :math:`|a - a_p| \le j\,dt`, where :math:`a_p` is the
+    previous one. The resulting velocity :math:`v + a\,dt` is then clipped so that the joint can still stop before its
+    limit. With D the distance to the limit, and the position changing by the mean of two velocities, the highest such
+    velocity is
 
     .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a D'}, \qquad D' = D - \tfrac12 v\,dt,
 
     and :math:`2 D'/dt` where that is negative.
 
-    A joint that kept this bound can keep it again by braking with a, so that there is always a way on. Near a limit
-    the last cut may exceed the jerk; position, velocity and acceleration are kept always.
+    A joint that keeps this bound once can always keep it by braking with a. Near a limit the last clipping may exceed
+    the jerk limit; position, velocity and acceleration are always kept.
 
-    An arm that is held up by something falls behind its commands, and its drives press harder the farther it does. So
-    a command that leads the measured joint by more than half of ``max_lead`` brakes: ``max_lead`` is one more limit of
-    position, and what it takes to brake may lead beyond.
+    A blocked arm falls behind its commands, and its drives press harder the further it falls behind. So a command that
+    is ahead of the measured joint by more than half of ``max_lead`` brakes: ``max_lead`` acts as one more position
+    limit. The command may exceed it by the braking distance.
 
     Args:
         arm: whose limits.
         dt: control period [s].
         frequency: omega [rad/s]; must be well below 1/dt.
-        rise_time: how long a joint takes to full acceleration [s]: j = a_max / rise_time.
-        max_lead: of a command over the measured position [rad]; half of it must be more than the joints go at full
-            speed within the robot's delay, or it slows them.
+        rise_time: time to full acceleration [s]: j = a_max / rise_time.
+        max_lead: of a command over the measured position [rad]; half of it must exceed the distance that the joints
+            move at full speed within the robot's delay, or it slows them down.
 
     Raises:
-        InputError: when a number can't work.
+        InputError: when a number is out of range.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class JerkLimiter:
         if not max_lead > 0.0:
             raise InputError(f"JerkLimiter: max_lead must be positive [rad], got {max_lead:g}")
         self._dt = dt
-        # semi-implicit: the error is that at the end of the period, which keeps the follower calm at a large omega dt
+        # semi-implicit: uses the error at the end of the period, which keeps the follower stable at a large omega dt
         calm = 1.0 + 2.0 * frequency * dt + frequency * frequency * dt * dt
         self._stiffness, self._damping = frequency * frequency / calm, 2.0 * frequency / calm
         self._v_max, self._a_max = arm.max_velocity, arm.max_acceleration
@@ -64,7 +64,7 @@ class JerkLimiter:
         self._jerk_step = arm.max_acceleration * (dt / rise_time)
         self.max_jerk = arm.max_acceleration / rise_time
         self._upper, self._lower, self._lead = arm.upper, arm.lower, max_lead
-        # farther than this from an end no bound on the way left is below the other two
+        # farther than this from a position limit, that limit never restricts the velocity
         room = arm.max_velocity * (arm.max_velocity / (2.0 * arm.max_acceleration) + 2.0 * dt)
         self._inner = list(zip((arm.lower + room).tolist(), (arm.upper - room).tolist(), strict=True))
         self._half_squared, self._double = 0.25 * np.square(self._step), 2.0 * arm.max_acceleration
@@ -77,12 +77,12 @@ class JerkLimiter:
         self.acceleration: Array = np.zeros_like(self.q)
 
     def follow(self, q: Array, velocity: Array, measured: Array | None = None) -> Array:
-        """Go on by one period towards a reference and return the joint positions reached, (n_joints,) [rad].
+        """Advance by one period towards a reference and return the joint positions reached, (n_joints,) [rad].
 
         Args:
             q: of the reference, shape (n_joints,) [rad].
             velocity: of the reference, shape (n_joints,) [rad/s].
-            measured: where the joints are, shape (n_joints,) [rad]; None: where they were told to be.
+            measured: measured joint positions, shape (n_joints,) [rad]; None: as commanded.
         """
         dt, before = self._dt, self.velocity
         wanted = self._stiffness * (q - self.q - dt * before) + self._damping * (velocity - before)
@@ -96,14 +96,14 @@ class JerkLimiter:
         return self.q
 
     def _box(self, measured: Array | None) -> tuple[Array, Array]:
-        """Return the least and largest velocity from which each joint can still stop before its limits."""
+        """Return the lowest and highest velocity from which each joint can still stop before its limits."""
         q, velocity, step = self.q, self.velocity, self._step
         upper, lower = np.minimum(velocity + step, self._v_max), np.maximum(velocity - step, self._v_min)
         if self._free(q, measured):
             return lower, upper
         top, bottom = self._upper, self._lower
         if measured is not None:
-            held = np.abs(q - measured) > 0.5 * self._lead  # joints that do follow are not slowed
+            held = np.abs(q - measured) > 0.5 * self._lead  # joints that keep up are not slowed
             top = np.where(held, np.minimum(top, measured + self._lead), top)
             bottom = np.where(held, np.maximum(bottom, measured - self._lead), bottom)
         ahead = q + (0.5 * self._dt) * velocity
@@ -113,7 +113,7 @@ class JerkLimiter:
         )
 
     def _free(self, q: Array, measured: Array | None) -> bool:
-        """Return whether no limit of position is near; in plain floats, which for few numbers take less time."""
+        """Return whether every position limit is far away; plain floats are faster than NumPy for so few numbers."""
         half = 0.5 * self._lead
         where = q if measured is None else measured
         for value, at, (low, high) in zip(q.tolist(), where.tolist(), self._inner, strict=True):
@@ -121,7 +121,7 @@ class JerkLimiter:
                 return False
         return True
 
-    def _braking(self, way: Array) -> Array:
-        """Return the largest velocity from which a joint can stop within ``way``; negative where it is beyond."""
-        bound = np.sqrt(self._half_squared + self._double * np.maximum(way, 0.0)) - 0.5 * self._step
-        return np.asarray(bound + np.minimum(way, 0.0) * (2.0 / self._dt))
+    def _braking(self, distance: Array) -> Array:
+        """Return the highest velocity from which a joint can stop within ``distance``; negative beyond the limit."""
+        bound = np.sqrt(self._half_squared + self._double * np.maximum(distance, 0.0)) - 0.5 * self._step
+        return np.asarray(bound + np.minimum(distance, 0.0) * (2.0 / self._dt))

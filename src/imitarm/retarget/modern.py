@@ -1,4 +1,4 @@
-"""ModernRetargeter: what we would use on a robot; every limit kept, the elbow followed, losses of sight survived."""
+"""ModernRetargeter: the method to use on a robot; it keeps every limit, follows the elbow and bridges losses."""
 
 from __future__ import annotations
 
@@ -28,58 +28,62 @@ from imitarm.scene.clearance_limit import ClearanceLimit
 
 Array = NDArray[np.float64]
 
-_FADE = 0.05  # [s] time constant of the fading motion
+_FADE = 0.05  # [s] time constant of the velocity's decay after the last frame
 _BETWEEN = 0.07  # [s] since the last frame: cameras drop a frame now and then, which is no loss of the arm
 _SWING_GAIN, _SWING_RATE = 2.5, 1.0  # [1/s], [rad/s] of the elbow
-_BEHIND = 0.01  # [m] a tool that is farther than this from its target lets the elbow be, 1 rad counting as 0.3 m
-_BENT = 0.1  # squared sine of the angle at the person's elbow below which its swing tells less and less
-_BRAKING = 1.5  # [m/s^2] the tool can nearly always brake so hard, 1 rad counting as 0.3 m
-# [m] what a radian counts as beside a metre: little where a camera saw the turn, more where the tool is to keep it
-_TURN_LENGTHS = {"hand": (0.1, 0.1, 0.1), "upright": (0.2, 0.2, 0.05), "fixed": (0.3, 0.3, 0.3)}
-_HELD = 0.02  # [rad] a joint that is farther than this behind its command is held up by something
-_SLIP = 0.015  # [m] farther a hand does not lead the target from a tool that is held up
-_STANDS, _STUCK = 0.03, 0.05  # [m/s] a tool that is slower for so long [s] is stuck
+_BEHIND = 0.01  # [m] error of the tool, 1 rad counted as 0.3 m, at which the elbow's weight is halved
+_BENT = 0.1  # squared sine of the person's elbow angle, below which the swing angle loses weight
+_BRAKING = 1.5  # [m/s^2] deceleration that the tool nearly always achieves, 1 rad counted as 0.3 m
+# [m] that a radian counts as: little when a camera measured the rotation, more when the tool must keep its own
+_ROTATION_LENGTHS = {"hand": (0.1, 0.1, 0.1), "upright": (0.2, 0.2, 0.05), "fixed": (0.3, 0.3, 0.3)}
+_HELD = 0.02  # [rad] a joint farther than this behind its command is blocked by something
+_SLIP = 0.015  # [m] largest distance of the target from a blocked tool
+_STANDS, _STUCK = 0.03, 0.05  # [m/s], [s]: a tool that is slower for so long is stuck
 _METRES = np.array([1.0, 1.0, 1.0, ROTATION_LENGTH, ROTATION_LENGTH, ROTATION_LENGTH])
-_STILL = 1e-3  # [rad/s] slower is at rest
+_STILL = 1e-3  # [rad/s] a slower joint is at rest
 
 
 class ModernRetargeter(Retargeter):
-    r"""Follow the hand with the tool and the elbow with the elbow, inside every limit (METHODS A.9).
+    r"""Follow the hand with the tool and the person's elbow with the robot's, within every limit.
 
-    One step is
+    One step does the following (see docs/retargeting.md):
 
-    1. the arm's estimate (:class:`~imitarm.retarget.arm_estimator.ArmEstimator`), carried on from its last frame at
-       the estimated velocity, which fades: :math:`W + v\,\tau(1 - e^{-s/\tau})` after s seconds, tau = 50 ms;
-    2. the clutch's target, and the twist that goes there, :math:`K \log(T_d T^{-1})` plus a share of the hand's
-       velocity;
-    3. a quadratic programme for the joints' velocities: the twist, the elbow's SEW angle, the box of position, velocity
-       and acceleration that can always be kept, bounds that keep elbow and wrist off their singularities, rows that
-       keep the links off each other and off the scene; while nobody leads, the arm goes nowhere by itself;
-    4. a follower that limits the jerk (:class:`~imitarm.retarget.jerk_limit.JerkLimiter`), guards the limits again,
-       and does not press on against what holds the arm up; a clutch whose tool stands held slips.
+    1. extrapolate the estimate of the person's arm (:class:`~imitarm.retarget.arm_estimator.ArmEstimator`) from its
+       last frame at a decaying velocity: after s seconds the wrist is at :math:`W + v\,\tau(1 - e^{-s/\tau})`, with
+       :math:`\tau` = 50 ms;
+    2. compute the tool's target and the twist towards it, :math:`K \log(T_d T^{-1})`, plus a fraction of the hand's
+       velocity (feed-forward);
+    3. solve a quadratic programme for the joint velocities. Its tasks are the twist and the elbow's SEW angle; its
+       limits are the box of position, velocity and acceleration, bounds that keep elbow and wrist away from their
+       singularities, and the distances of the links to each other and to the scene. While nobody leads, the arm does
+       not move by itself;
+    4. limit the jerk (:class:`~imitarm.retarget.jerk_limit.JerkLimiter`) and check all limits again. If something
+       blocks the arm, it does not press harder, and the target does not run away from the blocked tool.
 
-    The elbow's angle changes as the person's does, from where both were when the clutch engaged:
-    :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. It counts less the less surely the person's elbow is seen, and the
-    straighter either arm is.
+    The robot's elbow angle changes as the person's does, from the angles that both had when the person began to lead:
+    :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. Its weight decreases when the camera sees the person's elbow poorly
+    and when either arm is nearly straight.
 
-    Without a sight of the arm it coasts for 0.1 s, holds until 0.3 s, then stops; a stopped one waits until the arm has
-    been seen for half a second and takes hold where both are then, so nothing jumps.
+    When the person is lost, the arm coasts for 0.1 s, holds its target until 0.3 s, then stops. It starts again from
+    where both are once the person has been seen for half a second, so that nothing jumps.
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: what of the person's arm stands for what of the robot's.
+        correspondence: between the person's arm and the robot's.
         dt: control period [s].
-        scene: obstacles to keep clear of.
+        scene: obstacles to avoid.
         gain: K [1/s].
-        lead: share of the hand's velocity that is fed forward, 0 to 1.
-        turn_length: what one radian of the tool's turn counts as, beside a metre of its way, where the joints can't do
-            both [m], about the base's x, y and z; None: 0.1 where the tool turns with the hand, which a camera
-            sees badly, 0.3 where it keeps its turn; where it stays upright 0.2 against tilting and 0.05 about z.
-        elbow: weight of the elbow's swing beside the tool [m^2]; 0: the elbow is free.
-        clearance: to keep from the scene [m].
-        own_clearance: of links from each other [m]; None: not watched.
-        max_speed: the twist is cut to this [m/s], 1 rad counting as ``turn_length``.
-        max_lead: how far a joint's command may lead its measured position [rad]; a robot that answers late needs more.
+        lead: fraction of the hand's velocity that is fed forward, 0 to 1.
+        rotation_length: length [m] that one radian of the tool's rotation counts as, when the joints can't achieve
+            position and rotation both; about the base's x, y and z. None: 0.1 when the tool rotates with the hand,
+            which a camera sees poorly; 0.3 when it keeps its rotation; when it stays upright, 0.2 against tilting and
+            0.05 about z.
+        elbow: weight of the elbow's motion relative to the tool's [m^2]; 0: the elbow is free.
+        clearance: required distance from the scene [m].
+        own_clearance: required distance between links [m]; None: not checked.
+        max_speed: the twist is cut to this [m/s], with 1 rad counted as ``rotation_length``.
+        max_lead: how far a joint's command may be ahead of its measured position [rad]; a robot that responds late
+            needs more.
 
     Raises:
         InputError: when a number is out of range.
@@ -100,7 +104,7 @@ class ModernRetargeter(Retargeter):
         scene: Scene | None = None,
         gain: float = 15.0,
         lead: float = 0.9,
-        turn_length: float | tuple[float, float, float] | None = None,
+        rotation_length: float | tuple[float, float, float] | None = None,
         elbow: float = 0.1,
         clearance: float = 0.01,
         own_clearance: float | None = 0.02,
@@ -113,12 +117,12 @@ class ModernRetargeter(Retargeter):
             )
         self._gain, self._lead = gain, lead
         self._obstacles = ClearanceLimit(arm, clearance)
-        known = arm.landmarks is not None  # else neither its elbow's angle nor its singularities are
-        if turn_length is None:
-            turn_length = _TURN_LENGTHS[(correspondence or Correspondence()).orientation]
+        known = arm.landmarks is not None  # otherwise its elbow angle and its singularities are unknown
+        if rotation_length is None:
+            rotation_length = _ROTATION_LENGTHS[(correspondence or Correspondence()).orientation]
         limits = [JointLimits(arm), *(singularity_limits(arm) if known else ())]
         self._solver = IKSolver(arm, limits, dt=dt)
-        self._rotation_length, self._max_speed = turn_length, max_speed
+        self._rotation_length, self._max_speed = rotation_length, max_speed
         self._elbow = elbow if known else 0.0
         self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).watch(dt)
         self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
@@ -128,8 +132,8 @@ class ModernRetargeter(Retargeter):
         if self._own is not None:
             self._own.reset()
         self._seeing = False  # a step with a new frame has less time for the rest
-        self._stuck, self._held_at = 0, np.zeros(3)  # steps for which the tool has been held, and where
-        self._offset: float | None = None  # of the robot's elbow angle from the person's
+        self._stuck, self._held_at = 0, np.zeros(3)  # steps for which the tool has been blocked, and where
+        self._offset: float | None = None  # of the robot's elbow angle to the person's
 
     def _rest_at(self, q: Array) -> None:
         self._limiter.start(q)
@@ -165,7 +169,7 @@ class ModernRetargeter(Retargeter):
     def _advance(self, goal: Goal | None, measured: Array) -> Array:
         if goal is None:
             self._offset = None
-            self._drive(np.zeros(6), None, led=False)
+            self._drive(np.zeros(6), None, engaged=False)
         else:
             ahead = np.zeros(6)
             ahead[:3] = (self._lead * math.exp(-goal.age / _FADE) * self.correspondence.scale) * goal.estimate.velocity
@@ -173,7 +177,7 @@ class ModernRetargeter(Retargeter):
         return self._limiter.follow(self._q, self._velocity, measured)
 
     def _elbow_task(self, estimate: ArmEstimate) -> ElbowTask | None:
-        """Return where the elbow should be; None when it is free, or one of the two angles is lost."""
+        """Return the desired angle of the robot's elbow; None when the elbow is free or an angle is undefined."""
         if self._elbow == 0.0:
             return None
         person = one_angle(estimate.shoulder.tolist(), estimate.elbow.tolist(), estimate.wrist.tolist())
@@ -189,13 +193,13 @@ class ModernRetargeter(Retargeter):
         return ElbowTask(angle, self._elbow, confidence, _SWING_GAIN, _SWING_RATE)
 
     def _reach(self, target: Pose, ahead: Array, elbow: ElbowTask | None, measured: Array) -> None:
-        """Move the reference towards a target; not on against what holds the arm up."""
+        """Move the reference towards the target, but not further against an obstruction."""
         error = self.arm.tool_pose(self._q).error_to(target)
         x, y, z, u, v, w = error.tolist()
         weighted = math.hypot(x, y, z, ROTATION_LENGTH * u, ROTATION_LENGTH * v, ROTATION_LENGTH * w)
-        # far away it goes no faster than it can brake again, or it would swing about the target
+        # far from the target it moves no faster than it can brake, or it would overshoot
         gain = min(self._gain, math.sqrt(2.0 * _BRAKING / max(weighted, 1e-9)))
-        if elbow is not None:  # a tool that is behind needs all the joints
+        if elbow is not None:  # a tool that lags needs all the joints
             elbow = elbow._replace(confidence=elbow.confidence / (1.0 + (weighted / _BEHIND) ** 2))
         twist = gain * error + ahead
         held = max(map(abs, (self._limiter.q - measured).tolist()))
@@ -207,34 +211,34 @@ class ModernRetargeter(Retargeter):
         self._drive(twist, elbow)
 
     def _slip(self, target: Pose, measured: Array) -> None:
-        """Let the clutch slip while the hand leads the target away from a tool that is held up and stands.
+        """Move the clutch's origin while the hand pulls the target away from a blocked tool that stands still.
 
-        Else the tool would leap after the target, and against whatever is there, as soon as it is free. A robot that is
-        only late goes on, and is not taken for one that is held.
+        Otherwise the tool would jump to the target, and against whatever is there, as soon as it is free. A robot that
+        only responds late keeps moving, and is not mistaken for a blocked one.
         """
         at = self.arm.tool_pose(measured).position
-        moved, way = at - self._held_at, target.position - at
+        moved, offset = at - self._held_at, target.position - at
         self._held_at = at
         self._stuck = self._stuck + 1 if float(moved.dot(moved)) < (_STANDS * self.dt) ** 2 else 0
-        length = math.sqrt(float(way.dot(way)))
+        length = math.sqrt(float(offset.dot(offset)))
         if self._stuck > _STUCK / self.dt and length > _SLIP:
-            self._engagement.shift((_SLIP / length - 1.0) * way)
+            self._engagement.shift((_SLIP / length - 1.0) * offset)
 
-    def _yielding(self, twist: Array, measured: Array, share: float) -> Array:
-        """Return a twist without a share of what goes on in the direction in which the tool is held back."""
+    def _yielding(self, twist: Array, measured: Array, fraction: float) -> Array:
+        """Return the twist without a fraction of its component in the direction in which the tool is held back."""
         back = self.arm.tool_pose(measured).error_to(self.arm.tool_pose(self._limiter.q)) * _METRES
         square = float(back.dot(back))
         along = float(back.dot(twist * _METRES))
         if square < 1e-12 or along <= 0.0:
             return twist
-        return twist - share * (along / square) * back / _METRES
+        return twist - fraction * (along / square) * back / _METRES
 
-    def _drive(self, twist: Array, elbow: ElbowTask | None, *, led: bool = True) -> None:
-        """Move the reference by one step of inverse kinematics; an arm that nobody leads goes nowhere by itself."""
+    def _drive(self, twist: Array, elbow: ElbowTask | None, *, engaged: bool = True) -> None:
+        """Move the reference by one step of inverse kinematics; an arm that nobody leads does not move by itself."""
         obstacles = self._obstacles.rows(self._q, self.scene)
         own = None if self._own is None else self._own.rows(self._q, time_to_look=not self._seeing)
         rows = ([] if obstacles is None else [obstacles]) + ([] if own is None else [own])
-        if not led:  # what is too near already is left when the person leads on
+        if not engaged:  # whatever is too close already is corrected once the person leads
             rows = [Rows(part.matrix, np.minimum(part.lower, 0.0)) for part in rows]
         tasks: list[Task] = [TwistTask(twist, "tool", self._rotation_length, self._max_speed)]
         if elbow is not None:
