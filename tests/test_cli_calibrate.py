@@ -259,5 +259,5 @@ def test_each_step_adds_to_one_file(inside, capsys):
     assert main(["calibrate", "limbs", "a.csv", "--side", "left", "--out", "mine.json"]) in {0, 1}
     (inside / "other.json").write_text("{}")
     assert main(["calibrate", "sensor", "pairs.csv", "--out", "other.json"]) == 2
-    assert "no calibration" in capsys.readouterr().err and (inside / "other.json").read_text() == "{}"
+    assert "not a calibration" in capsys.readouterr().err and (inside / "other.json").read_text() == "{}"
     assert main(["calibrate", "sensor", "pairs.csv", "--out", "no/c.json"]) == 2

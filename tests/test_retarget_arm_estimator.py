@@ -11,7 +11,7 @@ from imitarm.capture.synthetic import SyntheticSource
 from imitarm.errors import UnknownNameError
 from imitarm.retarget import FACING, Correspondence, LimbLengths
 from imitarm.retarget.arm_estimator import ArmEstimator
-from imitarm.retarget.smoothing import Anchoring
+from imitarm.retarget.smoothing import TrackingOffsets
 
 PERSON = Person.from_seed(2)
 LENGTHS = LimbLengths(PERSON.upper_arm, PERSON.forearm)
@@ -100,7 +100,7 @@ def test_an_unknown_way_with_limbs_is_named():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_hand_at_rest_that_is_hidden_now_and_then_wanders_less_than_half_as_far(seed, monkeypatch):
-    """The way that its estimate goes, with and without anchoring; the camera loses and guesses the arm often."""
+    """The way that its estimate goes, with and without compensation of offsets; the camera often loses the arm."""
     still = Person(**{**PERSON.__dict__, "tremor": 0.0 * PERSON.tremor, "sway": 0.0 * PERSON.sway})
 
     def wandered():
@@ -111,13 +111,13 @@ def test_a_hand_at_rest_that_is_hidden_now_and_then_wanders_less_than_half_as_fa
         assert len(wrist) > 300
         return np.linalg.norm(np.diff(wrist, axis=0), axis=1).sum()
 
-    anchored = wandered()
-    monkeypatch.setattr(Anchoring, "anchor", lambda self, points, *_: points)
-    assert anchored < 0.5 * wandered()
+    compensated = wandered()
+    monkeypatch.setattr(TrackingOffsets, "compensate", lambda self, points, *_: points)
+    assert compensated < 0.5 * wandered()
 
 
 def test_an_elbow_that_is_guessed_wrong_does_not_pull_the_wrist_away():
-    """Guessed 15 cm off, then seen again: what it was anchored to is doubtful, the wrist is seen all the time."""
+    """Guessed 15 cm off, then seen again: what it was compensated to is doubtful, the wrist is seen all the time."""
     still = Person(**{**PERSON.__dict__, "tremor": 0.0 * PERSON.tremor, "sway": 0.0 * PERSON.sway})
     estimator, off = ArmEstimator(Correspondence(lengths=LENGTHS)), []
     arm = still.skeleton(0.0, HOLD).arm()

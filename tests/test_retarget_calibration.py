@@ -47,9 +47,9 @@ def test_a_correspondence_holds_all_that_was_measured():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": "other"}, "no calibration"),
-        ({"version": 2}, "of version 2, this imitarm reads 1; update imitarm"),
-        ({"version": True}, "of version True"),
+        ({"format": "other"}, "not a calibration"),
+        ({"version": 2}, "has version 2, this imitarm reads version 1; update imitarm"),
+        ({"version": True}, "has version True"),
         ({"side": "both"}, "unknown side 'both'; known: left, right"),
         ({"side": 3}, "'side' should be text"),
         ({"scale": "1"}, "'scale' should hold numbers"),
@@ -79,7 +79,7 @@ def test_a_file_that_was_altered_is_refused_with_its_name_and_the_field(tmp_path
 def test_a_file_that_is_no_calibration_is_refused(tmp_path, content):
     path = tmp_path / "c.json"
     path.write_bytes(content)
-    with pytest.raises(FileFormatError, match=r"c\.json: (not readable as JSON|no calibration)"):
+    with pytest.raises(FileFormatError, match=r"c\.json: (not readable as JSON|not a calibration)"):
         Calibration.load(path)
 
 

@@ -70,14 +70,14 @@ def test_a_point_of_little_weight_counts_little():
 def test_points_on_a_plane_will_do_but_it_is_said():
     flat = BASE * [1, 1, 0] + [0, 0, 0.3]
     fit = fit_sensor_to_base(seen(flat, sigma=0.003), flat)
-    assert fit.flat and fit.accepted and "mirrored axis would not be noticed" in fit.notes()[0]
+    assert fit.flat and fit.accepted and "mirrored axis would not be detected" in fit.notes()[0]
     assert angle(fit.sensor_to_base, SENSOR) < 0.03
     assert not fit_sensor_to_base(seen(), BASE).flat
 
 
 def test_points_on_a_line_are_refused():
     line = np.linspace(0.0, 1.0, 6)[:, None] * [0.3, 0.2, 0.4] + [0.4, 0.0, 0.1]
-    with pytest.raises(InputError, match=r"lie on a line.*add points well off it"):
+    with pytest.raises(InputError, match=r"lie on a line.*add points well outside it"):
         fit_sensor_to_base(seen(line), line)
     with pytest.raises(InputError, match="lie on a line"):  # nearly is as bad
         fit_sensor_to_base(seen(line, sigma=0.005), line + 0.005 * np.random.default_rng(3).normal(size=line.shape))
@@ -90,9 +90,9 @@ def test_points_on_a_line_are_refused():
         (seen(), BASE[:5], r"shapes \(6, 3\) and \(5, 3\)"),
         (seen()[:, :2], BASE[:, :2], "shapes"),
         (seen(), np.where(np.arange(18).reshape(6, 3) == 7, np.nan, BASE), "point 3 is not finite; touch it again"),
-        (seen(0.1 * BASE), 0.1 * BASE, r"within 2\.. cm of their middle, as the sensor has them; choose points"),
-        (seen(), BASE * 100.0, "the robot's points lie 100 times as far apart"),
-        (seen() * 1000.0, BASE, "the robot's points lie 0.001 times as far apart.*give both in metres"),
+        (seen(0.1 * BASE), 0.1 * BASE, r"points of the sensor lie within 2\.. cm of their mean; choose points"),
+        (seen(), BASE * 100.0, "the robot's points are 100 times as far apart"),
+        (seen() * 1000.0, BASE, "the robot's points are 0.001 times as far apart.*give both in metres"),
         (seen() * [-1, 1, 1], BASE, "mirrored; reverse the sensor's x axis"),
         (seen()[[3, 4, 0, 5, 1, 2]], BASE, "not the same points in the same order"),
     ],
@@ -122,7 +122,7 @@ def test_the_one_point_that_was_missed_is_named(i):
 
 def test_points_that_are_all_poor_are_not_accepted():
     fit = fit_sensor_to_base(seen(sigma=0.04, seed=2), BASE)
-    assert not fit.accepted and "20 to" not in fit.notes()[-1] and "2 cm is good" in fit.notes()[-1]
+    assert not fit.accepted and "20 to" not in fit.notes()[-1] and "2 cm or less is good" in fit.notes()[-1]
 
 
 def test_the_condition_grows_as_points_near_a_line():

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from imitarm import InputError
 from imitarm.kinematics.pose import quaternion_exp, quaternion_log
-from imitarm.retarget.smoothing import Hampel, OneEuro, OneEuroRotation, smoothing_share
+from imitarm.retarget.smoothing import Hampel, OneEuro, OneEuroRotation, smoothing_weight
 
 T = 1 / 30
 
@@ -27,8 +27,8 @@ def test_the_usual_speed_estimate_is_too_large_on_a_steady_motion_and_ours_is_no
     path, speed = 0.8 * np.arange(120) * T, 0.0
     smooth = path[0]
     for x in path[1:]:  # the difference to the smoothed value, which is behind
-        speed += smoothing_share(3.0, T) * ((x - smooth) / T - speed)
-        smooth += smoothing_share(1.0 + 10.0 * speed, T) * (x - smooth)
+        speed += smoothing_weight(3.0, T) * ((x - smooth) / T - speed)
+        smooth += smoothing_weight(1.0 + 10.0 * speed, T) * (x - smooth)
     one = OneEuro(derivative_cutoff=3.0)
     for k, x in enumerate(path):
         one.filter(k * T, np.array([x]))
@@ -91,8 +91,8 @@ def test_confidence_weighs_a_value():
 
 
 def test_the_share_is_that_of_a_low_pass():
-    assert smoothing_share(1e9, T) == pytest.approx(1.0)
-    assert smoothing_share(1.0, 1.0 / (2.0 * np.pi)) == pytest.approx(0.5)
+    assert smoothing_weight(1e9, T) == pytest.approx(1.0)
+    assert smoothing_weight(1.0, 1.0 / (2.0 * np.pi)) == pytest.approx(0.5)
 
 
 def test_rotations_are_smoothed_on_the_sphere_and_signs_do_not_matter():

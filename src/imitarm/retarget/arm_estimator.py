@@ -16,7 +16,7 @@ from imitarm.kinematics.pose import matrix_to_quaternion
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import carried, hand_rotation
 from imitarm.retarget.limbs import LimbLengths, correct_limbs, fit_limbs, measure_limbs
-from imitarm.retarget.smoothing import GAP, Anchoring, Hampel, OneEuro, OneEuroRotation
+from imitarm.retarget.smoothing import GAP, Hampel, OneEuro, OneEuroRotation, TrackingOffsets
 
 Array = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ class ArmEstimator:
     Args:
         correspondence: which arm, and the pose of the sensor.
         smoothing: filter by One-Euro, and remove jumps that come with a change of tracking
-            (:class:`~imitarm.retarget.smoothing.Anchoring`); off: return the corrected points unfiltered.
+            (:class:`~imitarm.retarget.smoothing.TrackingOffsets`); off: return the corrected points unfiltered.
         limbs: how bone lengths are corrected: ``"fit"`` by the smallest change of all three points, ``"direction"`` as
             in the thesis, from the shoulder outwards.
     """
@@ -92,7 +92,7 @@ class ArmEstimator:
         self._rotation = correspondence.sensor_to_base.rotation
         self._origin = correspondence.sensor_to_base.position
         self._filter, self._rotation_filter = OneEuro(*_FILTER), OneEuroRotation()
-        self._guard, self._anchoring = Hampel(least=_JUMP), Anchoring()
+        self._guard, self._offsets = Hampel(least=_JUMP), TrackingOffsets()
         self.reset()
 
     def reset(self) -> None:
@@ -104,7 +104,7 @@ class ArmEstimator:
         self._grips: deque[HandState] = deque(maxlen=_GRIP_FRAMES)
         self._learning: list[Skeleton] = []
         self.lengths: LimbLengths | None = self.correspondence.lengths
-        for one in (self._filter, self._rotation_filter, self._guard, self._anchoring):
+        for one in (self._filter, self._rotation_filter, self._guard, self._offsets):
             one.reset()
 
     def update(self, skeleton: Skeleton) -> ArmEstimate | None:
@@ -122,7 +122,7 @@ class ArmEstimator:
         period, self._used = arm.time - self._used, arm.time
         if period > GAP:
             self._hand = None
-            self._anchoring.reset()
+            self._offsets.reset()
         points = arm.points.dot(self._rotation.T) + self._origin
         confidence = arm.confidence.tolist()
         bones = self._bones(points[:3], arm.confidence[:3], period, self.lengths)
@@ -141,24 +141,24 @@ class ArmEstimator:
         """Return shoulder, elbow and wrist with the true bone lengths between them, shape (3, 3) [m]."""
         if self._smoothing:
             velocity = self._filter.velocity if period <= GAP else np.zeros((3, 3))
-            points = self._anchoring.anchor(points, confidence.tolist(), velocity, period)
-            confidence = self._believed(confidence)
+            points = self._offsets.compensate(points, confidence.tolist(), velocity, period)
+            confidence = self._weights(confidence)
         if self._limbs == "fit":
             return fit_limbs(points, confidence, lengths)
         return np.array([points[0], *correct_limbs(points[0], points[1], points[2], lengths)])
 
-    def _believed(self, confidence: Array) -> Array:
+    def _weights(self, confidence: Array) -> Array:
         """Return the weights of the three points; that of the elbow decreases with the error of its inferred position.
 
         Otherwise the elbow would pull the wrist along, through the length of the forearm, and the tool follows the
         wrist.
         """
-        shift = self._anchoring.shift(1)
-        if shift == 0.0:
+        offset = self._offsets.offset(1)
+        if offset == 0.0:
             return confidence
-        believed = confidence.copy()
-        believed[1] /= 1.0 + (shift / _DOUBTFUL) ** 2
-        return believed
+        weights = confidence.copy()
+        weights[1] /= 1.0 + (offset / _DOUBTFUL) ** 2
+        return weights
 
     def _learn(self, skeleton: Skeleton) -> None:
         """Measure the arm over the first frames in which it is seen."""

@@ -1,4 +1,4 @@
-"""Calibration: what is measured once of a person, a sensor and a robot, kept in one file."""
+"""Calibration: measurements of a person, a sensor and a robot that are made once and kept in a file."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ _GRID = 41
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What is measured once, and holds until the person changes or the sensor is moved; None: not measured.
+    """Measurements that are valid until the person changes or the sensor is moved; None: not measured.
 
     Attributes:
         side: which arm of the person.
         lengths: of that arm.
-        sensor_to_base: where the sensor is.
-        sensor_rms: by how much the touched points were missed [m].
-        scale: robot's motion over person's motion; None: 1.
-        orientation: what of the hand's turning the tool follows; None: all of it.
+        sensor_to_base: pose of the sensor in the robot's base frame.
+        sensor_rms: RMS residual of that pose [m].
+        scale: robot's motion over the person's; None: 1.
+        orientation: how the tool rotates with the hand; None: exactly as the hand does.
 
     Raises:
         InputError: when a value is not usable.
@@ -58,7 +58,7 @@ class Calibration:
             raise InputError(f"Calibration: sensor_rms must be a finite length [m], got {self.sensor_rms!r}")
 
     def correspondence(self) -> Correspondence:
-        """Return what of the person's arm stands for what of the robot's; the usual where nothing was measured."""
+        """Return the correspondence; with defaults for what was not measured."""
         return Correspondence(
             self.side,
             FACING if self.sensor_to_base is None else self.sensor_to_base,
@@ -68,10 +68,10 @@ class Calibration:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write it as JSON that a person can read; written aside and renamed.
+        """Write the calibration as readable JSON, atomically.
 
         Raises:
-            InputError: when it can't be written; what was there before stays as it was.
+            InputError: when it can't be written; an existing file is then unchanged.
         """
         target = Path(path)
         aside = target.with_name(f".{target.name}.{os.getpid()}.part")
@@ -111,11 +111,11 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
-        """Read what :meth:`save` wrote.
+        """Read a file written by :meth:`save`.
 
         Raises:
             InputError: when there is no such file.
-            FileFormatError: when it is no calibration, was cut or altered, or is of a version not known here.
+            FileFormatError: when it is not a calibration, is damaged, or has an unknown version.
         """
         content = _read(Path(path))
         try:
@@ -145,24 +145,22 @@ def _read(path: Path) -> dict[str, Any]:
             f"{path}: can't be read ({error.strerror or error}); make one with 'imitarm calibrate'"
         ) from error
     if len(data) > _LARGEST:
-        raise FileFormatError(f"{path}: larger than {_LARGEST // 2**20} MB, so it is no calibration")
+        raise FileFormatError(f"{path}: larger than {_LARGEST // 2**20} MB, so it is not a calibration")
     try:
         content = json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(
-            f"{path}: not readable as JSON ({error}); it was cut or altered, or is no calibration"
-        ) from error
+        raise FileFormatError(f"{path}: not readable as JSON ({error}); it is damaged or not a calibration") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise FileFormatError(f"{path}: no calibration (its 'format' is not {FORMAT!r})")
+        raise FileFormatError(f"{path}: not a calibration (its 'format' is not {FORMAT!r})")
     if content.get("version") != VERSION or isinstance(content.get("version"), bool):
         raise FileFormatError(
-            f"{path}: of version {content.get('version')!r:.40}, this imitarm reads {VERSION}; update imitarm"
+            f"{path}: has version {content.get('version')!r:.40}, this imitarm reads version {VERSION}; update imitarm"
         )
     return content
 
 
 class _Fields:
-    """A group of fields; every answer has the type that was asked for, or an error names the field."""
+    """A group of fields; every value has the requested type, or an error names the field."""
 
     def __init__(self, values: object, place: str) -> None:
         if not isinstance(values, Mapping):
@@ -175,7 +173,7 @@ class _Fields:
         return self._values[name]
 
     def refuse_others(self, known: set[str]) -> None:
-        """Refuse fields that are not ``known``: a word that is misspelt must not be passed over."""
+        """Refuse fields that are not ``known``, so that a misspelt name is not ignored."""
         for name in self._values:
             if name not in known:
                 raise InputError(f"{self._place}: unknown field {name!r:.60}; known: {', '.join(sorted(known))}")
@@ -227,10 +225,10 @@ def _sensor(content: Mapping[str, Any]) -> tuple[Pose | None, float | None]:
 
 
 def robot_reach(arm: ArmModel) -> float:
-    """Return how far the wrist of a robot's arm gets from its shoulder [m], by a search over its joints.
+    """Return the largest distance of a robot's wrist from its shoulder [m], by a search over the joints.
 
     Raises:
-        InputError: when the arm's file does not say where shoulder and wrist are.
+        InputError: when the arm's file does not define shoulder and wrist.
     """
     q = np.array(arm.home)
     lower, upper = np.maximum(arm.lower, -math.pi), np.minimum(arm.upper, math.pi)
@@ -252,13 +250,13 @@ def robot_reach(arm: ArmModel) -> float:
 
 
 def suggested_scale(arm: ArmModel, lengths: LimbLengths, anchor: Anchor = "shoulder") -> float:
-    r"""Return a scale for this robot and this person (METHODS A.5).
+    r"""Return a scale for this robot and this person (docs/capture.md).
 
     Args:
         arm: the robot's.
         lengths: the person's.
-        anchor: ``"shoulder"``: the stretched arm of the one stands for that of the other,
-            :math:`\rho = reach_{robot} / reach_{human}`, so that all of the workspace is used; ``"object"``: 1, for
-            work on things of which both have the same size before them.
+        anchor: ``"shoulder"``: the straight arms of person and robot correspond,
+            :math:`\rho = reach_{robot} / reach_{human}`, so that the whole workspace is used; ``"object"``: 1, for work
+            on objects of the same size.
     """
     return 1.0 if anchor == "object" else robot_reach(arm) / lengths.reach

@@ -1,11 +1,11 @@
-r"""The person's arm as a chain of joints: seven angles, forwards and backwards (thesis Eq 3.5, METHODS A.2 and A.3).
+r"""Kinematics of the person's arm: seven joint angles, forward and inverse (thesis Eq 3.5; docs/retargeting.md).
 
-The chain is shoulder, upper arm, elbow, forearm, wrist; all angles zero is the arm stretched along the base's x:
+The chain is shoulder, upper arm, elbow, forearm, wrist. With all angles zero the arm is straight along the base's x:
 
 .. math:: R = R_z(q_0) R_y(q_1) R_x(q_2)\;|\,L_U\,|\;R_y(q_3) R_x(q_4)\;|\,L_F\,|\;R_y(q_5) R_x(q_6)
 
-These are the axes of Sawyer's joints at zero, in the same order, so a person's angles are a Sawyer's angles but for the
-offsets between its links.
+These are the axes of Sawyer's joints at zero, in the same order. So a person's angles are a Sawyer's angles, apart from
+the offsets between its links.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ HUMAN_ARM_DH = (
 upper arm in the third row and the forearm in the fifth."""
 
 _TO_HAND = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # from the table's last frame
-_SINGULAR = 0.05  # sine below which an angle is held, because noise alone would turn it
-_APART = 0.2  # least sine between hand and thumb
-_HAND_LENGTH = 0.03  # [m] a hand tip nearer to the wrist has no direction
+_SINGULAR = 0.05  # sine below which an angle keeps its value, because it would only follow noise
+_APART = 0.2  # smallest sine of the angle between hand and thumb
+_HAND_LENGTH = 0.03  # [m] a hand tip closer to the wrist has no direction
 _UNIT = {"x": 0, "y": 1, "z": 2}
 
 
 def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike, *, as_printed: bool = False) -> Array:
-    r"""Return Denavit-Hartenberg transforms from frame i to frame i-1 (thesis Eq 3.5).
+    r"""Return Denavit-Hartenberg transforms from frame i to frame i-1 (thesis Eq 3.5, corrected).
 
     .. math::
         \begin{pmatrix} c & -c_\alpha s & s_\alpha s & a c \\ s & c_\alpha c & -s_\alpha c & a s \\
         0 & s_\alpha & c_\alpha & d \\ 0 & 0 & 0 & 1 \end{pmatrix}
 
     Args:
-        theta: angle about the old z [rad]; all four broadcast.
-        d: along the old z [m].
-        a: along the new x [m].
-        alpha: about the new x [rad].
-        as_printed: with the thesis's second row, which has sin where cos belongs and is no rotation.
+        theta: angle about the old z [rad]; all four arguments broadcast.
+        d: distance along the old z [m].
+        a: distance along the new x [m].
+        alpha: angle about the new x [rad].
+        as_printed: use the second row as printed in the thesis, with sin instead of cos: the result is not a rotation.
 
     Returns:
         shape (..., 4, 4).
@@ -67,18 +67,18 @@ def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike,
 
 
 def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: bool = False) -> Array:
-    """Return the frames of the Denavit-Hartenberg chain seen from the shoulder (thesis Eq 3.5).
+    """Return the frames of the Denavit-Hartenberg chain relative to the shoulder (thesis Eq 3.5).
 
-    The thesis prints no table for the arm; :data:`HUMAN_ARM_DH` is one that has the module's chain. Frame 3 has the
-    elbow's position, frame 5 the wrist's; frame 7 is that of the hand: x along it, z away from its back.
+    The thesis prints no table for the arm; :data:`HUMAN_ARM_DH` is a table for this module's chain. Frame 3 is at the
+    elbow, frame 5 at the wrist; frame 7 is that of the hand: x along the hand, z out of its back.
 
     Args:
         angles: shape (7,) [rad].
         lengths: of this person.
-        as_printed: with the thesis's second row, so that what comes out is no rotation.
+        as_printed: use the thesis's second row, so that the result is not a rotation.
 
     Returns:
-        shape (8, 4, 4), the shoulder's own first.
+        shape (8, 4, 4), the shoulder's own frame first.
     """
     offset, alpha = HUMAN_ARM_DH
     along = np.array([0.0, 0.0, lengths.upper_arm, 0.0, lengths.forearm, 0.0, 0.0])
@@ -92,13 +92,13 @@ def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: boo
 
 
 def human_arm_pose(angles: ArrayLike, lengths: LimbLengths) -> tuple[Array, Array, Array]:
-    """Return elbow (3,), wrist (3,) [m] and the hand's rotation (3, 3), seen from the shoulder, for angles (7,)."""
+    """Return elbow (3,), wrist (3,) [m] and the hand's rotation (3, 3) relative to the shoulder, for angles (7,)."""
     elbow, wrist, hand, _ = _chain(np.asarray(angles, dtype=float), lengths)
     return elbow, wrist, hand
 
 
 def human_arm_jacobian(angles: ArrayLike, lengths: LimbLengths) -> Array:
-    """Return the Jacobian of wrist and hand, shape (6, 7), linear rows first, in the shoulder's frame."""
+    """Return the Jacobian of wrist and hand in the shoulder's frame, shape (6, 7), linear rows first."""
     elbow, wrist, _, axes = _chain(np.asarray(angles, dtype=float), lengths)
     origins = np.array([np.zeros(3)] * 3 + [elbow] * 2 + [wrist] * 2)
     return np.concatenate([np.cross(axes, wrist - origins).T, axes.T])
@@ -110,7 +110,7 @@ def _chain(angles: Array, lengths: LimbLengths) -> tuple[Array, Array, Array, Ar
     at, elbow = np.zeros(3), np.zeros(3)
     for i, (name, angle) in enumerate(zip(AXES, angles, strict=True)):
         axes[i] = rotation[:, _UNIT[name]]
-        rotation = rotation @ _turn(name, float(angle))
+        rotation = rotation @ _rotation_about(name, float(angle))
         if i == 2:
             elbow = at = lengths.upper_arm * rotation[:, 0]
         elif i == 4:
@@ -118,7 +118,7 @@ def _chain(angles: Array, lengths: LimbLengths) -> tuple[Array, Array, Array, Ar
     return elbow, at, rotation, axes
 
 
-def _turn(axis: str, angle: float) -> Array:
+def _rotation_about(axis: str, angle: float) -> Array:
     c, s = math.cos(angle), math.sin(angle)
     if axis == "x":
         return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
@@ -128,17 +128,17 @@ def _turn(axis: str, angle: float) -> Array:
 
 
 def human_arm_angles(upper: ArrayLike, forearm: ArrayLike, hand: ArrayLike, previous: ArrayLike | None = None) -> Array:
-    """Return the seven angles of an arm in closed form (METHODS A.2).
+    """Return the seven angles of an arm in closed form.
 
-    Where an angle can't be seen, it is held at its previous value: the first when the upper arm points along z, the
-    third when the arm is stretched, the fifth when the hand is in line with the forearm. Of the two ways to bend the
-    wrist the one nearer to the previous angles is taken.
+    An angle that is undefined keeps its previous value: the first when the upper arm is along z, the third when the arm
+    is straight, the fifth when the hand is in line with the forearm. Of the two solutions for the wrist the one closer
+    to the previous angles is used.
 
     Args:
         upper: unit vector from shoulder to elbow, shape (3,).
         forearm: unit vector from elbow to wrist, shape (3,).
         hand: rotation of the hand, shape (3, 3).
-        previous: angles one frame before, shape (7,); None: zeros.
+        previous: angles of the previous frame, shape (7,); None: zeros.
 
     Returns:
         shape (7,) [rad].
@@ -149,22 +149,22 @@ def human_arm_angles(upper: ArrayLike, forearm: ArrayLike, hand: ArrayLike, prev
     across = math.hypot(u[0], u[1])
     q[0] = math.atan2(u[1], u[0]) if across >= _SINGULAR else held[0]
     q[1] = math.atan2(-u[2], u[0] * math.cos(q[0]) + u[1] * math.sin(q[0]))
-    upper_rotation = _turn("z", q[0]) @ _turn("y", q[1])
+    upper_rotation = _rotation_about("z", q[0]) @ _rotation_about("y", q[1])
     fx, fy, fz = upper_rotation.T @ f
     bent = math.hypot(fy, fz)
     q[2] = math.atan2(fy, -fz) if bent >= _SINGULAR else held[2]
     q[3] = math.atan2(fy * math.sin(q[2]) - fz * math.cos(q[2]), fx)
-    forearm_rotation = upper_rotation @ _turn("x", q[2]) @ _turn("y", q[3])
+    forearm_rotation = upper_rotation @ _rotation_about("x", q[2]) @ _rotation_about("y", q[3])
     wrist = forearm_rotation.T @ np.asarray(hand, dtype=float)
     q[4:] = _wrist_angles(wrist, held[4:])
     return q
 
 
 def _wrist_angles(rotation: Array, held: Array) -> Array:
-    """Return angles (a, b, c) with Rx(a) Ry(b) Rx(c) = rotation, the branch nearest to ``held``."""
+    """Return angles (a, b, c) with Rx(a) Ry(b) Rx(c) = rotation, the solution closest to ``held``."""
     sine = math.hypot(rotation[1, 0], rotation[2, 0])
-    if sine < _SINGULAR:  # only the sum of the two turns about the forearm is seen
-        rest = _turn("x", -held[0]) @ rotation
+    if sine < _SINGULAR:  # only the sum of the two angles about the forearm is defined
+        rest = _rotation_about("x", -held[0]) @ rotation
         bend = math.atan2(-rest[2, 0], rest[0, 0])
         return np.array([held[0], bend, math.atan2(-rest[1, 2], rest[1, 1])])
     branches = [
@@ -185,20 +185,21 @@ def _wrapped(angles: Array) -> Array:
 
 
 def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
-    r"""Return the hand's rotation from three of its points, or None when they do not tell it (METHODS A.3).
+    r"""Return the hand's rotation from three of its points, or None when they do not determine it.
 
-    The shoulder, elbow and wrist alone do not show how the forearm is rolled or the wrist bent. With
-    :math:`x = \overline{tip - W}` and :math:`n = \overline{x \times (thumb - W)}` it is :math:`[x,\; n \times x,\; n]`.
+    Shoulder, elbow and wrist alone do not show how the forearm is rotated or the wrist bent. With the unit vectors
+    :math:`x = \overline{tip - W}` and :math:`n = \overline{x \times (thumb - W)}` the rotation is
+    :math:`[x,\; n \times x,\; n]`.
 
     Args:
-        wrist: shape (3,) [m]; so are tip and thumb.
+        wrist: position, shape (3,) [m]; so are tip and thumb.
         tip: of the hand.
         thumb: its tip.
 
     Returns:
-        shape (3, 3); None when hand and thumb are in line within 12 degrees, or a point is not where a hand has one.
+        shape (3, 3); None when hand and thumb are within 12 degrees of one line, or a point is not plausible.
     """
-    # nine numbers: plain floats take a third of NumPy's time
+    # plain floats: for nine numbers three times as fast as NumPy
     x0, x1, x2 = (tip - wrist).tolist()
     y0, y1, y2 = (thumb - wrist).tolist()
     long, wide = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2), math.sqrt(y0 * y0 + y1 * y1 + y2 * y2)
@@ -214,15 +215,15 @@ def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
 
 
 def carried(rotation: Array | None, before: Array | None, after: Array) -> Array:
-    """Return the hand's rotation after the forearm turned, when the hand itself is not seen (METHODS A.3).
+    """Return the hand's rotation after a rotation of the forearm, when the hand itself is not seen.
 
     Args:
-        rotation: of the hand before, shape (3, 3); None: not known, then its x is along the forearm and its z level.
+        rotation: of the hand before, shape (3, 3); None: unknown, then its x is along the forearm and its z is level.
         before: unit vector along the forearm then, shape (3,).
         after: unit vector along the forearm now, shape (3,).
 
     Returns:
-        shape (3, 3): ``rotation`` turned by the smallest turn that takes ``before`` to ``after``.
+        shape (3, 3): ``rotation``, rotated by the smallest rotation that takes ``before`` to ``after``.
     """
     if rotation is None or before is None:
         side = _cross(np.array([0.0, 0.0, 1.0]), after)
@@ -232,13 +233,13 @@ def carried(rotation: Array | None, before: Array | None, after: Array) -> Array
         y /= math.sqrt(float(y.dot(y)))
         return np.stack([after, y, _cross(after, y)], axis=1)
     axis, cosine = _cross(before, after), float(before.dot(after))
-    if cosine < -0.999:  # turned back on itself: no smallest turn; keep what was
+    if cosine < -0.999:  # reversed: the smallest rotation is undefined; keep the old one
         return rotation
     k = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    turned: Array = rotation + (k + (k @ k) / (1.0 + cosine)) @ rotation
-    return turned
+    rotated: Array = rotation + (k + (k @ k) / (1.0 + cosine)) @ rotation
+    return rotated
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return the cross product of two vectors (3,): np.cross takes longer for two."""
+    """Return the cross product of two vectors (3,), faster than np.cross."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

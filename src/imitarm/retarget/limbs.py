@@ -1,4 +1,4 @@
-"""The lengths of a person's arm: measured over many frames, then put back into every one (thesis Eq 3.1 to 3.4)."""
+"""The bone lengths of a person's arm: measured over many frames, then imposed on every frame (thesis Eq 3.1 to 3.4)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from imitarm.errors import InputError
 
 Array = NDArray[np.float64]
 
-MAD_TO_SIGMA = 1.4826  # of a normal distribution
-ACCEPTED = 0.005  # [m] standard error of a length that is good enough (METHODS A.1)
-_SLOW = 0.3  # [m/s] a faster elbow or wrist is smeared by the camera's exposure
+MAD_TO_SIGMA = 1.4826  # median absolute deviation to standard deviation, for a normal distribution
+ACCEPTED = 0.005  # [m] standard error of a length that is good enough
+_SLOW = 0.3  # [m/s] faster elbows and wrists are blurred by the camera's exposure
 _LEAST_FRAMES = 5
-_PLAUSIBLE = (0.10, 0.60)  # [m] of an upper arm or forearm, from a child's to a giant's
-_POINT = 1e-3  # [m] two joints nearer than this have no direction
+_PLAUSIBLE = (0.10, 0.60)  # [m] of an upper arm or forearm
+_POINT = 1e-3  # [m] a shorter bone has no direction
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class LimbLengths:
     Attributes:
         upper_arm: shoulder to elbow [m].
         forearm: elbow to wrist [m].
-        spread: of single measurements of the two about their median, as a standard deviation [m].
-        n_frames: frames measured; 0 when the lengths were given.
+        spread: standard deviation of single measurements about the median, for the two lengths [m].
+        n_frames: number of frames measured; 0 when the lengths were given.
 
     Raises:
-        InputError: when a length is not one of an arm.
+        InputError: when a length is not plausible for an arm.
     """
 
     upper_arm: float
@@ -53,29 +53,29 @@ class LimbLengths:
 
     @property
     def standard_error(self) -> float:
-        """Of the worse of the two lengths [m]; 0 when they were given."""
+        """Standard error of the less certain length [m]; 0 when the lengths were given."""
         return max(self.spread) / self.n_frames**0.5 if self.n_frames else 0.0
 
     @property
     def accepted(self) -> bool:
-        """Whether they are known to 5 mm."""
+        """Whether the lengths are known to within 5 mm."""
         return self.standard_error < ACCEPTED
 
     @property
     def reach(self) -> float:
-        """Of the stretched arm, shoulder to wrist [m]."""
+        """Distance from shoulder to wrist of the straight arm [m]."""
         return self.upper_arm + self.forearm
 
 
 def measure_limbs(skeletons: Iterable[Skeleton], side: str = "right") -> LimbLengths:
-    """Measure the lengths of an arm: the medians over frames in which it is tracked and slow (METHODS A.1).
+    """Measure the bone lengths of an arm: the medians over frames in which it is tracked and slow (docs/capture.md).
 
     Args:
-        skeletons: in the order of their times; two seconds are plenty.
+        skeletons: in order of time; two seconds are enough.
         side: which arm.
 
     Raises:
-        InputError: when fewer than five frames show the whole arm, or what they show is no arm.
+        InputError: when fewer than five frames show the whole arm, or the lengths are not plausible.
     """
     arms = [skeleton.arm(side) for skeleton in skeletons]
     whole = [arm for arm in arms if arm.confidence[:3].min() >= 1.0]
@@ -106,17 +106,17 @@ def correct_limbs(
     *,
     as_printed: bool = False,
 ) -> tuple[Array, Array]:
-    r"""Give an arm its true lengths back, keeping the directions of its bones (thesis Eq 3.1 to 3.4, METHODS A.1).
+    r"""Impose the true bone lengths on an arm and keep the directions of its bones (thesis Eq 3.1 to 3.4, corrected).
 
     .. math:: E_c = S + L_U \frac{E - S}{|E - S|}, \qquad W_c = E_c + L_F \frac{W - E}{|W - E|}
 
     Args:
-        shoulder: shape (..., 3) [m]; so are elbow and wrist.
+        shoulder: position, shape (..., 3) [m]; so are elbow and wrist.
         elbow: as measured.
         wrist: as measured.
         lengths: of this person.
-        as_printed: with the thesis's signs, and the forearm set on the measured elbow: the elbow then comes out on
-            the other side of the shoulder.
+        as_printed: use the signs printed in the thesis, with the forearm attached to the measured elbow; the elbow is
+            then on the opposite side of the shoulder.
 
     Returns:
         elbow and wrist, shapes (..., 3) [m].
@@ -130,26 +130,26 @@ def correct_limbs(
 
 
 def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds: int = 3) -> Array:
-    r"""Move shoulder, elbow and wrist as little as possible so that the bones have their lengths (METHODS A.1).
+    r"""Move shoulder, elbow and wrist as little as possible so that the bones have their true lengths.
 
-    The most likely arm when every point is measured with an error, each believed by its confidence c:
+    This is the most likely arm when every point is measured with an error and weighted by its confidence c:
 
     .. math:: \min \sum_j c_j |x_j - \tilde x_j|^2 \quad\text{s.t.}\quad |E - S| = L_U,\; |W - E| = L_F
 
-    by a few steps of Gauss and Newton, each with its 2 x 2 system for the multipliers. :func:`correct_limbs` is the
-    case in which the shoulder is exact and of the rest only the directions count: it carries the errors of shoulder
-    and elbow to the wrist.
+    It is solved by a few Gauss-Newton steps, each with a 2 x 2 system for the multipliers. :func:`correct_limbs` is the
+    special case in which the shoulder is exact and only the directions of the others count: it passes the errors of
+    shoulder and elbow on to the wrist.
 
     Args:
         points: shoulder, elbow, wrist, shape (3, 3) [m].
         confidence: of each, above 0, shape (3,).
         lengths: of this person.
-        rounds: steps.
+        rounds: number of steps.
 
     Returns:
-        shoulder, elbow, wrist, shape (3, 3) [m]; the bones have their lengths exactly.
+        shoulder, elbow, wrist, shape (3, 3) [m]; the bones have exactly the given lengths.
     """
-    # nine numbers: plain floats take a fifth of NumPy's time
+    # plain floats: for nine numbers five times as fast as NumPy
     (sx, sy, sz), (ex, ey, ez), (wx, wy, wz) = points.tolist()
     free_s, free_e, free_w = (1.0 / max(c, 1e-3) for c in confidence.tolist())
     m11, m22 = free_s + free_e, free_e + free_w
@@ -168,17 +168,17 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
         sx, sy, sz = sx - at_s * ux, sy - at_s * uy, sz - at_s * uz
         ex, ey, ez = ex + at_e * ux - at_f * fx, ey + at_e * uy - at_f * fy, ez + at_e * uz - at_f * fz
         wx, wy, wz = wx + at_w * fx, wy + at_w * fy, wz + at_w * fz
-    long_u, long_f = lengths.upper_arm, lengths.forearm  # what is left is set right as in correct_limbs
+    long_u, long_f = lengths.upper_arm, lengths.forearm  # the remaining error is removed as in correct_limbs
     ex, ey, ez = sx + long_u * ux, sy + long_u * uy, sz + long_u * uz
     return np.array([[sx, sy, sz], [ex, ey, ez], [ex + long_f * fx, ey + long_f * fy, ez + long_f * fz]])
 
 
 def _unit(x: float, y: float, z: float, length: float) -> tuple[float, float, float]:
-    """Return a unit vector; one of hardly any length has no direction and becomes zero."""
+    """Return a unit vector; zero for a vector of hardly any length."""
     return (x / length, y / length, z / length) if length > _POINT else (0.0, 0.0, 0.0)
 
 
 def _direction(vectors: Array) -> Array:
-    """Return unit vectors; a vector of hardly any length has none and becomes zero."""
+    """Return unit vectors; zero for vectors of hardly any length."""
     length = np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True))
     return np.where(length > _POINT, vectors / np.maximum(length, _POINT), 0.0)

@@ -1,4 +1,4 @@
-"""Where the sensor is: fitted to points that were touched, known both to the sensor and to the robot."""
+"""The pose of the sensor, fitted to points whose positions are known both to the sensor and to the robot."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from imitarm.kinematics.pose import Pose, matrix_to_quaternion
 Array = NDArray[np.float64]
 
 LEAST_PAIRS = 4
-GOOD = 0.02  # [m] root mean square residual of a good calibration; a skeleton camera's noise is 1 to 2 cm
-_USABLE = 0.10  # [m] more is no calibration: a unit, an order or an axis is wrong
-_NEAR = 0.05  # [m] points that lie this close about their middle are all one point to a skeleton camera
-_THIN = 0.03  # [m] likewise about a line
-_FLAT = 0.02  # [m] likewise about a plane
-_MISTAKEN = 3.0  # a pair without which the residual is so many times less is a mistake
-_WORTH = 0.005  # [m] residuals below which no pair is suspected
+GOOD = 0.02  # [m] RMS residual of a good calibration; the noise of a skeleton camera is 1 to 2 cm
+_USABLE = 0.10  # [m] with a larger RMS residual a unit, the order or an axis is wrong
+_NEAR = 0.05  # [m] points within this distance of their mean are one point for a skeleton camera
+_THIN = 0.03  # [m] the same for the distance from a line
+_FLAT = 0.02  # [m] the same for the distance from a plane
+_MISTAKEN = 3.0  # a pair is suspect when the RMS residual without it is smaller by this factor
+_WORTH = 0.005  # [m] RMS residual below which no pair is suspect
 
 
 @dataclass(frozen=True, eq=False)
 class SensorFit:
-    """Where the sensor is, and how well that is known.
+    """The pose of the sensor and its uncertainty.
 
     Attributes:
-        sensor_to_base: the pose of the sensor in the robot's base frame.
-        residuals: by how much each point is missed, shape (n,) [m].
-        condition: first over second singular value of the points' cross-covariance H: 1 for points that lie well
-            apart in all directions, large for points almost on a line.
+        sensor_to_base: pose of the sensor in the robot's base frame.
+        residuals: remaining distance of each pair of points, shape (n,) [m].
+        condition: first over second singular value of the points' cross-covariance H: 1 for points spread equally in
+            all directions, large for points almost on a line.
         angle_error: standard error of the rotation about its least certain axis [rad].
-        flat: whether the points lie in a plane, so that a mirrored axis would not be noticed.
-        suspect: the pair that does not fit the others, from 0; None: they agree.
+        flat: whether the points lie in a plane; a mirrored axis is then not detected.
+        suspect: index of the pair that does not fit the others, from 0; None: all fit.
     """
 
     sensor_to_base: Pose
@@ -51,47 +51,47 @@ class SensorFit:
 
     @property
     def accepted(self) -> bool:
-        """Whether it is good enough to teleoperate by: 2 cm, and no pair that does not fit."""
+        """Whether the fit is good enough for teleoperation: 2 cm, and every pair fits."""
         return self.rms <= GOOD and self.suspect is None
 
     def notes(self) -> list[str]:
-        """Return what is worth knowing, a line each."""
+        """Return remarks for the user, one line each."""
         lines = []
         if self.flat:
             lines.append(
-                "the points lie in a plane: the rotation is known, but a mirrored axis would not be noticed; add a "
-                "point well off that plane"
+                "the points lie in a plane, so a mirrored axis would not be detected; add a point well outside that "
+                "plane"
             )
         if self.suspect is not None:
             lines.append(
-                f"point {self.suspect + 1} does not fit the others ({100 * self.residuals[self.suspect]:.1f} cm off); "
+                f"point {self.suspect + 1} does not fit the others (by {100 * self.residuals[self.suspect]:.1f} cm); "
                 "touch it again, or leave it out"
             )
         elif self.rms > GOOD:
             lines.append(
-                f"the points are missed by {100 * self.rms:.1f} cm on average, {100 * GOOD:.0f} cm is good; hold the "
+                f"the average error is {100 * self.rms:.1f} cm, {100 * GOOD:.0f} cm or less is good; hold the "
                 "hand still and in view while it is measured"
             )
         return lines
 
 
 def fit_sensor_to_base(sensor: ArrayLike, base: ArrayLike, weights: ArrayLike | None = None) -> SensorFit:
-    r"""Find where the sensor is from points given in both frames (METHODS A.5; Kabsch 1976, Umeyama 1991).
+    r"""Fit the pose of the sensor to points given in both frames (Kabsch 1976, Umeyama 1991).
 
     .. math::
         H = \sum_i c_i (k_i - \bar k)(b_i - \bar b)^T = U S V^T, \quad
         R = V\,\mathrm{diag}(1, 1, \det V U^T)\,U^T, \quad t = \bar b - R \bar k
 
-    There is no scale: both frames are in metres, so a scale would only hide a wrong unit.
+    No scale is fitted: both frames are in metres, and a scale would only hide a wrong unit.
 
     Args:
         sensor: the points as the sensor saw them, shape (n, 3) [m].
         base: the same points in the robot's base frame, shape (n, 3) [m].
-        weights: how far each is believed, shape (n,); None: all alike.
+        weights: of the pairs, shape (n,); None: equal.
 
     Raises:
-        InputError: when there are fewer than four pairs, they are not finite, lie on a line or too near to each other,
-            or no rigid motion maps one set on the other; the message says what to do.
+        InputError: when there are fewer than four pairs, they are not finite, lie on a line or too close together, or
+            no rigid motion maps one set to the other; the message says what to do.
     """
     k, b, c = _checked(sensor, base, weights)
     pose, singular = _kabsch(k, b, c)
@@ -128,13 +128,13 @@ def _checked(sensor: ArrayLike, base: ArrayLike, weights: ArrayLike | None) -> t
         wide, thin, _ = _spread(points)
         if wide < _NEAR:
             raise InputError(
-                f"sensor calibration: the points lie within {100 * wide:.1f} cm of their middle, as {whose} has them; "
-                "choose points that are 20 to 60 cm apart (is the unit metres?)"
+                f"sensor calibration: the points of {whose} lie within {100 * wide:.1f} cm of their mean; choose "
+                "points that are 20 to 60 cm apart (is the unit metres?)"
             )
         if thin < _THIN:
             raise InputError(
-                f"sensor calibration: the points lie on a line, as {whose} has them (within {100 * thin:.1f} cm), so "
-                "the turn about that line is not known; add points well off it"
+                f"sensor calibration: the points of {whose} lie on a line (within {100 * thin:.1f} cm), so "
+                "the rotation about that line is unknown; add points well outside it"
             )
     return k, b, c
 
@@ -146,11 +146,11 @@ def _spread(points: Array) -> Array:
 
 def _kabsch(k: Array, b: Array, c: Array) -> tuple[Pose, Array]:
     """Return the rigid motion from k to b, and the singular values of H."""
-    share = c / c.sum()
-    k_mean, b_mean = share @ k, share @ b
-    u, singular, vt = np.linalg.svd((k - k_mean).T @ (share[:, None] * (b - b_mean)))
-    turn = vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
-    return Pose(b_mean - turn @ k_mean, matrix_to_quaternion(turn)), singular
+    weight = c / c.sum()
+    k_mean, b_mean = weight @ k, weight @ b
+    u, singular, vt = np.linalg.svd((k - k_mean).T @ (weight[:, None] * (b - b_mean)))
+    rotation = vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
+    return Pose(b_mean - rotation @ k_mean, matrix_to_quaternion(rotation)), singular
 
 
 def _rms(k: Array, b: Array, c: Array) -> float:
@@ -159,7 +159,7 @@ def _rms(k: Array, b: Array, c: Array) -> float:
 
 
 def _suspect(k: Array, b: Array, c: Array, rms: float) -> int | None:
-    """Return the pair without which the others agree far better; None when there is none, or too few to tell."""
+    """Return the index of the pair without which the others fit far better; None when there is none."""
     if len(k) < LEAST_PAIRS + 1 or rms < _WORTH:
         return None
     every = np.arange(len(k))
@@ -169,13 +169,13 @@ def _suspect(k: Array, b: Array, c: Array, rms: float) -> int | None:
 
 
 def _misfit(k: Array, b: Array, c: Array, rms: float) -> str:
-    """Say why no rigid motion maps one set on the other."""
-    text = f"sensor calibration: the points are missed by {100 * rms:.0f} cm on average: "
+    """Return why no rigid motion maps one set to the other."""
+    text = f"sensor calibration: the average error is {100 * rms:.0f} cm: "
     ratio = float(np.linalg.norm(b - b.mean(axis=0)) / np.linalg.norm(k - k.mean(axis=0)))
     if _rms(k * [-1.0, 1.0, 1.0], b, c) < 0.5 * rms:
         return text + "one of the frames is mirrored; reverse the sensor's x axis (is its picture mirrored?)"
     if not 0.67 < ratio < 1.5 and _rms(ratio * k, b, c) < 0.5 * rms:
-        return text + f"the robot's points lie {ratio:.3g} times as far apart as the sensor's; give both in metres"
+        return text + f"the robot's points are {ratio:.3g} times as far apart as the sensor's; give both in metres"
     suspect = _suspect(k, b, c, rms)
     if suspect is not None:
         return text + f"point {suspect + 1} does not fit the others; touch it again, or leave it out"
