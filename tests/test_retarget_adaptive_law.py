@@ -18,9 +18,9 @@ def tracked(arm, reference, steps, *, closure=0.0, q=None):
     joints, torques = [], []
     for k in range(steps):
         found = law.torques(plant.q, plant.velocity, reference(k * T), closure)
-        plant.step(found.given)
+        plant.step(found.applied)
         joints.append(plant.q)
-        torques.append(found.given)
+        torques.append(found.applied)
     return np.array(joints), np.array(torques), law, plant
 
 
@@ -83,7 +83,7 @@ def test_it_learns_a_load_that_the_model_does_not_know():
     """A constant torque on a joint: F takes over a part, so the joint hangs less than K alone lets it."""
     law, plant, load = AdaptiveLaw(SAWYER, T), JointPlant(SAWYER, T), np.array([0, 8.0, 0, 0, 0, 0, 0])
     for _ in range(400):
-        plant.step(law.torques(plant.q, plant.velocity, SAWYER.home, 0.0).given - load)
+        plant.step(law.torques(plant.q, plant.velocity, SAWYER.home, 0.0).applied - load)
     sag = abs(plant.q[1] - SAWYER.home[1])
     assert law.force[1] < -0.5
     assert sag < 8.0 / law.stiffness[1]

@@ -77,7 +77,7 @@ def test_a_joint_beyond_its_limit_is_cleared_by_another_elbow():
     """The upper arm's roll is beyond the Sawyer's limit; the elbow outwards by some degrees brings it back."""
     base = EASY + [0, 0, 0.2, 0, 0, 0, 0]
     run = M1(SAWYER, FIXED, relative=False).run(shown(swing(2, 3.12 - base[2], over=6.0, base=base), 8.0), base)
-    assert run.notes["elbow_turned"] >= 1.0
+    assert run.notes["elbow_rotated"] >= 1.0
     assert run.notes["failures"] == run.notes["position_clips"] == 0.0
 
 
@@ -87,7 +87,7 @@ def test_what_no_operator_clears_is_repaired_at_key_frames():
     plain = SAWYER.tool_path(M1(SAWYER, FIXED).run(frames).joints)[0][:, 2].min()
     method = M1(SAWYER, FIXED, constraints={"table": above(plain + 0.03)})
     run = method.run(frames)
-    assert run.notes["repaired"] + run.notes["elbow_turned"] >= 1.0
+    assert run.notes["repaired"] + run.notes["elbow_rotated"] >= 1.0
     assert run.notes["infeasible_after"] < run.notes["infeasible_before"]
 
 
@@ -131,7 +131,7 @@ def test_at_the_edge_it_is_mended_as_far_as_it_goes_and_all_of_it_is_noted():
     correspondence, frames = edge()
     run = M1(SAWYER, correspondence).run(frames)
     notes = run.notes
-    kinds = ("slowed", "pulled_in", "elbow_turned", "repaired")
+    kinds = ("slowed", "pulled_in", "elbow_rotated", "repaired")
     assert notes["segments"] == sum(notes[kind] for kind in kinds) > 0.0
     assert notes["infeasible_after"] <= notes["infeasible_before"]
     assert notes["teaching_time"] > 5.0 * notes["segments"]

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from imitarm import ArmModel
 from imitarm.errors import InputError
-from imitarm.retarget.baselines.feasibility import Infeasible, above, blend, segments, upright
+from imitarm.retarget.baselines.feasibility import FeasibilityCheck, above, blend, segments, upright
 
 SAWYER = ArmModel.load("sawyer", tool="gripper")
-F = Infeasible(SAWYER, 0.01)
+F = FeasibilityCheck(SAWYER, 0.01)
 
 
 def standing(q, n=5):
@@ -56,14 +56,14 @@ def test_only_the_samples_beside_a_quick_step_are_too_fast():
 
 
 def test_a_teachers_constraints_count_too():
-    table = Infeasible(SAWYER, 0.01, {"table": above(0.5), "upright": upright(np.deg2rad(15.0))})
+    table = FeasibilityCheck(SAWYER, 0.01, {"table": above(0.5), "upright": upright(np.deg2rad(15.0))})
     assert only(table.reasons(standing(SAWYER.home))) == {"table"}  # the home is lower, and looks down
     turned = SAWYER.home.copy()
     turned[5] += np.deg2rad(20.0)
     assert "upright" in only(table.reasons(standing(turned)))
     assert not table.allows(turned)
     with pytest.raises(InputError, match="speed"):
-        Infeasible(SAWYER, 0.01, {"speed": above(0.0)})
+        FeasibilityCheck(SAWYER, 0.01, {"speed": above(0.0)})
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=200))

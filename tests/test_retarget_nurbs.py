@@ -113,10 +113,10 @@ def test_a_number_gives_one_point_and_what_is_given_does_not_change():
         ([0, 0, 0, 1, 1], [1, 1, 1], 2, "knots"),
         ([0, 0, 0, 1, 1, 1], [1, 1], 2, "weights"),
         ([0, 0, 0.1, 1, 1, 1], [1, 1, 1], 2, "repeated 3 times"),
-        ([0, 0, 0, 1, 1, 0.5], [1, 1, 1], 2, "must not fall"),
+        ([0, 0, 0, 1, 1, 0.5], [1, 1, 1], 2, "must not decrease"),
         ([0, 0, 0, 1, 1, 1], [1, 0, 1], 2, "positive"),
         ([0, 0, 0, 1, 1, np.nan], [1, 1, 1], 2, "finite"),
-        ([0, 0, 0, 0, 0, 0], [1, 1, 1], 2, "breaks it apart"),
+        ([0, 0, 0, 0, 0, 0], [1, 1, 1], 2, "would be discontinuous"),
         ([0, 0, 0, 1, 1, 1], [1, 1, 1], 0, "degree 0"),
     ],
 )

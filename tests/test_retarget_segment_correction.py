@@ -6,16 +6,16 @@ from hypothesis import strategies as st
 from imitarm import ArmModel
 from imitarm.kinematics.sew import sew_angle
 from imitarm.retarget.arm_estimator import ArmEstimator
-from imitarm.retarget.baselines.demonstrated_motion import ShownMotion
-from imitarm.retarget.baselines.feasibility import Infeasible, blend, segments
+from imitarm.retarget.baselines.demonstrated_motion import DemonstratedMotion
+from imitarm.retarget.baselines.feasibility import FeasibilityCheck, blend, segments
 from imitarm.retarget.baselines.joint_mapping import JointMapping
-from imitarm.retarget.baselines.segment_correction import elbow_turned, pull, pulled_in, repaired, slowed
+from imitarm.retarget.baselines.segment_correction import elbow_rotated, pull, pulled_in, repaired, slowed
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import human_arm_pose
 from shown_arm import EASY, LENGTHS, shown, swing
 
 SAWYER = ArmModel.load("sawyer", tool="gripper")
-F = Infeasible(SAWYER, 0.01)
+F = FeasibilityCheck(SAWYER, 0.01)
 ANGLES = st.lists(st.floats(-1.0, 1.0), min_size=7, max_size=7)
 
 
@@ -23,7 +23,7 @@ def motion_of(joints):
     """A motion with these joints (n, 7); the person's part of it stands."""
     n = len(joints)
     points = np.tile(arm_points(EASY), (n, 1, 1))
-    return ShownMotion(0.01 * np.arange(n), points, np.tile([1.0, 0, 0, 0], (n, 1)), points, (None,) * n, joints)
+    return DemonstratedMotion(0.01 * np.arange(n), points, np.tile([1.0, 0, 0, 0], (n, 1)), points, (None,) * n, joints)
 
 
 def arm_points(angles):
@@ -55,8 +55,8 @@ def test_slower_clears_a_motion_that_is_too_fast_and_keeps_its_path():
     assert (np.diff(slow.joints[:, 0]) >= -1e-12).all()
     np.testing.assert_allclose(slow.joints[:first], motion.joints[:first], atol=1e-9)
     np.testing.assert_allclose(slow.joints[end:], motion.joints[-len(slow.joints[end:]) :], atol=0.01)
-    assert (np.diff(slow.clock) > 0.0).all()
-    assert np.diff(slow.clock).min() < 0.01 / 1.5
+    assert (np.diff(slow.shown_times) > 0.0).all()
+    assert np.diff(slow.shown_times).min() < 0.01 / 1.5
 
 
 @given(ANGLES, st.floats(0.5, 1.0))
@@ -85,7 +85,7 @@ def test_pulling_in_clears_a_stretched_arm():
     frames = shown(swing(3, 0.1 - EASY[3], over=2.0), 3.2)
     estimates = [estimator.update(frame) for frame in frames]
     clutch = correspondence.engage(estimates[0].wrist, estimates[0].hand, SAWYER.tool_pose(SAWYER.home))
-    motion = ShownMotion.through(estimates, 0.01)
+    motion = DemonstratedMotion.through(estimates, 0.01)
     joints = np.array([mapping.joints(e, clutch) for e in motion.estimates()])
     assert F.reasons(joints)["stretched"].any()
     kappa = pull(motion.points, joints)
@@ -94,7 +94,7 @@ def test_pulling_in_clears_a_stretched_arm():
     np.testing.assert_allclose((kappa * reach)[joints[:, 3] < 0.44], 0.975, atol=2e-3)  # METHODS: 0.78 of 0.80
     points = pulled_in(motion.points, kappa)
     mapping.resume(joints[0])
-    changed = ShownMotion(motion.clock, points, motion.hands, motion.shown, motion.closed, joints)
+    changed = DemonstratedMotion(motion.shown_times, points, motion.hands, motion.shown, motion.closed, joints)
     pulled = np.array([mapping.joints(e, clutch) for e in changed.estimates()])
     assert not F.reasons(pulled)["stretched"].any()
 
@@ -102,7 +102,7 @@ def test_pulling_in_clears_a_stretched_arm():
 @given(ANGLES, st.floats(-1.0, 1.0))
 def test_a_turned_elbow_turns_by_that_angle_and_the_wrist_stays(by, angle):
     points = arm_points(EASY + np.array(by))
-    (turned,) = elbow_turned(points[None], np.array([angle]))
+    (turned,) = elbow_rotated(points[None], np.array([angle]))
     np.testing.assert_array_equal(turned[[0, 2]], points[[0, 2]])
     np.testing.assert_allclose(bones(turned), bones(points), atol=1e-9)
     change = sew_angle(*turned) - sew_angle(*points)
@@ -127,7 +127,7 @@ def test_a_repair_leaves_no_posture_that_is_infeasible_at_its_key_frames():
 
 
 def test_where_no_sample_will_do_the_key_frame_is_put_back_into_the_limits_and_counted():
-    nowhere = Infeasible(SAWYER, 0.01, {"never": lambda p, r: np.zeros(len(p), dtype=bool)})
+    nowhere = FeasibilityCheck(SAWYER, 0.01, {"never": lambda p, r: np.zeros(len(p), dtype=bool)})
     joints = np.tile(SAWYER.upper + 0.5, (100, 1))
     mended, missed = repaired(joints, 0, 100, nowhere, np.random.default_rng(0))
     assert missed == 7  # five, and both ends, which may move as well

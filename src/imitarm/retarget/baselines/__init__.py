@@ -1,1 +1,1 @@
-"""The thesis's mapping method and the three baselines M1 to M3, with what only they need."""
+"""The thesis's method and the baselines M1 to M3, with everything that only they need."""

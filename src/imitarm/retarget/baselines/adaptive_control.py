@@ -20,37 +20,36 @@ from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
 
-_SUBSTEP = 0.002  # [s] longest step of the physics
+_SUBSTEP = 0.002  # [s] longest simulation step
 
-START_STIFFNESS = (200.0, 200.0, 100.0, 100.0, 20.0, 20.0, 20.0)  # [N m/rad] METHODS B
+START_STIFFNESS = (200.0, 200.0, 100.0, 100.0, 20.0, 20.0, 20.0)  # [N m/rad] K_lo
 SLIDING_GAIN = (10.0, 10.0, 5.0, 5.0, 1.0, 1.0, 1.0)  # [N m s/rad] Gamma
 _KAPPA = 5.0  # [1/s]
 _RATES = (0.5, 5.0, 0.5)  # Q_F, Q_K, Q_D
 _FORGETTING = (0.2, 5.0)  # a, b
 _DAMPING_RATIO = 0.7
-_STIFFER = 2.0  # K_hi over K_lo: of a closed hand over an open one
+_STIFFER = 2.0  # K_hi / K_lo: closed hand over open hand
 _FLOOR = 0.5  # Kmin over Kmax(h)
 
-CUT_OFF = 3.0  # [Hz] of the reference's low-pass
-_GRIP = 0.2  # [s] in which a hand counts as closed more and more
+CUT_OFF = 3.0  # [Hz] of the reference's low-pass filter
+_GRIP = 0.2  # [s] in which the closure follows a closing hand
 
 
 class JointPlant:
-    """What a joint controller is tried on: the arm in MuJoCo, gravity on, contacts off.
+    """The arm on which a joint controller is simulated: in MuJoCo, with gravity, without contacts.
 
-    It holds what ``ArmModel`` does not: inertia of the rotors, viscous damping and dry friction of the joints. A
-    controller that knows the arm by its ``ArmModel`` does not know these.
+    It includes what ``ArmModel`` leaves out: rotor inertia, viscous damping and dry friction of the joints. So a
+    controller that uses an ``ArmModel`` does not know them.
 
     Args:
         arm: whose dynamics.
-        dt: for how long a torque is held [s].
+        dt: how long a torque is applied [s].
 
     Attributes:
-        substeps: steps of the physics in ``dt``.
-        energy: kinetic and potential energy [J]; of the last state that was stepped from.
+        substeps: number of simulation steps in ``dt``.
 
     Raises:
-        InputError: when ``dt`` is not positive.
+        InputError: when ``dt`` is out of range.
     """
 
     def __init__(self, arm: ArmModel, dt: float) -> None:
@@ -87,70 +86,74 @@ class JointPlant:
 
     @property
     def energy(self) -> float:
-        """Kinetic and potential energy [J]."""
+        """Kinetic plus potential energy of the last state from which a step was made [J]."""
         return float(self._data.energy.sum())
 
     def step(self, torque: Array) -> None:
-        """Go on for ``dt`` with torques (n_joints,) [N m] on the joints."""
+        """Advance by ``dt`` with torques (n_joints,) [N m] on the joints."""
         self._data.qfrc_applied[self._dofs] = torque
         mujoco.mj_step(self._model, self._data, self.substeps)
 
 
 @dataclass(frozen=True, eq=False)
 class Torques:
-    """What the law gave in one period.
+    """Torques of one period.
 
     Attributes:
-        wanted: shape (n_joints,) [N m].
-        given: cut to the rated torques, shape (n_joints,) [N m].
+        wanted: as computed by the law, shape (n_joints,) [N m].
+        applied: limited to the rated torques, shape (n_joints,) [N m].
     """
 
     wanted: Array
-    given: Array
+    applied: Array
 
 
 class AdaptiveLaw:
-    r"""A discrete-time adaptive controller of joints (METHODS B, M2).
+    r"""A discrete-time adaptive joint controller (baseline M2).
 
     With :math:`e = q - q_r`, :math:`\dot e = (e - e_{k-1})/T`, :math:`\varepsilon = \dot e + \kappa e`,
-    :math:`\dot q_e = \dot q_r - \kappa e` and :math:`\ddot q_e` by differences,
+    :math:`\dot q_e = \dot q_r - \kappa e` and :math:`\ddot q_e` by differences, the torque is
 
     .. math::
         u = M(q)\,\ddot q_e + C(q, \dot q)\,\dot q_e + G(q) - \Gamma\varepsilon - F - K e - D \dot e
+
+    and feed-forward F, stiffness K and damping D adapt, joint by joint,
 
     .. math::
         F \leftarrow F + Q_F(\varepsilon - \gamma F), \quad
         K \leftarrow [K + Q_K(\varepsilon e - \gamma K)]_{K_{min}}^{K_{max}(h)}, \quad
         D \leftarrow [D + Q_D(\varepsilon\dot e - \gamma D)]_0^{D_{max}}
 
-    joint by joint, with the forgetting :math:`\gamma = a/(1 + b|\varepsilon|^2)`. The closed hand stiffens:
-    :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. M, C and G are the rigid arm's, as ``ArmModel`` has them; what it
-    leaves out (rotors, friction) is for F, K and D to make up for. C is the matrix of Christoffel symbols, for which
+    with the forgetting factor :math:`\gamma = a/(1 + b|\varepsilon|^2)`. A closed hand (h = 1) raises the stiffness:
+    :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. M, C and G are those of the rigid arm, from ``ArmModel``; F, K and
+    D compensate for what it leaves out (rotors, friction). C is the matrix of Christoffel symbols, for which
     :math:`C(q, a)\,b = \tfrac12\,(h(a+b) - h(a) - h(b))` with :math:`h(v) = C(q, v)\,v`.
 
-    At small deviations :math:`\gamma = a` and :math:`Q_K \gamma = 1`: the stiffness forgets all but :math:`K_{min}`
-    within one period. So that the hand still counts, :math:`K_{min} = K_{max}(h)/2`, which the source leaves open.
+    The law is that of Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet, made discrete; the gains are ours. For
+    small errors :math:`\gamma = a` and :math:`Q_K \gamma = 1`: the stiffness forgets everything above :math:`K_{min}`
+    within one period. So that the hand still has an effect, we set :math:`K_{min} = K_{max}(h)/2`, which the sources
+    leave open.
 
     Args:
-        arm: whose M, C, G and rated torques.
+        arm: provides M, C, G and the rated torques.
         period: T [s].
 
     Raises:
-        InputError: when the arm has not seven joints, for which the gains are.
+        InputError: when the arm does not have seven joints, for which the gains are given.
     """
 
     def __init__(self, arm: ArmModel, period: float) -> None:
         if arm.n_joints != len(START_STIFFNESS):
             raise InputError(
                 f"AdaptiveLaw: {arm.name} has {arm.n_joints} joints, but the gains are for {len(START_STIFFNESS)}; "
-                "take modern, thesis or m3"
+                "use modern, thesis or m3"
             )
         self.arm, self.period = arm, period
         self._gamma = np.array(SLIDING_GAIN)
         self.start()
 
     def start(self) -> None:
-        """Forget all that was learnt."""
+        """Forget everything that was adapted."""
         n = self.arm.n_joints
         self.stiffness = np.array(START_STIFFNESS)
         self.damping = 2.0 * _DAMPING_RATIO * np.sqrt(self.stiffness)
@@ -165,7 +168,7 @@ class AdaptiveLaw:
         Args:
             q: joint positions, shape (n_joints,) [rad].
             velocity: joint velocities, shape (n_joints,) [rad/s].
-            reference: where the joints should be, shape (n_joints,) [rad].
+            reference: desired joint positions, shape (n_joints,) [rad].
             closure: of the person's hand, 0 open to 1 closed.
         """
         q, velocity, wanted = (np.asarray(x, dtype=float) for x in (q, velocity, reference))
@@ -211,37 +214,36 @@ class AdaptiveLaw:
 
 
 class AdaptiveControl(BaselineRetargeter):
-    r"""Rival M2: our reading of "discrete-time adaptive control" in the thesis (METHODS B).
+    r"""Baseline M2: our reading of "discrete-time adaptive control" in the thesis.
 
-    It stands for Liang et al. 2016, of which the abstract is known: the arm's configuration from a Kinect by vectors, a
-    stiffness index by the hand's gesture, a biomimetic controller in discrete time, on a Baxter in simulation. The
-    equations are those of the human-like controllers of Yang et al. 2011 and Li and Burdet 2016, made discrete, from
-    memory.
+    The thesis refers to Liang et al. 2016, of which we know the abstract: arm configuration from a Kinect by vectors, a
+    stiffness index from the hand's gesture, a biomimetic controller in discrete time, on a simulated Baxter. The
+    equations are those of the human-like controllers of Yang et al. 2011 and Li and Burdet 2016, made discrete.
 
-    The person's joint angles, held from frame to frame, go through a low-pass of first order at 3 Hz,
-    :math:`q_r \leftarrow q_r + (1 - e^{-2\pi f T})(q_h - q_r)`; an
-    :class:`AdaptiveLaw` gives torques, cut to the rated ones, at which the
-    arm's own dynamics (:class:`JointPlant`) move. Where they have moved it to
-    is the command. What it adapts is joints: the tool is not where the hand is.
+    The person's joint angles, held between frames, pass a first-order low-pass filter at 3 Hz, :math:`q_r \leftarrow
+    q_r + (1 - e^{-2\pi f T})(q_h - q_r)`. An :class:`AdaptiveLaw` computes torques, limited to the rated ones, which
+    drive the simulated arm (:class:`JointPlant`). The position that the arm reaches is the command. The method tracks
+    joints: the tool is not where the hand is.
 
-    A joint's velocity is limited by nothing but its torque. In ``notes``: ``"saturated"``, joints and steps at the
-    rated torque, ``"peak_torque"`` as a share of it before it is cut, and ``"rms_torque"`` [N m] over all joints and
-    steps.
+    Only the torque limits the joint velocity. ``notes`` has ``"saturated"``, the number of joints and steps at the
+    rated torque; ``"peak_torque"``, the largest torque relative to the rated one before it is limited; and
+    ``"rms_torque"`` [N m] over all joints and steps.
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: what of the person's arm stands for what of the robot's.
+        correspondence: between the person's arm and the robot's.
         dt: control period T [s].
-        scene: not heeded.
+        scene: ignored.
         velocity_scaling: scale every step, of the reference and of the command, so that no joint exceeds its limit.
-        relative: map the change of the person's joints since the hold was taken; else the joints themselves, which are
-            approached at limited speed. See :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
+        relative: map the change of the person's joint angles since the person began to lead; otherwise the angles
+            themselves, approached at limited speed. See
+            :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
 
     Attributes:
         torque: of the last control period, shape (n_joints,) [N m].
 
     Raises:
-        InputError: when the arm has not the axes of a person's arm.
+        InputError: when the arm does not have the joint axes of a person's arm.
     """
 
     name: ClassVar[str] = "m2"
@@ -262,7 +264,7 @@ class AdaptiveControl(BaselineRetargeter):
         self._mapping = JointMapping(arm, relative=relative)
         self._law = AdaptiveLaw(arm, dt)
         self._plant = JointPlant(arm, dt)
-        self._share = 1.0 - math.exp(-2.0 * math.pi * CUT_OFF * dt)
+        self._filter_weight = 1.0 - math.exp(-2.0 * math.pi * CUT_OFF * dt)
         self.torque = np.zeros(arm.n_joints)
         self._peak = self._squares = 0.0
         self._periods = 0
@@ -295,16 +297,16 @@ class AdaptiveControl(BaselineRetargeter):
         return self._driven_on() if self._driven else self.latest.q
 
     def _driven_on(self) -> Array:
-        """Let the reference, the controller and the arm go on by one period; return where the arm is then."""
-        step = self._share * (self._held_goal - self._reference)
+        """Advance the reference, the controller and the arm by one period; return the position reached."""
+        step = self._filter_weight * (self._held_goal - self._reference)
         if self.velocity_scaling:
             step = step / max(float((np.abs(step) / (self.dt * self.arm.max_velocity)).max()), 1.0)
         self._reference = self._reference + step
         torques = self._law.torques(self._plant.q, self._plant.velocity, self._reference, self._closure)
-        self.torque = torques.given
-        shares = np.abs(torques.wanted) / self.arm.max_torque
-        self.counts["saturated"] += int(np.count_nonzero(shares > 1.0))
-        self._peak = max(self._peak, float(shares.max()))
+        self.torque = torques.applied
+        fractions = np.abs(torques.wanted) / self.arm.max_torque
+        self.counts["saturated"] += int(np.count_nonzero(fractions > 1.0))
+        self._peak = max(self._peak, float(fractions.max()))
         self._squares += float(np.mean(self.torque**2))
         self._periods += 1
         self._plant.step(self.torque)

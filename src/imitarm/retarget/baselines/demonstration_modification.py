@@ -1,4 +1,4 @@
-"""DemonstrationModification: rival M1, the person's joints as the robot's, corrected afterwards where the arm can't."""
+"""DemonstrationModification: baseline M1, the person's joint angles, corrected where the arm can't follow."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.retarget.baselines.baseline_retargeter import BaselineRetargeter
-from imitarm.retarget.baselines.demonstrated_motion import ShownMotion, holds
-from imitarm.retarget.baselines.feasibility import Constraint, Infeasible
+from imitarm.retarget.baselines.demonstrated_motion import DemonstratedMotion, engagements
+from imitarm.retarget.baselines.feasibility import Constraint, FeasibilityCheck
 from imitarm.retarget.baselines.joint_mapping import Approach, JointMapping
-from imitarm.retarget.baselines.segment_correction import COUNTED, Advice
+from imitarm.retarget.baselines.segment_correction import COUNTED, SegmentCorrector
 from imitarm.retarget.correspondence import Clutch, Correspondence
 from imitarm.retarget.engagement import EngagementState
 from imitarm.retarget.retargeter import Goal, Retargeting, RetargetStep, in_order
@@ -25,51 +25,54 @@ from imitarm.scene import Scene
 Array = NDArray[np.float64]
 
 ROUNDS = 5
-SECONDS_A_SEGMENT = 5.0  # [s] that a teacher takes to advise on one segment, besides watching it
+ADVICE_TIME = 5.0  # [s] that a teacher needs for one segment, in addition to watching it
 
 
 class DemonstrationModification(BaselineRetargeter):
-    r"""Rival M1: our reading of "demonstration modification" in the thesis (METHODS B).
+    """Baseline M1: our reading of "demonstration modification" in the thesis.
 
-    It stands for Argall's advice operators, by which corrected data are made from an execution and a teacher's advice
-    on a segment of it, and for Mueller et al. 2018, who annotate constraints and replace key frames that violate them.
-    The paper that the thesis cites is on policies of a mobile robot; what can be advised for an arm, and the
-    machine that here stands in for the teacher, are ours.
+    It combines Argall's advice operators, which derive corrected data from an execution and a teacher's advice on a
+    segment of it, and Mueller et al. 2018, who annotate constraints and replace key frames that violate them. The paper
+    cited by the thesis is about policies of a mobile robot; the possible corrections for an arm, and the program that
+    replaces the teacher, are ours.
 
-    The method is an offline one. :meth:`run` takes the whole recording:
+    The method is offline. :meth:`run` processes the whole recording:
 
-    1. the person's joint angles in closed form are the robot's
+    1. the person's joint angles, in closed form, become the robot's
        (:class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`);
-    2. :class:`~imitarm.retarget.baselines.feasibility.Infeasible` says where the arm can't do that;
-    3. for each such segment, widened by 0.2 s, the first that clears it is taken of: slower, wrist pulled in, elbow
-       turned; else its key frames are repaired (:mod:`imitarm.retarget.baselines.segment_correction`);
-    4. up to five rounds; what is still infeasible then is counted, and cut at the limits of position.
+    2. :class:`~imitarm.retarget.baselines.feasibility.FeasibilityCheck` finds the infeasible segments;
+    3. each of them, extended by 0.2 s on both sides, is changed by the first correction that makes it feasible: slower,
+       wrist closer, elbow rotated; otherwise its key frames are repaired
+       (:mod:`imitarm.retarget.baselines.segment_correction`);
+    4. steps 2 and 3 are repeated up to five times; what is infeasible after that is counted, and clipped to the joint
+       ranges.
 
-    :meth:`step` is the mapping of step 1, uncorrected, cut at the limits of position, for what must be live.
+    :meth:`step` is only the mapping of step 1, clipped to the joint ranges, for live use.
 
-    In ``notes`` of a run: ``"rounds"``; ``"segments"`` advised on, over all rounds; ``"slowed"``, ``"pulled_in"``,
-    ``"elbow_turned"`` and ``"repaired"`` of them; ``"missed_keys"``, key frames for which no sample was found;
-    ``"infeasible_before"`` and ``"infeasible_after"``, samples; ``"failures"``, segments that are left;
+    ``notes`` of a run has ``"rounds"``; ``"segments"`` corrected in all rounds, of which ``"slowed"``, ``"pulled_in"``,
+    ``"elbow_rotated"`` and ``"repaired"``; ``"missed_keys"``, key frames without a feasible sample;
+    ``"infeasible_before"`` and ``"infeasible_after"``, samples; ``"failures"``, segments that remain;
     ``"execution_time"`` and, without slowing and approach, ``"shown_time"`` of the motion [s]; ``"teaching_time"`` [s],
-    the length of each segment and 5 s in each round.
+    the length of each segment plus 5 s, per round.
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: what of the person's arm stands for what of the robot's.
+        correspondence: between the person's arm and the robot's.
         dt: control period [s].
-        scene: not heeded.
+        scene: ignored.
         velocity_scaling: scale every step as a whole so that no joint exceeds its velocity limit.
-        relative: map the change of the person's joints since the hold was taken; else the joints themselves, which are
-            approached at limited speed. See :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
-        constraints: more that must hold, by name, for example ``{"table": above(0.02)}``.
-        advice_time: that a teacher takes for each segment besides watching it [s].
+        relative: map the change of the person's joint angles since the person began to lead; otherwise the angles
+            themselves, approached at limited speed. See
+            :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
+        constraints: additional conditions, by name, for example ``{"table": above(0.02)}``.
+        advice_time: time that a teacher needs for each segment in addition to watching it [s].
         seed: of the samples that repair key frames.
 
     Attributes:
-        infeasible: what the arm can't do.
+        check: finds what the arm can't do.
 
     Raises:
-        InputError: when the arm has not the axes of a person's arm, or a number can't be used.
+        InputError: when the arm does not have the joint axes of a person's arm, or a number is out of range.
     """
 
     name: ClassVar[str] = "m1"
@@ -88,14 +91,14 @@ class DemonstrationModification(BaselineRetargeter):
         velocity_scaling: bool = False,
         relative: bool = True,
         constraints: Mapping[str, Constraint] | None = None,
-        advice_time: float = SECONDS_A_SEGMENT,
+        advice_time: float = ADVICE_TIME,
         seed: int = 0,
     ) -> None:
         if not 0.0 <= advice_time < np.inf:
             raise InputError(f"DemonstrationModification: advice_time must not be negative [s], got {advice_time!r}")
         super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
         self._mapping = JointMapping(arm, relative=relative)
-        self.infeasible = Infeasible(arm, dt, constraints)
+        self.check = FeasibilityCheck(arm, dt, constraints)
         self._advice_time, self._seed = advice_time, seed
         self._shown_times = np.empty(0)
 
@@ -118,14 +121,14 @@ class DemonstrationModification(BaselineRetargeter):
         return np.asarray(q + step)
 
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
-        """Retarget a whole recording, correct it, and say in ``notes`` what that took.
+        """Retarget a whole recording and correct it; ``notes`` says what was done.
 
-        Where the motion is slowed, the result is longer than the recording. Its targets are where the tool should be
-        at that moment of what was shown: they are slowed with it, and otherwise not corrected.
+        Where the motion is slowed, the result is longer than the recording; ``shown_times`` says when the person showed
+        each sample. The targets are those of that time: slowed with the motion, but otherwise not corrected.
 
         Args:
-            skeletons: in the order of their times.
-            q: where the arm is at first, shape (n_joints,) [rad]; None: ``arm.home``.
+            skeletons: in order of time.
+            q: start posture, shape (n_joints,) [rad]; None: ``arm.home``.
 
         Raises:
             InputError: when there are fewer than two skeletons, or times do not increase.
@@ -135,39 +138,39 @@ class DemonstrationModification(BaselineRetargeter):
         rng = np.random.default_rng(self._seed)
         steps, now = [self.latest], frames[0].time
         self._shown_times = np.empty(0)
-        lessons: list[Advice] = []
+        correctors: list[SegmentCorrector] = []
         performed = 0
         state = EngagementState.WAITING
-        for estimates in holds(frames, self.correspondence, self.rule):
+        for estimates in engagements(frames, self.correspondence, self.rule):
             first, last = estimates[0], estimates[-1]
             self._rest(steps, first.time - now, state)
             q = self.latest.q
             clutch = self.correspondence.engage(first.wrist, first.hand, self.arm.tool_pose(q))
             self._mapping.start(q)
-            lessons.append(Advice(self._mapping, clutch, self.infeasible, rng))
-            motion = lessons[-1].corrected(ShownMotion.through(estimates, self.dt), ROUNDS)
+            correctors.append(SegmentCorrector(self._mapping, clutch, self.check, rng))
+            motion = correctors[-1].corrected(DemonstratedMotion.through(estimates, self.dt), ROUNDS)
             performed -= len(steps)
             self._perform(steps, motion, clutch)
             performed += len(steps)
-            self._append_shown_times(steps, motion.clock - frames[0].time)
+            self._append_shown_times(steps, motion.shown_times - frames[0].time)
             now, state = last.time, EngagementState.STOPPED
         self._rest(steps, frames[-1].time - now, state)
         self._append_shown_times(steps, np.empty(0))
-        return Retargeting.of(self, steps, {**self.notes, **self._notes_of(lessons, performed)}, self._shown_times)
+        return Retargeting.of(self, steps, {**self.notes, **self._notes_of(correctors, performed)}, self._shown_times)
 
-    def _notes_of(self, lessons: Sequence[Advice], performed: int) -> dict[str, float]:
-        """Return what a run came to, over all holds."""
-        counts = {name: sum(lesson.counts[name] for lesson in lessons) for name in COUNTED}
-        watched = counts.pop("advised_time")
+    def _notes_of(self, correctors: Sequence[SegmentCorrector], performed: int) -> dict[str, float]:
+        """Return the counts of a run, over all engagements."""
+        counts = {name: sum(corrector.counts[name] for corrector in correctors) for name in COUNTED}
+        watched = counts.pop("corrected_time")
         return {
-            "rounds": float(max((lesson.rounds for lesson in lessons), default=0)),
+            "rounds": float(max((corrector.rounds for corrector in correctors), default=0)),
             **counts,
             "execution_time": self.dt * performed,
             "teaching_time": watched + self._advice_time * counts["segments"],
         }
 
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
-        """Complete the shown times: of the last steps they are ``shown``, of those before them those of waiting."""
+        """Complete the shown times: the last steps show ``shown``, those before them are waiting."""
         rest = len(steps) - len(self._shown_times) - len(shown)
         begin = float(self._shown_times[-1]) if len(self._shown_times) else -self.dt
         waited = begin + self.dt * np.arange(1, rest + 1)
@@ -180,8 +183,8 @@ class DemonstrationModification(BaselineRetargeter):
         for _ in range(round(duration / self.dt)):
             self._append(steps, RetargetStep(0.0, q, q, None, state), q)
 
-    def _perform(self, steps: list[RetargetStep], motion: ShownMotion, clutch: Clutch) -> None:
-        """Go to where the motion begins, at limited speed, then through it."""
+    def _perform(self, steps: list[RetargetStep], motion: DemonstratedMotion, clutch: Clutch) -> None:
+        """Move to where the motion begins, at limited speed, then through it."""
         approach = Approach(self.arm, self.dt)
         start = np.clip(motion.joints[0], self.arm.lower, self.arm.upper)
         at = self.latest.q
@@ -197,7 +200,7 @@ class DemonstrationModification(BaselineRetargeter):
             self._append(steps, done, q)
 
     def _append(self, steps: list[RetargetStep], step: RetargetStep, wanted: Array) -> None:
-        """Append a step that leads to joints (n_joints,) [rad], as far as limits let it."""
+        """Append a step towards joints (n_joints,) [rad], as far as the limits allow."""
         before, q = self.latest, self._limited(wanted)
         velocity = (q - before.q) / self.dt
         self.latest = replace(step, time=before.time + self.dt, q=q, velocity=velocity)

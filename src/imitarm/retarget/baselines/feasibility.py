@@ -1,4 +1,4 @@
-"""What an arm can't do of a motion of its joints: predicates that say where a demonstration must be changed."""
+"""FeasibilityCheck: where a joint motion is not possible for an arm, so that a demonstration must be changed."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from imitarm.kinematics.pose import quaternion_to_matrix
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-SINGULAR = 0.03  # least singular value of the tool's Jacobian, in m and rad, below which a posture is singular
-STRETCHED = 0.79 / 0.80  # share of the reach beyond which the wrist is too far from the shoulder
-ELBOW = 3  # index of the joint that bends the elbow; at zero the arm is straight
-DILATION = 0.2  # [s] by which what is infeasible is widened on both sides
-_WITHIN = 1e-6  # [rad] a joint may be so far beyond its limit
+SINGULAR = 0.03  # smallest singular value of the tool's Jacobian, in m and rad, of a feasible posture
+STRETCHED = 0.79 / 0.80  # largest distance of the wrist from the shoulder, as a fraction of the reach
+ELBOW = 3  # index of the elbow joint; at zero the arm is straight
+DILATION = 0.2  # [s] by which an infeasible segment is extended on both sides
+_WITHIN = 1e-6  # [rad] tolerance of a position limit
 
 
 class Constraint(Protocol):
-    """A condition on the tool, as a teacher annotates it."""
+    """A condition on the tool, as annotated by a teacher."""
 
     def __call__(self, positions: Array, rotations: Array, /) -> Mask:
         """Return where it holds, shape (n,), for positions (n, 3) [m] and rotations (n, 3, 3) in the base frame."""
@@ -31,7 +31,7 @@ class Constraint(Protocol):
 
 
 def above(height: float) -> Constraint:
-    """Return the constraint that the tool is higher than ``height`` [m], as a table."""
+    """Return the constraint that the tool is higher than ``height`` [m], for example above a table."""
 
     def holds(positions: Array, _: Array) -> Mask:
         return np.asarray(positions[:, 2] > height)
@@ -40,7 +40,7 @@ def above(height: float) -> Constraint:
 
 
 def upright(angle: float) -> Constraint:
-    """Return the constraint that the tool's axis is within ``angle`` [rad] of looking straight down."""
+    """Return the constraint that the tool points straight down to within ``angle`` [rad]."""
 
     def holds(_: Array, rotations: Array) -> Mask:
         return np.asarray(-rotations[:, 2, 2] > np.cos(angle))
@@ -48,19 +48,19 @@ def upright(angle: float) -> Constraint:
     return holds
 
 
-class Infeasible:
-    r"""The predicate F of M1 (METHODS B).
+class FeasibilityCheck:
+    """Finds the infeasible samples of a joint motion (baseline M1).
 
-    It is true where a joint is beyond a limit of position or velocity, where the arm is singular
-    (:math:`s_{min} < 0.03`) or stretched (:func:`stretch` above 79/80), or a constraint does not hold.
+    A sample is infeasible where a joint exceeds a limit of position or velocity, where the arm is singular
+    (:math:`s_{min} < 0.03`) or stretched (:func:`stretch` above 79/80), or where a constraint does not hold.
 
     Args:
         arm: the robot's arm with its tool.
         dt: sampling period [s].
-        constraints: more of them, by name.
+        constraints: additional ones, by name.
 
     Raises:
-        InputError: when a constraint has the name of one of the predicates above.
+        InputError: when a constraint has the name of a built-in condition.
     """
 
     def __init__(self, arm: ArmModel, dt: float, constraints: Mapping[str, Constraint] | None = None) -> None:
@@ -68,18 +68,20 @@ class Infeasible:
         self.constraints = {} if constraints is None else dict(constraints)
         taken = sorted({"limits", "speed", "singular", "stretched"} & set(self.constraints))
         if taken:
-            raise InputError(f"Infeasible: a constraint can't be called {taken[0]!r}: that is built in; rename it")
+            raise InputError(
+                f"FeasibilityCheck: a constraint can't be named {taken[0]!r}, because that one is built in; rename it"
+            )
 
     def reasons(self, joints: Array) -> dict[str, Mask]:
-        """Return for each predicate where it finds something, shape (n,), for joints (n, n_joints) [rad]."""
+        """Return for each condition where it is violated, shape (n,), for joints (n, n_joints) [rad]."""
         return {"speed": self.too_fast(joints), **self.postures(joints)}
 
     def anywhere(self, joints: Array) -> Mask:
-        """Return F itself, shape (n,)."""
+        """Return where any condition is violated, shape (n,), for joints (n, n_joints) [rad]."""
         return np.asarray(np.any(list(self.reasons(joints).values()), axis=0))
 
     def too_fast(self, joints: Array) -> Mask:
-        """Return the samples on both sides of a step that a joint can't make in time, shape (n,)."""
+        """Return the samples on both sides of a step that is too fast for a joint, shape (n,)."""
         found = np.zeros(len(joints), dtype=bool)
         over = (self.speeds(joints) > 1.0 + 1e-9).any(axis=1)
         found[1:] |= over
@@ -87,11 +89,11 @@ class Infeasible:
         return found
 
     def speeds(self, joints: Array) -> Array:
-        """Return speeds as shares of the joints' limits, shape (n - 1, n_joints)."""
+        """Return speeds relative to the velocity limits, shape (n - 1, n_joints)."""
         return np.asarray(np.abs(np.diff(joints, axis=0)) / (self.dt * self.arm.max_velocity))
 
     def postures(self, joints: Array) -> dict[str, Mask]:
-        """Return what can be told from one posture at a time, for each where it finds something, shape (n,)."""
+        """Return, for each condition on single postures, where it is violated, shape (n,)."""
         jacobians = np.array([self.arm.tool_jacobian(q) for q in joints]).reshape(-1, 6, self.arm.n_joints)
         found: dict[str, Mask] = {
             "limits": self.outside(joints),
@@ -105,34 +107,34 @@ class Infeasible:
         return found
 
     def clear(self, joints: Array) -> bool:
-        """Return whether F is nowhere true; what is quick to tell comes first."""
+        """Return whether the motion is feasible everywhere; cheap conditions are checked first."""
         return not (self.too_fast(joints).any() or self.outside(joints).any() or self._in_postures(joints))
 
     def allows(self, q: Array) -> bool:
-        """Return whether nothing is wrong with a posture (n_joints,) [rad]."""
+        """Return whether a posture (n_joints,) [rad] is feasible."""
         return not (self.outside(q[None])[0] or self._in_postures(q[None]))
 
     def _in_postures(self, joints: Array) -> bool:
         return any(found.any() for found in self.postures(joints).values())
 
     def outside(self, joints: Array) -> Mask:
-        """Return where a joint is beyond a limit of position, shape (n,)."""
+        """Return where a joint is outside its range, shape (n,)."""
         beyond = (joints < self.arm.lower - _WITHIN) | (joints > self.arm.upper + _WITHIN)
         return np.asarray(beyond.any(axis=1))
 
 
 def stretch(joints: Array) -> Array:
-    r"""Return how far the arm is stretched, shoulder to wrist over the reach, shape (n,), for joints (n, n_joints).
+    r"""Return how far the arm is stretched: distance shoulder to wrist over reach, (n,), for joints (n, n_joints).
 
-    It is that of the person's chain, on which the joints were mapped: upper arm and forearm in line with the joints'
-    axes and equally long (Sawyer's are 0.412 and 0.411 m), so :math:`|\cos(q_3/2)|`. The offsets between a robot's
-    links would let its own distance from shoulder to wrist be largest where the elbow is bent.
+    This is measured on the person's chain, to which the joints belong: upper arm and forearm along the joint axes and
+    equally long (Sawyer's are 0.412 and 0.411 m), so it is :math:`|\cos(q_3/2)|`. The robot's own distance from
+    shoulder to wrist is largest with a bent elbow, because of the offsets between its links.
     """
     return np.asarray(np.abs(np.cos(0.5 * joints[:, ELBOW])))
 
 
 def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
-    """Return the runs of True, widened by 0.2 s on both sides and joined where they touch, as (first, past the last).
+    """Return the runs of True, extended by 0.2 s on both sides and merged where they touch, as (first, past the last).
 
     Args:
         found: shape (n,).
@@ -145,7 +147,7 @@ def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
 
 
 def blend(found: Mask, first: int, past: int, dt: float) -> Array:
-    """Return how far to change a segment: 1 where needed, falling to 0 within 0.2 s, shape (past - first,)."""
+    """Return the weight of a change in a segment: 1 where needed, decaying to 0 within 0.2 s, shape (past - first,)."""
     at = np.arange(first, past)
     needed = at[found[first:past]]
     away = np.abs(at[:, None] - needed).min(axis=1) * dt

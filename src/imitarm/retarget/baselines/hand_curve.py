@@ -23,18 +23,18 @@ from imitarm.retarget.baselines.nurbs import NURBS, Smoothing, fit_nurbs
 Array = NDArray[np.float64]
 
 _DEGREE = 3
-_MU = 1.0  # strength of the live curve; cross validation takes longer than a frame and finds about this
-_SIGMA = 0.012  # [m] of a Kinect; what is 2.5 of it off the curve counts for less
-_LATE = 0.02  # share by which the clock follows frames that come later than usual
-_RESTART = 0.25  # [s] a source whose clock is off by more has begun anew
+_MU = 1.0  # smoothing of the live curve; cross validation takes longer than a frame and gives about this value
+_SIGMA = 0.012  # [m] standard deviation of a Kinect; samples farther than 2.5 of it lose weight
+_LATE = 0.02  # fraction by which the clock adapts to a frame that is later than usual
+_RESTART = 0.25  # [s] a source whose clock jumps by more has restarted
 
 
 @dataclass(frozen=True, eq=False)
 class RotationCurve:
     r"""Rotations along a curve: :math:`R(t) = R_0 \exp(c(t))` with c a :class:`NURBS` of rotation vectors.
 
-    Angles of roll, pitch and yaw would wrap and lock (METHODS A.3); rotation vectors about a middle rotation do neither
-    within a turn.
+    Roll, pitch and yaw would wrap around and have singularities; rotation vectors relative to a mean rotation have
+    neither within a full turn.
 
     Attributes:
         reference: :math:`R_0`, quaternion wxyz, shape (4,).
@@ -60,17 +60,17 @@ def fit_rotations(
     sigma: float | None = None,
     robust: bool = True,
 ) -> RotationCurve:
-    """Fit a curve to rotations: :func:`fit_nurbs` of their rotation vectors about the middle one.
+    """Fit a curve to rotations: :func:`fit_nurbs` of their rotation vectors relative to the mean rotation.
 
     Args:
         times: strictly increasing, shape (k,) [s].
         quaternions: unit, wxyz, shape (k, 4); signs do not matter.
         confidence: 0 to 1, shape (k,); None: all 1.
-        degree: as in :func:`fit_nurbs`, and so are the others.
+        degree: as for :func:`fit_nurbs`, and so are the others.
         n_control: number of control points.
         smoothing: a number, ``"gcv"`` or ``"morozov"``.
         sigma: standard deviation of a rotation vector on each axis [rad].
-        robust: samples far off count for less.
+        robust: reduce the weight of outliers.
 
     Raises:
         InputError: as :func:`fit_nurbs`.
@@ -94,9 +94,9 @@ def fit_rotations(
 
 
 def _continuous(vectors: Array) -> Array:
-    """Return rotation vectors (k, 3) of which none jumps by a turn where the angle passes pi, from the least one on."""
+    """Return rotation vectors (k, 3) without jumps by a full turn where the angle passes pi."""
     length = np.sqrt(np.sum(vectors * vectors, axis=1))
-    if not length.max() > 0.5 * math.pi:  # two such can't be half a turn apart
+    if not length.max() > 0.5 * math.pi:  # no two of them differ by half a turn
         return vectors
     result, middle = vectors.copy(), int(np.argmin(length))
     for k, beside in [(k, k - 1) for k in range(middle + 1, len(length))] + [(k, k + 1) for k in range(middle)[::-1]]:
@@ -108,13 +108,13 @@ def _continuous(vectors: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class HandSample:
-    """Where a hand was in one frame.
+    """Pose of a hand in one frame.
 
     Attributes:
         time: on the source's clock [s].
         wrist: position in the base frame, shape (3,) [m].
-        hand: rotation in the base frame, wxyz, shape (4,).
-        confidence: of the position, and of the rotation, 0 to 1.
+        hand: rotation in the base frame, quaternion wxyz, shape (4,).
+        confidence: of the position and of the rotation, 0 to 1.
     """
 
     time: float
@@ -137,7 +137,7 @@ class HandCurve:
 
     @classmethod
     def through(cls, samples: Sequence[HandSample], smoothing: Smoothing = "gcv", *, robust: bool = True) -> HandCurve:
-        """Fit both curves to samples, at least four.
+        """Fit both curves to at least four samples.
 
         Raises:
             InputError: when there are fewer, or times do not increase.
@@ -166,28 +166,29 @@ class HandCurve:
         return cls(wrist, hand)
 
     def at(self, time: float) -> tuple[Array, Array]:
-        """Return wrist (3,) and hand (4,); beyond the ends those of the end."""
+        """Return wrist (3,) and hand (4,) at a time; beyond the ends those of the end."""
         return self.wrist.evaluate(time), self.hand.evaluate(time)
 
 
-class Playback:
-    """Smooths a hand's motion while it comes in: a curve through the last moments, read ``lag`` seconds late.
+class DelayedCurve:
+    """Smooths a hand's motion live: fits a curve to the last 0.6 s and evaluates it ``lag`` seconds in the past.
 
-    A curve's end swings with every new frame; a little before it frames on both sides hold it, and that is what the lag
-    buys. Frames come in bursts and gaps, so time is counted by the steps of the robot and only led by the frames'.
+    The end of a fitted curve changes with every new frame; a little earlier it is supported by frames on both sides.
+    That is what the lag is for. Frames arrive irregularly, so time is counted in control steps and only corrected by
+    the frames.
 
     Args:
-        window: how much is fitted [s].
-        lag: how late the curve is read [s].
-        smooth: off, the newest frame is given as it is.
-        whole: a curve to read instead, of a motion that is over already; its lag is none.
+        window: duration to which the curve is fitted [s].
+        lag: delay of the evaluation [s].
+        smooth: False: return the newest frame unchanged.
+        whole: a curve of a complete motion to evaluate instead, without lag.
     """
 
     def __init__(
         self, window: float = 0.6, lag: float = 0.07, *, smooth: bool = True, whole: HandCurve | None = None
     ) -> None:
         if not 0.2 <= window <= 5.0 or not 0.0 <= lag <= 0.5 * window:
-            raise InputError("Playback: window must be 0.2 to 5 s and lag at most half of it")
+            raise InputError("DelayedCurve: window must be 0.2 to 5 s and lag at most half of it")
         self._window, self._smooth, self._whole = window, smooth, whole
         self._lag = lag if whole is None else 0.0
         self._samples: deque[HandSample] = deque()
@@ -195,7 +196,7 @@ class Playback:
         self._clock, self._ahead = 0.0, -math.inf
 
     def add(self, sample: HandSample) -> None:
-        """Take in a frame later than the one before."""
+        """Add a frame that is later than the one before."""
         ahead = sample.time - self._clock
         off = ahead - self._ahead
         self._ahead = ahead if off > 0.0 or off < -_RESTART else self._ahead + _LATE * off
@@ -207,11 +208,11 @@ class Playback:
             self._curve = HandCurve.through(seen, _MU) if len(seen) > _DEGREE else None
 
     def step(self, dt: float) -> None:
-        """Let time go on [s]."""
+        """Advance the time by ``dt`` [s]."""
         self._clock += dt
 
     def now(self) -> tuple[Array, Array] | None:
-        """Return wrist (3,) [m] and hand (4,) as they are to be followed now; None before the first frame."""
+        """Return wrist (3,) [m] and hand (4,) to follow now; None before the first frame."""
         if not self._samples:
             return None
         curve = self._curve if self._whole is None else self._whole

@@ -1,4 +1,4 @@
-"""IncrementalIK: rival M3, resolved rates that feed the tool's deviation back; no treatment of singularities."""
+"""IncrementalIK: baseline M3, resolved-rate control with feedback of the error; singularities are not treated."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
 
-_RCOND = 1e-6  # only what is numerically no direction at all is left out
+_RCOND = 1e-6  # ignores only singular values that are numerically zero
 
 
 class IncrementalIK(BaselineRetargeter):
-    r"""Rival M3: our reading of "incremental inverse kinematics" in the thesis (METHODS B).
+    r"""Baseline M3: our reading of "incremental inverse kinematics" in the thesis.
 
-    The thesis cites Ijspeert et al. 2002 for it. That paper is the one on movement primitives, and its abstract has
-    no incremental inverse kinematics; so this is no one's published method, but what the name says: once a frame
+    The thesis cites Ijspeert et al. 2002 for it, which is the paper on movement primitives; its abstract has no
+    incremental inverse kinematics. So this is not a published method, but what the name says: once per frame
 
     .. math:: \Delta q = J^+ \left(\Delta x_d + K\,e\right), \qquad e = \log(T_d\,T(q)^{-1}),
 
-    with :math:`\Delta x_d` the way of the target from the last frame to this one and e the deviation from where the
-    target was, spread evenly over the control steps of one frame. The pseudo-inverse is the plain one: its smallest
-    singular value is inverted however small it is, so near the edge of reach the step explodes. Each joint is cut to
-    its velocity limit by itself, which turns the tool's motion aside, and then to its limits of position; ``notes``
-    counts how often (``"caps"`` joints and steps, ``"capped_steps"`` steps).
+    with :math:`\Delta x_d` the displacement of the target since the last frame and e the error to the last target. The
+    step is spread evenly over the control steps of one frame. The pseudo-inverse is plain: it inverts even the smallest
+    singular value, so the step explodes near the edge of the workspace. Each joint is limited to its own velocity,
+    which changes the direction of the tool's motion, and then to its range. ``notes`` counts how often: ``"caps"``
+    joints and steps, ``"capped_steps"`` steps.
 
-    The layer of movement primitives that the cited paper would add is left out: it belongs to the learnt skill, which
-    stands beside this floor (:mod:`imitarm.skills`), can be put behind every method alike, and would compare
-    primitives, not mappings.
+    The movement primitives that the cited paper would add are left out: they belong to the learned skill, can be used
+    with every method, and would compare primitives instead of mappings.
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: what of the person's arm stands for what of the robot's.
+        correspondence: between the person's arm and the robot's.
         dt: control period [s].
-        scene: not heeded.
-        velocity_scaling: scale every step as a whole so that no joint exceeds its limit, instead of cutting joints.
-        gain: K, share of the deviation that one frame makes up for.
+        scene: ignored.
+        velocity_scaling: scale every step as a whole so that no joint exceeds its limit, instead of limiting each
+            joint.
+        gain: K, fraction of the error that is corrected per frame.
 
     Raises:
         InputError: when the gain is not in (0, 1].
@@ -93,14 +93,14 @@ class IncrementalIK(BaselineRetargeter):
         return np.asarray(np.linalg.pinv(self.arm.tool_jacobian(q), rcond=_RCOND) @ twist)
 
     def _capped(self, step: Array) -> Array:
-        """Cut each joint to its velocity limit by itself, or scale the step as a whole."""
+        """Limit each joint to its velocity, or scale the step as a whole."""
         most = self.dt * self.arm.max_velocity
         if self.velocity_scaling:
             return np.asarray(step / max(float((np.abs(step) / most).max()), 1.0))
         return np.clip(step, -most, most)
 
     def _count(self, step: Array) -> None:
-        """Count the joints that a step would take beyond their velocity limits."""
+        """Count the joints that a step would move faster than their velocity limits."""
         over = int(np.count_nonzero(np.abs(step) > self.dt * self.arm.max_velocity * (1.0 + 1e-9)))
         self.counts["caps"] += over
         self.counts["capped_steps"] += over > 0

@@ -1,4 +1,4 @@
-r"""JointMapping: the person's joint angles as the robot's, for methods that map joints and not the tool."""
+"""JointMapping: the person's joint angles become the robot's, for methods that map joints instead of the tool."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ Array = NDArray[np.float64]
 
 _STRETCHED = ((0.0,) * 7, (0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0))
 """Postures in which an arm may be stretched forward: Sawyer's zero; the Panda's, which points up at zero; mirrored."""
-_ALIGNED = 0.999  # cosine between a joint's axis and that of the person's
-_ANY = LimbLengths(0.3, 0.26)  # of an arm of which only rotations are asked
+_ALIGNED = 0.999  # smallest cosine between a joint's axis and the person's
+_ANY = LimbLengths(0.3, 0.26)  # where only rotations matter
 _AHEAD = np.array([1.0, 0.0, 0.0])
 
 
 class JointMapping:
-    r"""Maps the seven angles of a person's arm onto seven joints with the same order of axes (METHODS A.2).
+    r"""Maps the seven angles of a person's arm to seven robot joints with the same order of axes.
 
-    With the arm stretched forward a person's joints turn about z, y, x, y, x, y, x
-    (:mod:`imitarm.retarget.human_arm`). Sawyer's do so at zero, the Panda's when its second joint is at a right angle
-    and with some senses reversed; so with that posture :math:`q^*` and the senses :math:`\sigma_i = \pm 1` it is
+    When the arm is stretched forward, a person's joints rotate about z, y, x, y, x, y, x
+    (:mod:`imitarm.retarget.human_arm`). So do Sawyer's at zero, and the Panda's when its second joint is at a right
+    angle, some of them in the opposite direction. With that posture :math:`q^*` and the directions :math:`\sigma_i =
+    \pm 1` the mapping is
 
     .. math:: q_i = q^*_i + \sigma_i\,\theta_i \quad\text{(absolute)}, \qquad
               q_i = q_{i,0} + \sigma_i\,(\theta_i - \theta_{i,0}) \quad\text{(relative)},
 
-    relative to where person and robot were when the person took hold. That holds for shoulder and elbow, i = 1 to 4.
-    The last three follow in closed form from the rotation that the tool should have: the hand's own, when the mapping
-    is absolute and the correspondence follows the whole hand, else the clutch's target. The lengths of the links play
-    no part, so the tool is not where the hand is: that is the price of mapping joints.
+    the latter relative to the joints of both when the person began to lead. This holds for shoulder and elbow, i = 1 to
+    4. The last three joints follow in closed form from the desired rotation of the tool: the hand's own when the
+    mapping is absolute and the correspondence follows the whole hand, otherwise that of the clutch's target. Link
+    lengths are not used, so the tool is not where the hand is: this is inherent in mapping joints.
 
-    Angles are continued from frame to frame without a jump of a turn; an angle that can't be seen is held.
+    Angles are continuous from frame to frame, without jumps by a full turn; an undefined angle keeps its value.
 
     Args:
         arm: the robot's arm.
@@ -45,10 +46,10 @@ class JointMapping:
 
     Attributes:
         zero: the posture in which the arm is stretched forward, shape (7,) [rad].
-        sense: of each joint against the person's, 1 or -1, shape (7,).
+        sense: direction of each joint relative to the person's, 1 or -1, shape (7,).
 
     Raises:
-        InputError: when the arm has not the axes of a person's arm.
+        InputError: when the arm does not have the joint axes of a person's arm.
     """
 
     def __init__(self, arm: ArmModel, *, relative: bool) -> None:
@@ -65,18 +66,18 @@ class JointMapping:
         self._origin: tuple[Array, Array] | None = None  # robot's joints and person's angles when engaged
 
     def resume(self, q: Array) -> None:
-        """Go on from joints ``q``, shape (7,) [rad], with the same origin: to map a part of a motion anew."""
+        """Continue from joints ``q``, shape (7,) [rad], with the same origin: to map a part of a motion again."""
         self._q = np.array(q, dtype=float)
         if self._origin is not None:
             q0, theta0 = self._from
             self._person = theta0 + self.sense * (self._q - q0)
 
     def joints(self, estimate: ArmEstimate, clutch: Clutch) -> Array:
-        """Return the joints for one frame of the person's arm, not limited, shape (7,) [rad].
+        """Return the joints for one frame of the person's arm, before any limit, shape (7,) [rad].
 
         Args:
             estimate: of the person's arm.
-            clutch: engaged.
+            clutch: the poses of hand and tool when the person began to lead.
         """
         hand = quaternion_to_matrix(estimate.hand)
         theta = self.angles(estimate.elbow - estimate.shoulder, estimate.wrist - estimate.elbow, hand)
@@ -86,7 +87,7 @@ class JointMapping:
 
     @property
     def _from(self) -> tuple[Array, Array]:
-        """The robot's joints and the person's angles from which the mapping counts."""
+        """The robot's joints and the person's angles that correspond to each other."""
         if self.relative and self._origin is not None:
             return self._origin
         return self.zero, np.zeros(7)
@@ -95,8 +96,8 @@ class JointMapping:
         """Return the person's angles, continued from the last ones, shape (7,) [rad].
 
         Args:
-            upper: from shoulder to elbow, shape (3,), of any length.
-            forearm: from elbow to wrist, shape (3,), of any length.
+            upper: vector from shoulder to elbow, shape (3,), of any length.
+            forearm: vector from elbow to wrist, shape (3,), of any length.
             hand: rotation of the hand, shape (3, 3).
         """
         before = self._person
@@ -111,7 +112,8 @@ class JointMapping:
 
         Args:
             theta: the person's angles, shape (7,) [rad].
-            hand: wanted rotation of the robot's hand: the tool's times that of the stretched arm back, shape (3, 3).
+            hand: desired rotation of the robot's hand: that of the tool times the inverse of that of the stretched arm,
+                (3, 3).
         """
         begins = self._origin is None
         if self._origin is None:
@@ -119,12 +121,12 @@ class JointMapping:
         q0, theta0 = self._from
         q = q0 + self.sense * (theta - theta0)
         q[:4] = continued(q[:4], self._q[:4])
-        if begins:  # a whole turn may bring a joint into its limits; later that would be a jump
-            q[:4] = _turned_back(q[:4], self.arm.lower[:4], self.arm.upper[:4])
+        if begins:  # a whole turn may bring a joint within its limits; later it would be a jump
+            q[:4] = _whole_turn_inside(q[:4], self.arm.lower[:4], self.arm.upper[:4])
         chain = self.sense * (q - self.zero)
         _, _, forearm = human_arm_pose(np.concatenate([chain[:4], np.zeros(3)]), _ANY)
         held = np.concatenate([np.zeros(4), self.sense[4:] * (self._q[4:] - self.zero[4:])])
-        wrist = human_arm_angles(_AHEAD, _AHEAD, forearm.T @ hand, held)[4:]  # of an arm whose forearm is ahead
+        wrist = human_arm_angles(_AHEAD, _AHEAD, forearm.T @ hand, held)[4:]  # for an arm whose forearm points forward
         q[4:] = self.zero[4:] + self.sense[4:] * wrist
         q[4:] = continued(q[4:], self._q[4:])
         self._q = q
@@ -132,20 +134,20 @@ class JointMapping:
 
 
 class Approach:
-    """Goes to a goal that is far away at limited speed, then with it: the mapping may begin anywhere.
+    """Moves to a distant first goal at limited speed, then follows it: the mapping may begin anywhere.
 
     Args:
         arm: whose velocity limits.
         dt: control period [s].
-        share: of the velocity limits while it approaches.
+        fraction: of the velocity limits, while approaching.
     """
 
-    def __init__(self, arm: ArmModel, dt: float, share: float = 0.6) -> None:
-        self._most = share * dt * arm.max_velocity
+    def __init__(self, arm: ArmModel, dt: float, fraction: float = 0.6) -> None:
+        self._most = fraction * dt * arm.max_velocity
         self.active = True
 
     def towards(self, q: Array, goal: Array) -> Array:
-        """Return where to be one period after ``q``: on the way to ``goal``, or there once it has been reached."""
+        """Return the position one period after ``q``: towards ``goal``, or at it once it has been reached."""
         if self.active:
             reached = q + np.clip(goal - q, -self._most, self._most)
             self.active = bool((reached != goal).any())
@@ -154,19 +156,19 @@ class Approach:
 
 
 def continued(angles: Array, before: Array) -> Array:
-    """Return angles less whole turns, so that each is the nearest to the one before, shape (n,) [rad]."""
+    """Return angles plus whole turns so that each is closest to the one before, shape (n,) [rad]."""
     return np.asarray(before + (angles - before + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def _turned_back(angles: Array, lower: Array, upper: Array) -> Array:
-    """Turn angles that are beyond their limits by a whole turn where that brings them inside, shape (n,) [rad]."""
+def _whole_turn_inside(angles: Array, lower: Array, upper: Array) -> Array:
+    """Add a whole turn to angles beyond their limits where that brings them inside, shape (n,) [rad]."""
     turned = angles - 2.0 * np.pi * np.sign(angles)
     helps = ((angles < lower) | (angles > upper)) & (turned >= lower) & (turned <= upper)
     return np.where(helps, turned, angles)
 
 
 def _chain_of(arm: ArmModel) -> tuple[Array, Array]:
-    """Return the posture in which the arm is stretched forward like a person's, and the joints' senses, (7,) each."""
+    """Return the posture in which the arm is stretched forward, and the joints' directions, shape (7,) each."""
     axes = np.eye(3)[["xyz".index(name) for name in AXES]]
     if arm.n_joints == len(AXES):
         for stretched in _STRETCHED:
@@ -174,9 +176,8 @@ def _chain_of(arm: ArmModel) -> tuple[Array, Array]:
             if np.abs(cosines).min() > _ALIGNED:
                 return np.array(stretched), np.sign(cosines)
     raise InputError(
-        f"{arm.name}: its joints are not those of a person's arm (seven, that turn about z, y, x, y, x, y, x when it "
-        "is stretched forward), so a person's angles can't be its own; take a method that moves the tool: modern, "
-        "thesis, m3"
+        f"{arm.name}: its joints don't correspond to a person's arm (seven joints about z, y, x, y, x, y, x when "
+        "stretched forward), so joint angles can't be mapped; use a method that maps the tool: modern, thesis, m3"
     )
 
 

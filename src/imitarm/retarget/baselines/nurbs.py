@@ -1,4 +1,4 @@
-"""NURBS: rational spline curves (thesis Eq 3.6 and 3.7), and their fit to noisy samples."""
+"""NURBS: rational spline curves (thesis Eq 3.6 and 3.7), and their weighted, smooth, robust fit to noisy samples."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ Indices = NDArray[np.intp]
 Smoothing = float | str
 
 SMOOTHINGS = ("gcv", "morozov")
-"""How the strength of the smoothing may be chosen, beside a number."""
+"""How the smoothing may be chosen, besides a number."""
 
-_MU = (-6.0, 6.0)  # decades that are searched
-_HUBER, _PASSES = 2.5, 3  # an outlier is farther than 2.5 sigma; reweighted so often
-_MAD = 1.4826  # median of |normal| to its standard deviation
+_MU = (-6.0, 6.0)  # decades to search
+_HUBER, _PASSES = 2.5, 3  # an outlier is farther than 2.5 sigma; number of reweightings
+_MAD = 1.4826  # median absolute deviation to standard deviation
 _WEIGHTS = (0.2, 5.0)  # of rational curves
 _RATIONAL_PASSES = 3
 
 
 def basis_functions(knots: Array, degree: int, u: ArrayLike) -> tuple[Indices, Array]:
-    r"""Return the basis functions that are not zero (thesis Eq 3.7, corrected).
+    r"""Return the non-zero basis functions (thesis Eq 3.7, corrected).
 
     .. math::
         N_{i,0}(u) = \begin{cases} 1 & u_i \le u < u_{i+1} \\ 0 & \text{else} \end{cases} \qquad
@@ -36,16 +36,16 @@ def basis_functions(knots: Array, degree: int, u: ArrayLike) -> tuple[Indices, A
         + \frac{u_{i+p+1} - u}{u_{i+p+1} - u_{i+1}} N_{i+1,p-1}(u)
 
     with 0/0 = 0, and with the last span closed at the right, so that the last function is 1 at the end. At every ``u``
-    only p + 1 of them differ from zero; the recursion is run over these, where no divisor is zero.
+    only p + 1 of them are non-zero; the recursion runs over these, where no divisor is zero.
 
     Args:
-        knots: never falling, the first and the last repeated degree + 1 times, shape (m,).
+        knots: non-decreasing, the first and the last repeated degree + 1 times, shape (m,).
         degree: p.
-        u: shape (k,); cut to the knots' range.
+        u: shape (k,); clipped to the range of the knots.
 
     Returns:
-        indices of the first function that is not zero, shape (k,), and the values of it and the next ones,
-        shape (k, degree + 1).
+        indices of the first non-zero function, shape (k,), and the values of it and the next ones, shape (k, degree +
+        1).
     """
     at = np.minimum(np.maximum(np.asarray(u, dtype=float), knots[degree]), knots[-degree - 1])
     span = np.searchsorted(knots[degree + 1 : -degree - 1], at, side="right") + degree
@@ -64,13 +64,12 @@ def basis_functions(knots: Array, degree: int, u: ArrayLike) -> tuple[Indices, A
 
 @dataclass(frozen=True, eq=False)
 class NURBS:
-    r"""A non-uniform rational B-spline curve (thesis Eq 3.6, METHODS A.6).
+    r"""A non-uniform rational B-spline curve (thesis Eq 3.6; Piegl and Tiller, The NURBS Book).
 
     .. math:: C(u) = \frac{\sum_i N_{i,p}(u)\, w_i P_i}{\sum_i N_{i,p}(u)\, w_i}
 
-    with the functions of :func:`basis_functions` over knots
-    :math:`\{a, \dots, a, u_{p+1}, \dots, u_{m-p-1}, b, \dots, b\}`, a and b repeated p + 1 times. The parameter is a
-    time [s] where a curve was fitted to a motion.
+    with the functions of :func:`basis_functions` over the knots :math:`\{a, \dots, a, u_{p+1}, \dots, u_{m-p-1}, b,
+    \dots, b\}`, a and b repeated p + 1 times. For a curve fitted to a motion the parameter is the time [s].
 
     Attributes:
         knots: shape (n + degree + 1,).
@@ -79,8 +78,8 @@ class NURBS:
         degree: p, at least 1.
 
     Raises:
-        InputError: when shapes do not fit, knots fall, are not repeated at both ends or are repeated too often within,
-            or a weight is not positive.
+        InputError: when shapes do not match, knots decrease, are not repeated at both ends or are repeated too often
+            inside, or a weight is not positive.
     """
 
     knots: Array
@@ -99,9 +98,11 @@ class NURBS:
         if not (np.isfinite(knots).all() and np.isfinite(points).all()):
             raise InputError("NURBS: knots and control points must be finite numbers")
         if not (np.diff(knots) >= 0.0).all() or knots[p] != knots[0] or knots[-p - 1] != knots[-1]:
-            raise InputError(f"NURBS: knots must not fall, and the first and the last must be repeated {p + 1} times")
+            raise InputError(f"NURBS: knots must not decrease; the first and the last must be repeated {p + 1} times")
         if not (knots[p + 1 :] > knots[: -p - 1]).all():
-            raise InputError(f"NURBS: a knot is repeated more than {p} times inside the curve, which breaks it apart")
+            raise InputError(
+                f"NURBS: a knot inside the curve is repeated more than {p} times: it would be discontinuous"
+            )
         if not (np.isfinite(weights) & (weights > 0.0)).all():
             raise InputError("NURBS: weights must be positive")
         for name, value in (("knots", knots), ("control_points", points), ("weights", weights)):
@@ -110,33 +111,33 @@ class NURBS:
 
     @property
     def domain(self) -> tuple[float, float]:
-        """The least and the largest parameter."""
+        """The smallest and the largest parameter."""
         return float(self.knots[0]), float(self.knots[-1])
 
     def evaluate(self, u: ArrayLike) -> Array:
-        """Return the points of the curve at ``u`` (k,), shape (k, d); beyond its ends the curve stands still.
+        """Return the points of the curve at ``u`` (k,), shape (k, d); beyond its ends the end points.
 
         A single number gives one point, shape (d,).
         """
         at = np.asarray(u, dtype=float)
         first, values = basis_functions(self.knots, self.degree, at.reshape(-1))
         near = first[:, None] + np.arange(self.degree + 1)
-        share = values * self.weights[near]
-        points = (share[:, None, :] @ self.control_points[near])[:, 0] / share.sum(axis=1, keepdims=True)
+        weighted = values * self.weights[near]
+        points = (weighted[:, None, :] @ self.control_points[near])[:, 0] / weighted.sum(axis=1, keepdims=True)
         return np.asarray(points.reshape(*at.shape, points.shape[1]))
 
     def derivative(self, u: ArrayLike, order: int = 1) -> Array:
-        r"""Return a derivative by the parameter at ``u`` (k,), shape (k, d).
+        r"""Return a derivative with respect to the parameter at ``u`` (k,), shape (k, d).
 
         With :math:`A = \sum N_i w_i P_i` and :math:`W = \sum N_i w_i`:
         :math:`C^{(r)} = \frac1W \bigl(A^{(r)} - \sum_{j=1}^r \binom rj W^{(j)} C^{(r-j)}\bigr)`.
 
         Args:
-            u: where; a single number gives shape (d,). Beyond the ends it is the derivative at the end.
+            u: where; a single number gives shape (d,). Beyond the ends: the derivative at the end.
             order: 0 (the point itself) to ``degree``.
 
         Raises:
-            InputError: when the order is not one of these.
+            InputError: when the order is out of range.
         """
         if not 0 <= order <= self.degree:
             raise InputError(f"NURBS.derivative: order must be 0 to {self.degree}, got {order!r}")
@@ -163,7 +164,7 @@ class NURBS:
 
 
 def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
-    """Return knots that follow where the data are, so that every span holds some (Piegl and Tiller, Eq 9.69).
+    """Return knots that follow the density of the data: every span contains some (Piegl and Tiller, Eq 9.69).
 
     Args:
         u: parameters of the data, increasing, shape (k,), k at least ``n_control``.
@@ -175,19 +176,19 @@ def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
     """
     inner = np.arange(1, n_control - degree) * (len(u) / (n_control - degree))
     i = inner.astype(int)
-    share = inner - i
-    between = (1.0 - share) * u[i - 1] + share * u[i]
+    fraction = inner - i
+    between = (1.0 - fraction) * u[i - 1] + fraction * u[i]
     return np.concatenate([np.full(degree + 1, u[0]), between, np.full(degree + 1, u[-1])])
 
 
 class _Problem:
-    """The samples, the basis functions at them, and all of the normal equations that no confidence changes."""
+    """The samples, their basis functions, and the parts of the normal equations without the confidences."""
 
     def __init__(self, first: Indices, values: Array, points: Array, rows: Array) -> None:
         self.first, self.values, self.points, self.rows = first, values, points, rows
         self.n_control = n_control = len(rows) + 2
         self.order, self.dim = order, dim = values.shape[1], points.shape[1]
-        self.reached = first[:, None] + np.arange(order)  # which control points each sample depends on
+        self.reached = first[:, None] + np.arange(order)  # control points that each sample depends on
         pairs = [(a, b) for a in range(order) for b in range(a + 1)]
         a, b = (np.array(x) for x in zip(*pairs, strict=True))
         self._cells = ((a - b) * n_control + self.reached[:, b]).ravel()
@@ -225,38 +226,40 @@ def fit_nurbs(
     robust: bool = True,
     rational: bool = False,
 ) -> NURBS:
-    r"""Fit a curve to a motion, each sample by how far it is believed (METHODS A.6).
+    r"""Fit a curve to a motion, each sample weighted by its confidence (docs/thesis_map.md).
 
     .. math:: \min_P \sum_k c_k \Bigl|\sum_i R_{ik} P_i - Q_k\Bigr|^2 + \mu \sum_j |(D P)_j|^2,
         \qquad R_{ik} = \frac{N_i(t_k)\, w_i}{\sum_j N_j(t_k)\, w_j}
 
-    with D the second differences of :func:`bends`. The parameter is the time itself, not the length of the chord: the
-    speed is part of the motion. The normal equations have a band of width p, so the time it takes grows with the number
-    of samples only; ``"gcv"`` takes longer, since it needs the inverse.
+    with D the second differences of :func:`bends`. The parameter is the time, not the chord length, because the speed
+    is part of the motion. The normal equations are banded with width p, so the time grows linearly with the number of
+    samples; ``"gcv"`` takes longer because it needs the inverse.
 
     Args:
         times: strictly increasing, shape (k,) [s].
-        points: Q, shape (k, d); whatever where the confidence is 0, nan too.
+        points: Q, shape (k, d); arbitrary where the confidence is 0, also nan.
         confidence: c, 0 to 1, shape (k,); None: all 1.
         degree: p.
         n_control: number of control points; None: k/4 + p.
-        smoothing: :math:`\mu`, or ``"gcv"``: the one whose prediction of left-out samples is best (generalised cross
-            validation; supposes independent errors), or ``"morozov"``: the one that leaves a residual of ``sigma``.
+        smoothing: :math:`\mu`, or ``"gcv"``: by generalised cross validation, which assumes independent errors, or
+            ``"morozov"``: such that the residual equals ``sigma``.
         sigma: standard deviation of a sample on each axis, in the points' unit; None: from the residuals.
-        robust: samples farther than 2.5 sigma off count for less (Huber), found in three passes.
-        rational: fit the weights w too, between 0.2 and 5, mean 1; else all are 1. Needed for exact arcs only.
+        robust: reduce the weight of samples farther than 2.5 sigma from the curve (Huber), in three passes.
+        rational: also fit the weights w, between 0.2 and 5, mean 1; otherwise all are 1. Needed only for exact arcs.
 
     Raises:
-        InputError: when shapes do not fit, times do not increase, fewer than p + 1 samples are believed, or an option
-            is none.
+        InputError: when shapes do not match, times do not increase, fewer than p + 1 samples have confidence, or an
+            option is invalid.
     """
     t, q, c = _checked(times, points, confidence, degree)
     _check_options(smoothing, sigma)
-    believed = t[c > 0.0]
-    n = min(math.ceil(len(t) / 4) + degree, len(believed)) if n_control is None else n_control
-    if not degree + 1 <= n <= len(believed):
-        raise InputError(f"fit_nurbs: n_control must be {degree + 1} to {len(believed)} (samples believed), got {n}")
-    knots = averaged_knots(believed, n, degree)
+    used_times = t[c > 0.0]
+    n = min(math.ceil(len(t) / 4) + degree, len(used_times)) if n_control is None else n_control
+    if not degree + 1 <= n <= len(used_times):
+        raise InputError(
+            f"fit_nurbs: n_control must be {degree + 1} to {len(used_times)} (samples that count), got {n}"
+        )
+    knots = averaged_knots(used_times, n, degree)
     knots[: degree + 1], knots[-degree - 1 :] = t[0], t[-1]
     first, values = basis_functions(knots, degree, t)
     problem = _Problem(first, values, q, bends(knots, degree))
@@ -287,9 +290,9 @@ def _checked(
     if t.ndim != 1 or q.ndim != 2 or len(q) != len(t) or c.shape != t.shape:
         raise InputError(f"fit_nurbs: needs times (k,), points (k, d), confidence (k,); got {t.shape}, {q.shape}")
     if degree < 2:
-        raise InputError(f"fit_nurbs: degree must be at least 2, or the speed jumps; got {degree!r}")
+        raise InputError(f"fit_nurbs: degree must be at least 2, or the speed is discontinuous; got {degree!r}")
     if not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
-        raise InputError("fit_nurbs: times must be finite and strictly increasing; sort them, drop repeated frames")
+        raise InputError("fit_nurbs: times must be finite and strictly increasing; sort them, remove repeated frames")
     if not ((c >= 0.0) & (c <= 1.0)).all():
         raise InputError("fit_nurbs: confidence must be between 0 and 1")
     if int((c > 0.0).sum()) < degree + 1:
@@ -316,15 +319,15 @@ def _check_options(smoothing: Smoothing, sigma: float | None) -> None:
 def bends(knots: Array, degree: int) -> Array:
     r"""Return the second differences D of the control points, shape (n - 2, 3): row j acts on points j, j+1, j+2.
 
-    Control points stand over the means of p knots, :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`, which crowd at the
-    ends. Plain differences :math:`P_{j+1} - 2 P_j + P_{j-1}` would take a straight steady motion for a bent one there
-    and slow it down, so they are divided ones, :math:`h (\frac{P_{j+1} - P_j}{g_{j+1} - g_j} - \frac{P_j -
-    P_{j-1}}{g_j - g_{j-1}})` with h the mean distance: where knots are even, they are the plain ones.
+    Control points belong to the means of p knots, :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`, which are denser near
+    the ends. There plain differences :math:`P_{j+1} - 2 P_j + P_{j-1}` would see a curvature in a straight uniform
+    motion and slow it down. So they are divided differences, :math:`h (\frac{P_{j+1} - P_j}{g_{j+1} - g_j} - \frac{P_j
+    - P_{j-1}}{g_j - g_{j-1}})` with h the mean distance; for uniform knots they equal the plain ones.
     """
     means = np.convolve(knots[1:-1], np.full(degree, 1.0 / degree), "valid")
     apart = np.diff(means)
-    share = apart.mean() / apart
-    return np.column_stack([share[:-1], -share[:-1] - share[1:], share[1:]])
+    ratio = apart.mean() / apart
+    return np.column_stack([ratio[:-1], -ratio[:-1] - ratio[1:], ratio[1:]])
 
 
 def _bend_band(rows: Array, order: int) -> Array:
@@ -340,7 +343,7 @@ def _bend_band(rows: Array, order: int) -> Array:
 def _system(problem: _Problem, confidence: Array, mu: float) -> tuple[Array, Array, Array]:
     band, right = problem.normal(confidence)
     system = band + mu * problem.bend
-    system[0] += 1e-12 * float(system[0].max())  # where nothing was seen and nothing is smoothed: stay finite
+    system[0] += 1e-12 * float(system[0].max())  # stays finite where there are no samples and no smoothing
     return band, system, right
 
 
@@ -374,7 +377,7 @@ def _strength(problem: _Problem, confidence: Array, smoothing: Smoothing, sigma:
 
 
 def _cross_validated(problem: _Problem, confidence: Array) -> float:
-    r"""Return the mu with the least :math:`k\,RSS / (k - \mathrm{tr} H)^2`, H the matrix that smooths."""
+    r"""Return the mu with the lowest :math:`k\,RSS / (k - \mathrm{tr} H)^2`, H the smoothing matrix."""
     count = float((confidence > 0.0).sum())
     eye = np.eye(problem.n_control)
 
@@ -392,7 +395,7 @@ def _cross_validated(problem: _Problem, confidence: Array) -> float:
 
 
 def _least(score: Callable[[float], float]) -> float:
-    """Return 10 to the power of the decade of least score: first whole decades, then between their neighbours."""
+    """Return 10 to the power of the decade of the lowest score: among whole decades, then between neighbours."""
     decades = np.arange(_MU[0], _MU[1] + 0.5)
     best = float(decades[int(np.argmin([score(float(d)) for d in decades]))])
     finer = minimize_scalar(score, bounds=(best - 1.0, best + 1.0), method="bounded", options={"xatol": 0.1})
@@ -400,26 +403,26 @@ def _least(score: Callable[[float], float]) -> float:
 
 
 def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
-    r"""Return weights w (n,), mean 1, by least squares that are reweighted by the last denominator.
+    r"""Return weights w (n,), mean 1, by least squares, reweighted by the last denominator.
 
     :math:`\sum_k \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is quadratic in
-    both; X is eliminated, and of all w that do as well the one nearest to ones is taken.
+    both. X is eliminated, and among equally good w the one closest to ones is taken.
     """
     n = problem.n_control
     basis = np.zeros((len(problem.first), n))
     np.put_along_axis(basis, problem.reached, problem.values, axis=1)
-    middle = problem.points - problem.points.mean(axis=0)  # the origin must not matter
+    middle = problem.points - problem.points.mean(axis=0)  # independent of the origin
     weights = np.ones(n)
     bend = np.zeros((n - 2, n))
     np.put_along_axis(bend, np.arange(n - 2)[:, None] + np.arange(3), problem.rows, axis=1)
     stiff = mu * bend.T @ bend
     for _ in range(_RATIONAL_PASSES):
-        share = (confidence / np.square(basis @ weights))[:, None] * basis
-        inverse = np.linalg.pinv(basis.T @ share + stiff)
+        scaled = (confidence / np.square(basis @ weights))[:, None] * basis
+        inverse = np.linalg.pinv(basis.T @ scaled + stiff)
         cost = np.zeros((n, n))
         for axis in middle.T:
-            cross = share.T @ (axis[:, None] * basis)
-            cost += (np.square(axis)[:, None] * share).T @ basis - cross.T @ inverse @ cross
+            cross = scaled.T @ (axis[:, None] * basis)
+            cost += (np.square(axis)[:, None] * scaled).T @ basis - cross.T @ inverse @ cross
         near = 1e-9 * np.trace(cost) / n + 1e-300
         weights = np.linalg.solve(cost + near * np.eye(n), near * np.ones(n))
         weights = np.clip(weights / weights.mean(), *_WEIGHTS) if weights.mean() != 0.0 else np.ones(n)

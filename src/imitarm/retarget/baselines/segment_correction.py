@@ -1,4 +1,9 @@
-"""Corrections of a demonstrated motion, segment by segment: the step that a teacher performs in baseline M1."""
+"""Corrections of a demonstrated motion, segment by segment, in place of the teacher's advice in baseline M1.
+
+There are four corrections: slower, wrist closer, other elbow position, repair by key frames. Each changes one segment
+of a :class:`~imitarm.retarget.baselines.demonstrated_motion.DemonstratedMotion` by a weight that is 1 where the change
+is needed and decays to 0 at the segment's ends, so that the motion stays continuous.
+"""
 
 from __future__ import annotations
 
@@ -9,45 +14,48 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from imitarm.retarget.baselines.demonstrated_motion import ShownMotion
-from imitarm.retarget.baselines.feasibility import ELBOW, Infeasible, blend, segments
+from imitarm.retarget.baselines.demonstrated_motion import DemonstratedMotion
+from imitarm.retarget.baselines.feasibility import ELBOW, FeasibilityCheck, blend, segments
 from imitarm.retarget.baselines.joint_mapping import JointMapping
 from imitarm.retarget.correspondence import Clutch
 
 Array = NDArray[np.float64]
 
-SPEED_LEFT = 0.9  # share of the velocity limits that a slowed segment uses
-PULLED_TO = 0.78 / 0.80  # share of the reach to which the wrist is pulled in
-TURNS = tuple(np.deg2rad((10.0, -10.0, 20.0, -20.0, 30.0, -30.0)))  # [rad] of the elbow about shoulder to wrist
-KEYS, DRAWS = 5, 500  # key frames of a segment; samples drawn for one of them
-_ABOUT_KEY = 0.2  # [s] on both sides of a key frame, from which its spread is taken
-_LEAST_SPREAD = 0.1  # [rad] of each joint at a key frame: one demonstration tells little of what may vary
+SLOWED_TO = 0.9  # of the velocity limits: highest speed of a slowed segment
+PULLED_TO = 0.78 / 0.80  # of the reach: largest distance of the wrist after the correction
+# [rad] about the line from shoulder to wrist
+ELBOW_ROTATIONS = tuple(np.deg2rad((10.0, -10.0, 20.0, -20.0, 30.0, -30.0)))
+KEYS, DRAWS = 5, 500  # key frames per segment; samples drawn per key frame
+_ABOUT_KEY = 0.2  # [s] on both sides of a key frame: samples that determine its covariance
+_LEAST_SPREAD = 0.1  # [rad] smallest standard deviation of a joint: one demonstration shows little variation
 Mask = NDArray[np.bool_]
 
 COUNTED = (
     "segments",
     "slowed",
     "pulled_in",
-    "elbow_turned",
+    "elbow_rotated",
     "repaired",
     "missed_keys",
     "infeasible_before",
     "infeasible_after",
     "failures",
     "shown_time",
-    "advised_time",
+    "corrected_time",
 )
-"""What is counted and added up over the holds of a recording."""
-_GLANCE = 10  # samples between two that are looked at first
-_SLOWEST = 10.0  # nobody advises to be slower than so many times
+"""What is counted and summed over the engagements of a recording."""
+_STRIDE = 10  # every tenth sample is checked first
+_SLOWEST = 10.0  # largest factor of slowing down
 
 
-def slowed(motion: ShownMotion, first: int, past: int, weight: Array, factor: float) -> tuple[ShownMotion, int]:
+def slowed(
+    motion: DemonstratedMotion, first: int, past: int, weight: Array, factor: float
+) -> tuple[DemonstratedMotion, int]:
     r"""Slow a segment down: its time passes :math:`1 + w\,(s - 1)` times as slowly.
 
     Args:
         motion: with joints.
-        first: sample at which the segment begins.
+        first: first sample of the segment.
         past: the one after its last.
         weight: w, shape (past - first,).
         factor: s, at least 1.
@@ -64,10 +72,10 @@ def slowed(motion: ShownMotion, first: int, past: int, weight: Array, factor: fl
 
 
 def pull(points: Array, joints: Array) -> Array:
-    r"""Return how far to pull the wrist in so that the robot is stretched to 78/80 at most, :math:`\kappa`, (n,).
+    r"""Return the factor :math:`\kappa` of the distance shoulder to wrist for a stretch of 78/80 at most, shape (n,).
 
-    Where the robot's elbow is the person's, that is :math:`\kappa = 0.78/(\rho |W - S|)` as METHODS has it; where it is
-    not (a relative mapping), the person's elbow has to bend by what the robot's lacks.
+    Where the robot's elbow angle equals the person's, this is :math:`\kappa = 0.78/(\rho |W - S|)`; where it differs
+    (relative mapping), the person's elbow must bend by as much as the robot's lacks.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
@@ -83,7 +91,7 @@ def pull(points: Array, joints: Array) -> Array:
 
 
 def pulled_in(points: Array, kappa: Array) -> Array:
-    r"""Pull the wrist towards the shoulder, :math:`W' = S + \kappa (W - S)`; the elbow bends in the plane it is in.
+    r"""Move the wrist towards the shoulder, :math:`W' = S + \kappa (W - S)`; the elbow bends in its plane.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
@@ -96,19 +104,19 @@ def pulled_in(points: Array, kappa: Array) -> Array:
     upper, fore = _length(e - s), _length(w - e)
     pulled = s + kappa[:, None] * (w - s)
     reach = np.clip(_length(pulled - s), np.maximum(np.abs(upper - fore), 1e-6), upper + fore)
-    way = (pulled - s) / np.maximum(_length(pulled - s), 1e-9)[:, None]
-    side = (e - s) - way * np.sum(way * (e - s), axis=1, keepdims=True)
-    down = np.array([0.0, 0.0, -1.0]) - way * -way[:, 2:]  # where the elbow of a straight arm goes
+    axis = (pulled - s) / np.maximum(_length(pulled - s), 1e-9)[:, None]
+    side = (e - s) - axis * np.sum(axis * (e - s), axis=1, keepdims=True)
+    down = np.array([0.0, 0.0, -1.0]) - axis * -axis[:, 2:]  # direction in which the elbow of a straight arm moves
     side = np.where(_length(side)[:, None] > 1e-3 * upper[:, None], side, down)
     side = side / np.maximum(_length(side), 1e-9)[:, None]
     along = (upper**2 - fore**2 + reach**2) / (2.0 * reach)
     across = np.sqrt(np.maximum(upper**2 - along**2, 0.0))
-    elbow = s + along[:, None] * way + across[:, None] * side
-    return np.stack([s, elbow, s + reach[:, None] * way], axis=1)
+    elbow = s + along[:, None] * axis + across[:, None] * side
+    return np.stack([s, elbow, s + reach[:, None] * axis], axis=1)
 
 
-def elbow_turned(points: Array, angle: Array) -> Array:
-    """Turn the elbow about the line from shoulder to wrist.
+def elbow_rotated(points: Array, angle: Array) -> Array:
+    """Rotate the elbow about the line from shoulder to wrist.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
@@ -121,48 +129,49 @@ def elbow_turned(points: Array, angle: Array) -> Array:
     axis = (w - s) / np.maximum(_length(w - s), 1e-9)[:, None]
     c, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
     out = e - s
-    turned = c * out + sine * np.cross(axis, out) + (1.0 - c) * axis * np.sum(axis * out, axis=1, keepdims=True)
-    return np.stack([s, s + turned, w], axis=1)
+    rotated = c * out + sine * np.cross(axis, out) + (1.0 - c) * axis * np.sum(axis * out, axis=1, keepdims=True)
+    return np.stack([s, s + rotated, w], axis=1)
 
 
-def with_points(motion: ShownMotion, first: int, past: int, points: Array) -> ShownMotion:
-    """Return the motion with other points (past - first, 3, 3) [m] in a segment; the joints are to be mapped anew."""
+def with_points(motion: DemonstratedMotion, first: int, past: int, points: Array) -> DemonstratedMotion:
+    """Return the motion with other points (past - first, 3, 3) [m] in a segment; its joints must be mapped again."""
     changed = motion.points.copy()
     changed[first:past] = points
     return replace(motion, points=changed)
 
 
 def repaired(
-    joints: Array, first: int, past: int, infeasible: Infeasible, rng: np.random.Generator
+    joints: Array, first: int, past: int, check: FeasibilityCheck, rng: np.random.Generator
 ) -> tuple[Array, int]:
-    r"""Repair a segment at key frames (after Mueller et al. 2018), and lay a cubic spline through them.
+    r"""Repair a segment at key frames (after Mueller et al. 2018) and interpolate them by a cubic spline.
 
-    For each of five key frames a normal distribution :math:`N(\mu_k, \Sigma_k)` is fitted to the joints about it, and
-    up to 500 samples are drawn until one meets all that can be told from a posture; a key frame that meets
-    it already is kept. When none does, :math:`\mu_k` is put back into the limits.
+    For each of five key frames a normal distribution :math:`N(\mu_k, \Sigma_k)` is fitted to the joints around it, and
+    up to 500 samples are drawn until one is feasible; a key frame that is feasible already is kept. When no sample is
+    feasible, :math:`\mu_k` is clipped to the joint ranges.
 
     Args:
         joints: of the whole motion, shape (n, n_joints) [rad].
-        first: sample at which the segment begins.
+        first: first sample of the segment.
         past: the one after its last.
-        infeasible: what must not be.
+        check: the feasibility check.
         rng: for the samples.
 
     Returns:
-        joints, shape (n, n_joints) [rad], the same outside the segment; how many key frames found no sample.
+        joints, shape (n, n_joints) [rad], unchanged outside the segment; number of key frames without a feasible
+        sample.
     """
-    n, dt = len(joints), infeasible.dt
+    n, dt = len(joints), check.dt
     last = past - 1
     inside = np.unique(np.linspace(first, last, KEYS + 2).round().astype(int)[1:-1])
     keys = [int(k) for k in inside if first < k < last]
-    begin, end = (0 if first == 0 else None), (last if past == n else None)  # an end of the motion may move too
+    begin, end = (0 if first == 0 else None), (last if past == n else None)  # the ends of the motion may change too
     keys = sorted({*keys, *(k for k in (begin, end) if k is not None)})
     values, missed = [], 0
     wide = max(round(_ABOUT_KEY / dt), 1)
     for key in keys:
         about = joints[max(key - wide, 0) : key + wide + 1]
         spread = np.cov(about, rowvar=False) if len(about) > 1 else np.zeros((joints.shape[1],) * 2)
-        value, met = _sample(joints[key], spread + _LEAST_SPREAD**2 * np.eye(joints.shape[1]), infeasible, rng)
+        value, met = _sample(joints[key], spread + _LEAST_SPREAD**2 * np.eye(joints.shape[1]), check, rng)
         values.append(value)
         missed += not met
     at = sorted({first, *keys, last})
@@ -179,27 +188,27 @@ def repaired(
     return result, missed
 
 
-def _sample(mean: Array, covariance: Array, infeasible: Infeasible, rng: np.random.Generator) -> tuple[Array, bool]:
-    """Return a posture that nothing is wrong with, shape (n_joints,), and whether one was found."""
-    if infeasible.allows(mean):
+def _sample(mean: Array, covariance: Array, check: FeasibilityCheck, rng: np.random.Generator) -> tuple[Array, bool]:
+    """Return a feasible posture, shape (n_joints,), and whether one was found."""
+    if check.allows(mean):
         return mean, True
     for q in rng.multivariate_normal(mean, covariance, DRAWS):
-        if infeasible.allows(q):
+        if check.allows(q):
             return np.asarray(q), True
-    return np.clip(mean, infeasible.arm.lower, infeasible.arm.upper), False
+    return np.clip(mean, check.arm.lower, check.arm.upper), False
 
 
 def _length(vectors: Array) -> Array:
     return np.asarray(np.linalg.norm(vectors, axis=-1))
 
 
-class Advice:
-    """Corrects the motion of one hold on the robot (METHODS B, M1, steps 2 to 4).
+class SegmentCorrector:
+    """Corrects the motion of one engagement in rounds (baseline M1).
 
     Args:
-        mapping: of the person's joints, begun where the robot is.
-        clutch: of this hold.
-        infeasible: what must not be.
+        mapping: of the person's joints, started where the robot is.
+        clutch: of this engagement.
+        check: the feasibility check.
         rng: for the samples of a repair.
 
     Attributes:
@@ -207,67 +216,71 @@ class Advice:
         counts: by the names of :data:`COUNTED`; times in s.
     """
 
-    def __init__(self, mapping: JointMapping, clutch: Clutch, infeasible: Infeasible, rng: np.random.Generator) -> None:
-        self._mapping, self._clutch, self._infeasible, self._rng = mapping, clutch, infeasible, rng
+    def __init__(
+        self, mapping: JointMapping, clutch: Clutch, check: FeasibilityCheck, rng: np.random.Generator
+    ) -> None:
+        self._mapping, self._clutch, self._check, self._rng = mapping, clutch, check, rng
         self.rounds = 0
         self.counts: dict[str, float] = dict.fromkeys(COUNTED, 0.0)
 
-    def corrected(self, motion: ShownMotion, rounds: int) -> ShownMotion:
-        """Return the motion with the robot's joints, corrected as far as that goes.
+    def corrected(self, motion: DemonstratedMotion, rounds: int) -> DemonstratedMotion:
+        """Return the motion with the robot's joints, corrected as far as possible.
 
         Args:
             motion: without joints.
-            rounds: how many at most.
+            rounds: at most.
         """
-        dt = self._infeasible.dt
+        dt = self._check.dt
         motion = motion.with_joints(np.array([self._mapping.joints(e, self._clutch) for e in motion.estimates()]))
-        found = self._infeasible.anywhere(motion.joints)
+        found = self._check.anywhere(motion.joints)
         self.counts["shown_time"] += dt * len(motion)
         self.counts["infeasible_before"] += int(np.count_nonzero(found))
         while found.any() and self.rounds < rounds:
             self.rounds += 1
-            for first, past in reversed(segments(found, dt)):  # from the end: slowing moves what comes after
+            for first, past in reversed(segments(found, dt)):  # slowing down shifts what follows
                 self.counts["segments"] += 1
-                self.counts["advised_time"] += dt * (past - first)
-                motion = self._advised(motion, first, past, blend(found, first, past, dt))
-            found = self._infeasible.anywhere(motion.joints)
+                self.counts["corrected_time"] += dt * (past - first)
+                motion = self._corrected(motion, first, past, blend(found, first, past, dt))
+            found = self._check.anywhere(motion.joints)
         self.counts["infeasible_after"] += int(np.count_nonzero(found))
         self.counts["failures"] += len(segments(found, dt))
         return motion
 
-    def _advised(self, motion: ShownMotion, first: int, past: int, weight: Array) -> ShownMotion:
-        """Return the motion with one segment changed by the first operator that clears it, else repaired."""
+    def _corrected(self, motion: DemonstratedMotion, first: int, past: int, weight: Array) -> DemonstratedMotion:
+        """Return the motion with one segment changed by the first correction that makes it feasible, else repaired."""
         for name, changed, end in self._proposals(motion, first, past, weight):
-            if self._infeasible.clear(changed.joints[max(first - 1, 0) : end + 1]):
+            if self._check.clear(changed.joints[max(first - 1, 0) : end + 1]):
                 self.counts[name] += 1
                 return changed
-        joints, missed = repaired(motion.joints, first, past, self._infeasible, self._rng)
+        joints, missed = repaired(motion.joints, first, past, self._check, self._rng)
         self.counts["repaired"] += 1
         self.counts["missed_keys"] += missed
         return motion.with_joints(joints)
 
     def _proposals(
-        self, motion: ShownMotion, first: int, past: int, weight: Array
-    ) -> Iterator[tuple[str, ShownMotion, int]]:
-        """Give what may be advised, one after the other: name, changed motion, where the segment then ends."""
+        self, motion: DemonstratedMotion, first: int, past: int, weight: Array
+    ) -> Iterator[tuple[str, DemonstratedMotion, int]]:
+        """Yield the possible corrections in order: name, changed motion, new end of the segment."""
         window = motion.joints[first:past]
-        factor = float(self._infeasible.speeds(window).max(initial=0.0)) / SPEED_LEFT
-        if SPEED_LEFT * factor > 1.0 and factor <= _SLOWEST:
+        factor = float(self._check.speeds(window).max(initial=0.0)) / SLOWED_TO
+        if SLOWED_TO * factor > 1.0 and factor <= _SLOWEST:
             yield "slowed", *slowed(motion, first, past, weight, factor)
         kappa = pull(motion.points[first:past], window)
         if kappa.min() < 1.0:
             points = pulled_in(motion.points[first:past], 1.0 + weight * (kappa - 1.0))
             yield from self._mapped("pulled_in", with_points(motion, first, past, points), first, past)
-        for turn in TURNS:
-            points = elbow_turned(motion.points[first:past], weight * turn)
-            yield from self._mapped("elbow_turned", with_points(motion, first, past, points), first, past)
+        for angle in ELBOW_ROTATIONS:
+            points = elbow_rotated(motion.points[first:past], weight * angle)
+            yield from self._mapped("elbow_rotated", with_points(motion, first, past, points), first, past)
 
-    def _mapped(self, name: str, motion: ShownMotion, first: int, past: int) -> Iterator[tuple[str, ShownMotion, int]]:
-        """Give a motion with the joints of a segment mapped anew; not if a look at every tenth sample shows a fault."""
+    def _mapped(
+        self, name: str, motion: DemonstratedMotion, first: int, past: int
+    ) -> Iterator[tuple[str, DemonstratedMotion, int]]:
+        """Yield a motion with the joints of a segment mapped again, unless every tenth sample already shows a fault."""
         before = motion.joints[max(first - 1, 0)]
         self._mapping.resume(before)
-        for i in range(first, past, _GLANCE):
-            if not self._infeasible.allows(self._mapping.joints(motion.estimate(i), self._clutch)):
+        for i in range(first, past, _STRIDE):
+            if not self._check.allows(self._mapping.joints(motion.estimate(i), self._clutch)):
                 return
         joints = motion.joints.copy()
         self._mapping.resume(before)

@@ -23,7 +23,7 @@ from imitarm.kinematics.pose import (
 )
 from imitarm.kinematics.tasks import TwistTask
 from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
-from imitarm.retarget.baselines.hand_curve import HandCurve, HandSample, Playback
+from imitarm.retarget.baselines.hand_curve import DelayedCurve, HandCurve, HandSample
 from imitarm.retarget.correspondence import Clutch, Correspondence
 from imitarm.retarget.engagement import EngagementRule
 from imitarm.retarget.human_arm import carried, human_arm_angles, human_arm_frames, human_arm_jacobian, human_arm_pose
@@ -34,45 +34,46 @@ from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
 
-_NULL = 0.01  # share of the largest singular value below which the arm is taken not to move
-_LARGEST = 0.5  # [rad] of one increment
-_ARRIVED = 1e-5  # [m, rad] of error that needs no further one
+_NULL = 0.01  # of the largest singular value: smaller ones are directions in which the arm can't move
+_LARGEST = 0.5  # [rad] largest increment
+_ARRIVED = 1e-5  # [m, rad] error at which no further increment is needed
 Curve = Literal["live", "global"]
 
 PRINTED = {
-    "limbs": "Eq 3.1 to 3.4: the elbow comes out behind the shoulder, the forearm hangs on the measured elbow",
-    "dh": "Eq 3.5: the second row has sin for cos, so forward kinematics is no rotation",
-    "error": "the error is actual minus wanted: the angles run away from the target",
-    "rpy": "differences of roll, pitch and yaw beside a geometric Jacobian",
+    "limbs": "Eq 3.1 to 3.4: the elbow is behind the shoulder, the forearm is attached to the measured elbow",
+    "dh": "Eq 3.5: the second row has sin instead of cos, so forward kinematics gives no rotation",
+    "error": "the error is actual minus desired: the angles diverge from the target",
+    "rpy": "differences of roll, pitch and yaw are used with a geometric Jacobian",
     "step": "one increment per frame",
     "order": "P_R = P_HA R_HR: the hand moves the tool along the sensor's axes instead of the base's",
-    "damping": "Eq 3.9 fed with all of the error that is left: the farther the target, the slower the arm",
-    "small_angle": "the small angle after Eq 3.9: less damping than the bound on speed needs",
+    "damping": "Eq 3.9 uses the whole remaining error: the farther the target, the slower the arm",
+    "small_angle": "the small angle after Eq 3.9: less damping than the velocity limit needs",
 }
-"""What of the print can be run, by the names that ``as_printed`` takes."""
+"""The misprints that can be reproduced, by the names that ``as_printed`` accepts."""
 
-_UNCLAMPED = 1e6  # [m/s] a twist that no clamp reaches
-_UNSEEN = 0.2  # weight of a hand's rotation that was only carried along
+_UNLIMITED = 1e6  # [m/s] a limit that no twist reaches
+_UNSEEN = 0.2  # weight of a hand rotation that was not seen but moved with the forearm
 
 
 class HumanArmTracker:
-    r"""Follows a person's arm in joint angles (thesis 3.1.1 and 3.1.2, METHODS A.3 and A.4).
+    r"""Tracks a person's arm in joint angles (thesis 3.1.1 and 3.1.2).
 
-    From the angles :math:`\tau` of the frame before, one to three times
+    Starting from the angles :math:`\tau` of the previous frame, one to three times
 
     .. math:: \tau \leftarrow \tau + J^+ \varepsilon, \qquad
         \varepsilon = \begin{pmatrix} p_d - p(\tau) \\ \log(R_d R(\tau)^T) \end{pmatrix}
 
-    with p_d, R_d the wrist and hand as corrected, J the Jacobian of the person's arm, and directions in which a
-    stretched arm can't move left out of :math:`J^+`. The first frame, and one after a gap, is solved in closed form.
+    with :math:`p_d, R_d` the corrected wrist and hand and J the Jacobian of the person's arm; directions in which a
+    straight arm can't move are left out of :math:`J^+`. The first frame, and the first after a gap, is solved in closed
+    form.
 
     Attributes:
         angles: tau, shape (7,) [rad]; None before the first frame.
 
     Args:
         iterations: per frame.
-        faults: what of the print to put back, of :data:`imitarm.retarget.baselines.thesis.PRINTED`: ``"limbs"``,
-            ``"dh"``, ``"error"``, ``"rpy"`` and ``"step"`` concern this part.
+        faults: misprints to reproduce, of :data:`PRINTED`; ``"limbs"``, ``"dh"``, ``"error"``, ``"rpy"`` and ``"step"``
+            concern this class.
     """
 
     def __init__(self, iterations: int = 3, faults: Collection[str] = ()) -> None:
@@ -86,10 +87,10 @@ class HumanArmTracker:
         self._time = -math.inf
 
     def follow(self, estimate: ArmEstimate, lengths: LimbLengths) -> tuple[Array, Array]:
-        """Take in a frame and return the wrist (3,) [m] and the hand's quaternion (4,) of the followed arm, base frame.
+        """Process a frame; return wrist (3,) [m] and hand quaternion (4,) of the tracked arm in the base frame.
 
         Args:
-            estimate: of the arm, its bones of the true lengths.
+            estimate: of the arm, with true bone lengths.
             lengths: these lengths.
         """
         elbow, wrist = estimate.elbow, estimate.wrist
@@ -103,7 +104,7 @@ class HumanArmTracker:
         self._time = estimate.time
         at, rotation = self._pose(lengths)
         for _ in range(self._iterations):
-            error = np.concatenate([wrist - estimate.shoulder - at, self._turn(rotation, hand)])
+            error = np.concatenate([wrist - estimate.shoulder - at, self._rotation_error(rotation, hand)])
             if float(error @ error) < _ARRIVED**2:
                 break
             self._advance(-error if "error" in self._faults else error, lengths)
@@ -118,15 +119,15 @@ class HumanArmTracker:
         self.angles = (self.angles + increment + math.pi) % (2.0 * math.pi) - math.pi
 
     def _pose(self, lengths: LimbLengths) -> tuple[Array, Array]:
-        """Return wrist and hand, seen from the shoulder, by forward kinematics."""
+        """Return wrist and hand relative to the shoulder, by forward kinematics."""
         assert self.angles is not None
         if "dh" in self._faults:
             frames = human_arm_frames(self.angles, lengths, as_printed=True)
             return frames[5, :3, 3], _nearest_rotation(frames[7, :3, :3])
-        _, wrist, hand = human_arm_pose(self.angles, lengths)  # the same chain, in a third of the time
+        _, wrist, hand = human_arm_pose(self.angles, lengths)  # the same chain, three times as fast
         return wrist, hand
 
-    def _turn(self, rotation: Array, wanted: Array) -> Array:
+    def _rotation_error(self, rotation: Array, wanted: Array) -> Array:
         """Return the rotational part of the error, shape (3,) [rad]."""
         if "rpy" in self._faults:
             return roll_pitch_yaw(wanted) - roll_pitch_yaw(rotation)
@@ -138,8 +139,8 @@ class HumanArmTracker:
 def roll_pitch_yaw(rotation: Array) -> Array:
     """Return roll, pitch and yaw of a rotation Rz(yaw) Ry(pitch) Rx(roll), shape (3,) [rad].
 
-    Their differences are what the thesis takes for the error of orientation: they wrap at half a turn, lock at a pitch
-    of a quarter, and are no rotation vector.
+    The thesis uses their differences as the error of orientation: they wrap at half a turn, are singular at a pitch of
+    a quarter turn, and are not a rotation vector.
     """
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
     return np.array(
@@ -157,48 +158,49 @@ def _unit(vector: Array) -> Array:
 
 
 def _nearest_rotation(matrix: Array) -> Array:
-    """Return the rotation nearest to what the printed matrices multiply to."""
+    """Return the rotation closest to the product of the printed matrices."""
     left, values, right = np.linalg.svd(matrix)
-    if values[1] < 1e-9:  # hardly a direction is left
+    if values[1] < 1e-9:  # almost no direction is left
         return carried(None, None, left[:, 0])
     left[:, 2] *= np.linalg.det(left @ right)
     return np.asarray(left @ right)
 
 
 class ThesisRetargeter(Retargeter):
-    r"""Human arm to robot arm as thesis Chapter 3 does it, read as METHODS A.1 to A.8 does.
+    r"""Retarget as in Chapter 3 of the thesis, corrected as in docs/thesis_map.md.
 
     For each skeleton
 
     1. the bones get their true lengths (Eq 3.1 to 3.4);
-    2. the person's joint angles follow by increments :math:`\tau \leftarrow \tau + J^+ \varepsilon`
-       (:class:`~imitarm.retarget.baselines.thesis.HumanArmTracker`), and Denavit-Hartenberg forward
-       kinematics (Eq 3.5) gives the hand from the shoulder, then in the robot's base frame;
-    3. a NURBS is fitted to the last 0.6 s and read 70 ms late (Eq 3.6 and 3.7,
-       :class:`~imitarm.retarget.baselines.hand_curve.Playback`).
+    2. the person's joint angles are tracked by increments :math:`\tau \leftarrow \tau + J^+ \varepsilon`
+       (:class:`HumanArmTracker`), and Denavit-Hartenberg forward kinematics (Eq 3.5) gives the hand relative to the
+       shoulder, then in the robot's base frame;
+    3. a NURBS is fitted to the last 0.6 s and evaluated 70 ms in the past (Eq 3.6 and 3.7,
+       :class:`~imitarm.retarget.baselines.hand_curve.DelayedCurve`).
 
-    At each control step the tool goes towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
-    3.9), every step clamped, since otherwise the arm freezes. The joints keep their limits of position and velocity;
-    there is none of acceleration, no word on the elbow, none on obstacles and none on what to do when the person is
-    lost: the thesis has none. The target then stays where it was, and jumps when the person is back.
+    At each control step the tool moves towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
+    3.9). Every step is limited in length, since otherwise the arm freezes. Joint positions and velocities stay within
+    their limits. Accelerations, the elbow, obstacles and the loss of the person are not treated, because the thesis
+    does not: when the person is lost, the target stays, and it jumps when the person returns.
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: what of the person's arm stands for what of the robot's.
+        correspondence: between the person's arm and the robot's.
         dt: control period [s].
-        scene: not heeded.
-        small_angle: ``"thesis"``: with the term printed after Eq 3.9 (METHODS A.8).
-        as_printed: True: all of :data:`PRINTED`; or the names of some. The robot's limits are kept all the same.
-        smoothing: ``"live"``; ``"global"``: :meth:`run` fits one curve to the whole recording, without lag (step by
-            step it is live); None: no curve.
+        scene: ignored.
+        small_angle: ``"thesis"``: with the term printed after Eq 3.9.
+        as_printed: True: reproduce all misprints of :data:`PRINTED`; or the names of some. Limits are kept all the
+            same.
+        smoothing: ``"live"``; ``"global"``: :meth:`run` fits one curve to the whole recording, without lag
+            (:meth:`step` is live); None: no curve.
         lag: of the live curve [s].
         iterations: increments per frame.
-        gain: K of the twist :math:`K \log(T_d T^{-1})` [1/s]; METHODS A.4: one over the period of the frames.
-        max_speed: the twist is cut to this [m/s], 1 rad counting as 0.3 m.
+        gain: K of the twist :math:`K \log(T_d T^{-1})` [1/s]; one over the frame period.
+        max_speed: the twist is limited to this [m/s], 1 rad counted as 0.3 m.
 
     Raises:
         InputError: when a number is out of range.
-        UnknownNameError: when a name in ``as_printed``, ``smoothing`` or ``small_angle`` is not known.
+        UnknownNameError: when a name in ``as_printed``, ``smoothing`` or ``small_angle`` is unknown.
     """
 
     name: ClassVar[str] = "thesis"
@@ -233,13 +235,13 @@ class ThesisRetargeter(Retargeter):
         self.faults = faults
         self._small_angle = "thesis" if "small_angle" in faults else small_angle
         self._smoothing, self._lag, self._iterations = smoothing, lag, iterations
-        self._gain, self._max_speed = gain, _UNCLAMPED if "damping" in faults else max_speed
+        self._gain, self._max_speed = gain, _UNLIMITED if "damping" in faults else max_speed
         self._whole: HandCurve | None = None
         super().__init__(arm, correspondence, dt=dt, scene=scene)
 
     def _begin(self) -> None:
         self._tracker = HumanArmTracker(self._iterations, self.faults)
-        self._playback = Playback(lag=self._lag, smooth=self._smoothing is not None, whole=self._whole)
+        self._curve = DelayedCurve(lag=self._lag, smooth=self._smoothing is not None, whole=self._whole)
 
     def _new_estimator(self) -> ArmEstimator:
         return ArmEstimator(self.correspondence, smoothing=False, limbs="direction")
@@ -266,23 +268,23 @@ class ThesisRetargeter(Retargeter):
             self._whole = None
 
     def _see(self, skeleton: Skeleton | None) -> ArmEstimate | None:
-        self._playback.step(self.dt)
+        self._curve.step(self.dt)
         estimate = super()._see(skeleton)
         if estimate is not None:
-            self._playback.add(self._sample(estimate))
+            self._curve.add(self._sample(estimate))
         return estimate
 
     def _sample(self, estimate: ArmEstimate) -> HandSample:
-        """Return where the hand of the followed human arm is."""
+        """Return the pose of the hand of the tracked arm."""
         lengths = self._estimator.lengths
         assert lengths is not None  # else there would be no estimate
         wrist, hand = self._tracker.follow(estimate, lengths)
-        _, known, turned = estimate.confidence
-        return HandSample(estimate.time, wrist, hand, (known, max(turned, _UNSEEN)))
+        _, known, rotated = estimate.confidence
+        return HandSample(estimate.time, wrist, hand, (known, max(rotated, _UNSEEN)))
 
     def _hand(self) -> tuple[Array, Array]:
         """Return wrist and hand on the smoothed curve: there the clutch engages, so that the tool does not jump."""
-        hand = self._playback.now()
+        hand = self._curve.now()
         assert hand is not None
         return hand
 
@@ -290,10 +292,10 @@ class ThesisRetargeter(Retargeter):
         if "order" in self.faults:
             sensor_to_base = self.correspondence.sensor_to_base
             back = quaternion_conjugate(sensor_to_base.quaternion)
-            turn = quaternion_multiply(hand, quaternion_conjugate(clutch.hand))
-            turn = quaternion_multiply(quaternion_multiply(back, turn), sensor_to_base.quaternion)
+            rotation = quaternion_multiply(hand, quaternion_conjugate(clutch.hand))
+            rotation = quaternion_multiply(quaternion_multiply(back, rotation), sensor_to_base.quaternion)
             wrist = clutch.wrist + sensor_to_base.rotation.T @ (wrist - clutch.wrist)
-            hand = quaternion_multiply(turn, clutch.hand)
+            hand = quaternion_multiply(rotation, clutch.hand)
         return clutch.target(wrist, hand)
 
     def _advance(self, goal: Goal | None, measured: Array) -> Array:
