@@ -18,6 +18,7 @@ from imitarm import (
     InfeasibleError,
     InputError,
     Pose,
+    SafetyFilter,
     Scene,
     SimulatedRobot,
     Skill,
@@ -61,8 +62,10 @@ def main() -> None:
             nearest[" to ".join(robot.nearest_pair() or ())] += 1
 
     # `observe` answers what stands where at a time; here the scene as it is, with whatever moves moved on.
-    # With link_clearance no link may come nearer than this either, whatever the plan of the tool says.
-    rollout = reproduce(policy, robot, scene.at, timeout=40.0, link_clearance=CLEARANCE, on_step=watch)
+    # The safety filter lets no link come nearer than this either, whatever the plan of the tool says.
+    rollout = reproduce(
+        policy, robot, scene.at, timeout=40.0, safety=SafetyFilter(arm, clearance=CLEARANCE), on_step=watch
+    )
     rollout = task.judge(robot, rollout)  # the task's own verdict: is the dirt in the pan?
 
     adaptation = policy.adaptation
@@ -81,7 +84,7 @@ def main() -> None:
     covered = Scene(None, [*scene.obstacles, jar])
     robot.reset()
     try:
-        reproduce(policy, robot, covered.after)
+        reproduce(policy, robot, covered.at)
     except InfeasibleError as refusal:
         print(f"\nwith a jar on the goal: {refusal}")
 

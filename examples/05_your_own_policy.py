@@ -1,7 +1,7 @@
 """Write a policy of your own, register it, and let it reproduce a skill under the same conditions as the built-in one.
 
-A policy sees an `Observation` (time, measured pose of the tool, scene) and answers with a twist. Everything else is the
-same for all: robot, inverse kinematics, limits, and the clearance that the simulator measures.
+A policy sees an `Observation` (time, state of the arm, pose of the tool, scene) and answers with a `Command`.
+Everything else is the same for all: robot, safety filter, inverse kinematics, and the measured clearance.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ import numpy as np
 from imitarm import (
     POLICIES,
     ArmModel,
+    Command,
     Demonstration,
     Observation,
     Policy,
     Pose,
+    SafetyFilter,
     Scene,
     SimulatedRobot,
     Skill,
@@ -28,24 +30,22 @@ from imitarm import (
 class Repelled(Policy):
     """Follow the learnt path by the clock, pushed off whatever is near (the repulsive force of thesis Eq 2.19)."""
 
-    def __init__(self, skill: Skill, *, tool_radius: float, influence: float = 0.06, gain: float = 4.0) -> None:
-        super().__init__(skill)
-        self.tool_radius, self.influence, self.gain = tool_radius, influence, gain
+    influence, gain = 0.06, 4.0  # [m], [1/s]
 
     def reset(self, observation: Observation) -> None:
         """Take the learnt path from where the tool is."""
         self.path = self.skill.generate(observation.tool_to_base, observation.scene.goal)
 
-    def step(self, observation: Observation, dt: float) -> np.ndarray:
-        """Answer with a pull towards the path and a push off every obstacle that is near."""
+    def step(self, observation: Observation, dt: float) -> Command:
+        """Return a pull towards the path and a push away from every obstacle that is near."""
         positions, quaternions = self.path.at([observation.time + dt])
         twist = self.gain * observation.tool_to_base.error_to(Pose(positions[0], quaternions[0]))
         for obstacle in observation.scene.obstacles:
             distance, normal = obstacle.distance_and_gradient(observation.tool_to_base.position)
-            d = max(float(distance) - self.tool_radius, 0.01)
+            d = max(float(distance) - self.tool_spheres[0, 3], 0.01)
             if d < self.influence:
                 twist[:3] += 2e-6 * (1.0 / d - 1.0 / self.influence) / d**2 * normal
-        return twist
+        return Command(twist, progress=min(observation.time / self.path.duration, 1.0))
 
     def finished(self, observation: Observation) -> bool:
         """The time is over and the goal is reached."""
@@ -53,7 +53,7 @@ class Repelled(Policy):
         return observation.time > self.path.duration and bool(away < 0.005)
 
 
-POLICIES["repelled"] = Repelled
+POLICIES.register("repelled", Repelled)
 
 
 def reaches(start: Pose, goal: Pose, n: int = 5) -> list[Demonstration]:
@@ -92,13 +92,14 @@ def main() -> None:
     for name, scene in scenes.items():
         print(name)
         for key, make in POLICIES.items():
-            # Where a policy fails, the inverse kinematics can still keep every link clear, whatever is asked for.
-            for barrier in (None, 0.01):
+            # Where a policy fails, the safety filter can still keep every link clear, whatever is asked for.
+            for clearance in (None, 0.01):
                 robot = SimulatedRobot(arm, scene=scene, q=find_posture(arm, start))
-                policy = make(skill, tool_radius=arm.tool_radius)
-                rollout = reproduce(policy, robot, scene.at, timeout=6.0, link_clearance=barrier)
+                policy = make(skill, tool_spheres=[[0.0, 0.0, 0.0, arm.tool_radius]])
+                safety = SafetyFilter(arm, clearance=clearance)
+                rollout = reproduce(policy, robot, scene.at, timeout=6.0, safety=safety)
                 near = f"clearance {1e3 * rollout.min_clearance:.0f} mm, " if scene.obstacles else ""
-                held = "" if barrier is None else " with links kept clear"
+                held = "" if clearance is None else " with links kept clear"
                 print(f"  {key}{held}: {near}{rollout.trajectory.duration:.1f} s, {rollout.reason}")
                 if rollout.success:
                     break

@@ -13,6 +13,7 @@ from imitarm import (
     Correspondence,
     Demonstration,
     Pose,
+    SafetyFilter,
     Scene,
     SimulatedRobot,
     Skill,
@@ -96,7 +97,7 @@ def main() -> None:
     for name, scene in {"nothing in the way": Scene(), "a ball on the path": Scene(None, [ball])}.items():
         robot = SimulatedRobot(arm, scene=scene, q=find_posture(arm, skill.start_, q0=start))
         policy = ACFRA(skill, tool_spheres=arm.tool_spheres)
-        rollout = reproduce(policy, robot, scene.at, timeout=20.0, link_clearance=0.02)
+        rollout = reproduce(policy, robot, scene.at, timeout=20.0, safety=SafetyFilter(arm, clearance=0.02))
         ends = 1e3 * np.linalg.norm(rollout.trajectory.positions[-1] - skill.goal_.position)
         near = f", {1e3 * rollout.min_clearance:.0f} mm from the ball" if scene.obstacles else ""
         print(f"{name}: {rollout.reason}, {ends:.1f} mm from where the person ended{near}")

@@ -3,12 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from imitarm.command import Command
 from imitarm.control_loop.reproduce import reproduce
 from imitarm.errors import InfeasibleError, InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
 from imitarm.policies.policy import Policy
 from imitarm.robots import SimulatedRobot
+from imitarm.safety import SafetyFilter
 from imitarm.scene import Box, Scene
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -33,7 +35,8 @@ class Glide(Policy):
     def step(self, observation, dt):
         rate = (self.wanted(observation.time + dt).position - self.wanted(observation.time).position) / dt
         forward = np.concatenate([rate, np.zeros(3)])
-        return forward + 5.0 * observation.tool_to_base.error_to(self.wanted(observation.time))
+        twist = forward + 5.0 * observation.tool_to_base.error_to(self.wanted(observation.time))
+        return Command(twist, progress=min(observation.time / self.duration, 1.0))
 
     def finished(self, observation):
         return observation.time >= self.duration + 0.3
@@ -51,7 +54,9 @@ def wall(gap):
 @pytest.mark.parametrize("method", ["qp", "dls"])
 def test_the_tool_goes_where_the_policy_wants(dt, method):
     policy, robot = Glide([0.05, 0.15, -0.05]), robot_with(wall(0.4))
-    rollout = reproduce(policy, robot, lambda t: robot.scene, dt=dt, method=method)
+    options = {} if method == "qp" else {"clearance": None, "self_clearance": None, "method": method}
+    safety = SafetyFilter(ARM, dt=dt, **options)
+    rollout = reproduce(policy, robot, lambda t: robot.scene, dt=dt, safety=safety)
     assert rollout.success
     assert rollout.reason == "finished"
     wanted = np.array([policy.wanted(t).position for t in rollout.trajectory.times])
@@ -80,7 +85,7 @@ def test_each_step_is_told_and_the_scene_is_the_observed_one():
     assert all(step.scene in scenes for step in seen)
     assert seen[10].scene.goal.position[0] == pytest.approx(0.10)
     np.testing.assert_array_equal(seen[5].state.q, rollout.joints[6])
-    np.testing.assert_array_equal(seen[5].twist, rollout.details["twists"][6])
+    np.testing.assert_array_equal(seen[5].command.twist, rollout.details["twists"][6])
 
 
 def test_a_second_reproduction_begins_at_time_zero_again():
@@ -104,7 +109,7 @@ def test_out_of_time_the_robot_stops_and_the_reason_is_told():
 
 def test_what_is_touched_is_named_and_a_held_robot_gives_up():
     robot = robot_with(wall(0.04))
-    rollout = reproduce(Glide([0.3, 0.0, 0.0]), robot, lambda t: robot.scene)
+    rollout = reproduce(Glide([0.3, 0.0, 0.0]), robot, lambda t: robot.scene, safety=SafetyFilter(ARM, clearance=None))
     assert not rollout.success
     assert "protective stop" in rollout.reason
     assert 'with box "wall"' in rollout.reason
@@ -135,11 +140,32 @@ def test_whatever_is_raised_the_robot_is_stopped_first(stage):
     assert not robot.velocity.any()
 
 
-def test_an_answer_that_is_no_twist_is_an_error():
+def test_an_answer_that_is_no_command_is_an_error():
     policy = Glide([0.0, 0.1, 0.0])
-    policy.step = lambda observation, dt: np.full(6, np.nan)
-    with pytest.raises(InputError, match=r"Glide\.step must answer 6 finite numbers"):
+    policy.step = lambda observation, dt: np.zeros(6)
+    with pytest.raises(InputError, match=r"Glide\.step must return a Command"):
         reproduce(policy, robot_with(), lambda t: Scene())
+    with pytest.raises(InputError, match="Command: twist"):
+        Command(np.full(6, np.nan))
+
+
+def test_by_default_nothing_is_touched_whatever_the_policy_wants():
+    robot = robot_with(wall(0.04))
+    rollout = reproduce(Glide([0.3, 0.0, 0.0]), robot, lambda t: robot.scene, timeout=3.0)
+    assert not rollout.details["contacts"] and rollout.min_clearance > 0.0
+    assert rollout.details["filtered"] > 50
+
+
+def test_a_motion_nearer_than_the_filter_requires_is_no_success():
+    robot = robot_with(wall(0.05))
+    rollout = reproduce(Glide([0.0, 0.05, 0.0]), robot, lambda t: robot.scene, safety=SafetyFilter(ARM, clearance=0.08))
+    assert not rollout.success
+    assert rollout.reason.startswith("clearance fell to")
+
+
+def test_a_filter_for_another_period_is_refused():
+    with pytest.raises(InputError, match=r"made for dt 0\.02 s"):
+        reproduce(Glide([0, 0, 0]), robot_with(), lambda t: Scene(), safety=SafetyFilter(ARM, dt=0.02))
 
 
 def test_a_refusal_comes_before_any_motion():

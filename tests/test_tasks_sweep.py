@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
 
+from imitarm.command import Command
 from imitarm.control_loop.reproduce import reproduce
 from imitarm.demonstrations import align, read
 from imitarm.errors import InputError, UnknownNameError
@@ -13,6 +14,7 @@ from imitarm.kinematics.pose import Pose
 from imitarm.policies.acfra import ACFRA
 from imitarm.policies.adaptation import HORIZONTAL_ONLY
 from imitarm.policies.policy import Policy
+from imitarm.safety import SafetyFilter
 from imitarm.scene import Scene, load_scene, save_scene
 from imitarm.skills import Skill
 from imitarm.tasks.sweep import DEMONSTRATIONS, SCENES, SWEEPING, SweepTask
@@ -43,7 +45,7 @@ class Follow(Policy):
     def step(self, observation, dt):
         positions, quaternions = self.path.at([observation.time, observation.time + dt])
         forward = np.concatenate([(positions[1] - positions[0]) / dt, np.zeros(3)])
-        return forward + 4.0 * observation.tool_to_base.error_to(Pose(positions[0], quaternions[0]))
+        return Command(forward + 4.0 * observation.tool_to_base.error_to(Pose(positions[0], quaternions[0])))
 
     def finished(self, observation):
         return observation.time > self.path.times[-1] + 0.3
@@ -74,7 +76,8 @@ def test_without_avoidance_every_scene_is_a_collision(name):
     task = SweepTask()
     scene = task.scene(name)
     robot = task.robot(scene, arm=ARM)
-    rollout = task.judge(robot, reproduce(Follow(nominal()), robot, lambda t: scene))
+    blind = SafetyFilter(ARM, clearance=None)
+    rollout = task.judge(robot, reproduce(Follow(nominal()), robot, lambda t: scene, safety=blind))
     assert not rollout.success
     assert "touched" in rollout.reason
     assert "crumbs are not in the pan" in rollout.reason

@@ -1,5 +1,7 @@
 from .benchmark.experiment import Experiment, Result
 from .capture import SOURCES, Skeleton, SkeletonSource
+from .capture import Skeleton, SkeletonSource
+from .command import Command, Status
 from .control_loop import reproduce
 from .demonstrations import Finding, align, lint, read
 from .errors import ImitarmError, InfeasibleError, InputError, TaskFailedError, UnreachableError
@@ -12,6 +14,7 @@ from .kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, TwistTa
 from .policies import ACFRA, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Adaptation, Observation, Policy, adapt
 from .retarget import RETARGETERS, Correspondence, Retargeter
 from .robots import Robot, SimulatedRobot
+from .safety import SafetyFilter
 from .scene import (
     Box,
     Capsule,
@@ -32,28 +35,25 @@ from .trajectory import Demonstration, Rollout, Trajectory
 __version__: str
 __all__ = [
     "ACFRA",
-    "DMP",
-    "GMR",
-    "HORIZONTAL_ONLY",
-    "NOT_DOWN",
-    "POLICIES",
-    "RETARGETERS",
-    "SOURCES",
     "Adaptation",
     "ArmModel",
     "ArmState",
     "Box",
     "Capsule",
+    "Command",
     "Cone",
     "ConvexHull",
     "Correspondence",
     "Cylinder",
+    "DMP",
     "Demonstration",
     "ElbowTask",
     "Ellipsoid",
     "Experiment",
     "Finding",
+    "GMR",
     "GaussianMixture",
+    "HORIZONTAL_ONLY",
     "HalfSpace",
     "IKSolver",
     "ImitarmError",
@@ -61,21 +61,27 @@ __all__ = [
     "InputError",
     "JointLimits",
     "JointVelocityTask",
+    "NOT_DOWN",
     "Observation",
     "Obstacle",
+    "POLICIES",
     "Policy",
     "Pose",
     "PostureTask",
+    "RETARGETERS",
     "Result",
     "Retargeter",
     "Robot",
     "Rollout",
+    "SOURCES",
+    "SafetyFilter",
     "Scene",
     "SimulatedRobot",
     "Skeleton",
     "SkeletonSource",
     "Skill",
     "Sphere",
+    "Status",
     "TaskFailedError",
     "Trajectory",
     "TwistTask",

@@ -47,6 +47,17 @@ class Registry(Mapping[str, Item], Generic[Item]):
             self._loaded[name] = self._load(name, places[name])
         return self._loaded[name]
 
+    def register(self, name: str, item: Item) -> None:
+        """Add a member for this process, for example from a script.
+
+        Raises:
+            InputError: when a built-in member has that name.
+        """
+        if name in self._built_in:
+            raise InputError(f"{self.kind} {name!r} is built in; choose another name")
+        self._places()[name] = f"registered {name}"
+        self._loaded[name] = item
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._places())
 

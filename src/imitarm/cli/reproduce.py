@@ -1,10 +1,11 @@
-"""``imitarm reproduce``: let a simulated arm do what a skill has learnt, around what stands in the way."""
+"""``imitarm reproduce``: let a simulated arm reproduce a skill around obstacles."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,11 @@ from imitarm.cli.outputs import check_outputs
 from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
 from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.cli.trial import provenance, show_results, try_scene
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.posture import find_posture
-from imitarm.policies import ACFRA, ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN
+from imitarm.policies import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Policy
 from imitarm.robots import SimulatedRobot
 from imitarm.scene import Scene, load_scene
 from imitarm.skills import Skill
@@ -30,7 +32,7 @@ examples:
   imitarm reproduce pour.json --robot panda --scene bottles.yaml --clearance 30 --goal 40 -30 25
 
 The arm is simulated with its inertias and limits; the clearance is measured by the simulator between its own shapes.
-Exit status 1 when there is no way with the asked clearance, or the motion touched something or did not finish.
+Exit status 1: there is no path with the required clearance, or the motion touched something or did not finish.
 """
 
 FORBIDDEN = {"keep_height": HORIZONTAL_ONLY, "not_down": NOT_DOWN}
@@ -41,18 +43,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("skill", metavar="SKILL", type=Path, help="a skill file, as 'imitarm learn' writes it")
     add_robot_options(parser)
     parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles and goal (YAML); default: nothing")
-    way = parser.add_argument_group("the way round")
-    way.add_argument("--method", choices=ADAPTERS, default="certified", help="how to adapt; default: certified")
-    way.add_argument("--clearance", type=float, default=20.0, metavar="MM", help="to every obstacle; default: 20 mm")
-    way.add_argument("--tool-radius", type=float, metavar="MM", help="of a sphere; default: the tool's own shape")
-    way.add_argument("--tool-only", action="store_true", help="do not keep the other links clear (to compare)")
-    held = way.add_mutually_exclusive_group()
-    held.add_argument("--keep-height", action="store_true", help="give way only sideways, as on a table")
-    held.add_argument("--not-down", action="store_true", help="never give way downwards")
+    avoid = parser.add_argument_group("avoidance")
+    avoid.add_argument("--policy", choices=POLICIES, default="acfra", help="what decides the motion; default: acfra")
+    avoid.add_argument("--method", choices=ADAPTERS, help="how acfra adapts the path; default: certified")
+    avoid.add_argument(
+        "--clearance", type=float, default=20.0, metavar="MM", help="required distance to every obstacle; default: 20"
+    )
+    avoid.add_argument(
+        "--tool-radius", type=float, metavar="MM", help="of a sphere about the tip; default: the tool's own shape"
+    )
+    avoid.add_argument("--tool-only", action="store_true", help="do not keep the other links clear (to compare)")
+    held = avoid.add_mutually_exclusive_group()
+    held.add_argument("--keep-height", action="store_true", help="move the path only sideways, as on a table")
+    held.add_argument("--not-down", action="store_true", help="never move the path downwards")
     moved = parser.add_argument_group("from and to somewhere else")
     triple = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
-    moved.add_argument("--start", **triple, help="where the motion begins [cm]; default: as learnt")  # type: ignore[arg-type]
-    moved.add_argument("--goal", **triple, help="where it ends [cm]; default: as the scene says, else as learnt")  # type: ignore[arg-type]
+    moved.add_argument("--start", **triple, help="where the motion begins [cm]; default: as learned")  # type: ignore[arg-type]
+    moved.add_argument("--goal", **triple, help="where it ends [cm]; default: as the scene says, else as learned")  # type: ignore[arg-type]
     parser.add_argument("--control", choices=("position", "torque"), default="position", help="of the simulated drives")
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=Path, metavar="FILE", help="the measured motion, as a demonstration (CSV)")
@@ -85,13 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
         find_posture(arm, Pose(scene.goal.position, turn))
     robot = SimulatedRobot(arm, scene=scene, control=arguments.control, q=find_posture(arm, start))
     spheres = _tool(skill, arm, arguments.tool_radius)
-    policy = ACFRA(
-        skill,
-        method=arguments.method,
-        tool_spheres=spheres,
-        clearance=1e-3 * arguments.clearance,
-        forbidden=next((FORBIDDEN[key] for key in FORBIDDEN if getattr(arguments, key)), ()),
-    )
+    policy = _policy(arguments, skill, spheres)
     with progress_bar() as progress:
         moving = progress.add_task("reproducing", total=1.0)
         result = try_scene(
@@ -115,6 +116,20 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"wrote {write_report(report, arguments.report)}")
     show_results(report)
     return 0 if report.passed else 1
+
+
+def _policy(arguments: argparse.Namespace, skill: Skill, spheres: NDArray[np.float64]) -> Policy:
+    """Return the policy that was chosen, with what every policy takes."""
+    options: dict[str, Any] = {
+        "tool_spheres": spheres,
+        "clearance": 1e-3 * arguments.clearance,
+        "forbidden": next((FORBIDDEN[key] for key in FORBIDDEN if getattr(arguments, key)), ()),
+    }
+    if arguments.method is not None:
+        if arguments.policy != "acfra":
+            raise InputError(f"--method is an option of --policy acfra, not of {arguments.policy}; leave it out")
+        options["method"] = arguments.method
+    return POLICIES[arguments.policy].build(skill, **options)
 
 
 def _start(skill: Skill, arm: ArmModel, centimetres: Sequence[float] | None) -> Pose:

@@ -16,8 +16,9 @@ from imitarm.cli.screen import remark, say, show_table
 from imitarm.control_loop.reproduce import Step, reproduce
 from imitarm.demonstrations import Alignment, Finding
 from imitarm.errors import InfeasibleError
-from imitarm.policies import ACFRA
+from imitarm.policies import Policy
 from imitarm.robots import SimulatedRobot
+from imitarm.safety import SafetyFilter
 from imitarm.skills import Skill
 from imitarm.trajectory import Demonstration, Rollout, Trajectory
 from imitarm.viewer import FrameRecorder, LearningSummary, Report, SceneResult
@@ -35,7 +36,7 @@ def try_scene(
     name: str,
     title: str,
     robot: SimulatedRobot,
-    policy: ACFRA,
+    policy: Policy,
     *,
     clearance: float,
     link_clearance: float | None = None,
@@ -72,9 +73,10 @@ def try_scene(
 
     def on_step(step: Step) -> None:
         frames.note(robot.data)
-        phases.append(policy.phase)
-        if progress is not None:
-            progress(policy.phase / policy.skill.duration_)
+        done = step.command.progress
+        phases.append(done * policy.skill.duration_)
+        if progress is not None and np.isfinite(done):
+            progress(done)
 
     rollout: Rollout | None = None
     try:
@@ -83,7 +85,7 @@ def try_scene(
             robot,
             scene.at,
             dt=CONTROL_PERIOD,
-            link_clearance=link_clearance,
+            safety=SafetyFilter(robot.arm, dt=CONTROL_PERIOD, clearance=link_clearance),
             timeout=PATIENCE * policy.skill.duration_,
             on_step=on_step,
         )
@@ -99,7 +101,7 @@ def try_scene(
         success=rollout is not None and rollout.success,
         asked_clearance=clearance,
         rollout=rollout,
-        adaptation=policy.adaptation,
+        adaptation=policy.plan,
         rmse=_distance_to(demonstrations, rollout, phases),
         reason=reason,
         tool_radius=tool_radius,
@@ -112,13 +114,13 @@ def try_scene(
     )
 
 
-def _details(rollout: Rollout | None, policy: ACFRA) -> dict[str, object]:
+def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
     """Return what else the table shows."""
     details: dict[str, object] = {}
     if rollout is not None and "swept_share" in rollout.details:
         details["dirt in the pan"] = f"{100 * rollout.details['swept_share']:.0f} %"
-    if policy.adaptation is not None:
-        details["demonstrated sigmas moved"] = f"{policy.adaptation.deviation:.1f}"
+    if policy.plan is not None:
+        details["demonstrated sigmas moved"] = f"{policy.plan.deviation:.1f}"
     return details
 
 
@@ -133,6 +135,8 @@ def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | Non
     positions = rollout.trajectory.positions
     n = min(len(phases), len(positions) - 1)
     done, at = positions[1 : n + 1], np.asarray(phases[:n])
+    if not np.isfinite(at).all():
+        return float("nan")
     squares = [np.sum((done - one.trajectory.at(at)[0]) ** 2, axis=1).mean() for one in demonstrations]
     return float(np.sqrt(np.mean(squares)))
 

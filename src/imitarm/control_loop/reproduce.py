@@ -1,4 +1,4 @@
-"""The control loop: look, decide, solve the inverse kinematics, move, note."""
+"""The control loop: observe, decide, filter, move, record."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.command import Command, Status
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmState
-from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import Pose
-from imitarm.kinematics.tasks import TwistTask
 from imitarm.policies.policy import Observation, Policy
 from imitarm.robots.robot import Robot
+from imitarm.safety import SafetyFilter, SafetyStep
 from imitarm.scene import Scene
-from imitarm.scene.clearance_limit import ClearanceLimit
 from imitarm.trajectory import Rollout, Trajectory
 
 Array = NDArray[np.float64]
@@ -26,14 +25,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One turn of the control loop, as ``on_step`` gets it.
+    """One control step, as ``on_step`` gets it.
 
     Attributes:
         time: since the reproduction began [s].
-        tool_to_base: measured pose of the tool.
-        state: measured state of the arm.
+        tool_to_base: measured pose of the tool after the step.
+        state: measured state of the arm after the step.
         scene: what was observed.
-        twist: what the policy asked for, shape (6,).
+        command: what the policy asked for.
+        safety: what the safety filter made of it.
         clearance: measured distance from arm and tool to the nearest obstacle [m].
     """
 
@@ -41,7 +41,8 @@ class Step:
     tool_to_base: Pose
     state: ArmState
     scene: Scene
-    twist: Array
+    command: Command
+    safety: SafetyStep
     clearance: float
 
 
@@ -52,73 +53,85 @@ def reproduce(
     *,
     dt: float = 0.01,
     timeout: float = 60.0,
-    method: str = "qp",
-    link_clearance: float | None = None,
+    safety: SafetyFilter | None = None,
     on_step: Callable[[Step], None] | None = None,
 ) -> Rollout:
-    """Let ``policy`` reproduce its skill on ``robot``, and note what happens.
+    """Let ``policy`` reproduce its skill on ``robot``, and record what happens.
 
-    Every ``dt``: the scene is observed, the policy answers with a twist of the tool, :func:`solve_ik` turns it into
-    joint velocities within the arm's limits, and the robot moves. The motion ends when the policy has finished, when
-    the robot has stopped to protect itself, or at ``timeout``. Whatever happens, also an exception, the robot is
-    braked to a stop.
+    Every ``dt``: the scene is observed, the policy answers with a :class:`~imitarm.command.Command`, the
+    :class:`~imitarm.safety.SafetyFilter` turns it into joint velocities within the arm's limits and clearances, and
+    the robot moves. The motion ends when the policy has finished, when the robot has stopped to protect itself, or at
+    ``timeout``. Whatever happens, also an exception, the robot is braked to a stop.
 
     Args:
         policy: what decides; its ``reset`` is called first.
         robot: what moves.
-        observe: the scene as it is known at a time since the beginning [s].
+        observe: the scene as it is known at a time since the beginning [s]; it may have been seen earlier, as its
+            ``stamp`` says.
         dt: control period [s]; a simulated robot needs a multiple of its timestep.
         timeout: longest duration [s].
-        method: of :func:`solve_ik`.
-        link_clearance: distance that every link must keep to every obstacle [m], held by
-            :class:`~imitarm.scene.clearance_limit.ClearanceLimit` in the inverse kinematics (``method="qp"``); the tool
-            then leaves its path where a link would not get by. None: only the policy looks after obstacles.
+        safety: the filter; None: one for this arm that keeps its limits, keeps links 10 mm apart and touches no
+            obstacle. Its ``dt`` must be this ``dt``.
         on_step: called after each step, for progress or drawing; what it raises stops the robot and is passed on.
 
     Returns:
-        The measured motion from rest to rest. ``success`` means finished in time without a touch; ``details`` holds
-        ``"twists"`` (n, 6) as asked, ``"clamped"``: how often each limit changed a command, and what the robot
-        has in its :meth:`~imitarm.robots.robot.Robot.report`.
+        The measured motion from rest to rest. ``success`` means finished in time, no contact, and, where the filter
+        requires a clearance, nowhere nearer than that. ``details`` holds ``"twists"`` (n, 6) as asked for,
+        ``"clamped"``: how often each limit changed a command, ``"filtered"``: in how many steps the filter changed one
+        for a clearance, ``"unsafe"``: in how many no safe motion existed, ``"statuses"``: steps by the policy's
+        status, and what the robot has in its :meth:`~imitarm.robots.robot.Robot.report`.
 
     Raises:
-        InputError: when ``dt`` or ``timeout`` is not positive, or the policy's answer is no twist.
+        InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not answer with a Command.
         InfeasibleError: passed on from ``policy.reset``; the robot has not moved.
     """
     if not 0.0 < dt <= timeout < np.inf:
         raise InputError(f"reproduce: needs 0 < dt <= timeout [s], got dt {dt!r} and timeout {timeout!r}")
-    notes = _Notes(robot)
-    policy.reset(Observation(0.0, notes.tool_to_base, observe(0.0)))
-    finished = False
+    keeper = SafetyFilter(robot.arm, dt=dt) if safety is None else safety
+    if keeper.dt != dt:
+        raise InputError(f"reproduce: the safety filter was made for dt {keeper.dt:g} s, not {dt:g} s")
+    keeper.reset()
+    log = _Log(robot)
+    policy.reset(Observation(0.0, log.state, log.tool_to_base, observe(0.0)))
+    finished, last = False, Command(np.zeros(6))
     try:
         for k in range(round(timeout / dt) + 1):
-            observation = Observation(k * dt, notes.tool_to_base, observe(k * dt))
+            observation = Observation(k * dt, log.state, log.tool_to_base, observe(k * dt))
             finished = policy.finished(observation)
             if finished:
                 break
-            twist = np.asarray(policy.step(observation, dt), dtype=float)
-            if twist.shape != (6,) or not np.isfinite(twist).all():
-                raise InputError(f"{type(policy).__name__}.step must answer 6 finite numbers, got {twist!r}")
-            q, rows = notes.state.q, None
-            if link_clearance is not None:
-                rows = ClearanceLimit(robot.arm, link_clearance).rows(q, observation.scene)
-            velocity = solve_ik(
-                robot.arm, q, TwistTask(twist), method=method, dt=dt, velocity=robot.velocity, rows=rows
-            )
-            robot.move(velocity, dt)
-            step = notes.take(robot, observation.scene, twist)
+            last = policy.step(observation, dt)
+            if not isinstance(last, Command):
+                raise InputError(f"{type(policy).__name__}.step must return a Command, got {last!r}")
+            scene = observation.scene.now(k * dt)
+            kept = keeper.step(last, log.state.q, robot.velocity, scene)
+            robot.move(kept.velocity, dt)
+            step = log.take(robot, scene, last, kept)
             if on_step is not None:
                 on_step(step)
             if robot.fault:
                 break
     finally:
         robot.stop(dt)
-    notes.take(robot, observation.scene, np.zeros(6))
-    return notes.rollout(robot, robot.fault or ("" if finished else f"not finished within {timeout:g} s"))
+    log.take(robot, observation.scene, Command(np.zeros(6)), None)
+    fault = robot.fault or ("" if finished else _unfinished(timeout, last, robot))
+    return log.rollout(robot, fault, keeper.clearance)
+
+
+def _unfinished(timeout: float, last: Command, robot: Robot) -> str:
+    """Return why a motion has not finished in time."""
+    reason = f"not finished within {timeout:g} s"
+    if last.status in {Status.WAITING, Status.BRAKING}:
+        reason += f": {last.status.value}, {last.reason}"
+        nearest = robot.nearest_pair()
+        if last.status is Status.WAITING and nearest is not None:
+            reason += f"; nearest: {nearest[0]} and {nearest[1]}, {1e3 * robot.clearance():.1f} mm apart"
+    return reason
 
 
 @dataclass
-class _Notes:
-    """What is written down during a reproduction."""
+class _Log:
+    """What is recorded during a reproduction."""
 
     robot: Robot
     states: list[ArmState] = field(default_factory=list)
@@ -126,10 +139,13 @@ class _Notes:
     clearances: list[float] = field(default_factory=list)
     twists: list[Array] = field(default_factory=list)
     clamped: Counter[str] = field(default_factory=Counter)
+    statuses: Counter[str] = field(default_factory=Counter)
+    filtered: int = 0
+    unsafe: int = 0
 
     def __post_init__(self) -> None:
         self.begin = self.robot.state().time
-        self.take(self.robot, Scene(), np.zeros(6))
+        self.take(self.robot, Scene(), Command(np.zeros(6)), None)
 
     @property
     def state(self) -> ArmState:
@@ -139,18 +155,24 @@ class _Notes:
     def tool_to_base(self) -> Pose:
         return self.poses[-1]
 
-    def take(self, robot: Robot, scene: Scene, twist: Array) -> Step:
+    def take(self, robot: Robot, scene: Scene, command: Command, safety: SafetyStep | None) -> Step:
         state, clearance = robot.state(), robot.clearance()
         pose = robot.arm.tool_pose(state.q)
         if not self.states or state.time > self.state.time:
             self.states.append(state)
             self.poses.append(pose)
             self.clearances.append(clearance)
-            self.twists.append(twist)
+            self.twists.append(command.twist)
         self.clamped.update(robot.clamped)
-        return Step(state.time - self.begin, pose, state, scene, twist, clearance)
+        if safety is None:
+            safety = SafetyStep(robot.velocity, 0.0, 0.0, True)
+        else:
+            self.statuses[command.status.value] += 1
+            self.filtered += safety.changed > 0.0
+            self.unsafe += not safety.safe
+        return Step(state.time - self.begin, pose, state, scene, command, safety, clearance)
 
-    def rollout(self, robot: Robot, fault: str) -> Rollout:
+    def rollout(self, robot: Robot, fault: str, required: float | None) -> Rollout:
         times = np.array([state.time for state in self.states]) - self.begin
         positions = np.array([pose.position for pose in self.poses])
         quaternions = np.array([pose.quaternion for pose in self.poses])
@@ -158,7 +180,17 @@ class _Notes:
         touched = sorted(report.get("contacts", ()))
         if touched:
             fault = "; ".join(filter(None, [fault, "touched: " + ", ".join(" with ".join(pair) for pair in touched)]))
-        details: dict[str, Any] = {"twists": np.array(self.twists), "clamped": dict(self.clamped), **report}
+        nearest = float(np.min(self.clearances, initial=np.inf))
+        if not fault and required is not None and nearest < required:
+            fault = f"clearance fell to {1e3 * nearest:.1f} mm, {1e3 * required:.1f} mm required"
+        details: dict[str, Any] = {
+            "twists": np.array(self.twists),
+            "clamped": dict(self.clamped),
+            "filtered": self.filtered,
+            "unsafe": self.unsafe,
+            "statuses": dict(self.statuses),
+            **report,
+        }
         return Rollout(
             Trajectory(times, positions, quaternions),
             joints=np.array([state.q for state in self.states]),

@@ -6,8 +6,10 @@
 from imitarm.policies.acfra import ACFRA
 from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, Adaptation, PathAdapter, adapt
 from imitarm.policies.policy import Observation, Policy
+from imitarm.registry import Registry
 
-POLICIES: dict[str, type[Policy]] = {"acfra": ACFRA}
+POLICIES: Registry[type[Policy]] = Registry("policy", "imitarm.policies", {"acfra": "imitarm.policies.acfra:ACFRA"})
+"""All policies by name."""
 
 __all__ = [
     "ACFRA",

@@ -3,39 +3,58 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from imitarm.command import Command, Status
 from imitarm.errors import InfeasibleError, InputError
 from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply
 from imitarm.policies.adaptation import ADAPTERS, Adaptation, adapt
 from imitarm.policies.policy import Observation, Policy
-
-if TYPE_CHECKING:
-    from imitarm.skills.skill import Skill
+from imitarm.scene.scene import Scene
+from imitarm.skills.skill import Skill
+from imitarm.trajectory import Trajectory
+from imitarm.validation import finite_number
 
 Array = NDArray[np.float64]
 
-_LEAST_PATIENCE = 5e-3  # [m] no robot follows more closely than this at every moment
-_SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learnt one is the learnt one
+_LEAST_PATIENCE = 5e-3  # [m] no robot follows more closely than this at all times
+_SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learned one is the learned one
+_STANDS = 0.05  # speed of the phase below which the motion is said to wait
+_DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
 
 
 class ACFRA(Policy):
-    """Adapt the whole path once, then follow it (thesis Chapter 4).
+    r"""Adapt the whole path once, then follow it (thesis Chapter 4).
 
-    ``reset`` adapts the skill to the scene that is seen and refuses when it can't keep the clearance. ``step`` follows
-    the adapted path with the velocity that belongs to it plus a pull towards it::
+    ``reset`` adapts the skill to the observed scene and refuses when it can't keep the clearance. ``step`` follows the
+    adapted path with its own velocity plus feedback::
 
         twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
-    so the phase ``s`` waits for a robot that lags (its speed limits, a hand that holds it). With ``e_0`` the asked
-    clearance, no corner is cut by more than half of it: each point of the straight way back is within ``e_0 / 2`` of
+    so the phase ``s`` waits for a robot that lags (its speed limits, a hand that holds it). With ``e_0`` the required
+    clearance, no corner is cut by more than half of it: each point of the straight line back is within ``e_0 / 2`` of
     the tool or of its target, and both are clear.
+
+    Among moving obstacles the plan holds only on schedule: the phase follows the clock and waits for nothing. When the
+    tool is farther than ``e_0 / 2`` from where the plan has it, the plan is void: the arm brakes to rest and stays.
 
     Only ``"certified"`` knows beforehand that it can't keep the clearance, and refuses; the thesis's potential fields
     (``"mapf"``, ``"literal"``) are followed wherever they lead, so that they can be compared.
+
+    Args:
+        skill: what to reproduce.
+        method: name in :data:`~imitarm.policies.ADAPTERS`.
+        tool_radius: in place of ``tool_spheres``, radius of one sphere about the tool's tip [m].
+        tool_spheres: spheres that hold the tool, rows x y z r in the tool's frame, shape (m, 4) [m].
+        clearance: required distance of the tool to every obstacle [m].
+        forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
+        pinned: times at which the path must not move [s].
+        gain: K [1/s].
+        patience: e_0 [m]; None: the clearance, at least 5 mm.
+        arrival: distance to the end of the path at which the motion has arrived [m].
+        allowance: planned for beyond the clearance, where that is possible, since no robot follows exactly [m].
 
     Attributes:
         adaptation: what the last ``reset`` found.
@@ -51,24 +70,25 @@ class ACFRA(Policy):
         clearance: float = 0.02,
         forbidden: ArrayLike = (),
         pinned: Sequence[float] = (),
-        gain: float = 8.0,  # [1/s]
-        patience: float | None = None,  # [m] e_0: the phase stops at this lag; None: the clearance, at least 5 mm
-        arrival: float = 0.003,  # [m]
+        gain: float = 8.0,
+        patience: float | None = None,
+        arrival: float = 0.003,
+        allowance: float = 0.002,
     ) -> None:
-        super().__init__(skill)
+        super().__init__(skill, tool_spheres=tool_spheres, clearance=clearance, forbidden=forbidden)
         self._refuses = ADAPTERS[method].refuses
         self._options = {
             "method": method,
             "tool_radius": tool_radius,
             "tool_spheres": tool_spheres,
-            "clearance": clearance,
             "forbidden": forbidden,
             "pinned": pinned,
         }
         self._gain, self._arrival = gain, arrival
+        self._allowance = finite_number(allowance, "ACFRA: allowance", "m", at_least=0.0)
         self._patience = max(clearance, _LEAST_PATIENCE) if patience is None else patience
         self.adaptation: Adaptation | None = None
-        self._phase = 0.0
+        self._phase, self._void = 0.0, ""
 
     def reset(self, observation: Observation) -> None:
         """Adapt the path to the scene, beginning where the tool is.
@@ -80,54 +100,93 @@ class ACFRA(Policy):
         if not self.skill.gmr_.has_orientation_:
             away = away[:3]
         start = observation.tool_to_base if np.linalg.norm(away) > _SAME_PLACE else None
-        self.adaptation = adapt(self.skill, observation.scene, start=start, **self._options)  # type: ignore[arg-type]
+        self.adaptation = self._adapted(observation.scene.now(observation.time), start)
         if not self.adaptation.feasible and self._refuses:
             raise InfeasibleError(self.adaptation.reason)
         path = self.adaptation.trajectory
-        self._velocity = np.gradient(path.positions, path.times, axis=0)
-        self._rotation = np.zeros((len(path), 3))
+        velocity = np.gradient(path.positions, path.times, axis=0)
+        rotation = np.zeros((len(path), 3))
         if path.quaternions is not None:
-            turn = quaternion_multiply(path.quaternions[1:], quaternion_conjugate(path.quaternions[:-1]))
-            self._rotation[:-1] = quaternion_log(turn) / np.diff(path.times)[:, None]
+            step = quaternion_multiply(path.quaternions[1:], quaternion_conjugate(path.quaternions[:-1]))
+            rotation[:-1] = quaternion_log(step) / np.diff(path.times)[:, None]
+        self._twists = np.concatenate([velocity, rotation], axis=1)
+        self._displaced = np.linalg.norm(path.positions - self.adaptation.nominal.positions, axis=1)
         self._hold = observation.tool_to_base
-        self._phase = 0.0
+        self._began = observation.time
+        self._phase, self._void = 0.0, ""
+
+    def _adapted(self, scene: Scene, start: Pose | None) -> Adaptation:
+        """Plan with the allowance where there is room for it, else without."""
+        plan = None
+        for allowance in sorted({self._allowance if self._refuses else 0.0, 0.0}, reverse=True):
+            clearance = self.clearance + allowance
+            plan = adapt(self.skill, scene, start=start, clearance=clearance, **self._options)  # type: ignore[arg-type]
+            if plan.feasible:
+                break
+        assert plan is not None
+        return plan
+
+    @property
+    def plan(self) -> Adaptation | None:
+        """What a report draws of the plan: the adaptation."""
+        return self.adaptation
 
     @property
     def phase(self) -> float:
         """How far along the demonstrated time the motion is [s]."""
         return self._phase
 
-    def _target(self, adaptation: Adaptation) -> tuple[Pose, Array]:
-        """Return the desired pose and the twist (6,) that belongs to it at the present phase."""
-        path = adaptation.trajectory
-        positions, quaternions = path.at([self._phase])
-        pose = Pose(positions[0], self._hold.quaternion if quaternions is None else quaternions[0])
-        rates = np.concatenate([self._velocity, self._rotation], axis=1)
-        twist = np.array([np.interp(self._phase, path.times, column) for column in rates.T])
-        return pose, twist
-
-    def step(self, observation: Observation, dt: float) -> Array:
-        """Return the twist (6,) that follows the adapted path.
+    def step(self, observation: Observation, dt: float) -> Command:
+        """Return the command that follows the adapted path.
 
         Raises:
             InputError: when ``reset`` was not called.
         """
         if self.adaptation is None:
             raise InputError("ACFRA.step: call reset(observation) first")
-        target, forward = self._target(self.adaptation)
+        path = self.adaptation.trajectory
+        end = float(path.times[-1])
+        on_schedule = self.adaptation.only_on_schedule
+        if on_schedule:
+            self._phase = min(observation.time - self._began, end)
+        target = self._target(path)
         error = observation.tool_to_base.error_to(target)
-        if self.adaptation.trajectory.quaternions is None:
-            error[3:] = quaternion_log(
-                quaternion_multiply(self._hold.quaternion, quaternion_conjugate(observation.tool_to_base.quaternion))
+        lag = float(np.linalg.norm(error[:3]))
+        if on_schedule and lag > 0.5 * self._patience:
+            self._void = self._void or (
+                f"the plan holds only on schedule, and the tool is {1e3 * lag:.0f} mm from where it should be at "
+                f"{observation.time:.2f} s: the arm brakes; plan again from here"
             )
-        lag = float(np.linalg.norm(error[:3])) / self._patience
-        pace = max(0.0, 1.0 - lag**2) if self._phase < self.adaptation.trajectory.times[-1] else 0.0
-        self._phase = min(self._phase + pace * dt, float(self.adaptation.trajectory.times[-1]))
-        return pace * forward + self._gain * error
+        if self._void:
+            return Command(np.zeros(6), progress=self._phase / end, status=Status.BRAKING, reason=self._void)
+        speed = 1.0 if on_schedule else max(0.0, 1.0 - (lag / self._patience) ** 2)
+        forward = np.array([np.interp(self._phase, path.times, column) for column in self._twists.T])
+        if self._phase >= end:
+            speed = 0.0
+        elif not on_schedule:
+            self._phase = min(self._phase + speed * dt, end)
+        return self._command(speed * forward + self._gain * error, speed, lag, end)
+
+    def _command(self, twist: Array, speed: float, lag: float, end: float) -> Command:
+        assert self.adaptation is not None
+        progress = self._phase / end
+        if speed < _STANDS and self._phase < end:
+            reason = f"the tool is {1e3 * lag:.0f} mm behind its path"
+            return Command(twist, progress=progress, status=Status.WAITING, reason=reason)
+        displaced = float(np.interp(self._phase, self.adaptation.trajectory.times, self._displaced))
+        if displaced > _DISPLACED:
+            reason = f"the path is moved by {1e3 * displaced:.0f} mm here"
+            return Command(twist, progress=progress, status=Status.AVOIDING, reason=reason)
+        return Command(twist, progress=progress)
+
+    def _target(self, path: Trajectory) -> Pose:
+        """Return the desired pose at the present phase; a skill without orientation keeps the tool's rotation."""
+        positions, quaternions = path.at([self._phase])
+        return Pose(positions[0], self._hold.quaternion if quaternions is None else quaternions[0])
 
     def finished(self, observation: Observation) -> bool:
-        """Tell whether the end of the path is reached within ``arrival``."""
-        if self.adaptation is None:
+        """Return whether the end of the path is reached within ``arrival``."""
+        if self.adaptation is None or self._void:
             return False
         path = self.adaptation.trajectory
         away = np.linalg.norm(observation.tool_to_base.position - path.positions[-1])

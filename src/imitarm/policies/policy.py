@@ -1,63 +1,102 @@
-"""What every way of reproducing a skill has in common: look at the scene, answer with a twist."""
+"""What every policy has in common: it looks at an arm and its scene, and answers with a command."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from imitarm.command import Command
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import Pose
 from imitarm.scene.scene import Scene
-
-if TYPE_CHECKING:
-    from imitarm.skills.skill import Skill
+from imitarm.skills.skill import Skill
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What a policy is told at one instant.
+    """What a policy knows at one control step.
 
     Attributes:
         time: since the reproduction began [s].
+        state: measured state of the arm.
         tool_to_base: measured pose of the tool in the base frame.
-        scene: goal and obstacles as they are known now.
+        scene: goal and obstacles as last seen; ``scene.stamp`` says when that was, and ``scene.at(time)`` predicts
+            where the obstacles are now.
     """
 
     time: float
+    state: ArmState
     tool_to_base: Pose
     scene: Scene
 
 
 class Policy(ABC):
-    """Decides the next twist of the tool from what is seen now.
+    """Decides the next command from what is observed now.
 
-    A policy holds state between ``reset`` and the end of one reproduction, and nothing else: the same observations
-    give the same twists.
+    A policy of your own is one subclass with the three methods below. Registered under the entry point group
+    ``imitarm.policies``, or by ``POLICIES.register(name, policy)``, it appears in ``imitarm reproduce --policy``, in
+    ``imitarm benchmark placements`` and in their reports, which build it with the arguments below. It holds state
+    between :meth:`reset` and the end of one reproduction: the same observations give the same commands.
+
+    Args:
+        skill: what to reproduce.
+        tool_spheres: spheres that hold the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: its tip.
+        clearance: required distance of the tool to every obstacle [m].
+        forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
+
+    Attributes:
+        plan: what is drawn of the policy's plan in a report, an :class:`~imitarm.policies.Adaptation`; None: nothing.
     """
 
-    def __init__(self, skill: Skill) -> None:
+    plan: Any = None
+
+    def __init__(
+        self,
+        skill: Skill,
+        *,
+        tool_spheres: ArrayLike | None = None,
+        clearance: float = 0.02,
+        forbidden: ArrayLike = (),
+    ) -> None:
         self.skill = skill
+        self.tool_spheres = None if tool_spheres is None else np.asarray(tool_spheres, dtype=float)
+        self.clearance = clearance
+        self.forbidden = forbidden
+
+    @classmethod
+    def build(cls, skill: Skill, **options: Any) -> Self:
+        """Return a policy for the command line and the benchmark, with the constructor's common arguments.
+
+        Raises:
+            InputError: when the constructor does not take them.
+        """
+        try:
+            return cls(skill, **options)
+        except TypeError as error:
+            raise InputError(
+                f"{cls.__name__}: can't be built with the arguments {', '.join(options)}: {error}; let its constructor "
+                "take what Policy's takes"
+            ) from error
 
     @abstractmethod
     def reset(self, observation: Observation) -> None:
-        """Begin a reproduction in the scene that is seen.
+        """Begin a reproduction in the observed scene.
 
         Raises:
             InfeasibleError: when the policy knows beforehand that it can't be done; the message says why.
         """
 
     @abstractmethod
-    def step(self, observation: Observation, dt: float) -> Array:
-        """Return the twist (6,) of the tool in the base frame for the next ``dt`` seconds.
-
-        Linear velocity [m/s] first, then angular velocity [rad/s].
-        """
+    def step(self, observation: Observation, dt: float) -> Command:
+        """Return the command for the next ``dt`` seconds."""
 
     @abstractmethod
     def finished(self, observation: Observation) -> bool:
-        """Tell whether the motion has arrived."""
+        """Return whether the motion has arrived."""

@@ -168,6 +168,10 @@ class Robot(ABC):
         """Return the measured distance from arm and tool to the nearest obstacle [m]; nan for a body that can't."""
         return float("nan")
 
+    def nearest_pair(self) -> tuple[str, str] | None:
+        """Return the names of the arm's part and the obstacle that are nearest; None when there is none, or unknown."""
+        return None
+
     def report(self) -> Mapping[str, Any]:
         """Return what else this body has measured since it was started, by name; empty by default."""
         return {}

@@ -136,7 +136,7 @@ class PackedObstacles:
 
     def after(self, dt: float) -> PackedObstacles:
         """Return the obstacles ``dt`` seconds later, each moved with its velocity and angular velocity [s]."""
-        if self._still or dt == 0.0:
+        if self.still or dt == 0.0:
             return self
         positions = self.positions + dt * self.velocities
         if self.rotating:
@@ -171,7 +171,8 @@ class PackedObstacles:
         return moved
 
     @cached_property
-    def _still(self) -> bool:
+    def still(self) -> bool:
+        """Whether no obstacle moves."""
         return not (self.velocities.any() or self.angular_velocities.any())
 
     @cached_property

@@ -86,6 +86,14 @@ class Scene:
             seen = self  # its obstacles were moved by something else
         return Scene.predicted(seen, seen.packed.after(time - seen.stamp), time)
 
+    def now(self, time: float) -> Scene:
+        """Return :meth:`at`, or the scene itself where no obstacle moves or it was seen at that time.
+
+        Args:
+            time: on the clock of ``stamp`` [s].
+        """
+        return self if time == self.stamp or self.packed.still else self.at(time)
+
     def __getattr__(self, name: str) -> Any:
         """Build the obstacles of a predicted scene, the only attribute that may be missing."""
         seen: Scene | None = self.__dict__.get("_seen")

@@ -1,0 +1,64 @@
+"""Command: what a policy asks an arm to do next, and how the motion goes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InputError
+from imitarm.validation import finite_vector
+
+Array = NDArray[np.float64]
+
+
+class Status(Enum):
+    """How a reproduction goes, as its policy sees it."""
+
+    NOMINAL = "nominal"
+    """The motion follows the learned path."""
+    AVOIDING = "avoiding"
+    """The motion differs from the learned path because of an obstacle."""
+    WAITING = "waiting"
+    """The motion does not go on: something must change first, for example an obstacle must move away."""
+    BRAKING = "braking"
+    """The motion is being stopped: its plan no longer holds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Command:
+    """What a policy asks for in the next control period.
+
+    Attributes:
+        twist: of the tool in the base frame, linear velocity first, shape (6,) [m/s, rad/s].
+        joint_velocity: of the joints, shape (n_joints,) [rad/s]; it replaces the twist where it is given, for example
+            along a planned joint path. None: the inverse kinematics chooses it.
+        posture: joint positions to drift to where the twist leaves freedom, shape (n_joints,) [rad]; None: any.
+        elbow: SEW angle to turn the elbow to where the twist leaves freedom [rad]; None: any.
+        progress: fraction of the motion that is done, 0 to 1; nan: unknown.
+        status: how it goes.
+        reason: why it does not go on nominally, in words that name what is in the way; empty when nominal.
+    """
+
+    twist: Array
+    joint_velocity: Array | None = None
+    posture: Array | None = None
+    elbow: float | None = None
+    progress: float = math.nan
+    status: Status = Status.NOMINAL
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "twist", finite_vector(self.twist, 6, "Command: twist", "m/s, rad/s"))
+        for name, unit in (("joint_velocity", "rad/s"), ("posture", "rad")):
+            value = getattr(self, name)
+            if value is not None:
+                n = len(value) if isinstance(value, np.ndarray | list | tuple) else 0
+                object.__setattr__(self, name, finite_vector(value, max(n, 1), f"Command: {name}", unit))
+        if self.elbow is not None and not math.isfinite(self.elbow):
+            raise InputError(f"Command: elbow must be a finite angle [rad] or None, got {self.elbow!r}")
+        if not isinstance(self.status, Status):
+            raise InputError(f"Command: status must be a Status such as Status.NOMINAL, got {self.status!r}")

@@ -1,0 +1,135 @@
+"""SafetyFilter: the last word on every joint velocity that is sent to an arm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.command import Command
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik import IKSolver
+from imitarm.kinematics.ik_problem import Rows
+from imitarm.kinematics.limits import Limit
+from imitarm.kinematics.self_clearance import SelfClearance
+from imitarm.kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, Task, TwistTask
+from imitarm.scene.clearance_limit import ClearanceLimit
+from imitarm.scene.scene import Scene
+
+Array = NDArray[np.float64]
+
+_KEPT = 1e-6  # [m/s] a row that is missed by less is kept: what rounding leaves
+
+
+@dataclass(frozen=True, eq=False)
+class SafetyStep:
+    """What the filter made of one command.
+
+    Attributes:
+        velocity: of the joints, to be sent, shape (n_joints,) [rad/s].
+        changed: how far it differs from what the command alone would give, the joint limits kept, as the norm of the
+            difference [rad/s]; 0 where no clearance row was active.
+        slack: by how much the clearance row that is violated most is violated [m/s]; 0 where all are kept.
+        safe: whether a joint velocity exists that keeps every limit and every row; ``velocity`` is then such a one.
+    """
+
+    velocity: Array
+    changed: float
+    slack: float
+    safe: bool
+
+
+class SafetyFilter:
+    r"""Turns commands into joint velocities that keep the arm's limits and its clearances.
+
+    Each step solves one quadratic program (:class:`~imitarm.kinematics.ik.IKSolver`): as near to the command as
+    possible,
+
+    * inside the position, velocity and acceleration limits of the joints, always;
+    * so that no part of the arm approaches an obstacle faster than
+      :class:`~imitarm.scene.clearance_limit.ClearanceLimit` allows, and no link another link faster than
+      :class:`~imitarm.kinematics.self_clearance.SelfClearance` allows.
+
+    Where these rows contradict the joint limits, no safe motion exists: the velocity violates them as little as it
+    can, which moves away from what is too near, and ``safe`` is False.
+
+    The same filter serves every policy and teleoperation.
+
+    Args:
+        arm: the arm with its tool.
+        dt: control period [s].
+        clearance: required distance of every part of the arm to every obstacle [m]; None: obstacles are ignored.
+        allowance: kept beyond the clearance, since no robot moves exactly as commanded [m].
+        self_clearance: required distance between links that are not neighbours [m]; None: not watched.
+        limits: in place of the joint limits; None: position, velocity and acceleration of each joint.
+        method: of the inverse kinematics; only ``"qp"`` keeps clearances, so another one needs both of them None.
+
+    Raises:
+        InputError: when a number can't be used, or the method can't keep what is required.
+    """
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        *,
+        dt: float = 0.01,
+        clearance: float | None = 0.0,
+        allowance: float = 0.001,
+        self_clearance: float | None = 0.01,
+        limits: Sequence[Limit] | None = None,
+        method: str = "qp",
+    ) -> None:
+        self.arm, self.dt, self.clearance = arm, dt, clearance
+        self.solver = IKSolver(arm, limits, dt=dt, method=method)
+        self._obstacles = None if clearance is None else ClearanceLimit(arm, clearance + allowance)
+        self._own = None if self_clearance is None else SelfClearance(arm, self_clearance).watch(dt)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new run."""
+        if self._own is not None:
+            self._own.reset()
+
+    def step(self, command: Command, q: ArrayLike, velocity: ArrayLike | None, scene: Scene) -> SafetyStep:
+        """Return the joint velocity for one control period.
+
+        Args:
+            command: what is asked for.
+            q: joint positions, shape (n_joints,) [rad].
+            velocity: joint velocity that was sent last, shape (n_joints,) [rad/s]; None: unknown, accelerations are
+                not limited.
+            scene: obstacles as predicted for now, with their velocities.
+
+        Raises:
+            InputError: when a shape is wrong or a number is not finite.
+        """
+        position = np.asarray(q, dtype=float)
+        tasks = _tasks(command)
+        rows = self._rows(position, scene)
+        allowed = self.solver.solve(position, tasks, velocity=velocity, rows=rows)
+        missing = max((float((part.lower - part.matrix @ allowed).max()) for part in rows), default=-math.inf)
+        changed = 0.0
+        if missing > -_KEPT:  # a row is active, or violated
+            alone = self.solver.solve(position, tasks, velocity=velocity)
+            changed = float(np.linalg.norm(allowed - alone))
+        return SafetyStep(allowed, changed, max(missing, 0.0), missing <= _KEPT)
+
+    def _rows(self, q: Array, scene: Scene) -> list[Rows]:
+        obstacles = None if self._obstacles is None else self._obstacles.rows(q, scene)
+        own = None if self._own is None else self._own.rows(q)
+        return [part for part in (obstacles, own) if part is not None]
+
+
+def _tasks(command: Command) -> list[Task]:
+    """Return what a command asks of the inverse kinematics."""
+    if command.joint_velocity is not None:
+        return [JointVelocityTask(command.joint_velocity)]
+    tasks: list[Task] = [TwistTask(command.twist)]
+    if command.elbow is not None:
+        tasks.append(ElbowTask(command.elbow))
+    if command.posture is not None:
+        tasks.append(PostureTask(command.posture))
+    return tasks
