@@ -1,6 +1,5 @@
 from .benchmark.experiment import Experiment, Result
 from .capture import SOURCES, Skeleton, SkeletonSource
-from .capture import Skeleton, SkeletonSource
 from .command import Command, Status
 from .control_loop import reproduce
 from .demonstrations import Finding, align, lint, read
@@ -35,6 +34,13 @@ from .trajectory import Demonstration, Rollout, Trajectory
 __version__: str
 __all__ = [
     "ACFRA",
+    "DMP",
+    "GMR",
+    "HORIZONTAL_ONLY",
+    "NOT_DOWN",
+    "POLICIES",
+    "RETARGETERS",
+    "SOURCES",
     "Adaptation",
     "ArmModel",
     "ArmState",
@@ -45,15 +51,12 @@ __all__ = [
     "ConvexHull",
     "Correspondence",
     "Cylinder",
-    "DMP",
     "Demonstration",
     "ElbowTask",
     "Ellipsoid",
     "Experiment",
     "Finding",
-    "GMR",
     "GaussianMixture",
-    "HORIZONTAL_ONLY",
     "HalfSpace",
     "IKSolver",
     "ImitarmError",
@@ -61,19 +64,15 @@ __all__ = [
     "InputError",
     "JointLimits",
     "JointVelocityTask",
-    "NOT_DOWN",
     "Observation",
     "Obstacle",
-    "POLICIES",
     "Policy",
     "Pose",
     "PostureTask",
-    "RETARGETERS",
     "Result",
     "Retargeter",
     "Robot",
     "Rollout",
-    "SOURCES",
     "SafetyFilter",
     "Scene",
     "SimulatedRobot",
