@@ -97,12 +97,12 @@ def test_units(tmp_path, units, metres):
     scene = read(
         tmp_path,
         HEAD + f"units: {units}\n"
-        "goal: {position: [1, 2, 3], quaternion: [1, 0, 0, 0]}\n"
-        "obstacles:\n- {type: sphere, center: [4, 5, 6], radius: 7e-1, velocity: [1, 0, 0]}\n"
+        "goal: {position: [100, 20, 30], quaternion: [1, 0, 0, 0]}\n"
+        "obstacles:\n- {type: sphere, center: [40, 50, 60], radius: 7e-1, velocity: [1, 0, 0]}\n"
         "- {type: convex_hull, points: [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]}\n",
     )
-    np.testing.assert_allclose(scene.goal.position, np.array([1, 2, 3]) * metres)
-    np.testing.assert_allclose(scene.obstacles[0].center, np.array([4, 5, 6]) * metres)
+    np.testing.assert_allclose(scene.goal.position, np.array([100, 20, 30]) * metres)
+    np.testing.assert_allclose(scene.obstacles[0].center, np.array([40, 50, 60]) * metres)
     assert scene.obstacles[0].radius == pytest.approx(0.7 * metres)
     np.testing.assert_allclose(scene.obstacles[0].velocity, [metres, 0, 0])
     np.testing.assert_allclose(scene.obstacles[1].bounds()[1], np.full(3, metres))
@@ -136,6 +136,106 @@ def test_numbers_as_people_write_them(tmp_path):
     scene = read(tmp_path, "\ufeff" + HEAD + "obstacles:\n- {type: sphere, center: [1e-1, +2E-1, .3], radius: 5.e-2}\n")
     np.testing.assert_allclose(scene.obstacles[0].center, [0.1, 0.2, 0.3])
     assert scene.obstacles[0].radius == 0.05
+
+
+ODD = [
+    "0500",
+    "040",
+    "-07",
+    "00",
+    "010.5",
+    "1:30",
+    "1:30:00",
+    "190:20.5",
+    "0x1F",
+    "0o17",
+    "0b11",
+    "1_000",
+    "1.2.3",
+    "2e",
+]
+
+
+@pytest.mark.parametrize("number", ODD)
+@pytest.mark.parametrize(
+    "entry",
+    [
+        "type: sphere, center: [0.5, 0, 0], radius: {}",
+        "type: sphere, center: [{}, 0, 0], radius: 0.1",
+        "type: box, position: [0, {}, 0], size: [1, 1, 1]",
+        "type: box, position: [0, 0, 0], size: [1, 1, {}]",
+        "type: box, position: [0, 0, 0], size: [1, 1, 1], yaw_degrees: {}",
+    ],
+)
+def test_numbers_that_can_be_read_in_two_ways_are_refused(tmp_path, number, entry):
+    message = message_of(tmp_path, HEAD + f"obstacles:\n- {{{entry.format(number)}}}\n")
+    assert f"'{number}' can be read as several numbers; write a plain decimal number" in message
+
+
+@pytest.mark.parametrize("number", ["0500", "1:30", "0x1F", "1_000"])
+def test_an_explicit_tag_does_not_let_them_in(tmp_path, number):
+    for tag in ("!!int", "!!float"):
+        text = HEAD + f"obstacles:\n- {{type: sphere, center: [0.5, 0, 0], radius: {tag} {number}}}\n"
+        assert f"'{number}' is not a plain decimal number" in message_of(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("500", 500.0),
+        ("0", 0.0),
+        ("-0.5", -0.5),
+        ("+.5", 0.5),
+        ("5.", 5.0),
+        ("1e-1", 0.1),
+        ("1E+1", 10.0),
+        ("!!int 7", 7),
+    ],
+)
+def test_plain_decimal_numbers_are_read(tmp_path, text, value):
+    scene = read(tmp_path, HEAD + f"units: cm\nobstacles:\n- {{type: sphere, center: [{text}, 90, 0], radius: 5}}\n")
+    assert scene.obstacles[0].center[0] == pytest.approx(0.01 * value)
+
+
+@pytest.mark.parametrize("name", ["0500", "1:30", "0x1F", "007", "+.5", "5.", "1_000"])
+def test_a_name_may_look_like_such_a_number(tmp_path, name):
+    save_scene(Scene(None, [Sphere([0, 0, 0], 0.1, name=name)]), tmp_path / "scene.yaml")
+    assert load_scene(tmp_path / "scene.yaml").obstacles[0].name == name
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        "type: box, position: [0.57, 0, 0.33], size: [0.1, 0.1, 0.1]",
+        "type: box, position: [570, 0, 330], size: [100, 100, 0.9]",
+        "type: sphere, center: [570, 0, 330], radius: 0.08",
+        "type: capsule, start: [500, 0, 0], end: [500, 0, 400], radius: 0.05",
+        "type: cylinder, position: [500, 0, 0], radius: 40, length: 0.3",
+        "type: cone, position: [500, 0, 0], radius: 0.1, height: 100",
+        "type: ellipsoid, position: [500, 0, 0], semi_axes: [30, 20, 0.1]",
+        "type: convex_hull, points: [[500, 0, 0], [500.1, 0, 0], [500, 0.1, 0], [500, 0, 0.1]]",
+    ],
+)
+def test_obstacles_below_a_millimetre_are_in_another_unit(tmp_path, entry):
+    message = message_of(tmp_path, HEAD + f"units: mm\nobstacles:\n- {{{entry}}}\n")
+    assert re.search(
+        r"obstacles\[0\] \(\w+\): \w+ makes it 0?\.?\d+ mm thick, less than 1 mm; check units", message
+    ) or ("less than 1 mm; check units" in message)
+    thin = HEAD + "units: mm\nobstacles:\n- {type: box, position: [570, 0, 330], size: [100, 100, 1]}\n"
+    assert len(read(tmp_path, thin).obstacles) == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "units: cm\nobstacles:\n- {type: box, position: [0.57, 0, 0.33], size: [0.1, 0.1, 0.1]}\n",
+        "units: cm\nobstacles:\n- {type: sphere, center: [1.2, 0.3, 0.2], radius: 0.2}\n",
+        "units: mm\ngoal: {position: [0.5, 0.1, 0.3], yaw_degrees: 0}\n",
+    ],
+)
+def test_a_scene_within_the_base_is_in_another_unit(tmp_path, text):
+    message = message_of(tmp_path, HEAD + text)
+    assert "mm of the robot's base; check units: are these metres?" in message
 
 
 BOX = "type: box, name: tin, position: [0, 0, 0], size: [1, 1, 1]"
@@ -195,7 +295,7 @@ BAD = {
     ),
     "goal not unit": (
         HEAD + "goal: {position: [0, 0, 0], quaternion: [1, 1, 0, 0]}\n",
-        "goal: Pose: quaternion 0 has len",
+        "goal: Pose: quaternion [1.0, 1.0, 0.0, 0.0] has length",
     ),
     "goal in words": (
         HEAD + "goal: {position: here, yaw_degrees: 0}\n",
@@ -267,7 +367,7 @@ BAD = {
     "yaw a list": (one(BOX + ", yaw_degrees: [1]"), "yaw_degrees must be one finite number, got [1.0]"),
     "yaw of three": (one(BOX + ", yaw_degrees: [1, 2, 3]"), "yaw_degrees must be one finite number"),
     "yaw nan": (one(BOX + ", yaw_degrees: .nan"), "yaw_degrees must be one finite number"),
-    "quaternion of three": (one(BOX + ", quaternion: [1, 0, 0]"), '(box "tin"): Pose: quaternions need 4 columns'),
+    "quaternion of three": (one(BOX + ", quaternion: [1, 0, 0]"), '(box "tin"): Pose: quaternion must be 4 numbers'),
     "quaternion ragged": (one(BOX + ", quaternion: [1, [0, 2], 0, 0]"), 'obstacles[1] (box "tin"): '),
     "position ragged": (one("type: box, position: [1, [0, 2], 0], size: [1, 1, 1]"), "obstacles[1] (box): "),
     "flat hull": (

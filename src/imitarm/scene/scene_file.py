@@ -29,6 +29,10 @@ FORMAT = "imitarm-scene"
 VERSION = 1
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
+_SMALLEST = 1e-3  # [m] of an obstacle; smaller sizes are in another unit
+_NEAREST = 0.02  # [m] in a scene in cm or mm, something is farther from the base than this, which stands there
+_POINTS = ("center", "start", "end", "point", "normal", "points")  # keys that are no sizes
+
 _TOP = ("format", "version", "units", "goal", "obstacles")
 _ROTATIONS = ("quaternion", "rpy_degrees", "yaw_degrees")
 _COMMON = ("name", "velocity", "angular_velocity")
@@ -89,8 +93,20 @@ def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
         raise InputError(f"scene file {path} can't be written: {error.strerror}") from error
 
 
+# plain decimal numbers; 0500, 1:30, 0x1F and 1_000 (in YAML 1.1: 320, 90, 31 and 1000) stay text, and are refused
+_INTEGER = re.compile(r"[-+]?(0|[1-9]\d*)$")
+_REAL = re.compile(r"[-+]?((0|[1-9]\d*)(\.\d*)?|\.\d+)([eE][-+]?\d+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$")
+_ODD_NUMBER = re.compile(r"[-+]?[\d.][\w.:+-]*$")
+_INTEGER_TAG, _REAL_TAG = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+
+
 class _Loader(yaml.SafeLoader):
-    """Plain YAML, where a key can't be given twice and 1e-3 is a number (as YAML 1.2 has it)."""
+    """Plain YAML, where no key is given twice and numbers are decimal, without leading zeros."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own attribute)
+        first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INTEGER_TAG, _REAL_TAG)]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -102,15 +118,24 @@ class _Loader(yaml.SafeLoader):
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
 
+    def number(self, node: yaml.ScalarNode) -> int | float:
+        """Return a number, also one with an explicit tag, which must be written in the same way."""
+        if _INTEGER.match(node.value):
+            return int(node.value)
+        if _REAL.match(node.value):
+            return float(self.construct_yaml_float(node))
+        problem = f"{_shown(node.value)} is not a plain decimal number"
+        raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+
 
 class _Dumper(yaml.SafeDumper):
-    """Writes quotes around text that the loader would take for a number."""
+    """Writes quotes around text that a loader would read as a number."""
 
 
-for _either in (_Loader, _Dumper):
-    _either.add_implicit_resolver(
-        "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-    )
+for _tag, _pattern in ((_INTEGER_TAG, _INTEGER), (_REAL_TAG, _REAL)):
+    _Loader.add_constructor(_tag, _Loader.number)
+    for _either in (_Loader, _Dumper):
+        _either.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
 
 
 def _parsed(text: str) -> object:
@@ -147,10 +172,22 @@ def _scene(content: object) -> Scene:
     entries = content.get("obstacles")
     if entries is not None and not isinstance(entries, list):
         raise InputError("obstacles: must be a list; begin each obstacle with a dash")
-    return Scene(
-        None if goal is None else _goal(goal, UNITS[units]),
-        tuple(_obstacle(entry, i, UNITS[units]) for i, entry in enumerate(entries or [])),
-    )
+    pose = None if goal is None else _goal(goal, UNITS[units])
+    obstacles = tuple(_obstacle(entry, i, UNITS[units]) for i, entry in enumerate(entries or []))
+    if units != "m":
+        _check_distances(pose, obstacles, units)
+    return Scene(pose, obstacles)
+
+
+def _check_distances(goal: Pose | None, obstacles: Iterable[Obstacle], units: str) -> None:
+    """Refuse a scene that lies within the robot's base: its numbers are metres, not ``units``."""
+    corners = [obstacle.bounds() for obstacle in obstacles] + ([] if goal is None else [goal.position])
+    farthest = max((float(np.abs(corner).max()) for corner in corners), default=np.inf)
+    if farthest < _NEAREST:
+        raise InputError(
+            f"units: in {units}, everything lies within {1e3 * farthest:.3g} mm of the robot's base; check units: are "
+            "these metres?"
+        )
 
 
 def _goal(entry: object, metres: float) -> Pose:
@@ -184,10 +221,23 @@ def _obstacle(entry: object, index: int, metres: float) -> Obstacle:
     if "angular_velocity" in entry:
         values["angular_velocity"] = _scaled(entry["angular_velocity"], f"{where}: angular_velocity", 1.0)
     try:
-        return shape(**values, name=name)
+        obstacle = shape(**values, name=name)
     except InputError as error:
         label = f'{shape.__name__} "{name}": ' if name else f"{shape.__name__}: "
         raise InputError(f"{where}: {str(error).replace(label, '')}") from error
+    for key in lengths:
+        if key not in _POINTS or key == "points":
+            _check_size(key, values[key], where)
+    return obstacle
+
+
+def _check_size(key: str, value: Any, where: str) -> None:
+    """Refuse an obstacle of less than 1 mm: its numbers are in another unit."""
+    numbers = np.asarray(value)
+    sizes = np.ptp(numbers, axis=0) if key == "points" else np.atleast_1d(numbers)
+    smallest = float(sizes.min()) * (2.0 if key in ("radius", "semi_axes") else 1.0)
+    if smallest < _SMALLEST * (1.0 - 1e-9):
+        raise InputError(f"{where}: {key} makes it {1e3 * smallest:.3g} mm thick, less than 1 mm; check units")
 
 
 def _shape(kind: object, where: str) -> type[Obstacle]:
@@ -244,6 +294,11 @@ def _scaled(value: object, where: str, metres: float, depth: int = 2) -> Any:
     """Return a number, a list of numbers or a list of such lists times ``metres``."""
     if isinstance(value, list) and depth:
         return [_scaled(item, f"{where}[{i}]", metres, depth - 1) for i, item in enumerate(value)]
+    if isinstance(value, str) and _ODD_NUMBER.match(value) and not (_INTEGER.match(value) or _REAL.match(value)):
+        raise InputError(
+            f"{where}: {_shown(value)} can be read as several numbers; write a plain decimal number, without leading "
+            "zeros, colons or underscores"
+        )
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where} must be a number or a list of numbers, got {_shown(value)}")
     try:
