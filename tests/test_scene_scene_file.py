@@ -218,9 +218,7 @@ def test_a_name_may_look_like_such_a_number(tmp_path, name):
 )
 def test_obstacles_below_a_millimetre_are_in_another_unit(tmp_path, entry):
     message = message_of(tmp_path, HEAD + f"units: mm\nobstacles:\n- {{{entry}}}\n")
-    assert re.search(
-        r"obstacles\[0\] \(\w+\): \w+ makes it 0?\.?\d+ mm thick, less than 1 mm; check units", message
-    ) or ("less than 1 mm; check units" in message)
+    assert "mm thick, less than 1 mm; check units" in message
     thin = HEAD + "units: mm\nobstacles:\n- {type: box, position: [570, 0, 330], size: [100, 100, 1]}\n"
     assert len(read(tmp_path, thin).obstacles) == 1
 

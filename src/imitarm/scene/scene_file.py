@@ -1,7 +1,7 @@
 """Scene files: a goal and obstacles as YAML that a person writes (docs/scene.md).
 
-What each shape needs in a file follows from its fields, so a shape added to ``OBSTACLES`` can be read and written at
-once. Only plain YAML is read: numbers, text, lists and mappings; nothing in a file is executed.
+The keys of each shape are its fields, so a shape that is added to ``OBSTACLES`` can be read and written at once. Only
+plain YAML is read: numbers, text, lists and mappings; nothing in a file is executed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _POINTS = ("center", "start", "end", "point", "normal", "points")  # keys that a
 _TOP = ("format", "version", "units", "goal", "obstacles")
 _ROTATIONS = ("quaternion", "rpy_degrees", "yaw_degrees")
 _COMMON = ("name", "velocity", "angular_velocity")
-_UNWRITTEN = ("covariance", "track_id")  # what only a tracker knows
+_UNWRITTEN = ("covariance", "track_id")  # set by trackers only
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
@@ -69,7 +69,7 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
 def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     """Write a scene file in metres that :func:`load_scene` reads back to the last digit.
 
-    It is written aside and renamed, so a file that was there is kept when something fails.
+    The text goes to a temporary file first, which is then renamed: an existing file is kept when something fails.
 
     Args:
         scene: of obstacles in ``OBSTACLES``.
@@ -148,7 +148,7 @@ def _parsed(text: str) -> object:
         where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark is not None else ""
         raise InputError(f"{where}not readable as YAML: {problem}") from error
     except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
-        # what PyYAML lets through: the 13th month, an explicit tag that does not fit its value, endless nesting
+        # errors that PyYAML does not convert: the 13th month, an explicit tag that does not fit its value, deep nesting
         raise InputError(f"not readable as YAML: {error}") from error
 
 
@@ -194,7 +194,7 @@ def _goal(entry: object, metres: float) -> Pose:
     if not isinstance(entry, Mapping):
         raise InputError(f"goal: must have the keys position and quaternion, got {_shown(entry)}")
     _check_keys(entry, ("position", *_ROTATIONS), "goal")
-    if not any(key in entry for key in _ROTATIONS):  # an arm's tool seldom points up, so none is assumed
+    if not any(key in entry for key in _ROTATIONS):  # the tool of an arm rarely points up, so no rotation is assumed
         raise InputError(f"goal: the rotation of the tool is missing; give one of: {', '.join(_ROTATIONS)}")
     return _pose(entry, "goal", metres)
 
@@ -251,7 +251,7 @@ def _shape(kind: object, where: str) -> type[Obstacle]:
 
 
 def _own_keys(shape: type[Obstacle]) -> list[str]:
-    """Return the fields that make this shape, without those that all obstacles have."""
+    """Return the fields of this shape, without those that all obstacles have."""
     return [f.name for f in fields(shape) if f.init and f.name not in (*_COMMON, *_UNWRITTEN)]
 
 
