@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imitarm.capture.mediapipe import FIELD_OF_VIEW, N_LANDMARKS, Landmarks
+from imitarm.capture.mediapipe import FIELD_OF_VIEW, N_LANDMARKS, PoseLandmarks
 
 VIDEOS = Path(__file__).resolve().parents[1] / ".cache" / "pose2sim"
 SIZE = (1280, 720)
@@ -45,7 +45,7 @@ def standing() -> np.ndarray:
 
 
 def seen(points, place, *, time=0.0, size=SIZE, field_of_view=FIELD_OF_VIEW, visibility=1.0):
-    """Landmarks of points about the hips (33, 3), standing at a place (3,), as a true camera would show them."""
+    """PoseLandmarks of points about the hips (33, 3), standing at a place (3,), as a true camera would show them."""
     at = np.asarray(points) + place
     focal = 0.5 * max(size) / math.tan(math.radians(0.5 * field_of_view))
     image = at[:, :2] / at[:, 2:] * focal / np.array(size) + 0.5
@@ -58,10 +58,10 @@ def seen(points, place, *, time=0.0, size=SIZE, field_of_view=FIELD_OF_VIEW, vis
         turn = np.eye(3) + sin * cross + (1.0 - cos) * cross @ cross
     else:
         turn = np.eye(3)
-    return Landmarks(time, np.asarray(points) @ turn, image, np.full(N_LANDMARKS, visibility))
+    return PoseLandmarks(time, np.asarray(points) @ turn, image, np.full(N_LANDMARKS, visibility))
 
 
-def line(landmarks: Landmarks) -> str:
+def line(landmarks: PoseLandmarks) -> str:
     """A line of the worker."""
     each = np.column_stack([landmarks.world, landmarks.image, landmarks.visibility])
     return f"frame {landmarks.time:.6f} " + " ".join(f"{number:.6f}" for number in each.ravel())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from imitarm.capture import kinect
-from imitarm.capture.filters import SwapGuard
+from imitarm.capture.filters import SideFilter
 from imitarm.capture.kinect import AzureKinectSource, KinectV2Source
 from imitarm.capture.skeleton import JOINT, JOINTS, HandState, Tracking
 from imitarm.capture.sources import is_live, open_source
@@ -301,7 +301,7 @@ def test_several_persons_late_pictures_and_a_slow_tracker(azure):
     source = AzureKinectSource()
     persons = [source.read(5.0).person for _ in range(3)]
     assert persons == [0, 1, 1] and azure.given == []  # no picture waits in the tracker
-    guarded = SwapGuard(source)
+    guarded = SideFilter(source)
     assert guarded.read(0.0) is None and not guarded.over
 
 

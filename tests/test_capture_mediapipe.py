@@ -76,7 +76,7 @@ def test_the_worker_is_told_what_to_read_and_may_not_import_what_lies_around(wor
 @pytest.mark.parametrize(
     ("program", "error", "message"),
     [
-        (said("error is not a video that can be read"), InputError, r"film\.mp4: is no video that can be read$"),
+        (said("error is not a video that can be read"), InputError, r"film\.mp4: is not a video that can be read$"),
         ("sys.exit('no module named cv2')", InputError, "does not start.*no module named cv2.*rebuild its environment"),
         (said("hello world"), InputError, "does not send what MediaPipe's process should: 'hello world'"),
         (said("imitarm-mediapipe 2 1280 720"), InputError, "does not send what"),

@@ -10,7 +10,7 @@ from imitarm.capture.mediapipe import (
     INFERRED,
     TRACKED,
     LandmarkConverter,
-    Landmarks,
+    PoseLandmarks,
 )
 from imitarm.capture.skeleton import JOINT, JOINTS, HandState, Tracking
 from imitarm.errors import InputError
@@ -105,7 +105,7 @@ def test_the_distance_is_averaged_and_begins_anew_after_a_gap():
     for i in range(200):
         scale = 1.0 + 0.03 * rng.normal()  # MediaPipe's metres tremble
         landmarks = seen(standing(), PLACE, time=i / 30)
-        shaken = Landmarks(landmarks.time, landmarks.world * scale, landmarks.image, landmarks.visibility)
+        shaken = PoseLandmarks(landmarks.time, landmarks.world * scale, landmarks.image, landmarks.visibility)
         depths.append(converter.skeleton(shaken).joint("spine_base")[2])
     alone = 0.03 * PLACE[2]
     expected = alone * np.sqrt(np.tanh(0.5 / 30 / DEPTH_MEMORY))  # of an exponential average of white noise
@@ -119,7 +119,7 @@ def test_what_is_hidden_is_inferred_or_lost_and_what_is_outside_is_never_tracked
     for visibility, state in ((TRACKED, 2), (0.9 * TRACKED, 1), (INFERRED, 1), (0.9 * INFERRED, 0)):
         changed = whole.visibility.copy()
         changed[16] = visibility
-        skeleton = converted(Landmarks(0.0, whole.world, whole.image, changed))
+        skeleton = converted(PoseLandmarks(0.0, whole.world, whole.image, changed))
         assert skeleton.tracking[JOINT["wrist_right"]] == state
         assert skeleton.tracking[JOINT["hand_right"]] == state  # is made of it
         assert skeleton.tracking[JOINT["elbow_right"]] == Tracking.TRACKED
@@ -132,15 +132,15 @@ def test_what_is_hidden_is_inferred_or_lost_and_what_is_outside_is_never_tracked
 def test_nobody_who_can_be_placed_is_nobody():
     assert converted(seen(standing(), PLACE, visibility=0.05)) is None
     behind = seen(standing(), PLACE)
-    assert converted(Landmarks(0.0, behind.world, 1.0 - behind.image, behind.visibility)) is None  # upside down
+    assert converted(PoseLandmarks(0.0, behind.world, 1.0 - behind.image, behind.visibility)) is None  # upside down
 
 
 def test_landmarks_that_are_none_are_refused():
     good = seen(standing(), PLACE)
     with pytest.raises(InputError, match="33 of them"):
-        Landmarks(0.0, good.world[:32], good.image, good.visibility)
+        PoseLandmarks(0.0, good.world[:32], good.image, good.visibility)
     with pytest.raises(InputError, match="finite"):
-        Landmarks(0.0, good.world * np.inf, good.image, good.visibility)
+        PoseLandmarks(0.0, good.world * np.inf, good.image, good.visibility)
     with pytest.raises(InputError, match="10 to 150"):
         LandmarkConverter(SIZE, 5.0)
     with pytest.raises(InputError, match="needs an image size"):

@@ -42,7 +42,16 @@ def test_it_never_changes():
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ((0.0, np.ones((24, 3))), "shapes"),
+        ((0.0, np.ones((24, 3))), r"positions must be an array of shape \(25, 3\)"),
+        (("soon", np.ones((25, 3))), "time must be a finite number"),
+        ((None, np.ones((25, 3))), "time"),
+        ((0.0, "here"), "positions must be numbers"),
+        ((0.0, [[1.0, 2.0], [3.0]]), "positions"),
+        ((0.0, np.ones((25, 3)) * 1j), "positions"),
+        ((0.0, np.ones((25, 3)), ["seen"] * 25), "tracking"),
+        ((0.0, np.ones((25, 3)), np.full(25, 2), None), "hand_states"),
+        ((0.0, np.ones((25, 3)), np.full(25, 2), (0, 0), "Ann"), "person must be a whole number"),
+        ((0.0, np.ones((25, 3)), np.full(25, 2), (0, 0), np.nan), "person"),
         ((np.nan, np.ones((25, 3))), "time"),
         ((0.0, np.ones((25, 3)), np.full(25, 7)), "tracking"),
         ((0.0, np.ones((25, 3)), np.full(25, 2), (9, 2)), "hand_states"),

@@ -8,7 +8,7 @@ import pytest
 
 from imitarm import SOURCES, SkeletonSource, cli
 from imitarm.capture import filters, kinect, mediapipe, stream
-from imitarm.capture.filters import PersonFilter, SwapGuard
+from imitarm.capture.filters import PersonFilter, SideFilter
 from imitarm.capture.recording import SkeletonRecording, read_recording
 from imitarm.capture.sources import find_source, followed, is_live, open_source, source_words
 from imitarm.capture.synthetic import SyntheticSource
@@ -86,9 +86,9 @@ def test_every_source_is_described_and_says_whether_it_is_live():
 
 def test_filters_are_as_live_as_what_they_filter():
     source = Listed([])
-    assert not PersonFilter(SwapGuard(source)).live
+    assert not PersonFilter(SideFilter(source)).live
     source.live = True
-    assert PersonFilter(SwapGuard(source)).live
+    assert PersonFilter(SideFilter(source)).live
 
 
 def test_a_source_in_real_time_gives_nothing_early(monkeypatch):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.capture.skeleton import JOINT, JOINTS, SIDES, HandState, Skeleton, Tracking
-from imitarm.errors import InputError
+from imitarm.validation import finite_number, whole_number
 
 Array = NDArray[np.float64]
 
@@ -124,12 +124,13 @@ class SkeletonCamera:
         elbow_bias: float = 0.02,
         faultless: bool = False,
     ) -> None:
-        if not (0.0 <= sigma <= 0.1 and 1.0 <= rate <= 200.0 and 0.0 <= dropout <= 5.0 and 0.0 <= elbow_bias <= 0.1):
-            raise InputError("SkeletonCamera: needs sigma and elbow_bias to 0.1 m, rate 1 to 200 Hz, dropout to 5 Hz")
-        if not 0.0 <= jitter <= 0.2 / rate:
-            raise InputError(
-                f"SkeletonCamera: jitter must be 0 to a fifth of the period at {rate:g} Hz, got {jitter!r} s"
-            )
+        whole_number(seed, "SkeletonCamera: seed", at_least=0)
+        finite_number(sigma, "SkeletonCamera: sigma", "m", at_least=0.0, at_most=0.1)
+        finite_number(rate, "SkeletonCamera: rate", "Hz", at_least=1.0, at_most=200.0)
+        finite_number(dropout, "SkeletonCamera: dropout", "Hz", at_least=0.0, at_most=5.0)
+        finite_number(elbow_bias, "SkeletonCamera: elbow_bias", "m", at_least=0.0, at_most=0.1)
+        longest = 0.2 / rate  # a fifth of the period
+        finite_number(jitter, f"SkeletonCamera: jitter at {rate:g} Hz", "s", at_least=0.0, at_most=longest)
         self._rng = np.random.default_rng([30311, seed])
         self.sigma, self.rate, self.jitter, self.dropout = sigma, rate, jitter, dropout
         self.occlusion, self.faultless = occlusion, faultless

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.capture.skeleton import JOINT, JOINTS, SIDES, Skeleton, SkeletonSource, Tracking
-from imitarm.errors import InputError
+from imitarm.validation import finite_number, instance
 
 Array = NDArray[np.float64]
 
@@ -37,12 +37,12 @@ class PersonFilter(SkeletonSource):
         passed_over: number of skeletons of other persons so far.
 
     Raises:
-        InputError: when the patience is negative.
+        InputError: when the patience is negative, or the source is not a SkeletonSource.
     """
 
     def __init__(self, source: SkeletonSource, *, person: int | None = None, patience: float = PATIENCE) -> None:
-        if not patience >= 0.0:
-            raise InputError(f"PersonFilter: patience must be at least 0 s, got {patience!r}")
+        patience = finite_number(patience, "PersonFilter: patience", "s", at_least=0.0)
+        instance(source, SkeletonSource, "PersonFilter: source")  # type: ignore[type-abstract]
         self.name, self.live = source.name, source.live
         self.followed: int | None = None
         self.passed_over = 0
@@ -237,7 +237,7 @@ class SideMemory:
         return right
 
 
-class SwapGuard(SkeletonSource):
+class SideFilter(SkeletonSource):
     """A source with left and right kept apart, for each person; see :func:`unswapped`.
 
     Only motion decides: the sides of the first frame are taken as right. After half a second without frames it starts

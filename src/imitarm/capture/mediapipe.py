@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.capture.mediapipe_environment import LineProcess, find_python
-from imitarm.capture.skeleton import JOINTS, SIDES, Skeleton, SkeletonSource, Tracking, whole_number
+from imitarm.capture.skeleton import JOINTS, SIDES, Skeleton, SkeletonSource, Tracking, number_after_colon
 from imitarm.errors import InputError, TaskFailedError
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ _TO_SENSOR = np.array([-1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
-class Landmarks:
+class PoseLandmarks:
     """What MediaPipe found in one image.
 
     Attributes:
@@ -85,10 +85,10 @@ class Landmarks:
     def __post_init__(self) -> None:
         n = N_LANDMARKS
         if self.world.shape != (n, 3) or self.image.shape != (n, 2) or self.visibility.shape != (n,):
-            raise InputError(f"Landmarks: there must be {n} of them, with 3, 2 and 1 numbers each")
+            raise InputError(f"PoseLandmarks: there must be {n} of them, with 3, 2 and 1 numbers each")
         finite = all(np.isfinite(part).all() for part in (self.time, self.world, self.image, self.visibility))
         if not finite:
-            raise InputError("Landmarks: all numbers must be finite")
+            raise InputError("PoseLandmarks: all numbers must be finite")
 
 
 class LandmarkConverter:
@@ -125,7 +125,7 @@ class LandmarkConverter:
         self._scale = np.array(size, dtype=float) / focal
         self._distance: tuple[float, float] | None = None  # time and t_z of the image before
 
-    def skeleton(self, landmarks: Landmarks) -> Skeleton | None:
+    def skeleton(self, landmarks: PoseLandmarks) -> Skeleton | None:
         """Return the skeleton; None when the image shows too little of the person to locate them.
 
         A joint is tracked, inferred or lost according to the least visibility of the landmarks that it is made of;
@@ -182,7 +182,7 @@ def _rotation_towards(place: Array) -> Array:
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + z))
 
 
-def _tracking(landmarks: Landmarks) -> NDArray[np.int8]:
+def _tracking(landmarks: PoseLandmarks) -> NDArray[np.int8]:
     """Return the tracking state of each joint, shape (25,)."""
     inside = ((landmarks.image >= 0.0) & (landmarks.image <= 1.0)).all(axis=1)
     known = (landmarks.visibility >= INFERRED).astype(np.int8)
@@ -352,7 +352,7 @@ class MediaPipeSource(SkeletonSource):
         if kind == b"nobody":
             return None
         each = numbers[1:].reshape(N_LANDMARKS, 6)
-        return self._converter.skeleton(Landmarks(self._last, each[:, :3], each[:, 3:5], each[:, 5]))
+        return self._converter.skeleton(PoseLandmarks(self._last, each[:, :3], each[:, 3:5], each[:, 5]))
 
     def _failed(self, why: str) -> TaskFailedError:
         """Close, and return the error that says why."""
@@ -393,7 +393,7 @@ class WebcamSource(MediaPipeSource):
         Raises:
             InputError: when it is not a number, there is no such webcam, or MediaPipe is not installed.
         """
-        return cls(whole_number("webcam", cls.argument, argument, 63))
+        return cls(number_after_colon("webcam", cls.argument, argument, 63))
 
 
 def _text(words: list[bytes]) -> str:

@@ -11,7 +11,8 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import Skeleton
-from imitarm.errors import InputError, UnknownNameError
+from imitarm.errors import UnknownNameError
+from imitarm.validation import finite_number
 
 Array = NDArray[np.float64]
 Truth = Callable[[float], Skeleton]
@@ -52,8 +53,7 @@ def reaching(person: Person, seed: int, *, duration: float = 12.0, kind: str = "
     """
     if kind not in REACHES:
         raise UnknownNameError.among("kind of reach", kind, REACHES)
-    if not duration >= 4.0:
-        raise InputError(f"reaching: duration must be at least 4 s, got {duration!r}")
+    finite_number(duration, "reaching: duration", "s", at_least=4.0)
     rng = np.random.default_rng([30312, person.seed, seed])
     place = _comfortable(rng, person)
     places, times = [place], [REST]
@@ -131,8 +131,7 @@ def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "c
     """
     if kind not in DRAWINGS:
         raise UnknownNameError.among("drawing", kind, DRAWINGS)
-    if not 4.0 <= duration < math.inf:
-        raise InputError(f"drawing: duration must be at least 4 s, got {duration!r}")
+    finite_number(duration, "drawing: duration", "s", at_least=4.0)
     shape, place, sizes, periods = DRAWINGS[kind]
     rng = np.random.default_rng([30315, person.seed, seed])
     out, up, forward = np.array(place) + rng.uniform(-0.05, 0.05, 3)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.capture.skeleton import JOINT, JOINTS, SIDES, HandState, Skeleton
 from imitarm.errors import InputError, UnknownNameError
+from imitarm.validation import finite_number, finite_vector, real_array, whole_number
 
 Array = NDArray[np.float64]
 
@@ -82,7 +83,7 @@ class Person:
     @classmethod
     def from_seed(cls, seed: int) -> Person:
         """Return synthetic person number ``seed``; limbs deviate by up to 15 percent from those of the stature."""
-        rng = np.random.default_rng([30310, seed])
+        rng = np.random.default_rng([30310, whole_number(seed, "Person.from_seed: seed", at_least=0)])
         stature = float(np.clip(rng.normal(1.72, 0.09), 1.50, 1.95))
         proportion = np.clip(rng.normal(1.0, 0.05, 3), 0.85, 1.15)
         tremor = np.stack(
@@ -150,12 +151,10 @@ class Person:
                 rotation.
             UnknownNameError: when ``side`` is neither left nor right.
         """
-        wanted = np.asarray(wrist, dtype=float)
-        if wanted.shape != (3,) or not np.isfinite(wanted).all():
-            raise InputError(f"Person.skeleton: wrist must be 3 finite numbers [m], got {wrist!r}")
-        if swivel is not None and not math.isfinite(swivel):
-            raise InputError(f"Person.skeleton: swivel must be a finite angle [rad], got {swivel!r}")
-        if hand is not None and not _is_rotation(np.asarray(hand, dtype=float)):
+        wanted = finite_vector(wrist, 3, "Person.skeleton: wrist", "m")
+        if swivel is not None:
+            finite_number(swivel, "Person.skeleton: swivel", "rad")
+        if hand is not None and not _is_rotation(real_array(hand, (3, 3), "Person.skeleton: hand")):
             raise InputError(f"Person.skeleton: hand must be a rotation of shape (3, 3), got {hand!r}")
         points = self._body(time)
         other = "left" if side == "right" else "right"

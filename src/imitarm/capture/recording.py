@@ -26,6 +26,7 @@ from imitarm.capture.skeleton import Skeleton, SkeletonSource, Tracking
 from imitarm.errors import InputError
 from imitarm.files.part_file import PART, PartFile
 from imitarm.files.table import read_bytes
+from imitarm.validation import finite_number, instance
 
 SLOWEST: Final = 0.05
 _GAP: Final = 0.25  # [s] a longer gap in a recording is not filled with frames
@@ -63,7 +64,7 @@ class SkeletonRecording(SkeletonSource):
         issues: Iterable[RecordingIssue] = (),
         time_unit: float = 1.0,
     ) -> None:
-        self.skeletons = tuple(skeletons)
+        self.skeletons = tuple(instance(s, Skeleton, "SkeletonRecording: each of skeletons") for s in skeletons)
         self.issues = tuple(issues)
         self.time_unit = time_unit
         self.name = name
@@ -119,8 +120,9 @@ class SkeletonRecording(SkeletonSource):
         Raises:
             InputError: when nothing is left.
         """
+        start = finite_number(start, "SkeletonRecording.trim: start", "s")
         first = min((skeleton.time for skeleton in self.skeletons), default=0.0)
-        last = self.duration if end is None else end
+        last = self.duration if end is None else finite_number(end, "SkeletonRecording.trim: end", "s")
         kept = [s for s in self.skeletons if start - 1e-9 <= s.time - first <= last + 1e-9]
         if not kept:
             raise InputError(
@@ -282,8 +284,7 @@ def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
     Raises:
         InputError: when the pace is out of range.
     """
-    if not SLOWEST <= pace <= 1.0:
-        raise InputError(f"pace must be between {SLOWEST:g} and 1, got {pace!r}: a recording can only be slowed")
+    finite_number(pace, "pace (a recording can only be slowed)", at_least=SLOWEST, at_most=1.0)
     if pace == 1.0 or not skeletons:
         return list(skeletons)
     start, parts = skeletons[0].time, int(np.ceil(1.0 / pace))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from imitarm.capture.filters import SwapGuard
+from imitarm.capture.filters import SideFilter
 from imitarm.capture.mediapipe import MediaPipeSource
 from imitarm.capture.recording import SkeletonRecording
 from imitarm.capture.skeleton import JOINT, JOINTS, SIDES, Skeleton, Tracking
@@ -149,7 +149,7 @@ _LIMBS = {"upper arm": (0, 1), "forearm": (1, 2)}
 
 def guarded(recording: SkeletonRecording) -> SkeletonRecording:
     """Return a recording with left and right kept apart, as a retargeter gets it."""
-    return SkeletonRecording(list(SwapGuard(recording)), name=recording.name)
+    return SkeletonRecording(list(SideFilter(recording)), name=recording.name)
 
 
 def tracked_fraction(recording: SkeletonRecording, side: str) -> float:
@@ -258,7 +258,7 @@ def main(arguments: list[str]) -> int:
                 began = clock.monotonic()
                 recording = SkeletonRecording(list(source), name=source.name)
                 seconds = clock.monotonic() - began
-            guard = SwapGuard(recording)
+            guard = SideFilter(recording)
             view = SkeletonRecording(list(guard), name=recording.name)
             views.append(view)
             sys.stdout.write(_describe(view, source.images, seconds, guard.swaps) + "\n")

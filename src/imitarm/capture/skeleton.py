@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import InputError, UnknownNameError
+from imitarm.validation import finite_number, real_array, whole_number
 
 Array = NDArray[np.float64]
 
@@ -142,20 +143,15 @@ class Skeleton:
 
     def __post_init__(self) -> None:
         n = len(JOINTS)
-        positions = np.array(self.positions, dtype=float)
-        tracking = np.array(self.tracking)
-        if positions.shape != (n, 3) or tracking.shape != (n,):
-            raise InputError(
-                f"Skeleton: positions and tracking must have shapes ({n}, 3) and ({n},), "
-                f"got {positions.shape} and {tracking.shape}"
-            )
-        if not np.isfinite(self.time):
-            raise InputError(f"Skeleton: time must be a finite number of seconds, got {self.time!r}")
+        time = finite_number(self.time, "Skeleton: time", "s")
+        person = whole_number(self.person, "Skeleton: person")
+        positions = np.array(real_array(self.positions, (n, 3), "Skeleton: positions", "m"))
+        tracking = real_array(self.tracking, (n,), "Skeleton: tracking")
         if not ((tracking == 0) | (tracking == 1) | (tracking == 2)).all():
             raise InputError(f"Skeleton: tracking must be 0, 1 or 2 (lost, inferred, tracked), got {tracking}")
         try:
             left, right = (HandState(state) for state in self.hand_states)
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise InputError(f"Skeleton: hand_states must be two of 0 to 4, got {self.hand_states!r}") from error
         tracking = tracking.astype(np.int8)
         with np.errstate(invalid="ignore"):
@@ -164,7 +160,8 @@ class Skeleton:
         positions[tracking == Tracking.LOST] = np.nan
         positions.setflags(write=False)
         tracking.setflags(write=False)
-        object.__setattr__(self, "time", float(self.time))
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "person", person)
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "tracking", tracking)
         object.__setattr__(self, "hand_states", (left, right))
@@ -175,7 +172,7 @@ class Skeleton:
         Raises:
             UnknownNameError: when there is no such joint.
         """
-        if name not in JOINT:
+        if not isinstance(name, str) or name not in JOINT:
             raise UnknownNameError.among("joint", name, JOINTS)
         return self.positions[JOINT[name]]
 
@@ -185,7 +182,7 @@ class Skeleton:
         Raises:
             UnknownNameError: when ``side`` is neither left nor right.
         """
-        if side not in _ARM_INDEX:
+        if not isinstance(side, str) or side not in _ARM_INDEX:
             raise UnknownNameError.among("side", side, SIDES)
         index = _ARM_INDEX[side]
         return Arm(
@@ -196,7 +193,7 @@ class Skeleton:
         )
 
 
-def whole_number(word: str, what: str, text: str, largest: int) -> int:
+def number_after_colon(word: str, what: str, text: str, largest: int) -> int:
     """Return the number that a user wrote after the colon of a source.
 
     Raises:

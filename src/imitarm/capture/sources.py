@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from imitarm.capture import SOURCES
-from imitarm.capture.filters import PersonFilter, RealtimeSource, SwapGuard
+from imitarm.capture.filters import PersonFilter, RealtimeSource, SideFilter
 from imitarm.capture.skeleton import SkeletonSource
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.files.part_file import PART
@@ -99,4 +99,4 @@ def followed(source: SkeletonSource, *, person: int | None = None) -> PersonFilt
         source: as opened.
         person: number of the person to follow; None: the first who is seen.
     """
-    return PersonFilter(SwapGuard(source), person=person)
+    return PersonFilter(SideFilter(source), person=person)

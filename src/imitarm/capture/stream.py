@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from imitarm.capture.skeleton import HandState, Skeleton, SkeletonSource, Tracking, whole_number
+from imitarm.capture.skeleton import HandState, Skeleton, SkeletonSource, Tracking, number_after_colon
 from imitarm.transmission.datagram import Encoder, now_ns
 from imitarm.transmission.gate import Gate
 from imitarm.transmission.messages import SkeletonFrame
@@ -135,7 +135,7 @@ class UdpSource(SkeletonSource):
             InputError: when the port is not a number, is taken, or the address is not one of this machine's.
         """
         host, colon, port = argument.rpartition(":")
-        number = whole_number("udp", cls.argument, port, 65535)
+        number = number_after_colon("udp", cls.argument, port, 65535)
         return cls(number, host) if colon else cls(number)
 
     @property

@@ -9,8 +9,9 @@ from functools import partial
 from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.motions import DRAWINGS, REACHES, Truth, drawing, reaching
 from imitarm.capture.person import Person
-from imitarm.capture.skeleton import Skeleton, SkeletonSource, whole_number
-from imitarm.errors import InputError, UnknownNameError
+from imitarm.capture.skeleton import Skeleton, SkeletonSource, number_after_colon
+from imitarm.errors import UnknownNameError
+from imitarm.validation import finite_number
 
 MOTIONS: dict[str, Callable[..., Truth]] = {
     **{kind: partial(reaching, kind=kind) for kind in REACHES},
@@ -55,8 +56,7 @@ class SyntheticSource(SkeletonSource):
         realtime: bool = False,
         name: str = "synthetic person",
     ) -> None:
-        if not 0.0 < duration < 86400.0:
-            raise InputError(f"SyntheticSource: duration must be positive and at most a day [s], got {duration!r}")
+        finite_number(duration, "SyntheticSource: duration", "s", above=0.0, at_most=86400.0)
         self.truth, self.name = truth, name
         self._camera, self._duration, self._realtime = camera, duration, realtime
         self._next = 0.0
@@ -77,7 +77,7 @@ class SyntheticSource(SkeletonSource):
         Raises:
             UnknownNameError: when there is no such motion.
         """
-        if kind not in MOTIONS:
+        if not isinstance(kind, str) or kind not in MOTIONS:
             raise UnknownNameError.among("motion", kind, MOTIONS)
         truth = MOTIONS[kind](Person.from_seed(seed), seed, duration=duration)
         name = f"synthetic:{seed}" if kind == "inside" else f"synthetic:{seed}:{kind}"
@@ -90,7 +90,7 @@ class SyntheticSource(SkeletonSource):
         Raises:
             InputError: when it is not a whole number.
         """
-        return cls.from_seed(whole_number("synthetic", cls.argument, argument, 2**31 - 1), realtime=realtime)
+        return cls.from_seed(number_after_colon("synthetic", cls.argument, argument, 2**31 - 1), realtime=realtime)
 
     @property
     def over(self) -> bool:
