@@ -246,6 +246,20 @@ def test_a_synthetic_person_has_no_issue_of_plausibility(kind, seed):
     assert len(mended) == len(recording) and not any("spike" in n or "repeat" in n for n in notes)
 
 
+def test_real_gestures_stay_far_below_the_limits(real_data):
+    excursions, speeds = [], []
+    for path in sorted((real_data / "kinect_gestures").glob("*.csv")):
+        skeletons = read_recording(path).skeletons
+        points, times = np.array([s.positions for s in skeletons]), np.array([s.time for s in skeletons])
+        points = points[:, [i for name, i in JOINT.items() if name[:4] not in {"hip_", "knee", "ankl", "foot"}]]
+        excursions.append(np.linalg.norm(points[1:-1] - 0.5 * (points[2:] + points[:-2]), axis=2).max())
+        for side in ("left", "right"):
+            wrist = np.array([s.joint(f"wrist_{side}") for s in skeletons])
+            speed = np.linalg.norm(np.diff(wrist, axis=0), axis=1) / np.diff(times)
+            speeds.append(np.percentile(speed, 95.0))
+    assert max(excursions) < 0.125 and max(speeds) < 2.4
+
+
 @pytest.mark.parametrize("folder", ["kinect_gestures/*.csv", "mocap_arm/*.tsv"])
 def test_real_recordings_have_no_issue_of_plausibility(real_data, folder):
     files = sorted(real_data.glob(folder))

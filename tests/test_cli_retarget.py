@@ -216,7 +216,7 @@ def test_an_arm_that_is_never_seen_for_long_is_a_failure_and_nothing_is_written(
     ("words", "reported"),
     [
         (["--scale", "-1"], "scale must be between"),
-        (["--pace", "2"], "pace must be between"),
+        (["--pace", "2"], "must be a finite number of at least 0.05 and of at most 1"),
         (["--seconds", "0"], "--seconds must be above 0"),
         (["--trim", "50", "60"], "no frame between"),
         (["--out", "nowhere/demo.csv"], "there is no folder nowhere"),
