@@ -21,7 +21,7 @@ _LENGTH_UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "dm": 0.1, "feet": 0.
 FASTEST_HAND = 10.0  # [m/s] faster than a person moves for a robot to follow; real gestures have at most 2.4
 LARGEST_STEP = 0.3  # [m] from one frame to the next, if it is also faster than FASTEST_HAND
 _UPRIGHT = 0.5  # cosine of the largest angle between spine and vertical, as a median over the recording
-_SPIKE = 0.2  # [m] a smaller excursion is noise: real gestures have up to 0.12
+_SPIKE = 0.2  # [m] a smaller excursion is noise: arms in real gestures have up to 0.10
 _BONE_CHANGE = 0.12  # [m] of a bone's length in a spike
 _SPIKE_WIDTHS, _SPIKE_TIME = (1, 2, 3), 0.25  # [frames] a spike lasts, and [s] from the frame before to the one after
 
