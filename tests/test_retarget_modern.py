@@ -321,7 +321,7 @@ def test_the_clutch_does_not_slip_on_a_robot_that_is_only_late(arm):
 def test_an_arm_that_loses_sight_near_full_stretch_does_not_straighten_its_elbow(robot, seed, lost):
     """Moments at which braking without the elbow's bound brought it near to straight, or through."""
     arm = ARMS[robot]
-    marked = arm.marked()
+    marked = arm.required_landmarks()
     side = np.sign(arm.home[marked.elbow] - marked.elbow_straight)
     person, _, frames = recording(seed, "edge")
     retargeter = ModernRetargeter(arm, Correspondence(lengths=lengths(person), orientation="upright", scale=2.0))

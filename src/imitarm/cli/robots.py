@@ -1,4 +1,4 @@
-"""``imitarm robots``: which arms and tools are known, and what they can do."""
+"""``imitarm robots``: list the known arms and tools, or show the joints and limits of one arm."""
 
 from __future__ import annotations
 

@@ -183,7 +183,7 @@ def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _P
         unwanted = spec.compiler.discardvisual and not _touches(geom)  # a URDF's, unless it says otherwise
         if unwanted or (discard_meshes and geom.type in _MESHES):
             spec.delete(geom)
-    spec.compiler.discardvisual = False  # else a tool would lose its looks too
+    spec.compiler.discardvisual = False  # else a tool would lose its visual shapes too
     used = {geom.meshname for geom in spec.geoms}
     for asset in [*spec.hfields, *spec.skins] if discard_meshes else []:
         spec.delete(asset)
@@ -192,7 +192,7 @@ def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _P
             spec.delete(mesh)
     find_meshes(spec, path, root, package_path)
     _name_all(spec)
-    _part_contact_from_looks(spec)
+    _separate_contact_shapes(spec)
     faults = _replace_unusable_masses(spec, path, root)
     _check_sizes(compiled(spec, path), path, root)
     return _Part(spec, root, faults)
@@ -351,8 +351,8 @@ def _touches(geom: mujoco.MjsGeom) -> bool:
     return bool(geom.contype or geom.conaffinity)
 
 
-def _part_contact_from_looks(spec: mujoco.MjSpec) -> None:
-    """Put every shape that can touch into group 3; a link that would then look like nothing gets a copy in group 2."""
+def _separate_contact_shapes(spec: mujoco.MjSpec) -> None:
+    """Put every shape that can touch into group 3; a link without a visual shape gets a copy of it in group 2."""
     for body in spec.bodies:
         touching = [geom for geom in body.geoms if _touches(geom)]
         unseen = len(touching) == len(body.geoms)

@@ -141,8 +141,8 @@ class _HomeSearch:
 
     def candidates(self) -> Array:
         """Return postures that fill the ranges evenly (a Sobol sequence), shape (n, n_joints)."""
-        shares = qmc.Sobol(len(self._low), scramble=False).random(_SAMPLES)
-        return np.asarray(self._low + (0.1 + 0.8 * shares) * (self._high - self._low))
+        fractions = qmc.Sobol(len(self._low), scramble=False).random(_SAMPLES)
+        return np.asarray(self._low + (0.1 + 0.8 * fractions) * (self._high - self._low))
 
     def bend(self, q: Array) -> float:
         """Return how far a posture is from a singular one [m/rad]; 0 where singular.

@@ -78,7 +78,7 @@ class ArmMemory:
             home: positions of all joints, fingers too, shape (nq,).
             positions: indices of the arm's joints in qpos.
             joints: indices of the arm's joints in qvel.
-            landmarks: sites whose Jacobians :meth:`marked_jacobians` returns.
+            landmarks: sites whose Jacobians :meth:`landmark_jacobians` returns.
         """
         self.data = mujoco.MjData(model)
         self.data.qpos[:] = home
@@ -116,7 +116,7 @@ class ArmMemory:
         mujoco.mj_jacSite(self._model, self.data, self.linear, self.angular, site)
         return self.jacobian[:, self._joints] if self._views is None else self._views[0]
 
-    def marked_jacobians(self) -> Array:
+    def landmark_jacobians(self) -> Array:
         """Return the Jacobians of the landmarks, one below the other, (3 m, n), as a view that is overwritten."""
         for site, rows in self._landmarks:
             mujoco.mj_jacSite(self._model, self.data, rows, None, site)
@@ -170,8 +170,8 @@ class ArmKinematics:
         try:
             memory = self._local.memory
         except AttributeError:  # the first time in this thread
-            marked = () if self.landmarks is None else self.landmarks.sites
-            memory = self._local.memory = ArmMemory(self._model, self._posture, self._qpos, self._dofs, marked)
+            sites = () if self.landmarks is None else self.landmarks.sites
+            memory = self._local.memory = ArmMemory(self._model, self._posture, self._qpos, self._dofs, sites)
         memory.move_to(posture)
         return memory
 
@@ -248,7 +248,7 @@ class ArmKinematics:
         Raises:
             InputError: if the arm's file does not say where they are.
         """
-        return np.array(self.at(q).sites[list(self.marked().sites)])
+        return np.array(self.at(q).sites[list(self.required_landmarks().sites)])
 
     def sew_jacobians(self, q: ArrayLike) -> Array:
         """Return the Jacobians of shoulder, elbow and wrist, shape (3, 3, n_joints) [m/rad].
@@ -256,11 +256,11 @@ class ArmKinematics:
         Raises:
             InputError: if the arm's file does not say where they are.
         """
-        self.marked()
-        return np.array(self.at(q).marked_jacobians()).reshape(3, 3, -1)
+        self.required_landmarks()
+        return np.array(self.at(q).landmark_jacobians()).reshape(3, 3, -1)
 
-    def marked(self) -> Landmarks:
-        """Return ``landmarks``.
+    def required_landmarks(self) -> Landmarks:
+        """Return ``landmarks``, which the caller can't do without.
 
         Raises:
             InputError: if the arm's file does not say where shoulder, elbow and wrist are.

@@ -133,7 +133,7 @@ class ElbowSingularityLimit(Limit):
     """
 
     def __init__(self, arm: ArmModel) -> None:
-        marked = arm.marked()
+        marked = arm.required_landmarks()
         self._joint = joint = marked.elbow
         self._straight = marked.elbow_straight
         self._acceleration, self._most = float(arm.max_acceleration[joint]), float(arm.max_velocity[joint])
@@ -183,7 +183,7 @@ class WristSingularityLimit(Limit):
     soft: ClassVar[bool] = True
 
     def __init__(self, arm: ArmModel) -> None:
-        self._joint = arm.marked().wrist
+        self._joint = arm.required_landmarks().wrist
         self._acceleration = float(arm.max_acceleration[self._joint])
         self._most = float(arm.max_velocity[self._joint])
         self._rows = []

@@ -1,4 +1,4 @@
-"""Which links of an arm can meet at all, within the limits of the joints between them."""
+"""Which links of an arm can touch each other within the limits of the joints between them."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from scipy.stats import qmc
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.spheres import COLLISION_GROUP
 
-_FEW = 3  # links with more joints between them are taken to meet: their postures are too many to try
-_POSTURES = 512  # tried of the joints between two links
+_FEW = 3  # links with more joints between them are assumed to meet: there are too many postures to try
+_POSTURES = 512  # tried for each pair of links
 
 
 @lru_cache(maxsize=16)
 def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
-    """Tell of every two links whether they can meet, joints in between at any position within their limits.
+    """Return for every pair of links whether they can touch within the limits of the joints between them.
 
-    Link 0 is the base, link k is moved by k joints. Links joined by a joint are said not to meet. For links with two
-    or three joints between them the exact distance of their shapes is measured in 512 postures that cover what these
-    joints can do evenly (a Sobol sequence); those that never touch are said not to meet. Links with more joints
-    between them are said to.
+    Link 0 is the base; link k is moved by k joints. Neighbouring links are reported as not meeting. For links with two
+    or three joints between them, the distance of their exact shapes is measured in 512 postures that fill the ranges
+    of these joints evenly (a Sobol sequence); links that never touch are reported as not meeting. Links with more
+    joints between them are reported as meeting.
 
     Args:
         arm: the arm with its tool.
@@ -43,7 +43,7 @@ def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
 
 
 def _shapes(arm: ArmModel, model: mujoco.MjModel) -> list[list[int]]:
-    """Return the collision shapes of each link, the base's first."""
+    """Return the collision shapes of each link, those of the base first."""
     joints = [model.joint(name).id for name in arm.joint_names]
     carriers = [int(model.jnt_bodyid[joint]) for joint in joints]
     shapes: list[list[int]] = [[] for _ in range(arm.n_joints + 1)]
@@ -60,10 +60,13 @@ def _touch(
     arm: ArmModel, model: mujoco.MjModel, data: mujoco.MjData, links: tuple[list[int], list[int]], between: slice
 ) -> bool:
     """Return whether two links touch in any of the postures that are tried."""
-    low, high = np.maximum(arm.lower[between], -np.pi), np.minimum(arm.upper[between], np.pi)  # some turn for ever
+    low, high = (
+        np.maximum(arm.lower[between], -np.pi),
+        np.minimum(arm.upper[between], np.pi),
+    )  # continuous joints have no limits
     q = arm.home.copy()
-    for share in qmc.Sobol(len(low), scramble=False).random(_POSTURES):
-        q[between] = low + share * (high - low)
+    for fraction in qmc.Sobol(len(low), scramble=False).random(_POSTURES):
+        q[between] = low + fraction * (high - low)
         data.qpos[:] = arm.posture(model, q)
         mujoco.mj_kinematics(model, data)
         for one in links[0]:

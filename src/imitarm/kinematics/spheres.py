@@ -1,4 +1,4 @@
-"""Covering the collision shapes of an arm with spheres, so that its whole body can be kept off obstacles."""
+"""Covering the collision shapes of an arm with spheres, so that all of it can be kept clear of obstacles."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 COLLISION_GROUP = 3
-"""Group of the geoms that count for contact; looks are in groups 0 to 2."""
-_SPACING = 0.9  # distance of neighbours on a round bar, in radii: spheres then stand out by a tenth
+"""Group of the geoms that count for contact; geoms that are only drawn are in groups 0 to 2."""
+_SPACING = 0.9  # distance of neighbouring spheres on a bar, in radii: they then exceed the bar by a tenth
 _MOST_PIECES = 50  # of one bar
-_SMALLEST_CELL = 0.025  # [m] a plate thinner than this is not cut finer
+_SMALLEST_CELL = 0.025  # [m] smallest cell of a plate, however thin it is
 _LONGEST_ROW = 4  # cells along the longest edge of a plate
 
 
@@ -25,10 +25,10 @@ class SphereCover:
     Attributes:
         bodies: for each sphere the name of the body that carries it.
         radii: shape (m,) [m].
-        links: by how many of the arm's joints each sphere is moved, shape (m,).
-        follows_last_joint: which spheres move rigidly with the flange, shape (m,).
-        base_centers: of the spheres that cover the base, which never moves, shape (b, 3) [m].
-        base_radii: theirs, shape (b,) [m].
+        links: number of the arm's joints that move each sphere, shape (m,).
+        follows_last_joint: True for spheres that move rigidly with the flange, shape (m,).
+        base_centers: centers of the spheres that cover the base, which never moves, shape (b, 3) [m].
+        base_radii: radii of these spheres, shape (b,) [m].
     """
 
     def __init__(self, model: mujoco.MjModel, joints: NDArray[np.int_]) -> None:
@@ -69,7 +69,11 @@ class SphereCover:
         self.follows_last_joint = self._moves[:, 0, -1] > 0.0
 
     def centers(self, data: mujoco.MjData) -> Array:
-        """Return where the spheres are, shape (m, 3) [m]; ``data`` holds the kinematics of a posture."""
+        """Return the centers of the spheres in the base frame, shape (m, 3) [m].
+
+        Args:
+            data: the kinematics of a posture.
+        """
         turned = (data.xmat.reshape(-1, 3) @ self._columns).take(self._picked)
         turned += data.xpos.take(self._owners, axis=0)
         return np.asarray(turned)
@@ -101,16 +105,16 @@ class SphereCover:
     def parting(
         self, data: mujoco.MjData, outer: NDArray[np.int_], inner: NDArray[np.int_], centers: Array, normals: Array
     ) -> Array:
-        """Return how fast each joint parts two spheres, shape (k, n_joints) [m/rad]: the gradients of their distances.
+        """Return the gradients of the distances of pairs of spheres, shape (k, n_joints) [m/rad].
 
-        A joint that moves both leaves their distance as it is; one that moves the outer alone adds
-        n (a x (c - o)) = a (c x n) - n (a x o), with its axis a through o.
+        A joint that moves both spheres does not change their distance. A joint with axis a through the point o that
+        moves the outer one alone, whose center is c, changes it by n (a x (c - o)) = a (c x n) - n (a x o).
 
         Args:
             data: the kinematics of a posture.
-            outer: spheres (k,) that are moved by all joints that move the inner ones, and more.
-            inner: spheres (k,); those of the base are counted on after the others.
-            centers: of the outer spheres, shape (k, 3) [m].
+            outer: indices of the spheres farther from the base, shape (k,); moved by all joints that move the inner ones.
+            inner: indices of the spheres nearer to the base, shape (k,); those of the base follow after all others.
+            centers: centers of the outer spheres, shape (k, 3) [m].
             normals: unit vectors from inner to outer, shape (k, 3).
         """
         axes, anchors = data.xaxis[self._joints], data.xanchor[self._joints]
@@ -137,19 +141,19 @@ class SphereCover:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return the cross products of rows; np.cross takes many times as long for a few."""
+    """Return the cross products of rows; np.cross takes many times as long for few rows."""
     return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
 def _carries(model: mujoco.MjModel, carrier: int, body: int) -> bool:
-    """Return whether ``carrier`` is ``body`` or above it."""
+    """Return whether ``carrier`` is ``body`` or one of its parents."""
     while body > carrier:  # parents have smaller indices
         body = int(model.body_parentid[body])
     return body == carrier
 
 
 def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:
-    """Cover one geom with equal spheres, conservatively: every point of the geom is in one of them.
+    """Cover one geom with equal spheres: every point of the geom is inside one of them.
 
     Round bars (capsule, cylinder, ellipsoid) get a row of spheres, everything else (box, the bounding box of a mesh)
     a grid of them.

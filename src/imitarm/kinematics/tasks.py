@@ -157,11 +157,11 @@ class ElbowTask(NamedTuple):
             raise InputError(f"ElbowTask: needs a finite angle and other numbers that are not negative, got {self!r}")
         if not problem.tasks:
             raise InputError("ElbowTask: must follow a task for the tool, such as TwistTask, in the list of tasks")
-        shoulder, elbow, wrist = problem.memory.sites.take(_marked(problem.arm), axis=0).tolist()
+        shoulder, elbow, wrist = problem.memory.sites.take(_landmark_sites(problem.arm), axis=0).tolist()
         now = one_angle(shoulder, elbow, wrist, convention)
         if now is None:
             return None
-        gradient = np.array(now.shoulder + now.elbow + now.wrist).dot(problem.memory.marked_jacobians())
+        gradient = np.array(now.shoulder + now.elbow + now.wrist).dot(problem.memory.landmark_jacobians())
         motion = self_motion(problem.tasks[0].jacobian, gradient)
         if motion is None:
             return None
@@ -218,9 +218,9 @@ def joint_vector(values: ArrayLike, n: int, what: str) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _marked(arm: ArmModel) -> NDArray[np.intp]:
+def _landmark_sites(arm: ArmModel) -> NDArray[np.intp]:
     """Return the indices of the sites that mark shoulder, elbow and wrist."""
-    return np.array(arm.marked().sites, dtype=np.intp)
+    return np.array(arm.required_landmarks().sites, dtype=np.intp)
 
 
 def _root(weight: float, task: str) -> float:
