@@ -112,7 +112,7 @@ class SphereCover:
 
         Args:
             data: the kinematics of a posture.
-            outer: indices of the spheres farther from the base, shape (k,); moved by all joints that move the inner ones.
+            outer: indices of the spheres farther from the base, shape (k,); all joints of the inner ones move them.
             inner: indices of the spheres nearer to the base, shape (k,); those of the base follow after all others.
             centers: centers of the outer spheres, shape (k, 3) [m].
             normals: unit vectors from inner to outer, shape (k, 3).
