@@ -87,7 +87,7 @@ class SimulatedRobot(Robot):
         scene = Scene() if scene is None else instance(scene, Scene, "SimulatedRobot: scene")
         if world is None and not scene.fixtures:
             scene = replace(scene, fixtures=standard_fixtures())
-        self._source = MovingScene(scene, {} if motion is None else motion)
+        self._source = scene if motion is None else MovingScene(scene, motion)
         self.scene_at_start = self._source.at(scene.stamp)
         self.control: Control = control
         self._q_start = _checked_start(arm, arm.home if q is None else q)
@@ -130,7 +130,7 @@ class SimulatedRobot(Robot):
         self._gauge.ignore_present_self_contacts(self.data)
         count = len(scene.obstacles)
         self._mocap = np.array([m.body_mocapid[m.body(f"{OBSTACLE}{i}").id] for i in range(count)], dtype=int)
-        self._moving = bool(self._source.motions) or any(obstacle.moves for obstacle in scene.obstacles)
+        self._moving = isinstance(self._source, MovingScene) or any(obstacle.moves for obstacle in scene.obstacles)
 
     def reset(self, q: ArrayLike | None = None) -> ArmState:
         """Put everything back to time 0, and the arm at rest at ``q``.

@@ -132,7 +132,7 @@ def _shape(obstacle: Obstacle) -> tuple[mujoco.mjtGeom, list[float], Array | Non
         "cylinder": (types.mjGEOM_CYLINDER, [a, 0.5 * b, 0.0]),
         "capsule": (types.mjGEOM_CAPSULE, [a, max(0.5 * b, 1e-6), 0.0]),
         "ellipsoid": (types.mjGEOM_ELLIPSOID, [a, b, c]),
-        "half_space": (types.mjGEOM_PLANE, [3.0, 3.0, 0.05]),  # the size it is drawn in; it has no end
+        "half_space": (types.mjGEOM_PLANE, [0.0, 0.0, 0.05]),  # without end
     }
     if solid.kind in primitives:
         return *primitives[solid.kind], None

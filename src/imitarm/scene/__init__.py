@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from imitarm.scene.motion import MovingScene, Track
-from imitarm.scene.obstacle import (
+from imitarm.scene.obstacle import Obstacle
+from imitarm.scene.scene import Scene
+from imitarm.scene.scene_file import load_scene, save_scene
+from imitarm.scene.shapes import (
     Box,
     Capsule,
     Cone,
@@ -11,11 +14,8 @@ from imitarm.scene.obstacle import (
     Cylinder,
     Ellipsoid,
     HalfSpace,
-    Obstacle,
     Sphere,
 )
-from imitarm.scene.scene import Scene
-from imitarm.scene.scene_file import load_scene, save_scene
 
 OBSTACLES: dict[str, type[Obstacle]] = {
     shape.kind: shape for shape in (Sphere, Box, Capsule, Cylinder, Cone, Ellipsoid, ConvexHull, HalfSpace)

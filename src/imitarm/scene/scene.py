@@ -94,6 +94,11 @@ class Scene:
         """
         return self if time == self.stamp or self.packed.still else self.at(time)
 
+    def poses(self, time: float) -> tuple[Array, Array]:
+        """Return where the obstacles' own frames are at ``time`` [s]: positions (n, 3) [m], quaternions (n, 4)."""
+        packed = self.packed.after(time - self.stamp)
+        return packed.positions, packed.quaternions
+
     def __getattr__(self, name: str) -> Any:
         """Build the obstacles of a predicted scene, the only attribute that may be missing."""
         seen: Scene | None = self.__dict__.get("_seen")

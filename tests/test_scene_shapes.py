@@ -1,4 +1,4 @@
-"""Sphere, Capsule and Ellipsoid against closed forms and brute force."""
+"""Each shape against numbers worked out by hand, closed forms and brute force."""
 
 from __future__ import annotations
 
@@ -7,11 +7,55 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imitarm.kinematics.pose import Pose
-from imitarm.scene import Capsule, Ellipsoid, Sphere
+from imitarm.kinematics.pose import Pose, quaternion_exp
+from imitarm.scene import Box, Capsule, Cone, Cylinder, Ellipsoid, Sphere
 
 HERE = Pose.identity()
-COORDINATE = st.one_of(st.floats(-9.0, 9.0), st.sampled_from([0.0, 1e-300, -1e-17, 1e-9]))
+UPSIDE_DOWN = Pose([0, 0, 0], quaternion_exp([np.pi, 0, 0]))
+
+
+def test_box_by_hand():
+    box = Box(HERE, [2.0, 4.0, 6.0])
+    points = [[2, 0, 0], [4, 6, 0], [2, 3, 4], [0.5, 0, 0], [0, 0, 0], [1, 2, 3], [-1, -2, -3]]
+    distance, gradient = box.distance_and_gradient(points)
+    np.testing.assert_allclose(distance, [1, 5, np.sqrt(3), -0.5, -1, 0, 0])
+    third = 1 / np.sqrt(3)
+    np.testing.assert_allclose(
+        gradient,
+        [[1, 0, 0], [0.6, 0.8, 0], [third] * 3, [1, 0, 0], [1, 0, 0], [1, 0, 0], [-1, 0, 0]],
+        atol=1e-12,
+    )
+
+
+def test_box_is_turned_by_its_pose():
+    box = Box(Pose([0, 0, 1], quaternion_exp([0, 0, np.pi / 4])), [2.0, 2.0, 2.0])
+    assert float(box.signed_distance([np.sqrt(2), 0, 1])) == pytest.approx(0.0, abs=1e-12)  # an edge is there now
+    assert float(box.signed_distance([0, 0, 2.5])) == pytest.approx(0.5)
+    np.testing.assert_allclose(box.bounds(), [[-np.sqrt(2), -np.sqrt(2), 0], [np.sqrt(2), np.sqrt(2), 2]], atol=1e-12)
+
+
+def test_cylinder_by_hand():
+    can = Cylinder(HERE, 1.0, 4.0)
+    points = [[3, 0, 0], [0, 0, 3], [4, 0, 6], [0.5, 0, 0], [0, 0, 1.5], [0, 0, 0]]
+    distance, gradient = can.distance_and_gradient(points)
+    np.testing.assert_allclose(distance, [2, 1, 5, -0.5, -0.5, -1])
+    np.testing.assert_allclose(
+        gradient, [[1, 0, 0], [0, 0, 1], [0.6, 0, 0.8], [1, 0, 0], [0, 0, 1], [1, 0, 0]], atol=1e-12
+    )
+
+
+def test_cone_by_hand():
+    # base of radius 3 at z = -2, tip at z = 2: the side's normal is (4, 3) / 5 in (rho, z)
+    cone = Cone(HERE, 3.0, 4.0)
+    points = [[0, 0, 5], [0, 0, -3], [5, 0, -2], [7, 0, -5], [1.5 + 0.8, 0, 0.6], [0, 0, -1.9], [1.5 - 0.08, 0, -0.06]]
+    distance, gradient = cone.distance_and_gradient(points)
+    np.testing.assert_allclose(distance, [3, 1, 2, 5, 1, -0.1, -0.1], atol=1e-12)
+    side = [0.8, 0, 0.6]
+    np.testing.assert_allclose(
+        gradient, [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.8, 0, -0.6], side, [0, 0, -1], side], atol=1e-12
+    )
+    np.testing.assert_allclose(cone.bounds(), [[-3, -3, -2], [3, 3, 2]], atol=1e-12)
+    assert float(Cone(UPSIDE_DOWN, 3.0, 4.0).signed_distance([0, 0, -5])) == pytest.approx(3.0)
 
 
 def test_sphere_by_hand():

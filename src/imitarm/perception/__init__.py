@@ -1,0 +1,7 @@
+"""How a camera sees obstacles: depth pictures, and what is found in them."""
+
+from __future__ import annotations
+
+from imitarm.perception.depth_frame import DepthFrame, Intrinsics
+
+__all__ = ["DepthFrame", "Intrinsics"]

@@ -1,0 +1,142 @@
+"""DepthFrame: one picture of a depth camera, with all that is needed to turn it into points in the base frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError
+from imitarm.html_table import html_table
+from imitarm.kinematics.pose import Pose
+from imitarm.validation import finite_array, finite_number, instance, real_array, whole_number
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion.
+
+    The point ``(x, y, z)`` in the camera's frame is seen at column ``u = fx x/z + cx`` and row ``v = fy y/z + cy``. The
+    frame has its origin at the pinhole, x to the right of the picture, y down and z forward. The centre of the first
+    pixel is at ``u = v = 0``.
+
+    Attributes:
+        width: number of columns.
+        height: number of rows.
+        fx: focal length along the columns [pixel].
+        fy: focal length along the rows [pixel].
+        cx: column of the optical axis [pixel].
+        cy: row of the optical axis [pixel].
+
+    Raises:
+        InputError: when a number is not finite, or a size or focal length is not positive.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        for key in ("width", "height"):
+            object.__setattr__(self, key, whole_number(getattr(self, key), f"Intrinsics: {key}", at_least=1))
+        for key in ("fx", "fy"):
+            value = finite_number(getattr(self, key), f"Intrinsics: {key}", "pixel", above=0.0)
+            object.__setattr__(self, key, value)
+        for key in ("cx", "cy"):
+            object.__setattr__(self, key, finite_number(getattr(self, key), f"Intrinsics: {key}", "pixel"))
+
+    @classmethod
+    def from_field_of_view(cls, width: int, height: int, vertical: float) -> Intrinsics:
+        """Return the camera with square pixels, the optical axis in the middle and a vertical field of view [rad]."""
+        height = whole_number(height, "height", at_least=1)
+        angle = finite_number(vertical, "vertical field of view", "rad", above=0.0)
+        if angle >= np.pi:
+            raise InputError(f"vertical field of view must be below pi [rad], got {angle:g}")
+        focal = 0.5 * height / float(np.tan(0.5 * angle))
+        return cls(width, height, focal, focal, 0.5 * (whole_number(width, "width") - 1), 0.5 * (height - 1))
+
+    def project(self, points: ArrayLike) -> Array:
+        """Return the columns and rows at which points are seen.
+
+        Args:
+            points: in the camera's frame, shape (..., 3) [m].
+
+        Returns:
+            u and v, shape (..., 2) [pixel]; nan for points that are not in front of the camera. They may be outside of
+            the picture.
+        """
+        x, y, z = np.moveaxis(finite_array(points, (..., 3), "points", "m"), -1, 0)
+        ahead = np.where(z > 0.0, z, np.nan)
+        return np.stack([self.fx * x / ahead + self.cx, self.fy * y / ahead + self.cy], axis=-1)
+
+    def rays(self) -> Array:
+        """Return where each pixel looks, shape (height, width, 3): the point of its ray with ``z = 1``."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DepthFrame:
+    """One depth picture.
+
+    Attributes:
+        stamp: when it was taken [s].
+        depth: distance of the surface from the camera's plane (its z, not the length of the ray), shape
+            (height, width) [m]; nan where nothing was measured. 0 and infinity are replaced by nan.
+        intrinsics: the camera.
+        camera_to_base: where the camera was.
+
+    Raises:
+        InputError: when the shape is not that of the camera, a depth is negative, or a number is not finite.
+    """
+
+    stamp: float
+    depth: Array
+    intrinsics: Intrinsics
+    camera_to_base: Pose
+
+    def __post_init__(self) -> None:
+        camera = instance(self.intrinsics, Intrinsics, "DepthFrame: intrinsics")
+        instance(self.camera_to_base, Pose, "DepthFrame: camera_to_base")
+        object.__setattr__(self, "stamp", finite_number(self.stamp, "DepthFrame: stamp", "s"))
+        depth = np.array(real_array(self.depth, (camera.height, camera.width), "DepthFrame: depth", "m"))
+        if np.any(depth < 0.0):
+            row, column = np.argwhere(depth < 0.0)[0].tolist()
+            raise InputError(
+                f"DepthFrame: depth must not be negative [m], but depth[{row}, {column}] is {depth[row, column]}"
+            )
+        depth[(depth == 0.0) | np.isinf(depth)] = np.nan
+        depth.setflags(write=False)
+        object.__setattr__(self, "depth", depth)
+
+    def points(self) -> Array:
+        """Return what was measured as points in the base frame, row by row, shape (n, 3) [m]."""
+        measured = ~np.isnan(self.depth)
+        rays = self.intrinsics.rays()[measured]
+        return self.camera_to_base.apply(rays * self.depth[measured][:, None])
+
+    def __repr__(self) -> str:
+        width, height = self.intrinsics.width, self.intrinsics.height
+        return f"DepthFrame({width} x {height}, stamp {self.stamp:g} s, {self._measured()})"
+
+    def _repr_html_(self) -> str:
+        rows = {
+            "size": f"{self.intrinsics.width} x {self.intrinsics.height} pixels",
+            "stamp": f"{self.stamp:g} s",
+            "measured": self._measured(),
+            "camera": f"at {np.round(self.camera_to_base.position, 3).tolist()} m",
+        }
+        return html_table("DepthFrame", rows)
+
+    def _measured(self) -> str:
+        measured = self.depth[~np.isnan(self.depth)]
+        if not len(measured):
+            return "nothing measured"
+        share = 100.0 * len(measured) / self.depth.size
+        return f"{share:.0f} % measured, from {measured.min():.2f} to {measured.max():.2f} m"
