@@ -228,7 +228,7 @@ def test_orientation_covariance_is_of_small_turns_in_the_base_frame() -> None:
 
 def test_demonstrations_that_turn_opposite_ways_are_refused() -> None:
     there, back = shown(turn=3.0, n=2), shown(turn=-3.0, n=2)
-    with pytest.raises(InputError, match="don't turn the same way"):
+    with pytest.raises(InputError, match="do not rotate in the same way"):
         GMR(3).fit([*there, *back])
 
 

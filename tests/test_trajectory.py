@@ -204,7 +204,7 @@ ROLLOUT = Rollout(LINE, ZEROS, ZEROS, ZEROS, np.array([0.2, 0.1, np.inf]), True)
         ({"clearance": [0.1, np.nan, 0.1]}, "NaN in row 1"),
         ({"success": "no"}, "success must be True or False"),
         ({"reason": None}, "reason must be text"),
-        ({"details": [1]}, "details must be a mapping"),
+        ({"details": [1]}, "details must be a Mapping"),
     ],
 )
 def test_a_rollout_is_checked(change, message):

@@ -10,14 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from imitarm.errors import InputError
+from imitarm.errors import InputError, UnknownNameError
 from imitarm.validation import (
+    choice,
+    file_path,
     finite_array,
     finite_number,
+    finite_numbers,
     finite_vector,
     flag,
+    function,
     instance,
     real_array,
+    sequence,
     text,
     whole_number,
 )
@@ -158,3 +163,32 @@ def test_a_long_value_is_cut_in_the_message() -> None:
     with pytest.raises(InputError) as caught:
         finite_number("x" * 10_000, "dt")
     assert len(str(caught.value)) < 150
+
+
+def test_one_number_or_a_vector():
+    assert finite_numbers(3, "t").tolist() == [3.0]
+    assert finite_numbers([1, 2.5], "t").tolist() == [1.0, 2.5]
+    for bad in (np.zeros((2, 2)), [[1.0], [2.0, 3.0]], "1", None, np.nan):
+        with pytest.raises(InputError, match="t must be"):
+            finite_numbers(bad, "t")
+
+
+def test_a_choice_lists_the_names():
+    assert choice("a", ("b", "a"), "method") == "a"
+    for bad in ("c", 1, None, np.zeros(3), ["a"]):
+        with pytest.raises(UnknownNameError, match=r"unknown method .*known: a, b"):
+            choice(bad, ("b", "a"), "method")
+
+
+def test_sequences_functions_and_paths():
+    assert sequence(["a", "b"], str, "names") == ("a", "b")
+    for bad in ("ab", 3, ["a", 1], {"a"}):
+        with pytest.raises(InputError, match="names must be a sequence of str"):
+            sequence(bad, str, "names")
+    assert function(len, "f") is len
+    with pytest.raises(InputError, match="f must be a function"):
+        function(3, "f")
+    assert file_path("a/b", "path") == Path("a/b") == file_path(Path("a/b"), "path")
+    for bad in (b"a", 3, None, "a\0b"):
+        with pytest.raises(InputError, match="path must be text"):
+            file_path(bad, "path")

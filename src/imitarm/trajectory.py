@@ -9,7 +9,6 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,17 @@ from imitarm.errors import FileFormatError, InputError
 from imitarm.files.table import Table, read_table, write_table
 from imitarm.html_table import html_table
 from imitarm.kinematics.pose import Pose, checked_unit_quaternions, continuous_signs, slerp
-from imitarm.validation import finite_array, flag, instance, real_array, text, whole_number
+from imitarm.validation import (
+    file_path,
+    finite_array,
+    finite_numbers,
+    flag,
+    instance,
+    real_array,
+    sequence,
+    text,
+    whole_number,
+)
 
 Array = NDArray[np.float64]
 
@@ -122,7 +131,7 @@ class Trajectory:
         Raises:
             InputError: when the times are not finite numbers.
         """
-        t = finite_array(np.atleast_1d(times), (None,), "Trajectory.at: times", "s")
+        t = finite_numbers(times, "Trajectory.at: times", "s")
         positions = np.stack([np.interp(t, self.times, column) for column in self.positions.T], axis=1)
         return positions, None if self.quaternions is None else slerp(t, self.times, self.quaternions)
 
@@ -182,9 +191,9 @@ class Demonstration:
             return
         what = f"Demonstration joints of {self.source or self.task}"
         joints = _frozen(self.joints, (len(self.trajectory), None), what, "rad")
-        if isinstance(self.joint_names, str) or not all(isinstance(name, str) for name in self.joint_names):
-            raise InputError(f"{what}: joint_names must be a sequence of texts, got {self.joint_names!r:.80}")
-        names = tuple(self.joint_names) or tuple(f"joint_{i + 1}" for i in range(joints.shape[1]))
+        names = sequence(self.joint_names, str, f"{what}: joint_names") or tuple(
+            f"joint_{i + 1}" for i in range(joints.shape[1])
+        )
         if len(names) != joints.shape[1] or len(set(names)) != len(names):
             raise InputError(f"{what}: {joints.shape[1]} columns need as many different joint_names, got {names}")
         object.__setattr__(self, "joints", joints)
@@ -217,7 +226,7 @@ class Demonstration:
         Raises:
             InputError: when a joint's name can't be a column name, or the file can't be written.
         """
-        path = _checked_path(path, "Demonstration.save")
+        path = file_path(path, "Demonstration.save: path")
         for name in self.joint_names:
             if not _COLUMN_NAME.fullmatch(name) or name.lower() in _RESERVED:
                 raise InputError(f"{path}: {name!r} can't be the name of a joint's column; rename that joint")
@@ -249,7 +258,7 @@ class Demonstration:
             InputError: when the file can't be opened.
             FileFormatError: when it is damaged or incomplete, or has another format or a newer version.
         """
-        path = _checked_path(path, "Demonstration.load")
+        path = file_path(path, "Demonstration.load: path")
         table = read_demonstration_table(path)
         names = table.names or ()
         n_pose = 8 if "qw" in names else 4
@@ -272,7 +281,7 @@ def read_demonstration_table(path: str | os.PathLike[str]) -> Table:
         InputError: when the file can't be opened.
         FileFormatError: when it is damaged or incomplete, or has another format or a newer version.
     """
-    path = _checked_path(path, "read_demonstration_table")
+    path = file_path(path, "read_demonstration_table: path")
     table = read_table(path)
     if table.remarks.get("format") != FORMAT:
         raise FileFormatError(
@@ -340,8 +349,7 @@ class Rollout:
         object.__setattr__(self, "clearance", clearance)
         object.__setattr__(self, "success", flag(self.success, "Rollout: success"))
         text(self.reason, "Rollout: reason")
-        if not isinstance(self.details, Mapping):
-            raise InputError(f"Rollout: details must be a mapping from names to values, got {self.details!r:.80}")
+        instance(self.details, Mapping, "Rollout: details")  # type: ignore[type-abstract]
 
     def __repr__(self) -> str:
         samples, duration, *_ = self.trajectory._facts()
@@ -369,9 +377,3 @@ class Rollout:
 
 def _triple(position: Array) -> str:
     return f"({', '.join(f'{x:.4g}' for x in position)})"
-
-
-def _checked_path(path: str | os.PathLike[str], what: str) -> Path:
-    if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str) or "\0" in os.fspath(path):
-        raise InputError(f"{what}: path must be text or a pathlib.Path, got {path!r:.80}")
-    return Path(path)

@@ -10,14 +10,17 @@ the argument, its unit, what was expected and what was given. NaN, infinities, t
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral, Real
+from pathlib import Path
 from types import EllipsisType
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.errors import InputError
+from imitarm.errors import InputError, UnknownNameError
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -160,6 +163,65 @@ def instance(value: Any, kind: type[T], what: str) -> T:
     if not isinstance(value, kind):
         raise InputError(f"{what} must be a {kind.__name__}, got {_shown(value)}")
     return value
+
+
+def finite_numbers(value: Any, what: str, unit: str = "") -> Array:
+    """Return one finite number or a sequence of them as an array of shape (n,), float64.
+
+    Raises:
+        InputError: when the value is neither.
+    """
+    array = finite_array(value, (...,), what, unit)
+    if array.ndim > 1:
+        raise InputError(f"{what} must be one number or an array of shape (n,){_bracketed(unit)}, got {array.shape}")
+    return array.reshape(-1)
+
+
+def choice(value: Any, names: Iterable[str], what: str) -> str:
+    """Return ``value`` when it is one of ``names``.
+
+    Raises:
+        UnknownNameError: when it is not; the message lists the names.
+    """
+    known = tuple(names)
+    if not isinstance(value, str) or value not in known:
+        raise UnknownNameError(f"unknown {what} {_shown(value)}; known: {', '.join(sorted(known))}")
+    return value
+
+
+def sequence(value: Any, kind: type[T], what: str) -> tuple[T, ...]:
+    """Return ``value`` as a tuple when it is a sequence of objects of the class ``kind``; a text is not a sequence.
+
+    Raises:
+        InputError: when the value is not such a sequence.
+    """
+    if isinstance(value, str | bytes) or not isinstance(value, Sequence) or not all(isinstance(v, kind) for v in value):
+        raise InputError(f"{what} must be a sequence of {kind.__name__}, got {_shown(value)}")
+    return tuple(value)
+
+
+def function(value: Any, what: str) -> Callable[..., Any]:
+    """Return ``value`` when it can be called.
+
+    Raises:
+        InputError: when it can't.
+    """
+    if not callable(value):
+        raise InputError(f"{what} must be a function, got {_shown(value)}")
+    result: Callable[..., Any] = value
+    return result
+
+
+def file_path(value: Any, what: str) -> Path:
+    """Return ``value`` as a path.
+
+    Raises:
+        InputError: when it is neither text nor a path, or contains a null character.
+    """
+    name = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(name, str) or "\0" in name:
+        raise InputError(f"{what} must be text or a pathlib.Path, got {_shown(value)}")
+    return Path(name)
 
 
 def _real(value: Any, what: str, unit: str, n: int | None = None) -> Array:

@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.errors import InputError, UnknownNameError
+from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
 from imitarm.skills.dmp_fit import fit_weights, progress_at
 from imitarm.skills.dynamical_systems import (
@@ -25,7 +25,17 @@ from imitarm.skills.dynamical_systems import (
 )
 from imitarm.skills.quaternion_dmp import QuaternionDMP, RotationState
 from imitarm.trajectory import Trajectory
-from imitarm.validation import finite_array, finite_number, finite_vector, flag, instance, whole_number
+from imitarm.validation import (
+    choice,
+    finite_array,
+    finite_number,
+    finite_numbers,
+    finite_vector,
+    flag,
+    function,
+    instance,
+    whole_number,
+)
 
 Array = NDArray[np.float64]
 Coupling = Callable[[Array, Array], ArrayLike]
@@ -222,7 +232,7 @@ class DMP:
             InputError: when not fitted, or the times are not finite numbers.
         """
         self._check_fitted()
-        t = finite_array(np.atleast_1d(times), (None,), "DMP.progress: times", "s")
+        t = finite_numbers(times, "DMP.progress: times", "s")
         return progress_at(t / self.duration_, self.progress_weights_, self.gains_)
 
     def _target(self, start: Array, goal: Array, duration: float, adjustment: Adjustment) -> MovingTarget:
@@ -257,8 +267,7 @@ class DMP:
             UnknownNameError: when ``adjustment`` is none of the three.
         """
         self._check_fitted()
-        if adjustment not in ADJUSTMENTS:
-            raise UnknownNameError.among("adjustment", adjustment, ADJUSTMENTS)
+        choice(adjustment, ADJUSTMENTS, "adjustment")
         T = self.duration_ if duration is None else finite_number(duration, "DMP: duration", "s", above=0.0)
         x0 = _position(start, self.start_, "start")
         target = self._target(x0, _position(goal, self.goal_, "goal"), T, adjustment)
@@ -298,9 +307,8 @@ class DMP:
             InputError: when an argument is not finite or of a wrong shape, ``dt`` is not above 0 or above
                 100 durations, or ``patience`` is not above 0.
         """
-        if not isinstance(state, DMPState) or not hasattr(self, "weights_"):
-            self._check_fitted()
-            raise InputError(f"DMP.step: state must be a DMPState from begin or step, got {state!r:.80}")
+        self._check_fitted()
+        instance(state, DMPState, "DMP.step: state")
         if not math.isfinite(sum(state.motion.ravel().tolist())):
             raise InputError("DMP.step: state must hold finite numbers; begin again from a valid state")
         target, steps = state.target, state.steps
@@ -313,7 +321,7 @@ class DMP:
         h = finite_number(dt, "DMP.step: dt", "s", above=0.0, at_most=_LONGEST_STEP * T) / T
         if measured is not None:
             lag = finite_vector(measured, 3, "DMP.step: measured", "m") - state.motion[0]
-            h /= 1.0 + float(np.linalg.norm(lag)) / finite_number(patience, "DMP.step: patience", "m", above=0.0)
+            h /= 1.0 + math.hypot(*lag) / finite_number(patience, "DMP.step: patience", "m", above=0.0)
         h = max(h, _SHORTEST_STEP)
         done = 0
         if steps is not None:
@@ -329,7 +337,9 @@ class DMP:
             motion = one.transition.dot(state.motion) + one.drive.dot(y)
         angular = None
         if coupling is not None:
-            acceleration = _acceleration(coupling(state.motion[0], state.motion[1] / T)) * (T * T)
+            acceleration = _acceleration(function(coupling, "DMP: coupling")(state.motion[0], state.motion[1] / T)) * (
+                T * T
+            )
             motion += propagator(self.gains_, h, self.n_basis).push[:, None] * acceleration[:3]
             angular = acceleration[3:] if len(acceleration) == 6 else None
         rotation = state.rotation

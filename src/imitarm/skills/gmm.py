@@ -19,7 +19,7 @@ from imitarm.skills.em import (
     responsibilities_by_seeds,
     responsibilities_by_segments,
 )
-from imitarm.validation import finite_array, finite_number, real_array, whole_number
+from imitarm.validation import choice, finite_array, finite_number, real_array, whole_number
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ _MOST_COMPONENTS = 10_000
 
 
 class DegenerateAxisWarning(UserWarning):
-    """A column does not move, so nothing can be learnt from it; it is kept apart from the others."""
+    """A column does not move, so nothing can be learned from it; it does not influence the other columns."""
 
 
 def ellipsoid_scale(probability: float, n_dims: int) -> float:
@@ -44,7 +44,7 @@ def ellipsoid_scale(probability: float, n_dims: int) -> float:
     probability = finite_number(probability, "ellipsoid_scale: probability", at_least=0.0)
     if not probability < 1.0:
         raise InputError(f"ellipsoid_scale: probability must be at least 0 and below 1, got {probability!r}")
-    n_dims = whole_number(n_dims, "ellipsoid_scale: n_dims", at_least=1)
+    n_dims = whole_number(n_dims, "ellipsoid_scale: n_dims", at_least=1, at_most=1_000_000)
     return float(np.sqrt(2.0 * gammaincinv(0.5 * n_dims, probability)))
 
 
@@ -117,9 +117,7 @@ class GaussianMixture:
         self.random_state = whole_number(random_state, f"{what} random_state", at_least=0)
         self.reg_covar = finite_number(reg_covar, f"{what} reg_covar", above=0.0)
         self.tol = finite_number(tol, f"{what} tol", at_least=0.0)
-        if init not in ("time", "kmeans++"):
-            raise InputError(f"{what} init must be 'time' or 'kmeans++', got {init!r:.80}")
-        self.init = init
+        self.init = choice(init, ("time", "kmeans++"), "init of GaussianMixture")
         self.min_std = finite_array(min_std, (...,), f"{what} min_std")
         if self.min_std.ndim > 1 or np.any(self.min_std < 0.0):
             raise InputError(f"{what} min_std must be one number or one per column, each at least 0")
@@ -202,6 +200,8 @@ class GaussianMixture:
         if not hasattr(self, "means_"):
             raise InputError(f"GaussianMixture.{what}: not fitted yet; call fit first")
         X = _table(X, f"GaussianMixture.{what}")
+        if not len(X):
+            raise InputError(f"GaussianMixture.{what}: X has no samples")
         if X.shape[1] != self.means_.shape[1]:
             raise InputError(f"GaussianMixture.{what}: fitted to {self.means_.shape[1]} columns, got {X.shape[1]}")
         return X

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Literal, Self
 
 import numpy as np
@@ -15,7 +15,18 @@ from imitarm.skills.gmm import DegenerateAxisWarning, GaussianMixture
 from imitarm.skills.rotation_reference import RotationReference, left_jacobian
 from imitarm.skills.selection import MORE_NUMBERS, NUMBERS, Candidate, choose, try_numbers_of_components
 from imitarm.trajectory import Demonstration, Trajectory
-from imitarm.validation import finite_array, finite_number, finite_vector, flag, instance, real_array, whole_number
+from imitarm.validation import (
+    choice,
+    finite_array,
+    finite_number,
+    finite_numbers,
+    finite_vector,
+    flag,
+    instance,
+    real_array,
+    sequence,
+    whole_number,
+)
 
 Array = NDArray[np.float64]
 
@@ -107,14 +118,12 @@ class GMR:
         min_std: tuple[float, float] = (1e-4, 1e-3),
         random_state: int = 0,
     ) -> None:
-        if isinstance(n_components, str) and n_components != "auto":
-            raise InputError(f"GMR: n_components must be a whole number or 'auto', got {n_components!r:.80}")
-        if candidates is not None and (isinstance(candidates, str) or not isinstance(candidates, Iterable)):
-            raise InputError(f"GMR: candidates must be a sequence of whole numbers, got {candidates!r:.80}")
-        self.candidates = None if candidates is None else tuple(candidates)
+        if isinstance(n_components, str):
+            choice(n_components, ("auto",), "n_components of GMR (a whole number or a name)")
+        self.candidates = None if candidates is None else sequence(candidates, int, "GMR: candidates")
         if self.candidates == ():
             raise InputError("GMR: candidates is empty; give the numbers of components to try")
-        numbers = (self.candidates or NUMBERS) if n_components == "auto" else (n_components,)
+        numbers = (self.candidates or NUMBERS) if isinstance(n_components, str) else (n_components,)
         for number in numbers:  # the options are checked here, when they are given
             GaussianMixture(number, reg_covar=reg_covar, n_init=n_init, random_state=random_state)
         self.n_components = n_components
@@ -216,10 +225,10 @@ class GMR:
         gmr.duration_ = finite_number(duration, f"{what} duration", "s", above=0.0)
         gmr.n_demonstrations_ = whole_number(n_demonstrations, f"{what} n_demonstrations", at_least=1)
         gmr.reference_ = None if reference is None else instance(reference, RotationReference, f"{what} reference")
-        gmr.selection_ = tuple(instance(c, Candidate, f"{what} selection") for c in selection)
-        gmr.degenerate_axes_ = tuple(
-            whole_number(i, f"{what} degenerate_axes", at_least=0, at_most=columns - 2) for i in degenerate_axes
-        )
+        gmr.selection_ = sequence(selection, Candidate, f"{what} selection")
+        gmr.degenerate_axes_ = sequence(degenerate_axes, int, f"{what} degenerate_axes")
+        if any(not 0 <= i < columns - 1 for i in gmr.degenerate_axes_):
+            raise InputError(f"{what} degenerate_axes must be from 0 to {columns - 2}, got {gmr.degenerate_axes_}")
         gmr.converged_ = flag(converged, f"{what} converged")
         gmr.lower_bound_ = float(real_array(lower_bound, (), f"{what} lower_bound"))
         gmr._learn(w, mu, sigma)
@@ -270,14 +279,13 @@ class GMR:
         """Covariances of the positions [m^2], shape (K, 3, 3)."""
         return self.covariances_[:, 1:4, 1:4]
 
-    def _clamped(self, times: ArrayLike) -> Array:
+    def _fitted(self) -> Self:
         if not hasattr(self, "means_"):
             raise InputError("GMR: not fitted yet; call fit first")
-        t = finite_array(times, (...,), "GMR: times", "s")
-        if t.ndim > 1:
-            raise InputError(f"GMR: times must be one number or have shape (n,) [s], got shape {t.shape}")
-        t = t.reshape(-1)
-        return np.clip(t, 0.0, self.duration_)
+        return self
+
+    def _clamped(self, times: ArrayLike) -> Array:
+        return np.clip(finite_numbers(times, "GMR: times", "s"), 0.0, self._fitted().duration_)
 
     def responsibilities(self, times: ArrayLike) -> Array:
         """Return h_k(t), the weight of each component at ``times`` (n,) [s], shape (n, K); each row sums to one."""
@@ -384,9 +392,7 @@ class GMR:
             InputError: when not fitted, or ``n`` is not a whole number from 2 to 10 million.
         """
         n = whole_number(n, "GMR.trajectory: n", at_least=2, at_most=10_000_000)
-        if not hasattr(self, "duration_"):
-            raise InputError("GMR: not fitted yet; call fit first")
-        times = np.linspace(0.0, self.duration_, n)
+        times = np.linspace(0.0, self._fitted().duration_, n)
         return Trajectory(times, *self.nominal(times))
 
 

@@ -57,10 +57,10 @@ class QuaternionDMP:
         r = \log(R R_y(s)^T), \qquad \tau^2 \ddot r = -K r - D \tau \dot r + \tau^2 c
 
     with c an angular acceleration from outside. Only ``r``, the distance from the target, goes through a logarithm,
-    never the distance to the goal. So a rotation by 270 degrees, or by three full turns, is reproduced as it was shown.
-    (Forms that use log(q_goal conj(q)) go the other way round beyond 180 degrees.) The target is a cubic spline through
-    quaternions with continuous signs, normalised. Another start or goal rotates the target in the base frame, blended
-    by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both changes take the shorter way.
+    never the distance to the goal. So a rotation by 270 degrees, or by three full revolutions, is reproduced as it was
+    shown. (Forms that use log(q_goal conj(q)) go the other way round beyond 180 degrees.) The target is a cubic spline
+    through quaternions with continuous signs, normalised. Another start or goal rotates the target in the base frame,
+    blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both changes take the shorter way.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.

@@ -15,7 +15,7 @@ from imitarm.skills.dmp import number_of_steps
 from imitarm.skills.dynamical_systems import Gains, propagator, roll_out
 from imitarm.skills.rotation_reference import RotationReference
 from imitarm.trajectory import Trajectory
-from imitarm.validation import finite_number, finite_vector, instance, whole_number
+from imitarm.validation import finite_number, finite_vector, function, instance, whole_number
 
 Array = NDArray[np.float64]
 
@@ -223,7 +223,8 @@ class RhythmicDMP:
         one = propagator(self.gains_, h, self.n_basis)
         motion = one.transition @ state.motion + one.drive @ self._target(state, state.periods + one.instants)
         if coupling is not None:
-            added = finite_vector(coupling(state.position, state.velocity), 3, "RhythmicDMP: acceleration of coupling")
+            added = function(coupling, "RhythmicDMP: coupling")(state.position, state.velocity)
+            added = finite_vector(added, 3, "RhythmicDMP: acceleration that coupling returns", "m/s^2")
             motion[:, :3] += one.push[:, None] * added * state.period**2
         return state._replace(motion=motion, periods=state.periods + h)
 

@@ -22,7 +22,7 @@ from imitarm.skills.gmr import GMR
 from imitarm.skills.quaternion_dmp import with_other_ends
 from imitarm.skills.skill_file import dmp_of, fit_of, gmr_of, read_skill, write_skill
 from imitarm.trajectory import Demonstration, Trajectory
-from imitarm.validation import finite_array, finite_number, text
+from imitarm.validation import choice, file_path, finite_array, finite_number, finite_numbers, sequence, text
 
 Array = NDArray[np.float64]
 
@@ -81,8 +81,8 @@ class Skill:
         random_state: int = 0,
     ) -> None:
         self._gmr = GMR(n_components, random_state=random_state)
-        if isinstance(n_basis, str) and n_basis != "auto":
-            raise InputError(f"Skill: n_basis must be a whole number or 'auto', got {n_basis!r:.80}")
+        if isinstance(n_basis, str):
+            choice(n_basis, ("auto",), "n_basis of Skill (a whole number or a name)")
         numbers = _NUMBERS_OF_BASIS if isinstance(n_basis, str) else (n_basis,)
         self._primitives = [DMP(gains, n_basis=n) for n in numbers]
 
@@ -102,8 +102,7 @@ class Skill:
         Warns:
             PoorFitWarning: when the skill does not reproduce the motion, see ``fit_quality_``.
         """
-        if isinstance(notes, str) or not isinstance(notes, Sequence) or not all(isinstance(n, str) for n in notes):
-            raise InputError(f"Skill.fit: notes must be a sequence of texts, got {notes!r:.80}")
+        notes = sequence(notes, str, "Skill.fit: notes")
         provenance: dict[str, Any] = {"imitarm": imitarm.__version__, "sources": [], "notes": list(notes)}
         if date is not None:
             provenance["date"] = text(date, "Skill.fit: date")
@@ -252,7 +251,7 @@ class Skill:
             InputError: when not fitted, or an argument is not valid.
         """
         T = self.duration_
-        t = finite_array(np.atleast_1d(times), (None,), "Skill.tolerance: times", "s")
+        t = finite_numbers(times, "Skill.tolerance: times", "s")
         if duration is not None:
             t = t * (T / finite_number(duration, "Skill.tolerance: duration", "s", above=0.0))
         return self.gmr_.predict(t)[1]
@@ -267,8 +266,9 @@ class Skill:
             InputError: when not learned yet, or the file can't be written.
         """
         dmp = self._fitted()
-        path = _checked(path, "save")
-        write_skill(path, self.task_, self.provenance_, self.gmr_, dmp, self.fit_quality_)
+        write_skill(
+            file_path(path, "Skill.save: path"), self.task_, self.provenance_, self.gmr_, dmp, self.fit_quality_
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Skill:
@@ -281,7 +281,7 @@ class Skill:
             InputError: when there is no such file or it can't be read.
             FileFormatError: when it is not a skill file, was cut or altered, or has a newer version.
         """
-        document = read_skill(_checked(path, "load"))
+        document = read_skill(file_path(path, "Skill.load: path"))
         provenance = {k: v for k, v in msgspec.to_builtins(document.provenance).items() if v is not None}
         try:
             gmr, dmp = gmr_of(document.gmr), dmp_of(document.dmp)
@@ -297,12 +297,6 @@ class Skill:
         skill = cls(gmr.n_components_, gains=dmp.gains_, n_basis=dmp.n_basis)
         skill._take(gmr, dmp, document.task, provenance, quality)
         return skill
-
-
-def _checked(path: str | os.PathLike[str], what: str) -> str | os.PathLike[str]:
-    if not isinstance(path, str | os.PathLike):
-        raise InputError(f"Skill.{what}: path must be text or a pathlib.Path, got {path!r:.80}")
-    return path
 
 
 def _pose(position: Array, quaternion: Array | None) -> Pose:
