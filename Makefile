@@ -11,7 +11,7 @@ export MPLBACKEND = Agg
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo install test lint types floors unit mediapipe format bench clean
+.PHONY: help demo install test lint types floors unit mediapipe format bench tables clean
 
 help:  ## list the tasks
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -38,12 +38,18 @@ unit: $(VENV)/.dev $(MEDIAPIPE)  ## the tests
 
 mediapipe: .venv-mediapipe/imitarm-mediapipe.txt $(VIDEOS)/cam04.mp4  ## video and webcam: MediaPipe's own environment, and real video for the tests
 
-format: $(VENV)/.dev  ## mend what can be mended mechanically
+format: $(VENV)/.dev  ## fix what can be fixed mechanically
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 bench: $(VENV)/.bench  ## speed against installed peers, as ratios
 	$(BIN)/python benchmarks/speed.py
+
+DATA ?= ../shared/data
+tables: $(VENV)/.dev $(MEDIAPIPE)  ## print all tables of docs/ again, which takes hours; DATA=folder of real recordings
+	$(BIN)/imitarm benchmark mapping --out benchmark-mapping --data $(DATA) --fill docs/mapping_benchmark.md
+	$(BIN)/imitarm benchmark avoidance --seeds 200 --fill docs/avoidance.md
+	$(BIN)/imitarm benchmark people $(DATA) $(VIDEOS)/cam01.mp4 $(VIDEOS)/cam02.mp4 --fill docs/real_data.md
 
 clean:  ## remove the environment and everything made
 	rm -rf $(VENV) .venv-mediapipe .cache demo .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -5,21 +5,19 @@ import re
 
 import pytest
 
-from imitarm.benchmark.experiment import LIVE
-from imitarm.benchmark.mapping import BEGIN, CAMERAS, END, MappingBenchmark, fill_document, tables, write_tables
-from imitarm.benchmark.mapping_methods import MAIN, METHODS
-from imitarm.benchmark.mapping_pairs import COMPARED
+from imitarm.benchmark.experiment import LIVE, MAIN, METHODS
+from imitarm.benchmark.mapping import CAMERAS, MappingBenchmark, tables, write_tables
+from imitarm.benchmark.mapping_comparisons import COMPARED
 from imitarm.benchmark.mapping_report import mapping_report_html
 from imitarm.benchmark.mapping_tables import (
-    JUDGED,
+    TEST,
     Results,
 )
-from imitarm.benchmark.recording_plan import CAPTURED
+from imitarm.benchmark.recordings import CAPTURED
 from imitarm.benchmark.running import run_all
-from imitarm.benchmark.tables import Table
 from imitarm.errors import InputError, UnknownNameError
 
-MEASURED = sorted({figure.name for figure in COMPARED} - {"broken_limits", "mean_torque"})
+MEASURED = sorted({figure.name for figure in COMPARED} - {"limit_violations", "mean_torque"})
 
 
 def test_every_experiment_of_a_recording_has_the_same_recording():
@@ -33,7 +31,7 @@ def test_every_experiment_of_a_recording_has_the_same_recording():
     assert sum(e.task == LIVE for e in found) == 3 * 2 * len(MAIN)
     full = {e.plan for e in MappingBenchmark().experiments() if e.task != LIVE}
     assert len(full) >= 30
-    assert {plan.person for plan in full} == set(range(JUDGED, JUDGED + 10))
+    assert {plan.person for plan in full} == set(range(TEST, TEST + 10))
 
 
 def test_nobody_whom_the_methods_were_tuned_with_judges_them_unless_asked():
@@ -60,26 +58,6 @@ def test_an_unknown_method_is_refused_by_name():
         MappingBenchmark(methods=("magic",)).experiments()
 
 
-def test_tables_go_between_the_marks_and_nothing_else_changes(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(f"# Title\n\nbefore\n\n{BEGIN}\nold\n{END}\n\nafter\n")
-    table = Table("T", ("a", "b>"), (("x|y", "1"),), "note")
-    for _ in range(2):
-        fill_document(page, [table], "imitarm benchmark mapping", ["commit abc"])
-        text = page.read_text()
-        assert text.startswith(f"# Title\n\nbefore\n\n{BEGIN}\n")
-        assert text.endswith(f"{END}\n\nafter\n")
-        assert "old" not in text
-        assert "Printed by `imitarm benchmark mapping`. Results of commit abc, not of the code" in text
-        assert "| x\\|y | 1 |" in text
-        assert text.count("**T**") == 1
-    for wrong in ("no marks\n", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{BEGIN}\n{END}\n"):
-        page.write_text(wrong)
-        with pytest.raises(InputError, match="between"):
-            fill_document(page, [table], "", [])
-        assert page.read_text() == wrong
-
-
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     """A small but real benchmark: two people, two methods, the edge of reach."""
@@ -97,12 +75,12 @@ def test_a_small_benchmark_fills_its_tables(small, tmp_path):
     found = tables(results)
     titles = [table.title for table in found]
     assert any(title.startswith("Accuracy, edge") for title in titles)
-    assert any(title.startswith("Limits broken") for title in titles)
+    assert any(title.startswith("Limit violations") for title in titles)
     for table in found:
         assert table.rows or table.title.startswith("Where another")
         assert all(len(row) == len(table.columns) for row in table.rows)
         assert "nan" not in table.markdown()
-    (limits,) = (t for t in found if t.title.startswith("Limits broken: inside, edge"))
+    (limits,) = (t for t in found if t.title.startswith("Limit violations: inside, edge"))
     modern = next(row for row in limits.rows if row[0] == "modern")
     assert modern[1:5] == ("4 of 4", "0", "0", "0")
     document, data = write_tables(results, found, tmp_path)

@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import math
 
-from imitarm.benchmark.experiment import Experiment, Result
+from imitarm.benchmark.experiment import Experiment, Result, count_failures
 from imitarm.benchmark.mapping import tables
 from imitarm.benchmark.mapping_report import mapping_report_html
 from imitarm.benchmark.mapping_tables import (
-    JUDGED,
+    TEST,
     Figure,
     Results,
     accuracy_table,
@@ -16,8 +16,7 @@ from imitarm.benchmark.mapping_tables import (
     written,
     written_each,
 )
-from imitarm.benchmark.recording_plan import CAPTURED
-from imitarm.benchmark.stacking import failures
+from imitarm.benchmark.recordings import CAPTURED
 from imitarm.evaluation.intervals import Interval
 from mapping_results import captured, live, replay
 
@@ -28,8 +27,8 @@ def test_no_average_over_failures_without_the_successes_beside_it():
     assert row[1] == "6 of 8"
     assert row[3].startswith("40")  # the failures' 999 s are not in it
     assert row[-1] == "2 dropped"
-    assert failures(["", "dropped", "tower fell", "dropped", ""]) == "2 dropped, 1 tower fell"
-    assert failures(["", ""]) == "none"
+    assert count_failures(["", "dropped", "tower fell", "dropped", ""]) == "2 dropped, 1 tower fell"
+    assert count_failures(["", ""]) == "none"
     assert written(Interval(0.0412, 0.04, 0.05, 3, 5, 8), Figure("x", "", 1e3)) == "41.2 (40.0 to 50.0), 5 of 8"
     assert written(Interval(math.nan, math.nan, math.nan, 0, 0, 8), Figure("x", "")) == "– (0 of 8)"
 
@@ -66,29 +65,33 @@ def test_a_rates_interval_is_over_persons_and_honest_where_all_are_alike():
 
 
 def test_a_recording_that_cant_be_made_is_missing_and_said():
-    results = [replay(m, p, 1.0) for m in ("modern", "m3") for p in range(JUDGED, JUDGED + 3)]
+    results = [replay(m, p, 1.0) for m in ("modern", "m3") for p in range(TEST, TEST + 3)]
     results = [Result(r.experiment, "0", {**r.values, "recorded": 12.0, "beyond_reach": 0.0}, "", 1.0) for r in results]
     results += [
         Result(
-            Experiment("stacking", m, seed=JUDGED + 3), "0", {}, "TaskFailedError: the recording can't be made: no", 1.0
+            Experiment("stacking", m, seed=TEST + 3),
+            "0",
+            {},
+            "TaskFailedError: the recording could not be made: no",
+            1.0,
         )
         for m in ("modern", "m3")
     ]
     table = recordings_table(Results(results))
-    assert table.rows[0][:4] == ("stacking", "3 of 4", "4 made up", "12.0 (12.0 to 12.0)")
+    assert table.rows[0][:4] == ("stacking", "3 of 4", "4 simulated", "12.0 (12.0 to 12.0)")
     found = tables(Results(results))
     assert all(len(row) == len(t.columns) for t in found for row in t.rows)
-    (limits,) = (t for t in found if t.title.startswith("Limits broken"))
+    (limits,) = (t for t in found if t.title.startswith("Limit violations"))
     assert {row[1] for row in limits.rows} == {"3 of 3"}  # nothing that the methods did
     page = mapping_report_html(Results(results[-2:]), [], provenance={}, folder=None)
     assert "modern was not run" in page
-    lost = Result(Experiment("stacking", "modern", seed=JUDGED), "0", {}, "TaskFailedError: it gave up", 1.0)
+    lost = Result(Experiment("stacking", "modern", seed=TEST), "0", {}, "TaskFailedError: it gave up", 1.0)
     assert limits_table(Results([lost]), ["stacking"]).rows[0][1] == "0 of 1"  # what it did
     assert recordings_table(Results([lost])).rows[0][1] == "1"
 
 
 def test_it_is_said_which_persons_they_were():
-    judged = [replay("modern", p, 1.0) for p in (JUDGED, JUDGED + 1)]
+    judged = [replay("modern", p, 1.0) for p in (TEST, TEST + 1)]
     assert recordings_table(Results(judged)).note.endswith("Persons 200 to 201.")
     seen = [live("modern", 0, 0)]
-    assert success_table(Results(seen)).note.endswith("Those below 200 are for working on methods.")
+    assert success_table(Results(seen)).note.endswith("Those below 200 are for developing methods.")

@@ -3,11 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imitarm.benchmark.mapping_tables import JUDGED
-from imitarm.benchmark.recording_plan import CAPTURED, KINDS, Plan
-from imitarm.benchmark.recordings import MappingRecording, beyond_reach, make_recording
+from imitarm.benchmark.mapping_tables import TEST
+from imitarm.benchmark.recordings import CAPTURED, KINDS, MappingRecording, Plan, beyond_reach, make_recording
 from imitarm.capture.person import Person
-from imitarm.errors import InputError
+from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
 
 ARM = ArmModel.load("sawyer", tool="gripper")
@@ -68,15 +67,6 @@ def test_the_robot_is_still_led_when_the_person_rests_at_the_end():
     assert made.correspondence.lengths.upper_arm == pytest.approx(person.upper_arm, rel=0.2)
 
 
-@pytest.mark.slow
-def test_a_stacking_recording_holds_the_hands_grips(tmp_path):
-    made = make_recording(Plan("stacking", 0), ARM)
-    closed = np.array([s.hand_states[1].name == "CLOSED" for s in made.skeletons])
-    assert np.sum(np.diff(closed.astype(int)) == 1) >= 3  # three cubes were gripped
-    assert made.correspondence.scale == 1.0
-    assert made.correspondence.orientation == "fixed"
-
-
 def test_a_captured_arm_needs_its_data(real_data, tmp_path):
     with pytest.raises(InputError, match="--data"):
         make_recording(Plan(CAPTURED, 0, data=str(tmp_path)), ARM)
@@ -89,9 +79,31 @@ def test_a_captured_arm_needs_its_data(real_data, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("person", range(JUDGED, JUDGED + 10))
-def test_every_person_who_judges_makes_every_recording(person):
+@pytest.mark.parametrize("person", range(TEST, TEST + 10))
+def test_every_test_person_makes_every_recording(person):
     for kind in KINDS:
         made = make_recording(Plan(kind, person), ARM)
         assert made.true_times[-1] > 8.0
         assert len(made.skeletons) > 200
+    # the last is stacking
+    closed = np.array([s.hand_states[1].name == "CLOSED" for s in made.skeletons])
+    assert np.sum(np.diff(closed.astype(int)) == 1) >= 3  # three cubes were gripped
+    assert made.correspondence.scale == 1.0
+    assert made.correspondence.orientation == "fixed"
+
+
+@pytest.mark.parametrize("bad", [{"kind": "dance"}, {"person": -1}, {"repeat": 100}, {"seconds": 1.0}, {"sigma": 0.5}])
+def test_what_is_no_plan_is_refused(bad):
+    with pytest.raises((InputError, UnknownNameError)):
+        Plan(**{"kind": "inside", "person": 0, **bad})
+
+
+def test_no_two_recordings_have_the_same_seeds_whoever_the_persons_are():
+    plans = [
+        Plan(kind, person, repeat)
+        for kind in (*KINDS, CAPTURED)
+        for person in (0, 1, 30, 99, 100, 101, 200, 209, 1000)
+        for repeat in (0, 1, 99)
+    ]
+    cameras = [2 * plan.number + k for plan in plans for k in (0, 1)]
+    assert len(set(cameras)) == len(cameras) == 2 * len(plans)

@@ -6,11 +6,12 @@ import pytest
 
 from imitarm import cli
 from imitarm.benchmark import experiment, recordings
-from imitarm.benchmark.mapping import BEGIN, END
+from imitarm.benchmark.tables import END
 from imitarm.cli import benchmark
 from imitarm.errors import TaskFailedError
 
-WHOM = ("--people", "1", "--first", "0")  # no method is tried on people who judge
+BEGIN = "<!-- imitarm benchmark mapping -->"
+WHOM = ("--people", "1", "--first", "0")  # no method is tried on test persons
 SMALL = ("benchmark", "mapping", *WHOM, "--seconds", "4", "--kinds", "inside", "--no-live", "--jobs", "1")
 
 
@@ -21,7 +22,7 @@ def test_one_command_prints_tables_and_leaves_files(tmp_path, capsys):
     words = [*SMALL, "--methods", "modern", "m3", "--out", str(out), "--report", str(page), "--fill", str(document)]
     assert cli.main(words) == 0
     printed = capsys.readouterr()
-    for said in ("What the thesis claims", "Table 3.1", "Accuracy, inside", "Limits broken", "held?"):
+    for said in ("What the thesis claims", "Table 3.1", "Accuracy, inside", "Limit violations", "held?"):
         assert said in printed.out
     assert "--data" in printed.err  # what was left out is said
     assert (out / "mapping.md").read_text().startswith("**What the thesis claims")
@@ -111,7 +112,7 @@ def test_a_report_replaces_no_document(tmp_path, monkeypatch, capsys):
     assert "--report results/mapping.json: is the file of --out, too" in capsys.readouterr().err
     assert not list((tmp_path / "results").iterdir())
     assert cli.main([*SMALL, "--out", "paper.md"]) == 2
-    assert "--out paper.md: is no folder" in capsys.readouterr().err
+    assert "--out paper.md: is not a folder" in capsys.readouterr().err
     assert (
         sorted(path.name for path in tmp_path.iterdir()) == ["paper.md", "results"]
         and (tmp_path / "paper.md").read_text() == text
@@ -121,7 +122,7 @@ def test_a_report_replaces_no_document(tmp_path, monkeypatch, capsys):
 def test_the_avoidance_benchmark_stands_beside_it(capsys):
     assert cli.main(["benchmark", "avoidance", "--seeds", "1", "--methods", "certified"]) == 0
     printed = capsys.readouterr().out
-    assert "1 scenes a row" in printed
+    assert "1 scenes per row" in printed
     assert "gap too narrow" in printed
     assert cli.main(["benchmark", "avoidance", "--seeds", "0"]) == 2
     assert cli.main(["benchmark"]) == 2

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from imitarm.benchmark import families
-from imitarm.benchmark.avoidance import SLACK, judge, learn, run_family, wilson_interval
+from imitarm.benchmark.avoidance import SLACK, evaluate, learn, run_family, wilson_interval
 from imitarm.benchmark.families import CLEARANCE, TOOL_RADIUS
 from imitarm.kinematics.pose import Pose, quaternion_exp
 from imitarm.policies import HORIZONTAL_ONLY, NOT_DOWN, adapt
@@ -63,7 +63,7 @@ def test_the_answer_does_not_hang_on_rounding(planar, seed):
         shaken = [replace(o, velocity=rng.uniform(-size, size, 3)).after(1.0) for o in case.scene.obstacles]
         adaptation = adapt(skill, Scene(None, shaken), forbidden=case.forbidden, **OPTIONS)
         assert adaptation.feasible, adaptation.reason
-        assert judge(case, adaptation).kept
+        assert evaluate(case, adaptation).kept
         lengths.append(adaptation.rmse_to_nominal)
     assert np.ptp(lengths) < 1e-4  # one and the same detour, not another way round
 
@@ -117,7 +117,7 @@ def test_gaps_are_taken_when_wide_enough_and_refused_when_not():
     skill, path = learn(planar=True)
     for seed in range(60):
         wide = families.narrow_gap(seed, path, solvable=True)
-        outcome = judge(wide, adapt(skill, wide.scene, forbidden=wide.forbidden, **OPTIONS))
+        outcome = evaluate(wide, adapt(skill, wide.scene, forbidden=wide.forbidden, **OPTIONS))
         assert outcome.accepted and outcome.kept, seed
         narrow = families.narrow_gap(seed, path, solvable=False)
         adaptation = adapt(skill, narrow.scene, forbidden=narrow.forbidden, **OPTIONS)

@@ -36,17 +36,6 @@ def test_a_person_stacks_with_an_ideal_follower(arm):
     assert len(result.truth) == len(result.skeletons)  # the ideal camera loses nothing
 
 
-@pytest.mark.slow
-def test_ten_people_stack_with_a_method_before_a_noisy_camera(arm):
-    """1 to 2 cm of noise, dropouts, occlusion; the rates of all methods are in docs/mapping_benchmark.md."""
-    results = [stack_once(person, 0, ModernRetargeter, arm=arm) for person in range(10)]
-    assert sum(result.success for result in results) >= 7, [result.reason for result in results]
-    for result in results:
-        assert (result.failure == "") == result.success
-        assert result.method == "modern"
-        assert len(result.truth) > len(result.skeletons)  # frames were lost
-
-
 def test_a_trial_is_repeated_exactly_by_its_seeds(arm, short):
     again = stack_once(1, 0, ModernRetargeter, arm=arm, timeout=4.0)
     np.testing.assert_array_equal(again.joints, short.joints)
@@ -82,6 +71,8 @@ def test_the_camera_sees_the_truth_with_its_noise(short):
     truth = {skeleton.time: skeleton for skeleton in short.truth}
     pairs = [(seen.joint("wrist_right"), truth[seen.time].joint("wrist_right")) for seen in short.skeletons]
     away = np.linalg.norm([a - b for a, b in pairs], axis=1)
+    assert len(short.truth) > len(short.skeletons)  # frames were lost
+    assert short.method == "modern"
     assert 0.002 < np.nanmedian(away) < 0.03
 
 

@@ -1,1 +1,1 @@
-"""Is it any good? Figures that are measured, never asserted."""
+"""Experiments: seeded families of scenes and recordings, runs that can be continued, saved results, tables."""

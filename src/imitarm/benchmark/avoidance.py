@@ -1,6 +1,6 @@
 """How often a method keeps its clearance, over hundreds of seeded scenes: ``imitarm benchmark avoidance``.
 
-Success is judged on 4000 points of the path that would be executed, not on the samples that the method planned with.
+Success is evaluated on 4000 points of the path that would be executed, not on the samples of the plan.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from imitarm.skills.skill import Skill
 
 Array = NDArray[np.float64]
 
-SLACK = 0.0005  # [m] a path that keeps the asked clearance less this counts as keeping it
+SLACK = 0.0005  # [m] a path may fall below the required clearance by so much
 _DENSE = 4000
 _COLUMNS = (
     *("", "scenes", "method", "right answer % (95 %)>", "collision-free %>", "least mm>", "RMSE mm>", "unmoved %>"),
@@ -39,15 +39,15 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a method did in one scene.
+    """The result of a method in one scene.
 
     Attributes:
-        accepted: the method said that its path can be executed.
-        kept: the path keeps the asked clearance (less 0.5 mm) on the dense geometry.
-        collision_free: the path touches nothing on the dense geometry.
+        accepted: whether the method offers its path for execution.
+        kept: whether the path keeps the required clearance (less 0.5 mm) on the dense geometry.
+        collision_free: whether the path touches nothing on the dense geometry.
         clearance: smallest distance on the dense geometry [m].
         rmse: root mean square distance to the nominal path [m].
-        unmoved: share of components that did not move.
+        unmoved: fraction of the components that did not move.
         seconds: compute time [s].
     """
 
@@ -63,13 +63,13 @@ class Outcome:
 def learn(*, planar: bool) -> tuple[Skill, Array]:
     """Learn the S-shaped reach with 8 components; return the skill and its path (400, 3) [m]."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DegenerateAxisWarning)  # a planar reach has no spread in z: that is meant
+        warnings.simplefilter("ignore", DegenerateAxisWarning)  # a planar reach has no spread in z, on purpose
         skill = Skill(n_components=8).fit(s_shaped_demonstrations(planar=planar))
     path, _ = skill.gmr_.predict(np.linspace(0.0, skill.duration_, 400))
     return skill, path
 
 
-def judge(case: Case, adaptation: Adaptation) -> Outcome:
+def evaluate(case: Case, adaptation: Adaptation) -> Outcome:
     """Measure an adaptation on the dense geometry of its scene."""
     times = adaptation.trajectory.times
     points, _ = adaptation.trajectory.at(np.linspace(times[0], times[-1], _DENSE))
@@ -92,12 +92,12 @@ def run_family(skill: Skill, cases: Iterable[Case], method: str = "certified") -
         adaptation = adapt(
             skill, case.scene, method, tool_radius=TOOL_RADIUS, clearance=CLEARANCE, forbidden=case.forbidden
         )
-        outcomes.append(judge(case, adaptation))
+        outcomes.append(evaluate(case, adaptation))
     return outcomes
 
 
 def _families(path: Array, planar: bool) -> list[tuple[str, bool, Callable[[int], Case]]]:
-    """Return name, whether it can be solved, and the maker of each family."""
+    """Return the name of each family, whether it can be solved, and what makes its scenes."""
     rows: list[tuple[str, bool, Callable[[int], Case]]] = [
         (f"{k} on the path", True, lambda s, k=k: sparse_clutter(s, path, n_obstacles=k, planar=planar))  # type: ignore[misc]
         for k in (1, 2, 3)
@@ -138,7 +138,7 @@ def success_table(
         seeds: scenes in each family.
         first: first seed; 2000 and on are the test seeds.
         methods: of :data:`imitarm.policies.adaptation.ADAPTERS`.
-        on_done: is told how many rows are done, and of how many.
+        on_done: called with the number of rows that are done, and the number of all.
     """
     rows: list[tuple[str, ...]] = []
     planned = [(planar, *learn(planar=planar)) for planar in (True, False)]
@@ -153,8 +153,8 @@ def success_table(
                 if on_done is not None:
                     on_done(len(rows), total)
     return Table(
-        f"{seeds} scenes a row, {1e3 * CLEARANCE:.0f} mm asked of a {2e3 * TOOL_RADIUS:.0f} mm tool",
+        f"{seeds} scenes per row, {1e3 * CLEARANCE:.0f} mm required of a {2e3 * TOOL_RADIUS:.0f} mm tool",
         _COLUMNS,
         tuple(rows),
-        "right answer: solved with the asked clearance (less 0.5 mm), or refused where it can't be solved",
+        "Right answer: solved with the required clearance (less 0.5 mm), or refused where it can't be solved.",
     )

@@ -1,4 +1,4 @@
-"""Experiment and Result: one method, one recording or one trial; what came of it is a file that is compared later."""
+"""Experiment and Result: one method with one recording, or in one closed-loop trial; the result is a saved file."""
 
 from __future__ import annotations
 
@@ -7,45 +7,105 @@ import json
 import math
 import os
 import time as clock
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from functools import lru_cache
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from imitarm.benchmark.mapping_methods import method
+import numpy as np
+
 from imitarm.benchmark.provenance import code_version
-from imitarm.benchmark.recording_plan import CAPTURED, KINDS, Plan
-from imitarm.benchmark.recordings import MappingRecording, beyond_reach, make_recording
-from imitarm.benchmark.stacking import StackingTrial, run_trial
+from imitarm.benchmark.recordings import CAPTURED, KINDS, MappingRecording, Plan, beyond_reach, make_recording
+from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.errors import FileFormatError, ImitarmError, InputError, TaskFailedError, UnknownNameError
 from imitarm.evaluation.mapping_metrics import measure
+from imitarm.evaluation.motion import violations
 from imitarm.kinematics.arm import ArmModel
+from imitarm.retarget import RETARGETERS, Correspondence, Retargeter
+from imitarm.tasks.stack_trial import DT, stack_once
 
 REPLAYS = (*KINDS, CAPTURED)
-"""Tasks in which a recording is replayed through a method."""
+"""Tasks in which a method follows a recording."""
 LIVE = "live stacking"
-"""The task in which a made-up person stacks cubes with a method in the loop."""
+"""The task in which a simulated person stacks cubes with a method in the loop."""
 ROBOTS = ("sawyer", "panda")
 FORMAT = "imitarm-result"
 VERSION = 1
-_NO_RECORDING = "the recording can't be made"
+_NO_RECORDING = "the recording could not be made"
+
+
+@dataclass(frozen=True)
+class Method:
+    """A retargeting method with its options: a row of the tables.
+
+    Attributes:
+        retargeter: its name in :data:`imitarm.retarget.RETARGETERS`.
+        label: its name in tables and figures; empty: the method's own title.
+        options: for its constructor.
+    """
+
+    retargeter: str
+    label: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """The name in tables and figures."""
+        return self.label or RETARGETERS[self.retargeter].title
+
+    def __call__(self, arm: ArmModel, correspondence: Correspondence, *, dt: float = 0.01) -> Retargeter:
+        """Return the retargeter for this arm and this person."""
+        return RETARGETERS[self.retargeter](arm, correspondence, dt=dt, **self.options)
+
+
+MAIN: Mapping[str, Method] = {name: Method(name) for name in RETARGETERS}
+"""Every registered method with its default options. The built-in ones are those of thesis Table 3.1 and Figs 3.6 to
+3.8: ``thesis`` is its method Me with the equations corrected, M1 to M3 are our reading of its baselines; ``modern`` is
+this library's own. Methods of other packages are added by entry points."""
+
+VARIANTS: Mapping[str, Method] = {
+    "me-thesis": Method("thesis", "Me-thesis", {"smoothing": "global", "small_angle": "thesis"}),
+    "thesis-global": Method("thesis", "thesis, global", {"smoothing": "global"}),
+    "thesis-small-angle": Method("thesis", "thesis, small angle", {"small_angle": "thesis"}),
+    "thesis-printed": Method("thesis", "thesis, as printed", {"as_printed": True}),
+    "m1-scaled": Method("m1", "M1, scaled", {"velocity_scaling": True}),
+    "m3-scaled": Method("m3", "M3, scaled", {"velocity_scaling": True}),
+}
+"""The same methods with one option changed, to show its effect. Me-thesis fits one NURBS to the whole recording and
+uses the small-angle term; "as printed" keeps every misprint that can be run; "scaled" slows all joints together where
+one would be too fast."""
+
+METHODS: Mapping[str, Method] = {**MAIN, **VARIANTS}
+"""All methods by name."""
+
+
+def method(name: str) -> Method:
+    """Return a method by name.
+
+    Raises:
+        UnknownNameError: when there is none; the message lists those that exist.
+    """
+    if name not in METHODS:
+        raise UnknownNameError.among("method", name, METHODS)
+    return METHODS[name]
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """One method at one task; plain values, so that it can go to another process or machine.
+    """One method in one task, as plain values that can be sent to another process or machine.
 
     ``Experiment("edge", "modern", seed=3).run()`` makes the recording, lets the method follow it, and measures.
 
     Attributes:
         task: one of :data:`REPLAYS`, or :data:`LIVE`.
-        method: one of :data:`imitarm.benchmark.mapping_methods.METHODS`.
-        robot: one of :data:`ROBOTS`; the live task has a Sawyer.
+        method: one of :data:`METHODS`.
+        robot: one of :data:`ROBOTS`; stacking needs the Sawyer.
         seed: of the person.
-        repeat: which of this person's.
-        seconds: about how long reaches and drawings take [s].
-        sigma: of the camera's error [m]; None: 1 to 2 cm, by the seed.
+        repeat: number of the recording or trial among those of this person.
+        seconds: approximate duration of reaches and drawings [s].
+        sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
         data: folder of real recordings, for the task that needs them.
 
     Raises:
@@ -69,28 +129,28 @@ class Experiment:
         if self.robot not in ROBOTS:
             raise UnknownNameError.among("robot", self.robot, ROBOTS)
         if self.robot != "sawyer" and self.task in {LIVE, "stacking"}:
-            raise InputError(f"Experiment: {self.task} has a Sawyer, got robot {self.robot!r}")
+            raise InputError(f"Experiment: {self.task} needs the robot 'sawyer', got {self.robot!r}")
         _ = self.plan  # its checks
 
     @property
     def plan(self) -> Plan:
-        """The recording that is replayed; for the live task the one of the same seeds."""
+        """The recording that the method follows; for the live task the one of the same seeds."""
         kind = "stacking" if self.task == LIVE else self.task
         return Plan(kind, self.seed, self.repeat, self.seconds, self.sigma, self.data)
 
     @property
     def name(self) -> str:
-        """Short and unique among experiments that differ in nothing else."""
+        """A short name, unique among experiments that differ in nothing else."""
         return f"{self.task.replace(' ', '-')}-{self.method}-{self.robot}-{self.seed:02d}-{self.repeat}"
 
     def run(self, folder: str | Path | None = None) -> Result:
-        """Do it, and measure.
+        """Run the method, and measure.
 
         Args:
-            folder: where recordings are kept, so that the next method need not have them made again; None: nowhere.
+            folder: where recordings are kept, so that the next method can use the same file; None: nowhere.
 
         Returns:
-            The result; when the method could not do it, one with the reason in ``failure`` and without values.
+            The result; when the method fails, one without values and with the reason in ``failure``.
         """
         began = clock.perf_counter()
         try:
@@ -101,7 +161,7 @@ class Experiment:
         return Result(self, code_version(), values, failure, clock.perf_counter() - began)
 
     def recording(self, folder: Path | None = None) -> MappingRecording:
-        """Return the recording: from ``folder`` when it is there, else made anew, and kept there."""
+        """Return the recording: read from ``folder`` when it is there, else made and saved there."""
         if folder is None:
             return make_recording(self.plan, _arm(self.robot))
         facts = json.dumps([asdict(self.plan), self.robot, code_version()])
@@ -129,21 +189,95 @@ class Experiment:
         return {**asdict(metrics), **facts, "notes": dict(run.notes)}
 
     def _live(self) -> dict[str, Any]:
-        return asdict(run_trial(StackingTrial(self.method, self.seed, self.repeat, self.sigma), _arm(self.robot)))
+        return asdict(run_stacking(self.method, self.seed, self.repeat, self.sigma, _arm(self.robot)))
+
+
+@dataclass(frozen=True)
+class StackingOutcome:
+    """The outcome of one closed-loop trial of stacking; torques are those of the drives, contacts included.
+
+    Attributes:
+        success: whether four cubes stand in order.
+        failure: one of :data:`imitarm.tasks.stack.FAILURES`; empty on success.
+        reason: in words.
+        stacked: cubes in the tower at the end.
+        time: until the person had finished, or the time limit [s].
+        path_length: of the tool [m].
+        mean_torque: mean of the absolute torque of each joint [N m].
+        rms_torque: root mean square of each joint's torque [N m].
+        effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
+        peak_torque_ratio: largest torque over the rated one.
+        velocity_ratio: largest measured joint velocity over the one allowed.
+        clamped: control ticks in which the robot's own limits changed the command.
+    """
+
+    success: bool
+    failure: str
+    reason: str
+    stacked: int
+    time: float
+    path_length: float
+    mean_torque: tuple[float, ...]
+    rms_torque: tuple[float, ...]
+    effort: float
+    peak_torque_ratio: float
+    velocity_ratio: float
+    clamped: int
+
+
+def run_stacking(
+    method_name: str, person: int, repeat: int = 0, sigma: float | None = None, arm: ArmModel | None = None
+) -> StackingOutcome:
+    """Let a simulated person stack cubes by a method before a noisy camera, with real contact, and measure.
+
+    Args:
+        method_name: one of :data:`METHODS`.
+        person: seed of the person.
+        repeat: number of the trial among those of this person.
+        sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
+        arm: the Sawyer with the gripper, when it is loaded already.
+    """
+    arm = ArmModel.load("sawyer", tool="gripper") if arm is None else arm
+    done = stack_once(person, repeat, method(method_name), arm=arm, camera=camera_maker(sigma))
+    return StackingOutcome(
+        success=done.success,
+        failure=done.failure,
+        reason=done.reason,
+        stacked=done.stacked,
+        time=done.time,
+        path_length=done.path_length,
+        mean_torque=tuple(np.abs(done.torques).mean(axis=0).tolist()),
+        rms_torque=tuple(np.sqrt(np.mean(done.torques**2, axis=0)).tolist()),
+        effort=float(np.sum(done.torques**2) * DT),
+        peak_torque_ratio=float((np.abs(done.torques) / arm.max_torque).max()),
+        velocity_ratio=violations(arm, done.joints, DT).velocity_ratio,
+        clamped=done.clamped,
+    )
+
+
+def camera_maker(sigma: float | None) -> Callable[[int], SkeletonCamera]:
+    """Return what makes a camera with all the faults of a real one from a seed; ``sigma`` [m] as in Experiment."""
+    return SkeletonCamera.from_seed if sigma is None else partial(SkeletonCamera, sigma=sigma)
+
+
+def count_failures(outcomes: Sequence[str]) -> str:
+    """Return how often each failure happened, in words, the most frequent first; ``outcomes`` are "" on success."""
+    counted = Counter(outcome for outcome in outcomes if outcome)
+    return ", ".join(f"{n} {what}" for what, n in counted.most_common()) or "none"
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What came of an experiment, as plain values.
+    """The result of an experiment, as plain values.
 
     Attributes:
-        experiment: which.
-        code: which code did it, see :func:`imitarm.benchmark.provenance.code_version`.
-        values: what was measured, by name: those of :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics` with
-            ``recorded`` [s], ``beyond_reach`` (share of the time) and the method's own ``notes``; or those of
-            :class:`~imitarm.benchmark.stacking.TrialOutcome`; empty after a failure.
+        experiment: which one.
+        code: which code ran, see :func:`imitarm.benchmark.provenance.code_version`.
+        values: the measures by name: those of :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics` with
+            ``recorded`` [s], ``beyond_reach`` (fraction of the time) and the method's own ``notes``; or those of
+            :class:`StackingOutcome`; empty after a failure.
         failure: why there is nothing to measure; empty when there is.
-        seconds: that it took to compute [s].
+        seconds: computing time [s].
     """
 
     experiment: Experiment
@@ -153,12 +287,12 @@ class Result:
     seconds: float
 
     @property
-    def unmade(self) -> bool:
-        """Whether there was no recording to follow: that is no failure of the method."""
+    def without_recording(self) -> bool:
+        """Whether there was no recording to follow, which is no failure of the method."""
         return f": {_NO_RECORDING}: " in self.failure
 
     def value(self, name: str) -> float:
-        """Return a measured number; nan when it is not known."""
+        """Return a measure; nan when it is not known."""
         found = self.values.get(name)
         return math.nan if found is None else float(found)
 
@@ -169,7 +303,7 @@ class Result:
         return folder / f"{experiment.name}-{hashlib.sha256(facts.encode()).hexdigest()[:12]}.json"
 
     def save(self, folder: Path) -> Path:
-        """Write it aside, then rename; return where it is."""
+        """Write it atomically, and return where it is."""
         folder.mkdir(parents=True, exist_ok=True)
         path = self.path(folder, self.experiment)
         content = {
@@ -186,7 +320,7 @@ class Result:
 
     @classmethod
     def load(cls, path: Path) -> Result:
-        """Read what :meth:`save` wrote; what is not known, None in the file, is nan again.
+        """Read a file that :meth:`save` wrote; None in the file stands for nan.
 
         Raises:
             FileFormatError: when the file is not such a result.
@@ -194,7 +328,7 @@ class Result:
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             if content["format"] != FORMAT or content["version"] != VERSION:
-                raise FileFormatError(f"{path}: is no result of this version; delete it and run again")
+                raise FileFormatError(f"{path}: is not a result of this version; delete it and run again")
             experiment = Experiment(**content["experiment"])
             values = {name: math.nan if value is None else value for name, value in content["values"].items()}
             return cls(experiment, str(content["code"]), values, str(content["failure"]), float(content["seconds"]))
@@ -214,7 +348,7 @@ def plain(value: Any) -> Any:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file aside, then rename: nobody ever reads half of it."""
+    """Write a text file atomically: beside its name, then renamed, so that no reader finds half of it."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         aside.write_text(text, encoding="utf-8")

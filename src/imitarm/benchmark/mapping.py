@@ -1,17 +1,16 @@
-"""The mapping benchmark: which experiments it is made of, its tables, and the files it leaves behind."""
+"""The mapping benchmark: its experiments, its tables, and the files that it writes."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from imitarm.benchmark.experiment import LIVE, REPLAYS, Experiment, plain, write_text
-from imitarm.benchmark.mapping_methods import MAIN, METHODS
-from imitarm.benchmark.mapping_pairs import comparison_table, rivals_table
+from imitarm.benchmark.experiment import LIVE, MAIN, METHODS, REPLAYS, Experiment, plain, write_text
+from imitarm.benchmark.mapping_comparisons import better_methods_table, claims_table, comparison_table, printed_table
 from imitarm.benchmark.mapping_tables import (
-    JUDGED,
+    TEST,
     Results,
     accuracy_table,
     effort_table,
@@ -21,13 +20,11 @@ from imitarm.benchmark.mapping_tables import (
     success_table,
     torque_table,
 )
-from imitarm.benchmark.provenance import origin
-from imitarm.benchmark.recording_plan import CAPTURED, KINDS
+from imitarm.benchmark.recordings import CAPTURED, KINDS
 from imitarm.benchmark.tables import Table
-from imitarm.benchmark.thesis_table import claims_table, printed_table
 from imitarm.errors import InputError
 
-CAMERAS = 8  # before which the captured arm is put: it is one person's
+CAMERAS = 8  # simulated cameras before the captured arm, which is that of one person
 
 
 @dataclass(frozen=True)
@@ -35,15 +32,15 @@ class MappingBenchmark:
     """What is run.
 
     Attributes:
-        people: made-up persons.
-        first: of them; they are ``first`` to ``first + people - 1``. Persons below 200 are for working on methods,
-            those from 200 on for judging: what was tuned with a person in sight is not judged by that person.
-        repeats: closed-loop trials of each; recordings to replay are one of each kind a person.
-        methods: rows, of :data:`imitarm.benchmark.mapping_methods.METHODS`.
-        kinds: of recordings, of :data:`imitarm.benchmark.recording_plan.KINDS`.
-        seconds: about how long a recording is [s].
-        sigma: of the camera's error [m]; None: 1 to 2 cm, by the seed.
-        live: whether cubes are stacked with the loop closed, by the main methods among the rows.
+        people: number of simulated persons.
+        first: number of the first; they are ``first`` to ``first + people - 1``. Persons below 200 are for developing
+            methods, those from 200 on for testing: no method is tested with a person that it was tuned with.
+        repeats: closed-loop trials of each person; there is one recording of each kind and person to replay.
+        methods: of :data:`imitarm.benchmark.experiment.METHODS`.
+        kinds: of recordings, of :data:`imitarm.benchmark.recordings.KINDS`.
+        seconds: approximate duration of a recording [s].
+        sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
+        live: whether cubes are stacked in closed loop, by the main methods among ``methods``.
         data: folder of real recordings; empty: the captured arm is left out.
 
     Raises:
@@ -51,7 +48,7 @@ class MappingBenchmark:
     """
 
     people: int = 10
-    first: int = JUDGED
+    first: int = TEST
     repeats: int = 5
     methods: Sequence[str] = tuple(METHODS)
     kinds: Sequence[str] = KINDS
@@ -69,7 +66,7 @@ class MappingBenchmark:
             raise InputError("the benchmark needs a method, and a kind of recording or the closed loop")
 
     def experiments(self) -> list[Experiment]:
-        """Return all experiments, those of one recording side by side."""
+        """Return all experiments, those of one recording next to each other."""
         persons = range(self.first, self.first + self.people)
         found = [
             Experiment(kind, method, seed=person, seconds=self.seconds, sigma=self.sigma)
@@ -98,12 +95,12 @@ class MappingBenchmark:
 _TORQUES = {
     "mean_torque": "Mean of the absolute torque",
     "rms_torque": "Root mean square torque",
-    "mean_motion_torque": "Mean of the absolute torque without weight",
+    "mean_motion_torque": "Mean of the absolute torque without gravity",
 }
 
 
 def tables(results: Results) -> list[Table]:
-    """Return every table that the results fill: what the thesis says of it first."""
+    """Return every table that the results fill, the claims of the thesis first."""
     replayed, found = results.tasks(), []
     if replayed:
         stacking = results.tasks(["stacking"]) or replayed
@@ -114,7 +111,7 @@ def tables(results: Results) -> list[Table]:
         found.append(recordings_table(results))
     found += [accuracy_table(results, task) for task in results.tasks(REPLAYS)]
     if results.tasks([*replayed, LIVE]):
-        found.append(rivals_table(results, replayed))
+        found.append(better_methods_table(results, replayed))
     found += [comparison_table(results, tasks) for tasks in ([LIVE], replayed) if results.tasks(tasks)]
     if replayed:
         found += [limits_table(results, replayed), effort_table(results, replayed), smoothness_table(results, replayed)]
@@ -140,36 +137,3 @@ def write_tables(results: Results, found: Sequence[Table], folder: Path) -> tupl
     }
     write_text(data, json.dumps(content, indent=1, allow_nan=False))
     return document, data
-
-
-BEGIN, END = "<!-- imitarm benchmark mapping -->", "<!-- end -->"
-"""Between these lines of a document stand the tables."""
-
-
-def fill_document(path: Path, found: Sequence[Table], command: str, versions: Iterable[str]) -> None:
-    """Put the tables into a document, between the lines :data:`BEGIN` and :data:`END`; the rest stays as it is.
-
-    Args:
-        path: of the document, Markdown.
-        found: the tables.
-        command: that printed them.
-        versions: of the code of each result; the document says when it is not the code that is running.
-
-    Raises:
-        InputError: when the document can't be read, or has not these two lines in this order, once each.
-    """
-    check_document(path)
-    head, rest = path.read_text(encoding="utf-8").split(f"{BEGIN}\n")
-    tail = rest.split(f"{END}\n")[1]
-    body = "\n".join(table.markdown() for table in found)
-    write_text(path, f"{head}{BEGIN}\nPrinted by `{command}`. {origin(versions)}\n\n{body}\n{END}\n{tail}")
-
-
-def check_document(path: Path) -> None:
-    """Say at once when a document has no place for the tables; raises as :func:`fill_document` does."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: can't be read as a document ({error})") from error
-    if text.count(f"{BEGIN}\n") != 1 or text.count(f"{END}\n") != 1 or text.index(BEGIN) > text.index(END):
-        raise InputError(f"{path}: needs a line {BEGIN!r}, and after it a line {END!r}, once each: tables go between")

@@ -1,22 +1,28 @@
-"""The mapping benchmark as one self-contained HTML page: tables, figures, a person and a robot side by side."""
+"""The mapping benchmark as one self-contained HTML page: tables, figures, playback of person and robot.
+
+The figures follow Figs 3.6 to 3.8 of the thesis; each is one ``<svg>`` element.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from imitarm.benchmark import mapping_plots
-from imitarm.benchmark.experiment import LIVE, Experiment, Result, plain
-from imitarm.benchmark.mapping_methods import MAIN, METHODS
-from imitarm.benchmark.mapping_pairs import OURS
+import numpy as np
+
+from imitarm.benchmark.experiment import LIVE, MAIN, METHODS, Experiment, Result, plain
+from imitarm.benchmark.mapping_comparisons import OURS
 from imitarm.benchmark.mapping_tables import Results, number
-from imitarm.benchmark.recording_plan import CAPTURED
+from imitarm.benchmark.recordings import CAPTURED
 from imitarm.benchmark.tables import Table
+from imitarm.evaluation.intervals import Interval, Values, interval, rate_interval
 from imitarm.kinematics.arm import ArmModel
 from imitarm.viewer import palette
 from imitarm.viewer.background import provenance_section
+from imitarm.viewer.canvas import INK, canvas
 from imitarm.viewer.markup import figure
 from imitarm.viewer.page import data_link, draw_page, page_html, shared_players
 from imitarm.viewer.panels import Key, Panel, heading, player_card, tabbed
@@ -29,13 +35,13 @@ _KEYS: Final = (
     Key(palette.ADAPTED, "path of the robot's tool"),
 )
 _WORDS: Final = {
-    "Interval": "Where a mean over persons is with 95 % confidence: persons are drawn again with replacement. Two "
-    "intervals that overlap say little of a difference; the paired comparison does.",
+    "Interval": "The 95 % confidence interval of a mean over persons, by resampling persons. Two overlapping intervals "
+    "do not rule out a difference; the paired comparison tests it.",
     "Lag": "The constant delay with which the tool follows the true hand best.",
-    "From first hold": "The distance to where the hand of the first engagement leads, whatever the method let go of on "
-    "the way.",
+    "From first hold": "The distance to where the hand leads since the first engagement, as if the method had never "
+    "let go.",
     "SPARC": "Length of the speed's spectrum: the nearer to 0, the smoother.",
-    "Our reading": "The thesis names its rivals by words alone; these are methods that fit the words.",
+    "Our reading": "The thesis describes its baselines in words only; these are methods that fit the words.",
 }
 
 
@@ -48,7 +54,7 @@ def write_mapping_report(
         results: of the benchmark.
         tables: as the command printed them.
         path: the file to write; its folder must exist.
-        provenance: what is needed to do it again.
+        provenance: what is needed to repeat it.
         folder: where recordings are kept; None: nowhere.
 
     Returns:
@@ -67,7 +73,7 @@ def mapping_report_html(
     """Return the whole page; see :func:`write_mapping_report`."""
     players, panels = _players(results, folder)
     verdict, good = _verdict(results)
-    summary = "The same recordings of made-up people through every method, and the same people stacking cubes with it."
+    summary = "Every method on the same recordings of simulated people, and the same people stacking cubes with it."
     sections = [
         _figures(results),
         "".join(['<section id="tables"><h2>Tables</h2>', *(_table(table) for table in tables), "</section>"]),
@@ -81,7 +87,9 @@ def mapping_report_html(
 
 
 def _verdict(results: Results) -> tuple[str, bool]:
-    runs = [r for r in results.all if r.experiment.method == OURS and r.experiment.task != LIVE and not r.unmade]
+    runs = [
+        r for r in results.all if r.experiment.method == OURS and r.experiment.task != LIVE and not r.without_recording
+    ]
     if not runs:
         return f"{OURS} was not run", False
     broken = sum(_breaks(r) for r in runs)
@@ -90,7 +98,7 @@ def _verdict(results: Results) -> tuple[str, bool]:
 
 
 def _breaks(result: Result) -> bool:
-    return bool(result.failure) or number(result, "broken_limits") > 0
+    return bool(result.failure) or number(result, "limit_violations") > 0
 
 
 def _tiles(results: Results) -> list[tuple[str, str]]:
@@ -109,12 +117,12 @@ def _figures(results: Results) -> str:
     main = Results(r for r in results.all if r.experiment.method in MAIN)
     bars = "Bars are means over persons, lines 95 % intervals."
     cards = [
-        figure(mapping_plots.successes(main), "Success", f"Four cubes stacked, loop closed. {bars}"),
-        figure(mapping_plots.torques(main, stacking), "Mean torque of each joint (Fig 3.6)", bars),
-        figure(mapping_plots.path_lengths(main, tasks), "Path length (Fig 3.7)", bars),
-        figure(mapping_plots.times(main), "Time to complete (Fig 3.8)", f"Of the trials that succeeded. {bars}"),
-        figure(mapping_plots.accuracy(main, tasks), "Accuracy", bars),
-        figure(mapping_plots.broken_limits(main, tasks), "Limits broken", bars),
+        figure(successes(main), "Success", f"Four cubes stacked in closed loop. {bars}"),
+        figure(torques(main, stacking), "Mean torque of each joint (Fig 3.6)", bars),
+        figure(path_lengths(main, tasks), "Path length (Fig 3.7)", bars),
+        figure(times(main), "Time to complete (Fig 3.8)", f"Of the trials that succeeded. {bars}"),
+        figure(accuracy(main, tasks), "Accuracy", bars),
+        figure(limit_violations(main, tasks), "Limit violations", bars),
     ]
     return f'<section id="figures"><h2>Figures</h2><div class="columns">{"".join(cards)}</div></section>'
 
@@ -170,7 +178,7 @@ def _players(results: Results, folder: Path | None) -> tuple[tuple[str, str] | N
 
 def _data(result: Result) -> dict[str, Any]:
     experiment: Experiment = result.experiment
-    person = None if experiment.task == CAPTURED else experiment.seed  # that one is no made-up person
+    person = None if experiment.task == CAPTURED else experiment.seed  # that one is not a simulated person
     facts = {"task": experiment.task, "method": experiment.method, "person": person}
     return {
         **facts,
@@ -178,3 +186,103 @@ def _data(result: Result) -> dict[str, Any]:
         "failure": result.failure,
         "values": plain(dict(result.values)),
     }
+
+
+_COLOURS = (
+    *(palette.ADAPTED, palette.MEASURED, palette.UNMOVED, palette.DEMONSTRATION, palette.MOVED),
+    *(palette.NOMINAL, palette.OBSTACLE, palette.LIMIT),
+)
+_HATCHES = ("", "///", "...", "xxx", "---", "\\\\\\", "+++", "ooo")
+
+
+def torques(results: Results, tasks: Sequence[str], *, name: str = "torques") -> str:
+    """Draw the mean torque of each joint for each method (Fig 3.6)."""
+    groups = [f"τ{joint + 1}" for joint in range(7)]
+    series = [
+        (method, [interval(results.values(method, tasks, "mean_torque", joint)) for joint in range(7)])
+        for method in results.methods
+    ]
+    return _grouped(
+        name, "Mean of the absolute torque of each joint, for each method", "mean |τ| [N m]", groups, series
+    )
+
+
+def path_lengths(results: Results, tasks: Sequence[str], *, name: str = "paths") -> str:
+    """Draw the path length for each method (Fig 3.7)."""
+    return _by_task(results, tasks, "path_length", 1.0, "path of the tool [m]", "Path length for each method", name)
+
+
+def accuracy(results: Results, tasks: Sequence[str], *, name: str = "accuracy") -> str:
+    """Draw the distance of the tool to its true target, for each method and kind of recording."""
+    text = "Root mean square distance of the tool to its true target"
+    return _by_task(results, tasks, "tool_rms", 1e3, "tool RMS [mm]", text, name)
+
+
+def limit_violations(results: Results, tasks: Sequence[str], *, name: str = "limits") -> str:
+    """Draw the number of frames that break a limit, for each method and kind of recording."""
+    text = "Frames that break a limit of position, velocity or acceleration"
+    return _by_task(results, tasks, "limit_violations", 1.0, "frames per recording", text, name)
+
+
+def times(results: Results, *, name: str = "times") -> str:
+    """Draw the time to stack four cubes for each method, of the trials that succeeded (Fig 3.8)."""
+
+    def values(method: str) -> Values:
+        return results.values(method, [LIVE], "time")
+
+    return _live(results, lambda m: interval(values(m)), "time of the successes [s]", "Time to stack four cubes", name)
+
+
+def successes(results: Results, *, name: str = "successes") -> str:
+    """Draw the rate of stacked towers, with intervals over persons."""
+
+    def rate(method: str) -> Interval:
+        return _scaled(rate_interval(results.values(method, [LIVE], "success")), 100.0)
+
+    return _live(results, rate, "stacked [%]", "How often four cubes were stacked", name)
+
+
+def _live(results: Results, found: Callable[[str], Interval], unit: str, text: str, name: str) -> str:
+    methods = [method for method in results.methods if results.of(method, [LIVE])]
+    return _grouped(name, text, unit, [""], [(method, [found(method)]) for method in methods])
+
+
+def _by_task(
+    results: Results, tasks: Sequence[str], measured: str, factor: float, unit: str, text: str, name: str
+) -> str:
+    series = []
+    for method in results.methods:
+        found = [interval(results.values(method, [task], measured)) for task in tasks]
+        series.append((method, [_scaled(f, factor) for f in found]))
+    return _grouped(name, text, unit, list(tasks), series)
+
+
+def _scaled(found: Interval, factor: float) -> Interval:
+    mean, low, high = factor * found.mean, factor * found.low, factor * found.high
+    return Interval(mean, low, high, found.persons, found.used, found.of)
+
+
+def _grouped(
+    name: str, description: str, unit: str, groups: Sequence[str], series: Sequence[tuple[str, Sequence[Interval]]]
+) -> str:
+    """Draw bars in groups, one of each series in a group, with their intervals; nothing when there is no number."""
+    if not any(math.isfinite(found.mean) for _, bars in series for found in bars):
+        return ""
+    rows = -(-len(series) // 2)
+    size = (5.5, 2.35 + 0.19 * rows)
+    with canvas(name, description, size) as drawing:
+        axes = drawing.axes(0.72, 0.42 + 0.19 * rows, 5.4, size[1] - 0.1)
+        width = 0.84 / max(len(series), 1)
+        for i, (method, bars) in enumerate(series):
+            at = np.arange(len(groups)) + (i - 0.5 * (len(series) - 1)) * width
+            means = np.array([found.mean for found in bars])
+            spread = np.array([[found.mean - found.low, found.high - found.mean] for found in bars]).T
+            look = {"color": _COLOURS[i % len(_COLOURS)], "hatch": _HATCHES[i % len(_HATCHES)], "edgecolor": "white"}
+            axes.bar(at, np.nan_to_num(means), 0.92 * width, lw=0.3, label=METHODS[method].title, **look)
+            axes.errorbar(at, means, np.nan_to_num(spread), fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.5)
+        axes.set_xticks(range(len(groups)), groups)
+        axes.tick_params(axis="x", length=0)
+        axes.grid(axis="x", visible=False)
+        axes.set_ylabel(unit)
+        drawing.legend(2)
+    return drawing.svg

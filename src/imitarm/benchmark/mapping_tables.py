@@ -8,28 +8,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imitarm.benchmark.experiment import LIVE, REPLAYS, Result
-from imitarm.benchmark.mapping_methods import METHODS
-from imitarm.benchmark.recording_plan import CAPTURED, KINDS
-from imitarm.benchmark.stacking import failures
+from imitarm.benchmark.experiment import LIVE, METHODS, REPLAYS, Result, count_failures
+from imitarm.benchmark.recordings import CAPTURED, KINDS
 from imitarm.benchmark.tables import Table
 from imitarm.evaluation.intervals import Interval, Values, interval, rate_interval
 
-JUDGED = 200
-"""First of the persons that nobody looks at while a method is worked on."""
+TEST = 200
+"""First of the test persons, who are not used while methods are developed."""
 _DEGREES = 180.0 / math.pi
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A measured number in the unit in which people think of it.
+    """A measure with its title and the unit in which it is reported.
 
     Attributes:
         name: in ``Result.values``.
         title: with its unit.
         factor: from SI.
         digits: after the point.
-        more: whether more of it is better, not less.
+        more: whether a larger value is better.
     """
 
     name: str
@@ -46,9 +44,9 @@ ACCURACY = (
     Figure("executed_rms", "executed [mm]", 1e3),
     Figure("executed_rms_without_lag", "executed, without lag [mm]", 1e3),
     Figure("tool_rms_from_first", "from first hold [mm]", 1e3),
-    Figure("orientation_rms", "turn [°]", _DEGREES),
+    Figure("orientation_rms", "orientation [°]", _DEGREES),
     Figure("elbow_direction_rms", "upper arm [°]", _DEGREES),
-    Figure("elbow_angle_rms", "elbow's swing [°]", _DEGREES),
+    Figure("elbow_angle_rms", "swivel angle [°]", _DEGREES),
 )
 EFFORT = (
     Figure("duration", "motion [s]"),
@@ -56,7 +54,7 @@ EFFORT = (
     Figure("path_length", "path [m]", digits=2),
     Figure("settling_time", "settled after [s]", digits=2),
     Figure("effort", "∫τ² [N²m²s]", digits=0),
-    Figure("gravity_effort", "∫τ² of weight alone", digits=0),
+    Figure("gravity_effort", "∫τ² of gravity alone", digits=0),
     Figure("peak_torque_ratio", "peak over rated", digits=2),
 )
 SMOOTHNESS = (
@@ -64,11 +62,11 @@ SMOOTHNESS = (
     Figure("spectral_arc_length", "SPARC", digits=2, more=True),
     Figure("least_singular", "least singular value", digits=3, more=True),
 )
-LED = Figure("engaged_fraction", "led [%]", 100.0, 0, more=True)
+ENGAGED = Figure("engaged_fraction", "engaged [%]", 100.0, 0, more=True)
 TORQUES = (
     Figure("mean_torque", "mean torque [N m]", digits=2),
     Figure("rms_torque", "RMS torque [N m]", digits=2),
-    Figure("mean_motion_torque", "mean torque without weight [N m]", digits=2),
+    Figure("mean_motion_torque", "mean torque without gravity [N m]", digits=2),
 )
 """Means over the joints of what the tables of torques have for each."""
 LOOP = (Figure("time", "time [s]", digits=0), Figure("path_length", "path [m]", digits=2), TORQUES[0])
@@ -76,10 +74,11 @@ LOOP = (Figure("time", "time [s]", digits=0), Figure("path_length", "path [m]", 
 _RECORDED = (Figure("recorded", "length [s]"), Figure("beyond_reach", "beyond reach [%]", 100.0))
 _MEANS_NOTE = "Mean over persons (95 % interval)"
 _ACCURACY_NOTE = (
-    "root mean squares. Executed: by an arm that keeps its limits, which a real one does. Led: share of the time."
+    "root mean squares. Executed: by an arm that keeps its limits, as a real one does. Engaged: fraction of the time "
+    "in which the robot was led."
 )
 _CAPTURED_NOTE = "One person's motion, so without an interval: mean (least … greatest over the cameras)"
-_ONE = -1  # person of the captured arm, whichever made-up body carries it: it is one and the same
+_ONE = -1  # person of the captured arm: it is the same whichever simulated body carries it
 
 
 class Results:
@@ -103,7 +102,7 @@ class Results:
         Args:
             method: whose.
             tasks: at which.
-            name: what was measured; ``"broken_limits"`` is the sum of the three counts. With the loop closed
+            name: what was measured; ``"limit_violations"`` is the sum of the three counts. With the loop closed
                 ``"success"`` is 1 or 0, and the rest is known only of the trials that succeeded.
             joint: of what is measured for each joint, which; None: the mean over the joints.
         """
@@ -123,7 +122,7 @@ def number(result: Result, name: str, joint: int | None = None) -> float:
         done = bool(result.values.get("success"))
         if name == "success" or not done:
             return float(done) if name == "success" else math.nan
-    if name == "broken_limits":
+    if name == "limit_violations":
         return sum(result.value(f"{kind}_violations") for kind in ("position", "velocity", "acceleration"))
     found = result.values.get(name)
     if isinstance(found, list | tuple):
@@ -143,7 +142,7 @@ def written(found: Interval, figure: Figure) -> str:
 
 
 def written_each(values: Values, figure: Figure) -> str:
-    """Return a mean and, in brackets, the least and greatest of what it is the mean of: for what has no interval."""
+    """Return a mean and, in brackets, the smallest and largest value: for what has no interval."""
     known = [figure.factor * value for _, value in sorted(values.items()) if math.isfinite(value)]
     if not known:
         return f"– (0 of {len(values)})" if values else "–"
@@ -154,7 +153,7 @@ def written_each(values: Values, figure: Figure) -> str:
 
 
 def _cells(results: Results, name: str, task: str, figures: Sequence[Figure]) -> list[str]:
-    """Return figures of one kind of recording: with intervals over persons, or both of the captured arm's."""
+    """Return figures of one kind of recording: with intervals over persons, or the range for the captured arm."""
     found = [results.values(name, [task], figure.name) for figure in figures]
     if task == CAPTURED:
         return [written_each(values, figure) for values, figure in zip(found, figures, strict=True)]
@@ -162,15 +161,15 @@ def _cells(results: Results, name: str, task: str, figures: Sequence[Figure]) ->
 
 
 def recordings_table(results: Results) -> Table:
-    """Return how many recordings there are, how long, and how often they ask for what no arm of this length reaches."""
+    """Return how many recordings there are, how long, and how often the target is beyond the robot's reach."""
     rows = []
     for task in results.tasks(REPLAYS):
         runs = [r for r in results.all if r.experiment.task == task]
-        asked, made = {r.experiment.plan for r in runs}, {r.experiment.plan for r in runs if not r.unmade}
+        asked, made = {r.experiment.plan for r in runs}, {r.experiment.plan for r in runs if not r.without_recording}
         fact = {r.experiment.plan: r for r in runs if "recorded" in r.values}
         of = str(len(asked)) if made == asked else f"{len(made)} of {len(asked)}"
         persons = len({plan.person for plan in asked})
-        who = f"1 person, {len(asked)} cameras" if task == CAPTURED else f"{persons} made up"
+        who = f"1 person, {len(asked)} cameras" if task == CAPTURED else f"{persons} simulated"
         cells = []
         for figure in _RECORDED:
             values = {(_person(r), (task, plan.repeat)): number(r, figure.name) for plan, r in fact.items()}
@@ -178,28 +177,28 @@ def recordings_table(results: Results) -> Table:
         rows.append((task, of, who, *cells))
     columns = ("kind", "recordings>", "persons", *(f"{figure.title}>" for figure in _RECORDED))
     note = (
-        "Beyond reach: share of the time in which the wrist is led farther than the robot's arm is long. A recording "
-        f"that could not be made is missing, for every method. {persons_note(results)}"
+        "Beyond reach: fraction of the time in which the target of the wrist is farther away than the robot's arm is "
+        f"long. A recording that could not be made is missing for every method. {persons_note(results)}"
     )
     return Table("Recordings, the same for every method", columns, tuple(rows), note)
 
 
 def persons_note(results: Results) -> str:
-    """Return which made-up persons the figures are of, and whether they may judge a method."""
+    """Return which simulated persons the figures are of, and whether methods were developed with them."""
     seen = sorted({r.experiment.seed for r in results.all if r.experiment.task != CAPTURED})
     if not seen:
         return ""
     text = f"Persons {seen[0]} to {seen[-1]}." if len(seen) > 1 else f"Person {seen[0]}."
-    return text if seen[0] >= JUDGED else f"{text} Those below {JUDGED} are for working on methods."
+    return text if seen[0] >= TEST else f"{text} Those below {TEST} are for developing methods."
 
 
 def accuracy_table(results: Results, task: str) -> Table:
     """Return how well the methods follow the true arm in one kind of recording."""
     rows = []
     for name in results.methods:
-        led = interval(results.values(name, [task], "engaged_fraction")).mean
+        engaged = interval(results.values(name, [task], "engaged_fraction")).mean
         cells = _cells(results, name, task, ACCURACY)
-        rows.append((METHODS[name].title, *cells, f"{100 * led:.0f}" if math.isfinite(led) else "–"))
+        rows.append((METHODS[name].title, *cells, f"{100 * engaged:.0f}" if math.isfinite(engaged) else "–"))
     columns = ("method", *(f"{figure.title}>" for figure in ACCURACY), "led [%]>")
     note = f"{_CAPTURED_NOTE if task == CAPTURED else _MEANS_NOTE}; {_ACCURACY_NOTE}"
     return Table(f"Accuracy, {task}", columns, tuple(rows), note)
@@ -239,9 +238,9 @@ def limits_table(results: Results, tasks: Sequence[str]) -> Table:
     """Return what breaks limits, by finite differences of the joint positions alone."""
     rows = []
     for name in results.methods:
-        made = [r for r in results.of(name, tasks) if not r.unmade]
+        made = [r for r in results.of(name, tasks) if not r.without_recording]
         runs = [r for r in made if not r.failure]
-        clean = sum(number(r, "broken_limits") == 0 for r in runs)
+        clean = sum(number(r, "limit_violations") == 0 for r in runs)
         counts = [
             sum(int(r.value(f"{kind}_violations")) for r in runs) for kind in ("position", "velocity", "acceleration")
         ]
@@ -251,10 +250,10 @@ def limits_table(results: Results, tasks: Sequence[str]) -> Table:
         own = sum(int(r.value("failures")) for r in runs)
         row = (METHODS[name].title, f"{clean} of {len(made)}", *(str(n) for n in counts))
         rows.append((*row, *(f"{ratio:.2f}" for ratio in ratios), str(own)))
-    heads = ("method", "recordings without>", "position>", "velocity>", "acceleration>")
-    columns = (*heads, "worst velocity>", "worst acceleration>", "known to the method>")
-    note = "Frames that break a limit; the worst as a share of the limit; faults the method found itself and left."
-    return Table(f"Limits broken: {', '.join(tasks)}", columns, tuple(rows), note)
+    heads = ("method", "recordings without any>", "position>", "velocity>", "acceleration>")
+    columns = (*heads, "worst velocity>", "worst acceleration>", "found by the method>")
+    note = "Frames that break a limit; the worst value over the limit; faults that the method found itself and left."
+    return Table(f"Limit violations: {', '.join(tasks)}", columns, tuple(rows), note)
 
 
 def success_table(results: Results) -> Table:
@@ -270,13 +269,13 @@ def success_table(results: Results) -> Table:
         for figure in LOOP:
             values = {(r.experiment.seed, r.experiment.repeat): number(r, figure.name) for r in done}
             cells.append(written(interval(values), figure))
-        why = failures([str(r.values.get("failure", r.failure) or "") for r in runs if r not in done])
+        why = count_failures([str(r.values.get("failure", r.failure) or "") for r in runs if r not in done])
         rate = (f"{len(done)} of {len(runs)}", f"{100 * found.low:.0f} to {100 * found.high:.0f}")
         rows.append((METHODS[name].title, *rate, *cells, why))
     columns = ("method", "stacked>", "95 % [%]>", *(f"{figure.title}>" for figure in LOOP), "failures")
     note = (
-        "The rate's interval is Wilson's with fewer trials than there are, the fewer the more persons differ; a "
-        "failure more never raises its lower end. Time, path and torque are means over persons (95 % interval) of the "
-        f"trials that succeeded. {persons_note(results)}"
+        "The interval of the rate is Wilson's with an effective number of trials, which is smaller the more persons "
+        "differ; one more failure never raises its lower end. Time, path and torque are means over persons (95 % "
+        f"interval) of the trials that succeeded. {persons_note(results)}"
     )
-    return Table("Four cubes stacked, loop closed", columns, tuple(rows), note)
+    return Table("Four cubes stacked, closed loop", columns, tuple(rows), note)

@@ -1,4 +1,4 @@
-"""The recordings of the mapping benchmark: made-up people before made-up cameras, the same for every method."""
+"""The recordings of the mapping benchmark: simulated people before simulated cameras, the same for every method."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark.recording_plan import CAPTURED, REPEATS, Plan
+from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.motion_capture import MotionCapture
 from imitarm.capture.motions import DRAWINGS, REST, Truth, drawing, reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import HandState, Skeleton
-from imitarm.errors import InputError, TaskFailedError, UnreachableError
+from imitarm.errors import InputError, TaskFailedError, UnknownNameError, UnreachableError
 from imitarm.evaluation.tracking import TrueArm, motion_end
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
@@ -29,27 +29,82 @@ from imitarm.tasks.stack_trial import calibrate, stack_once
 
 Array = NDArray[np.float64]
 
-REACH = 0.80  # [m] from the Sawyer's shoulder to its wrist when it is stretched (METHODS A.5)
-BEYOND = 1.25  # "edge" is mapped so much larger that the stretched arm of a person is beyond the robot's reach
-_TAIL = 2.0  # [s] of rest at the end, so that settling can be seen
-_STEP = 0.01  # [s] at which the truth is kept
+KINDS = ("inside", "edge", "drawing", "stacking")
+"""Kinds of recordings of simulated people: reaches well inside the workspace; reaches with the arm stretched out every
+few seconds, beyond what the robot reaches; circles, eights and waves; stacking of four cubes."""
+CAPTURED = "captured"
+"""The kind that needs real data: an arm recorded by motion capture, before a simulated camera."""
+
+REPEATS = 100
+"""Largest number of recordings of one kind and person: more would get the seeds of the next person."""
+_LONGEST = 120.0  # [s] of a recording
+
+REACH = 0.80  # [m] from the Sawyer's shoulder to its wrist when it is stretched
+BEYOND = 1.25  # scale of "edge": with it, a person's stretched arm is beyond the robot's reach
+_TAIL = 2.0  # [s] of rest at the end, to measure settling
+_STEP = 0.01  # [s] between samples of the truth
 _STRETCH = 4.0  # [s] from one full stretch to the next
-_OUT = 1.02  # of the reach: as far as the arm is long, and a little more wished for
+_OUT = 1.02  # of the reach: a little farther than the arm is long
 _MOCAP = Path("mocap_arm", "recording.tsv")
-_TRIES = 5  # repeats of a person's stacking, until one succeeds with the ideal follower
+_TRIES = 5  # trials of a person, until one stacks the tower with the ideal follower
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What defines a recording, as plain values.
+
+    Attributes:
+        kind: one of :data:`KINDS`, or :data:`CAPTURED`.
+        person: seed of the person, whose limbs and habits differ.
+        repeat: number among this person's recordings, 0 to 99: seeds motion and camera; of the captured arm: number of
+            the camera.
+        seconds: approximate duration of reaches and drawings [s]; a capture is cut to it; stacking ignores it.
+        sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
+        data: folder of real recordings, for :data:`CAPTURED`.
+
+    Raises:
+        UnknownNameError: when there is no such kind.
+        InputError: when a number is out of range.
+    """
+
+    kind: str
+    person: int
+    repeat: int = 0
+    seconds: float = 10.0
+    sigma: float | None = None
+    data: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in {*KINDS, CAPTURED}:
+            raise UnknownNameError.among("kind of recording", self.kind, (*KINDS, CAPTURED))
+        if self.person < 0 or not 0 <= self.repeat < REPEATS or not 4.0 <= self.seconds <= _LONGEST:
+            raise InputError(
+                f"Plan: person must be at least 0, repeat 0 to {REPEATS - 1}, seconds 4 to {_LONGEST:g}; got {self}"
+            )
+        if self.sigma is not None and not 0.0 <= self.sigma <= 0.1:
+            raise InputError(f"Plan: sigma must be between 0 and 0.1 m, got {self.sigma!r}")
+
+    @property
+    def number(self) -> int:
+        """A seed that no other recording has."""
+        return 10 * (REPEATS * self.person + self.repeat) + (*KINDS, CAPTURED).index(self.kind)
+
+    def camera(self, number: int) -> SkeletonCamera:
+        """Return a camera with all the faults of a real one."""
+        return SkeletonCamera.from_seed(number) if self.sigma is None else SkeletonCamera(number, sigma=self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class MappingRecording:
-    """A recording with all that a method is given, and what it is never given: the truth.
+    """A recording with everything a method is given, and with the truth, which no method is given.
 
     Attributes:
-        plan: which it is.
-        skeletons: as the camera gave them.
-        correspondence: for all methods the same.
-        start: posture of the robot at first, shape (n_joints,) [rad].
+        plan: what defines it.
+        skeletons: as the camera saw them.
+        correspondence: the same for all methods.
+        start: first posture of the robot, shape (n_joints,) [rad].
         true_times: shape (m,) [s] since the first skeleton.
-        true_points: shoulder, elbow, wrist, hand, hand tip and thumb as they truly were, shape (m, 6, 3) [m], in the
+        true_points: true positions of shoulder, elbow, wrist, hand, hand tip and thumb, shape (m, 6, 3) [m], in the
             sensor's frame.
     """
 
@@ -61,13 +116,13 @@ class MappingRecording:
     true_points: Array
 
     def true_arm(self, times: Array) -> TrueArm:
-        """Return the true arm at the times (n,) of a run [s]; beyond the ends it is as it was there."""
+        """Return the true arm at the times (n,) of a run [s]; before the first and after the last sample it rests."""
         flat = self.true_points.reshape(len(self.true_times), -1)
         points = np.column_stack([np.interp(times, self.true_times, column) for column in flat.T])
         return TrueArm.from_points(times, points.reshape(-1, 6, 3), self.correspondence)
 
     def save(self, path: Path) -> None:
-        """Write it aside, then rename; nothing in the file can be executed."""
+        """Write it atomically; the file holds arrays only, nothing that could be executed."""
         c, lengths = self.correspondence, self.correspondence.lengths
         assert lengths is not None
         aside = path.with_name(f".{path.name}.{np.random.default_rng().integers(1 << 62):x}.part")
@@ -106,15 +161,15 @@ class MappingRecording:
 
 
 def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
-    """Make a recording; the same plan gives the same one, whatever the method.
+    """Make a recording; the same plan always gives the same recording.
 
     Args:
-        plan: which.
+        plan: what defines it.
         arm: the robot that will follow it.
 
     Raises:
-        InputError: when real data are asked for that are not there.
-        TaskFailedError: when this person can't stack the cubes even with a gripper that is the own hand.
+        InputError: when it needs real data that are not there.
+        TaskFailedError: when this person can't stack the cubes even with a gripper that moves exactly with the hand.
     """
     person = Person.from_seed(plan.person)
     truth, end, task = _MAKERS[plan.kind](plan, person)
@@ -128,7 +183,7 @@ def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
     first = skeletons[0].time
     true_times = np.arange(0.0, skeletons[-1].time - first + _STEP, _STEP)
     points = np.array([truth(first + t).arm("right").points for t in true_times])
-    if plan.kind == CAPTURED:  # bones of its own, and a motion that was not made for this robot
+    if plan.kind == CAPTURED:  # measured bones, and a motion that was not made for this robot
         lengths = LimbLengths(*np.median(np.linalg.norm(np.diff(points[:, :3], axis=1), axis=2), axis=0).tolist())
         wrist = FACING.apply(points[:, 2])
         fit = fit_motion(arm, wrist, wrist[0])
@@ -141,12 +196,12 @@ def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
 
 
 def _scale(plan: Plan, person: Person) -> float:
-    """Return the robot's motion over the person's: a centimetre is a centimetre, but where the edge is wanted."""
+    """Return the scale from the person's motion to the robot's: 1 except in the kind "edge"."""
     return BEYOND * REACH / (person.upper_arm + person.forearm) if plan.kind == "edge" else 1.0
 
 
 def _start(plan: Plan, arm: ArmModel, points: Array) -> Array:
-    """Return the posture to begin in: that of the stacking task, else the wrist where the person's maps to."""
+    """Return the first posture: that of the stacking task, else one with the wrist where the person's maps to."""
     if plan.kind == "stacking":
         return StackTask().start_posture(arm)
     s, e, w = FACING.apply(points[:3])
@@ -166,15 +221,15 @@ def _inside(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
 
 
 def _edge(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
-    """Reaches as inside, but every few seconds the arm is stretched out to its full length where it points."""
+    """Return reaches as inside, with the arm stretched out to its full length every few seconds."""
     inside, shoulder = reaching(person, plan.number, duration=plan.seconds), person.shoulder()
     begun, ended = REST, max(plan.seconds - 1.0, REST + _STRETCH)
     cycles = max(round((ended - begun) / _STRETCH), 1)
 
     def truth(time: float) -> Skeleton:
         away = inside(time).arm("right").wrist - shoulder
-        share = min(max((time - begun) / (ended - begun), 0.0), 1.0)
-        out = 0.5 - 0.5 * math.cos(2.0 * math.pi * cycles * share)
+        fraction = min(max((time - begun) / (ended - begun), 0.0), 1.0)
+        out = 0.5 - 0.5 * math.cos(2.0 * math.pi * cycles * fraction)
         return person.skeleton(time, shoulder + away * (1.0 + out * (_OUT * person.reach / np.linalg.norm(away) - 1.0)))
 
     return truth, _end(truth, plan.seconds + 8.0), "upright"
@@ -188,12 +243,12 @@ def _drawing(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
 
 
 def _stacking(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
-    """A person who stacks with a gripper that is where the hand is: no method has shaped it."""
+    """Return a person who stacks with a gripper that moves exactly with the hand: no method shapes the motion."""
     for k in range(_TRIES):
         done = stack_once(plan.person, plan.repeat + REPEATS * k, IdealFollower, camera=ideal_camera)
         if done.success:
             return _between(done.truth), done.truth[-1].time, "fixed"
-    raise TaskFailedError(f"person {plan.person} stacked no tower in {_TRIES} tries with the ideal gripper")
+    raise TaskFailedError(f"person {plan.person} stacked no tower in {_TRIES} trials with the ideal gripper")
 
 
 def _captured(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
@@ -221,34 +276,34 @@ _MAKERS: dict[str, Callable[[Plan, Person], tuple[Truth, float, Orientation]]] =
 
 
 def _end(truth: Truth, latest: float) -> float:
-    """Return when a motion is over that is at ``latest`` [s]."""
+    """Return when a motion ends [s], at the latest at ``latest`` [s]."""
     times = np.arange(0.0, latest, 0.02)
     return motion_end(times, np.array([truth(t).arm("right").wrist for t in times]))
 
 
 def _between(frames: tuple[Skeleton, ...]) -> Truth:
-    """Return a person in motion from frames, straight between them."""
+    """Return a person in motion, by linear interpolation between frames."""
     times = np.array([frame.time for frame in frames])
     positions = np.array([frame.positions for frame in frames])
 
     def truth(time: float) -> Skeleton:
         after = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1))
-        share = float(np.clip((time - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0))
-        at = positions[after - 1] + share * (positions[after] - positions[after - 1])
-        return Skeleton(time, at, hand_states=frames[after - (share < 1.0)].hand_states)
+        fraction = float(np.clip((time - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0))
+        at = positions[after - 1] + fraction * (positions[after] - positions[after - 1])
+        return Skeleton(time, at, hand_states=frames[after - (fraction < 1.0)].hand_states)
 
     return truth
 
 
 def beyond_reach(recording: MappingRecording, arm: ArmModel) -> float:
-    """Return the share of the time in which the clutch's law wants the robot's wrist farther than its arm is long.
+    """Return the fraction of the time in which the target of the robot's wrist is farther away than its arm is long.
 
-    The tool is taken to keep its rotation.
+    The target is the start plus the scaled displacement of the person's wrist; the tool keeps its orientation.
 
     Raises:
         InputError: when the arm's file does not say where shoulder and wrist are.
     """
     shoulder, _, wrist = arm.sew_points(recording.start)
     true = recording.true_arm(recording.true_times)
-    wanted = wrist + recording.correspondence.scale * (true.wrist - true.wrist[0])
-    return float(np.mean(np.linalg.norm(wanted - shoulder, axis=1) > REACH))
+    target = wrist + recording.correspondence.scale * (true.wrist - true.wrist[0])
+    return float(np.mean(np.linalg.norm(target - shoulder, axis=1) > REACH))

@@ -1,16 +1,14 @@
-"""Many experiments on local processes or a cluster; what is done is kept, so an interrupted benchmark goes on."""
+"""Running many experiments in parallel; each result is saved at once, so an interrupted benchmark can be continued."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib
-import multiprocessing
 import os
-import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +16,12 @@ from imitarm.benchmark.experiment import REPLAYS, Experiment, Result
 from imitarm.benchmark.provenance import code_version
 from imitarm.errors import FileFormatError, ImitarmError, InputError, TaskFailedError
 
-LOCAL = "local"
-"""Backend: processes of this machine."""
+LOCAL = "loky"
+"""Backend of joblib: processes of this machine."""
 _RUNS, _RECORDINGS = "runs", "recordings"
 
 OnDone = Callable[[int, int], None]
-"""Is told how many experiments are done, and of how many."""
+"""Called with the number of experiments that are done, and the number of all."""
 
 
 def run_all(
@@ -36,43 +34,42 @@ def run_all(
     backend: str = LOCAL,
     on_done: OnDone | None = None,
 ) -> list[Result]:
-    """Run experiments side by side and return their results, in their order.
+    """Run experiments in parallel and return their results, in their order.
 
     Each result is a file of its own in ``folder/runs``, written as soon as the experiment is done. A saved result of
-    the same configuration and the same code is read instead of run again.
+    the same configuration and the same code is read instead of run again. The values do not depend on ``jobs``.
 
     Args:
         experiments: what to run.
         folder: where results and recordings are kept; made when it is not there.
-        jobs: processes; None: one for each processor.
+        jobs: processes; None: one for each processor; 1: none but this one.
         fresh: run again what has been run.
         reuse: read saved results of the same configuration whatever code made them; each says which.
-        backend: ``"local"``, or the name of a joblib backend, such as ``"loky"``, ``"dask"`` or ``"ray"``, whose
-            workers see the same folder.
-        on_done: is told of the progress.
+        backend: a backend of joblib: ``"loky"`` (local processes), or one whose workers see the same folder, such as
+            ``"dask"`` or ``"ray"``.
+        on_done: called with the progress.
 
     Raises:
-        InputError: when the folder can't be written to, or the backend is not there.
-        TaskFailedError: when a worker was lost; what it and others had finished is kept.
-        KeyboardInterrupt: after Ctrl-C; what was finished is kept.
+        InputError: when the folder can't be written to, or the backend does not exist.
+        TaskFailedError: when a worker process was lost; the results that were finished are kept.
+        KeyboardInterrupt: after Ctrl-C; the results that were finished are kept.
     """
     place = _prepared(folder)
     known = {} if fresh else {e: found for e in experiments if (found := _kept(place, e, reuse)) is not None}
     missing = [e for e in experiments if e not in known]
     total, done = len(experiments), len(known)
-    tell = on_done if on_done is not None else _silent
-    tell(done, total)
+    report = on_done if on_done is not None else _ignore
+    report(done, total)
     if not missing:
         return [known[e] for e in experiments]
-    firsts = {e.plan: e for e in missing if e.task in REPLAYS}  # recordings first: every method then finds them made
-    version, workers = code_version(), max(min(jobs or os.cpu_count() or 1, len(missing)), 1)
-    with _backend(backend, workers) as mapped:
-        for _ in mapped(_make, [(e, str(place), version) for e in firsts.values()]):
-            pass
-        for experiment in mapped(_run, [(e, str(place), version) for e in missing]):
-            done += 1
-            tell(done, total)
-            known[experiment] = Result.load(Result.path(place / _RUNS, experiment))
+    workers, common = max(min(jobs or os.cpu_count() or 1, len(missing)), 1), (str(place), code_version(), os.getpid())
+    firsts = {e.plan: e for e in missing if e.task in REPLAYS}  # recordings first, so that methods share the files
+    for _ in _parallel(_make, [(e, *common) for e in firsts.values()], backend, workers):
+        pass
+    for experiment in _parallel(_run, [(e, *common) for e in missing], backend, workers):
+        done += 1
+        report(done, total)
+        known[experiment] = Result.load(Result.path(place / _RUNS, experiment))
     return [known[e] for e in experiments]
 
 
@@ -95,80 +92,55 @@ def _kept(place: Path, experiment: Experiment, reuse: bool) -> Result | None:
     return found if found is not None and (reuse or found.code == code_version()) else None
 
 
-Job = tuple[Experiment, str, str]
+Job = tuple[Experiment, str, str, int]
+"""The experiment, the folder, the version of the code, and the process that has asked for it."""
 
 
 def _make(job: Job) -> Experiment:
-    """Make the recording of an experiment; one that can't be made is the experiment's own failure, later."""
-    experiment, folder, _ = job
+    """Make the recording of an experiment; when that fails, the experiment will fail later and say why."""
+    experiment, folder, _, parent = job
+    _end_with(parent)
     with contextlib.suppress(ImitarmError):
         experiment.recording(Path(folder) / _RECORDINGS)
     return experiment
 
 
 def _run(job: Job) -> Experiment:
-    experiment, folder, version = job
+    experiment, folder, version, parent = job
+    _end_with(parent)
     if code_version() != version:
-        raise TaskFailedError("the code was changed while the benchmark ran; start it again, what is valid is kept")
+        raise TaskFailedError("the code was changed while the benchmark ran; start it again, valid results are kept")
     experiment.run(Path(folder) / _RECORDINGS).save(Path(folder) / _RUNS)
     return experiment
 
 
-Mapped = Callable[[Callable[[Job], Experiment], Sequence[Job]], Iterator[Experiment]]
-"""Does a function for each job, side by side, and gives what comes of it as it comes."""
-
-
-@contextlib.contextmanager
-def _backend(name: str, workers: int) -> Iterator[Mapped]:
-    """Give what does jobs side by side, while the ``with`` block runs."""
-    if name != LOCAL:
-        yield _joblib(name, workers)
-        return
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin_worker)
-
-    def mapped(function: Callable[[Job], Experiment], jobs: Sequence[Job]) -> Iterator[Experiment]:
-        try:
-            for future in as_completed([pool.submit(function, job) for job in jobs]):
-                yield future.result()
-        except BrokenProcessPool as error:
-            raise TaskFailedError(f"a worker was lost ({error}); start again, what was finished is kept") from error
+def _parallel(
+    function: Callable[[Job], Experiment], jobs: Sequence[Job], backend: str, workers: int
+) -> Iterator[Experiment]:
+    """Call a function for each job, in parallel, and give what it returns as soon as it does."""
+    import joblib  # noqa: PLC0415  (takes long to import)
 
     try:
-        yield mapped
-    finally:  # also after Ctrl-C: what runs is finished, what waits is dropped
-        pool.shutdown(wait=True, cancel_futures=True)
+        pool: Any = joblib.Parallel(workers, backend=backend, batch_size=1, return_as="generator_unordered")
+        yield from pool(joblib.delayed(function)(job) for job in jobs)
+    except BrokenProcessPool as error:
+        raise TaskFailedError(f"a worker process was lost ({error}); start again, valid results are kept") from error
+    except (ValueError, ImportError) as error:
+        raise InputError(f"backend {backend!r}: {error}") from error
 
 
-def _joblib(name: str, workers: int) -> Mapped:
-    try:
-        joblib: Any = importlib.import_module("joblib")  # optional
-    except ImportError as error:
-        raise InputError(f"backend {name!r} needs joblib, which is not installed: pip install joblib") from error
-
-    def mapped(function: Callable[[Job], Experiment], jobs: Sequence[Job]) -> Iterator[Experiment]:
-        try:
-            with joblib.parallel_config(backend=name, n_jobs=workers):
-                parallel = joblib.Parallel(return_as="generator_unordered")
-                yield from parallel(joblib.delayed(function)(job) for job in jobs)
-        except (ValueError, ImportError) as error:
-            raise InputError(f"backend {name!r}: {error}") from error
-
-    return mapped
+@lru_cache(maxsize=1)
+def _end_with(parent: int) -> None:
+    """End this worker when its parent is gone: workers outlive a parent that was killed."""
+    if os.getppid() == parent:
+        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 
 
-def _begin_worker() -> None:
-    """Leave Ctrl-C to the parent, and end with it: a pool's workers outlive a parent that was killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)  # results are written atomically: only what was half done is lost
 
 
-def _end_with_the_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)  # results are written aside and renamed: nothing is lost but what was half done
-
-
-def _silent(_done: int, _total: int) -> None:
-    """Tell nobody."""
+def _ignore(_done: int, _total: int) -> None:
+    """Report to nobody."""

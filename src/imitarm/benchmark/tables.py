@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+from imitarm.benchmark.experiment import write_text
+from imitarm.benchmark.provenance import origin
+from imitarm.errors import InputError
+
+END = "<!-- end -->"
 
 
 @dataclass(frozen=True)
@@ -20,3 +28,56 @@ class Table:
         lines.append(f"|{'|'.join('--:' if c.endswith('>') else '---' for c in self.columns)}|")
         lines += [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in self.rows]
         return "\n".join([*lines, *(["", self.note] if self.note else []), ""])
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the tables of a benchmark stand in a document.
+
+    Attributes:
+        document: the file, Markdown.
+        benchmark: its name; the tables stand between the lines ``<!-- imitarm benchmark NAME -->`` and
+            ``<!-- end -->``.
+
+    Raises:
+        InputError: when the document can't be read, or does not have these two lines in this order, once each.
+    """
+
+    document: Path
+    benchmark: str
+
+    def __post_init__(self) -> None:
+        self._parts()
+
+    @property
+    def begin(self) -> str:
+        """The line above the tables."""
+        return f"<!-- imitarm benchmark {self.benchmark} -->"
+
+    def fill(self, found: Sequence[Table], command: str, versions: Iterable[str]) -> None:
+        """Put tables into the document; the rest of it stays as it is.
+
+        Args:
+            found: the tables.
+            command: which printed them.
+            versions: which code made each result; the document says when it is not the code that is running.
+        """
+        head, tail = self._parts()
+        body = "\n".join(table.markdown() for table in found)
+        said = f"Printed by `{command}`. {origin(versions)}"
+        write_text(self.document, f"{head}{self.begin}\n{said}\n\n{body}\n{END}\n{tail}")
+
+    def _parts(self) -> tuple[str, str]:
+        """Return the document before and after the tables."""
+        try:
+            text = self.document.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{self.document}: can't be read as a document ({error})") from error
+        head, found, rest = text.partition(f"{self.begin}\n")
+        _, ended, tail = rest.partition(f"{END}\n")
+        if not found or not ended or self.begin in rest or f"{END}\n" in head + tail:
+            raise InputError(
+                f"{self.document}: the tables go between a line {self.begin!r} and a line {END!r} after it; write "
+                "both, once each"
+            )
+        return head, tail

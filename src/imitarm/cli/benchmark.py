@@ -1,4 +1,4 @@
-"""``imitarm benchmark``: measure how good the methods are, beside what the thesis says of it."""
+"""``imitarm benchmark``: measure how good the methods are, beside what the thesis reports."""
 
 from __future__ import annotations
 
@@ -9,20 +9,19 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from imitarm.benchmark import avoidance
-from imitarm.benchmark.experiment import Result
-from imitarm.benchmark.mapping import MappingBenchmark, check_document, fill_document, tables, write_tables
-from imitarm.benchmark.mapping_methods import METHODS
-from imitarm.benchmark.mapping_tables import JUDGED, Results
+from imitarm.benchmark import avoidance, real_motions
+from imitarm.benchmark.experiment import METHODS, Result
+from imitarm.benchmark.mapping import MappingBenchmark, tables, write_tables
+from imitarm.benchmark.mapping_tables import TEST, Results
 from imitarm.benchmark.provenance import code_version, origin
-from imitarm.benchmark.recording_plan import KINDS
+from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.running import LOCAL, run_all
-from imitarm.benchmark.tables import Table
+from imitarm.benchmark.tables import Place, Table
 from imitarm.cli.outputs import check_outputs, same_place
+from imitarm.cli.run_scene import provenance
 from imitarm.cli.screen import progress_bar, remark, say, show_table
-from imitarm.cli.trial import provenance
 from imitarm.errors import InputError
-from imitarm.policies.adaptation import ADAPTERS as ADAPTATIONS
+from imitarm.policies.adaptation import ADAPTERS
 
 EPILOG = """\
 examples:
@@ -31,59 +30,77 @@ examples:
   imitarm benchmark mapping --methods modern thesis --people 4 --no-live
   imitarm benchmark mapping --methods modern thesis --no-replay --sigma 5
   imitarm benchmark avoidance --seeds 200
+  imitarm benchmark people recordings person.mp4
 
-'mapping' keeps what it has run in the folder --out; Ctrl-C ends it, and the same command goes on where it was.
+'mapping' saves each result in the folder --out; after Ctrl-C the same command continues where it stopped.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes."""
-    parsers = parser.add_subparsers(metavar="WHAT", required=True, title="benchmarks")
+    """Add the arguments of the command."""
+    parsers = parser.add_subparsers(metavar="BENCHMARK", required=True, title="benchmarks")
     mapping = parsers.add_parser(
         "mapping", help="from a person's arm to a robot's: every method on the same recordings (thesis Table 3.1)"
     )
-    mapping.add_argument("--people", type=int, metavar="N", help="made-up people; default: 10, with --quick 2")
+    mapping.add_argument("--people", type=int, metavar="N", help="simulated people; default: 10, with --quick 2")
     mapping.add_argument(
         "--first",
         type=int,
         metavar="N",
-        help=f"first of them; default: {JUDGED}, with --quick 0. Those below {JUDGED} are for working on methods, the "
-        "others judge",
+        help=f"number of the first person; default: {TEST}, with --quick 0. Persons below {TEST} are for developing "
+        "methods, the others for testing them",
     )
-    mapping.add_argument("--repeats", type=int, metavar="N", help="closed-loop trials of each; default: 5, quick 1")
-    mapping.add_argument("--quick", action="store_true", help="a few short recordings: shows that it runs, no more")
+    mapping.add_argument(
+        "--repeats", type=int, metavar="N", help="closed-loop trials of each person; default: 5, with --quick 1"
+    )
+    mapping.add_argument("--quick", action="store_true", help="a few short recordings, to see that it runs")
     mapping.add_argument("--methods", nargs="+", choices=METHODS, metavar="NAME", help=f"of {', '.join(METHODS)}")
     mapping.add_argument("--kinds", nargs="+", choices=KINDS, metavar="KIND", help=f"recordings: {', '.join(KINDS)}")
     mapping.add_argument(
-        "--seconds", type=float, metavar="S", help="about how long a recording is; default: 10, quick 5"
+        "--seconds", type=float, metavar="S", help="approximate duration of a recording; default: 10, with --quick 5"
     )
-    mapping.add_argument("--sigma", type=float, metavar="MM", help="of the camera's error; default: 10 to 20 mm")
-    mapping.add_argument("--no-live", action="store_true", help="leave out the stacking with the loop closed")
-    mapping.add_argument("--no-replay", action="store_true", help="leave out the recordings: only stacking")
-    mapping.add_argument("--data", type=Path, metavar="FOLDER", help="real recordings: adds the captured arm")
-    mapping.add_argument("--out", type=Path, metavar="FOLDER", help="for results; default: benchmark-mapping")
-    mapping.add_argument("--report", type=Path, metavar="FILE", help="a page with figures and playback (HTML)")
-    mapping.add_argument("--fill", type=Path, metavar="FILE", help="put the tables into this document, between marks")
+    mapping.add_argument(
+        "--sigma", type=float, metavar="MM", help="standard deviation of the camera's error; default: 10 to 20 mm"
+    )
+    mapping.add_argument("--no-live", action="store_true", help="no closed loop, recordings only")
+    mapping.add_argument("--no-replay", action="store_true", help="closed loop only")
+    mapping.add_argument("--data", type=Path, metavar="DIR", help="folder of real recordings: adds a captured arm")
+    mapping.add_argument("--out", type=Path, metavar="DIR", help="folder of the results; default: benchmark-mapping")
+    mapping.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
+    _add_fill(mapping)
     mapping.add_argument("--fresh", action="store_true", help="run again what has been run")
     mapping.add_argument(
         "--reuse", action="store_true", help="take saved results of the same configuration, whatever code made them"
     )
     mapping.add_argument("--jobs", type=int, metavar="N", help="processes; default: one for each processor")
-    mapping.add_argument("--backend", default=LOCAL, metavar="NAME", help="local, or a joblib backend: dask, ray")
+    mapping.add_argument("--backend", default=LOCAL, metavar="NAME", help="of joblib: loky (local), dask, ray")
     mapping.set_defaults(benchmark=_mapping)
     other = parsers.add_parser("avoidance", help="how often a method keeps its clearance, over seeded scenes")
     other.add_argument("--seeds", type=int, default=200, metavar="N", help="scenes in each family; default: 200")
     other.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000, the test seeds")
-    other.add_argument("--methods", nargs="+", choices=ADAPTATIONS, default=list(ADAPTATIONS))
+    other.add_argument("--methods", nargs="+", choices=ADAPTERS, default=list(ADAPTERS))
+    _add_fill(other)
     other.set_defaults(benchmark=_avoidance)
+    people = parsers.add_parser("people", help="recordings of real people lead the simulated arms")
+    people.add_argument(
+        "data", type=Path, metavar="DATA", help="folder of real recordings, with kinect_gestures and mocap_arm"
+    )
+    people.add_argument("videos", nargs="*", metavar="VIDEO", help="videos of a person, or recordings of one")
+    _add_fill(people)
+    people.set_defaults(benchmark=_people)
+
+
+def _add_fill(parser: argparse.ArgumentParser) -> None:
+    text = "put the tables into this document, between the lines '<!-- imitarm benchmark NAME -->' and '<!-- end -->'"
+    parser.add_argument("--fill", type=Path, metavar="FILE", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the benchmark that was asked for.
+    """Run a benchmark.
 
     Raises:
         InputError: when an option is wrong or a folder can't be used.
-        TaskFailedError: when a worker was lost.
+        TaskFailedError: when a worker process was lost.
     """
     status: int = arguments.benchmark(arguments)
     return status
@@ -91,9 +108,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _mapping(arguments: argparse.Namespace) -> int:
     """Run the mapping benchmark, print its tables, write its files."""
-    benchmark = _asked(arguments)
+    benchmark = _configured(arguments)
     experiments = benchmark.experiments()
     folder: Path = arguments.out or Path("benchmark-mapping")
+    place = _place(arguments, "mapping")
     _check(arguments, folder)
     if not benchmark.data and benchmark.kinds:
         remark("the captured arm is left out: it needs real recordings, name their folder with --data")
@@ -108,20 +126,15 @@ def _mapping(arguments: argparse.Namespace) -> int:
             backend=arguments.backend,
             on_done=lambda finished, of: bar.update(task, completed=finished, total=of),
         )
-    results = Results(done)
+    results, versions = Results(done), [result.code for result in done]
     found = tables(results)
-    for table in found:
-        _show(table)
     for text in _not_done(done):
         remark(text)
-    versions = [result.code for result in done]
     if set(versions) != {code_version()}:
         remark(origin(versions))
+    _report(found, place, versions)
     for path in write_tables(results, found, folder):
         say(f"wrote {path}")
-    if arguments.fill is not None:
-        fill_document(arguments.fill, found, _command(), versions)
-        say(f"filled {arguments.fill}")
     if arguments.report is not None:
         from imitarm.benchmark.mapping_report import write_mapping_report  # noqa: PLC0415 (draws: needs an extra)
 
@@ -135,6 +148,7 @@ def _avoidance(arguments: argparse.Namespace) -> int:
     """Run the avoidance benchmark and print its table."""
     if arguments.seeds < 1 or arguments.first < 0:
         raise InputError(f"--seeds must be at least 1 and --first 0, got {arguments.seeds} and {arguments.first}")
+    place = _place(arguments, "avoidance")
     with progress_bar() as bar:
         task = bar.add_task("avoiding", total=None)
         table = avoidance.success_table(
@@ -143,16 +157,41 @@ def _avoidance(arguments: argparse.Namespace) -> int:
             arguments.methods,
             on_done=lambda finished, of: bar.update(task, completed=finished, total=of),
         )
-    _show(table)
+    _report([table], place, [code_version()])
     return 0
 
 
-def _asked(arguments: argparse.Namespace) -> MappingBenchmark:
+def _people(arguments: argparse.Namespace) -> int:
+    """Let recordings of real people lead the arms, and print the tables."""
+    place = _place(arguments, "people")
+    motions = list(real_motions.real_motions(arguments.data, arguments.videos))
+    _report(real_motions.tables(motions), place, [code_version()])
+    return 0
+
+
+def _place(arguments: argparse.Namespace, benchmark: str) -> Place | None:
+    """Return where the tables go besides the terminal; checks the document before the work."""
+    return None if arguments.fill is None else Place(arguments.fill, benchmark)
+
+
+def _report(found: Sequence[Table], place: Place | None, versions: Sequence[str]) -> None:
+    """Print tables, and put them into a document."""
+    for table in found:
+        show_table(table.columns, table.rows, title=table.title)
+        if table.note:
+            say(table.note)
+        say("")
+    if place is not None:
+        place.fill(found, _command(), versions)
+        say(f"filled {place.document}")
+
+
+def _configured(arguments: argparse.Namespace) -> MappingBenchmark:
     quick: bool = arguments.quick
     data: Path | None = arguments.data
     return MappingBenchmark(
         people=_given(arguments.people, 2 if quick else 10),
-        first=_given(arguments.first, 0 if quick else JUDGED),
+        first=_given(arguments.first, 0 if quick else TEST),
         repeats=_given(arguments.repeats, 1 if quick else 5),
         methods=arguments.methods or tuple(METHODS),
         kinds=() if arguments.no_replay else arguments.kinds or KINDS,
@@ -164,19 +203,19 @@ def _asked(arguments: argparse.Namespace) -> MappingBenchmark:
 
 
 def _command() -> str:
-    """Return the command without the places where this machine keeps its files."""
+    """Return the command without the names of this machine's files."""
     words, places = sys.argv[1:], {"--out", "--report", "--fill", "--jobs", "--backend"}
     kept = [
         w
         for i, w in enumerate(words)
         if w not in places | {"--fresh", "--reuse"} and (i == 0 or words[i - 1] not in places)
     ]
-    named = ["recordings" if i > 0 and kept[i - 1] == "--data" else w for i, w in enumerate(kept)]
+    named = ["recordings" if i > 0 and kept[i - 1] == "--data" else Path(w).name for i, w in enumerate(kept)]
     return shlex.join(["imitarm", *named])
 
 
 def _not_done(results: Sequence[Result]) -> list[str]:
-    """Return what could not be done and why: a recording that can't be made is told once, not for every method."""
+    """Return what could not be done and why: a recording that can't be made is reported once, not for every method."""
     found: dict[tuple[str, int, int, str], list[str]] = {}
     for result in results:
         if result.failure:
@@ -193,17 +232,15 @@ def _given(value: int | None, otherwise: int) -> int:
 
 
 def _check(arguments: argparse.Namespace, folder: Path) -> None:
-    """Find out before the work what would only fail after it."""
+    """Find out before the work what would fail after it."""
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {arguments.jobs}")
     if arguments.data is not None and not arguments.data.is_dir():
         raise InputError(f"--data {arguments.data}: there is no such folder")
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"--out {folder}: is no folder; name another one")
+        raise InputError(f"--out {folder}: is not a folder; name another one")
     if arguments.data is not None and same_place(folder, arguments.data):
         raise InputError(f"--out {folder}: is the folder of --data, too; name another one")
-    if arguments.fill is not None:
-        check_document(arguments.fill)
     written = [("--out", folder / name) for name in ("mapping.md", "mapping.json")]
     check_outputs([("--report", arguments.report)], [("--fill", arguments.fill), *written], new_folders=True)
     if arguments.report is None:
@@ -219,10 +256,3 @@ def _check(arguments: argparse.Namespace, folder: Path) -> None:
     from imitarm.viewer.page import check_writable  # noqa: PLC0415 (draws: needs an extra)
 
     check_writable(page)
-
-
-def _show(table: Table) -> None:
-    show_table(table.columns, table.rows, title=table.title)
-    if table.note:
-        say(table.note)
-    say("")

@@ -10,8 +10,8 @@ from pathlib import Path
 from rich.progress import Progress, TaskID
 
 from imitarm.cli.outputs import check_outputs
+from imitarm.cli.run_scene import learning_summary, provenance, run_scene, show_results
 from imitarm.cli.screen import progress_bar, say
-from imitarm.cli.trial import learning_summary, provenance, show_results, try_scene
 from imitarm.demonstrations import compute_alignment, lint
 from imitarm.errors import InputError
 from imitarm.policies import ACFRA, ADAPTERS, HORIZONTAL_ONLY
@@ -127,7 +127,7 @@ def _sweep(
         forbidden=HORIZONTAL_ONLY,  # the bristles stay on the table
         pinned=[task.dirt_time(skill.gmr_.trajectory(1000))],
     )
-    result = try_scene(
+    result = run_scene(
         name,
         name.replace("-", " ").replace("_", " "),
         robot,
@@ -135,7 +135,7 @@ def _sweep(
         clearance=task.clearance,
         tool_radius=task.tool_radius,
         demonstrations=demonstrations,
-        judge=task.judge,
+        evaluate=task.judge,
         caption=_CAPTIONS.get(name, ""),
         progress=lambda share: progress.update(whole, completed=before + share),
     )

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
+from imitarm.cli.run_scene import provenance, run_scene, show_results
 from imitarm.cli.screen import progress_bar, remark, say
-from imitarm.cli.trial import provenance, show_results, try_scene
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     policy = _policy(arguments, skill, spheres)
     with progress_bar() as progress:
         moving = progress.add_task("reproducing", total=1.0)
-        result = try_scene(
+        result = run_scene(
             "scene",
             f"{skill.task_ or 'skill'} on {arm.name}",
             robot,

@@ -17,8 +17,8 @@ from imitarm.capture.skeleton import SIDES, Skeleton
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.person import add_source, person_of
 from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
+from imitarm.cli.run_scene import provenance
 from imitarm.cli.screen import remark, say, show_table, watched, working
-from imitarm.cli.trial import provenance
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.evaluation.execution import Execution, execute_on_robot
 from imitarm.evaluation.run_evaluation import FAR, FAR_FRACTION, RunEvaluation, TargetTracking, evaluate_run

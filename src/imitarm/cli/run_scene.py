@@ -1,4 +1,4 @@
-"""One reproduction of a skill in one scene, from the policy to what a report says of it."""
+"""Reproducing a skill in one scene, and collecting what the report needs."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from imitarm.viewer import FrameRecorder, LearningSummary, Report, SceneResult
 Array = NDArray[np.float64]
 
 CONTROL_PERIOD = 0.01  # [s]
-PATIENCE = 4.0  # a reproduction may take this many times as long as the demonstrations
+TIMEOUT = 4.0  # a reproduction may take this many times as long as the demonstrations
 _LIBRARIES = ("numpy", "scipy", "mujoco", "daqp", "pyyaml", "rich", "viser", "matplotlib")
 
-Judge = Callable[[SimulatedRobot, Rollout], Rollout]
+Evaluate = Callable[[SimulatedRobot, Rollout], Rollout]
 
 
-def try_scene(
+def run_scene(
     name: str,
     title: str,
     robot: SimulatedRobot,
@@ -43,25 +43,25 @@ def try_scene(
     tool_radius: float = 0.0,
     tool_spheres: Array | None = None,
     demonstrations: Sequence[Demonstration] = (),
-    judge: Judge | None = None,
+    evaluate: Evaluate | None = None,
     caption: str = "",
     progress: Callable[[float], None] | None = None,
 ) -> SceneResult:
-    """Let a policy reproduce its skill on a simulated robot, and put together what came of it.
+    """Let a policy reproduce its skill on a simulated robot, and collect the result for the report.
 
     Args:
         name: short and unique.
-        title: what people read.
+        title: for tables and the report.
         robot: at its start posture, in its scene.
         policy: not yet reset.
-        clearance: that is asked for [m].
-        link_clearance: that every link must keep [m]; None: only the tool is looked after.
+        clearance: required clearance [m].
+        link_clearance: required clearance of every link [m]; None: only the tool keeps one.
         tool_radius: for the drawing [m].
         tool_spheres: for the drawing, instead of a radius, shape (m, 4) [m].
         demonstrations: aligned, to measure the distance to.
-        judge: the task's own verdict over the rollout.
-        caption: a sentence about what is to be seen.
-        progress: called with the share of the motion that is done, 0 to 1.
+        evaluate: the task's success test; returns the rollout with its verdict.
+        caption: a sentence about what the scene shows.
+        progress: called with the fraction of the motion that is done, 0 to 1.
 
     Returns:
         The result; when the policy refuses, one without a rollout and with the reason.
@@ -86,13 +86,13 @@ def try_scene(
             scene.at,
             dt=CONTROL_PERIOD,
             safety=SafetyFilter(robot.arm, dt=CONTROL_PERIOD, clearance=link_clearance),
-            timeout=PATIENCE * policy.skill.duration_,
+            timeout=TIMEOUT * policy.skill.duration_,
             on_step=on_step,
         )
     except InfeasibleError as refusal:
         reason = str(refusal)
     else:
-        rollout = done if judge is None else judge(robot, done)
+        rollout = done if evaluate is None else evaluate(robot, done)
         reason = rollout.reason
     return SceneResult(
         name=name,
@@ -127,8 +127,8 @@ def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
 def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | None, phases: Sequence[float]) -> float:
     """Return the root mean square distance [m] of the measured tool to all demonstrations at the same phase.
 
-    It is thesis Eq 4.9 with its root, which the print lacks. Comparing at the same phase, not at the same time, keeps a
-    robot that waits from being called inaccurate.
+    This is thesis Eq 4.9 with the root that the print lacks. Comparing at the same phase instead of the same time does
+    not count a robot that waits as inaccurate.
     """
     if rollout is None or not demonstrations or not phases:
         return float("nan")
@@ -144,7 +144,7 @@ def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | Non
 def learning_summary(
     skill: Skill, demonstrations: Sequence[Demonstration], findings: Sequence[Finding], alignment: Alignment | None
 ) -> LearningSummary:
-    """Return what a report says of the learning."""
+    """Return what the report shows of learning."""
     gmr = skill.gmr_
     predicted: Trajectory = gmr.trajectory(200)
     return LearningSummary(
@@ -159,7 +159,7 @@ def learning_summary(
 
 
 def provenance(**facts: object) -> Mapping[str, object]:
-    """Return what is needed to do it again: command, versions, platform, and the ``facts`` given."""
+    """Return what is needed to repeat a run: command, versions, platform, and the given ``facts``."""
     return {
         "command": shlex.join(["imitarm", *sys.argv[1:]]),
         **facts,
@@ -176,7 +176,7 @@ def _version(package: str) -> str:
 
 
 def show_results(report: Report) -> None:
-    """Print one row a scene, and below the table why a scene failed."""
+    """Print a row for each scene, and below the table why a scene failed."""
     rows, styles = [], []
     for scene in report.scenes:
         adaptation = scene.adaptation
@@ -194,11 +194,12 @@ def show_results(report: Report) -> None:
             )
         )
         styles.append("" if scene.success else "red")
-    headings = ["scene", "", "obstacles>", "clear>", "proven>", "RMSE>", "unmoved>", "adapted>"]
+    headings = ["scene", "", "obstacles>", "clearance>", "certified>", "RMSE>", "unmoved>", "adaptation>"]
     show_table(headings, rows, styles=styles)
     remark(
-        "clear: least distance of arm and tool to an obstacle, measured [mm]; proven: of the tool's path [mm]; "
-        "RMSE to the demonstrations [mm]; unmoved: share of components; adapted: compute time [ms]"
+        "clearance: smallest measured distance between the arm (with tool) and any obstacle [mm]; certified: "
+        "guaranteed lower bound for the tool on the planned path [mm]; RMSE to the demonstrations [mm]; unmoved: "
+        "fraction of the components; adaptation: computing time [ms]"
     )
     for scene in report.scenes:
         if not scene.success:

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from imitarm.benchmark import mapping_plots
+from imitarm.benchmark import mapping_report
 from imitarm.benchmark.experiment import LIVE, Experiment, Result
 from imitarm.benchmark.mapping_tables import Results
 
@@ -27,12 +27,12 @@ def results():
 @pytest.mark.parametrize(
     "draw",
     [
-        lambda r: mapping_plots.torques(r, ["inside"]),
-        lambda r: mapping_plots.path_lengths(r, ["inside"]),
-        lambda r: mapping_plots.accuracy(r, ["inside"]),
-        lambda r: mapping_plots.broken_limits(r, ["inside"]),
-        mapping_plots.times,
-        mapping_plots.successes,
+        lambda r: mapping_report.torques(r, ["inside"]),
+        lambda r: mapping_report.path_lengths(r, ["inside"]),
+        lambda r: mapping_report.accuracy(r, ["inside"]),
+        lambda r: mapping_report.limit_violations(r, ["inside"]),
+        mapping_report.times,
+        mapping_report.successes,
     ],
 )
 def test_each_figure_is_one_svg_that_names_its_methods(draw):
@@ -48,5 +48,5 @@ def test_each_figure_is_one_svg_that_names_its_methods(draw):
 
 def test_without_numbers_there_is_no_figure():
     empty = Results([Result(Experiment("inside", "modern"), "0", {"path_length": math.nan}, "", 1.0)])
-    assert mapping_plots.path_lengths(empty, ["inside"]) == ""
-    assert mapping_plots.times(empty) == ""
+    assert mapping_report.path_lengths(empty, ["inside"]) == ""
+    assert mapping_report.times(empty) == ""
