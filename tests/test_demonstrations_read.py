@@ -71,7 +71,8 @@ def test_the_content_decides_and_a_name_must_not_lie(tmp_path):
     assert len(read(tmp_path / "recording")) == 1
     (tmp_path / "bag.bag").write_bytes(b"#ROSBAG V2.0\n\x00\x00")
     with pytest.raises(
-        FileFormatError, match=r"this is a ROS 1 bag; known formats: NumPy arrays \(\.npy \.npz\), imitarm CSV"
+        FileFormatError,
+        match=r"this is a ROS 1 bag; known formats: imitarm CSV \(\.csv\), NumPy arrays \(\.npy \.npz\)",
     ):
         read(tmp_path / "bag.bag")
     (tmp_path / "model.npy").write_bytes(pickle.dumps([1, 2]))

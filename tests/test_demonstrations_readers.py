@@ -48,7 +48,7 @@ def readers(tmp_path, monkeypatch):
     (packages / "their_logger.py").write_text(READER, encoding="utf-8")
     install(packages, "imitarm.readers", logger="their_logger:LoggerReader")
     monkeypatch.syspath_prepend(str(packages))
-    fresh = Registry("reader", READERS.group, READERS._built_in)
+    fresh = Registry("reader", READERS.group, reading_module._BUILT_IN)
     for module in ("imitarm.demonstrations", "imitarm.demonstrations.reading", "imitarm.cli.reading"):
         monkeypatch.setattr(f"{module}.READERS", fresh)
     folder = tmp_path / "logs"
@@ -61,7 +61,7 @@ def readers(tmp_path, monkeypatch):
 
 def test_it_is_listed_and_read(readers):
     registry, folder = readers
-    assert list(registry) == ["NumPy arrays", "imitarm CSV", "text table", "logger"]
+    assert list(registry) == ["imitarm CSV", "NumPy arrays", "text table", "logger"]
     assert len(files_of(folder)) == 4
     expected = motions(4)[2].trajectory
     one = read(folder / "demo_2.log")[0].trajectory
@@ -102,6 +102,6 @@ def test_its_content_decides(readers, tmp_path):
 def test_a_reader_that_can_not_be_imported_is_named(tmp_path, monkeypatch):
     install(tmp_path, "imitarm.readers", broken="no_such_package:X")
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(reading_module, "READERS", Registry("reader", READERS.group, READERS._built_in))
+    monkeypatch.setattr(reading_module, "READERS", Registry("reader", READERS.group, reading_module._BUILT_IN))
     with pytest.raises(InputError, match=r"reader 'broken' is added by .*no_such_package.*uninstall"):
         files_of(tmp_path)

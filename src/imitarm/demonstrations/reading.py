@@ -11,7 +11,7 @@ import math
 import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -161,16 +161,13 @@ class Reader(ABC):
         """
 
 
-READERS: Registry[type[Reader]] = Registry(
-    "reader",
-    "imitarm.readers",
-    {
-        "NumPy arrays": "imitarm.demonstrations.arrays:NumpyReader",
-        "imitarm CSV": "imitarm.demonstrations.text_tables:ImitarmReader",
-        "text table": "imitarm.demonstrations.text_tables:TextTableReader",
-    },
-)
-"""The readers by name. Readers of other packages are asked first, then these, in this order."""
+_BUILT_IN = {
+    "imitarm CSV": "imitarm.demonstrations.text_tables:ImitarmReader",
+    "NumPy arrays": "imitarm.demonstrations.arrays:NumpyReader",
+    "text table": "imitarm.demonstrations.text_tables:TextTableReader",
+}
+READERS: Registry[type[Reader]] = Registry("reader", "imitarm.readers", _BUILT_IN)
+"""The readers by name: these, and those that other packages add by entry points."""
 
 
 def files_of(paths: Paths) -> list[str]:
@@ -276,26 +273,24 @@ def known_formats() -> str:
 
 
 def _reader_of(path: str) -> Reader:
-    """Return the reader that recognises the content of a file; the suffix must not contradict it."""
+    """Return the reader that recognises the content of a file; the suffix must not contradict it.
+
+    Readers of other packages are asked first, because the text table takes any text; then the readers that know the
+    suffix.
+    """
     content = read_bytes(path)
-    suffix, kind = Path(path).suffix.lower(), kind_of(content)
-    recognised = [name for name in _in_order(READERS) if READERS[name]().recognises(content[:_HEAD])]
-    if not recognised:
-        raise FileFormatError(f"{path}: this is {kind or 'text'}; known formats: {known_formats()}")
-    by_suffix = [name for name, reader in READERS.items() if suffix in reader.suffixes]
-    if by_suffix and not set(by_suffix) & set(recognised):
+    suffix, head = Path(path).suffix.lower(), content[:_HEAD]
+    names = sorted(READERS, key=lambda name: (name in _BUILT_IN, suffix not in READERS[name].suffixes))
+    name = next((name for name in names if READERS[name]().recognises(head)), None)
+    kind = kind_of(content) or "text"
+    if name is None:
+        raise FileFormatError(f"{path}: this is {kind}; known formats: {known_formats()}")
+    by_suffix = [name for name in names if suffix in READERS[name].suffixes]
+    if by_suffix and name not in by_suffix and not any(READERS[name]().recognises(head) for name in by_suffix):
         raise FileFormatError(
-            f"{path}: named {suffix} ({by_suffix[0]}), but its content is {kind or 'text'} ({recognised[0]}); "
-            "give it the right name"
+            f"{path}: named {suffix} ({by_suffix[0]}), but its content is {kind} ({name}); give it the right name"
         )
-    return READERS[recognised[0]]()
-
-
-def _in_order(names: Iterable[str]) -> Sequence[str]:
-    """Return readers of other packages first: they know one format, the text table takes any text."""
-    built_in = ("NumPy arrays", "imitarm CSV", "text table")
-    names = list(names)
-    return [*(name for name in names if name not in built_in), *(name for name in built_in if name in names)]
+    return READERS[name]()
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
