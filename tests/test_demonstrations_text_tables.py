@@ -7,7 +7,9 @@ import pytest
 
 from demonstration_samples import path, turn
 from imitarm.demonstrations import ReadOptions, read, read_raw
-from imitarm.demonstrations.text_tables import Column, SaidUnits, column_of, named_columns, unnamed_columns
+from imitarm.demonstrations.arrays import unnamed_columns
+from imitarm.demonstrations.reading import SaidUnits
+from imitarm.demonstrations.text_tables import Column, column_of, named_columns
 from imitarm.errors import FileFormatError, InputError
 from imitarm.kinematics.pose import quaternion_exp
 
@@ -250,7 +252,8 @@ def test_remarks_give_unit_and_task(tmp_path):
         ("stamp.sec", "stamp.nanosec", 1e9),
         ("header_stamp_sec", "header_stamp_nsec", 1e9),
         ("time [s]", "usec", 1e6),
-        ("t", "millisec", 1e3),
+        ("t", "millisecond", 1e3),
+        ("tv_sec", "tv_usec", 1e6),
     ],
 )
 def test_seconds_and_the_rest_of_the_second_are_added(whole, fine, factor):
@@ -366,7 +369,9 @@ def test_names_in_remarks_of_other_quantities_are_refused_too(tmp_path):
         read(file)
 
 
-@pytest.mark.parametrize("first", ["# recorded by Ann on Monday", "# robot: panda\n# date: 2024-05-01", "# v 2.1"])
+@pytest.mark.parametrize(
+    "first", ["# recorded by Ann on Monday", "# task: from x to y", "# robot: panda\n# date: 2024-05-01", "# v 2.1"]
+)
 def test_other_remarks_are_no_names(tmp_path, first):
     table = np.column_stack([0.1 * np.arange(30), POSES])
     (one,) = read(write(tmp_path / "a.txt", table, first=first))

@@ -135,6 +135,16 @@ def _factor(
     return known[asked or said or default]
 
 
+@dataclass(frozen=True)
+class SaidUnits:
+    """Units, and the order of quaternions, that a file states outside its column names; None: it states none."""
+
+    length: str | None = None
+    time: str | None = None
+    angle: str | None = None
+    quaternion_order: str | None = None
+
+
 class Reader(ABC):
     """Reads one file format.
 

@@ -13,17 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.demonstrations.arrays import unnamed_columns
 from imitarm.demonstrations.raw import RawDemonstration
-from imitarm.demonstrations.reading import Reader, ReadOptions
+from imitarm.demonstrations.reading import Reader, ReadOptions, SaidUnits
 from imitarm.errors import FileFormatError, InputError
 from imitarm.files.table import Table, kind_of, read_table, split_names
 from imitarm.trajectory import FORMAT, read_demonstration_table
 
 Array = NDArray[np.float64]
-
-# columns without names, by their number ("q": the four numbers of a quaternion)
-UNNAMED = {2: "xy", 3: "xyz", 4: "txyz", 7: "xyzq", 8: "txyzq"}
-COUNTS = "2 (x y), 3 (x y z), 7 (x y z and quaternion), with the time before them 4 or 8"
 
 _UNIT_WORDS = {
     "length": {
@@ -31,9 +28,13 @@ _UNIT_WORDS = {
         **{"mm": "mm millimetre millimetres millimeter millimeters", "in": "in inch inches", "ft": "ft foot feet"},
     },
     "time": {
-        **{"s": "s sec secs second seconds", "ms": "ms msec msecs millis millisec milliseconds"},
-        **{"us": "us usec usecs micros microsec microseconds", "min": "min minute minutes", "h": "h hr hour hours"},
-        "ns": "ns nsec nsecs nanos nanosec nanosecs nanoseconds",
+        **{"s": "s sec secs second seconds", "ms": "ms msec msecs millis millisec millisecond milliseconds"},
+        **{
+            "us": "us usec usecs micros microsec microsecond microseconds",
+            "min": "min minute minutes",
+            "h": "h hr hour hours",
+        },
+        "ns": "ns nsec nsecs nanos nanosec nanosecs nanosecond nanoseconds",
     },
     "angle": {"rad": "rad rads radian radians", "deg": "deg degs degree degrees ° º"},
     "rotation": {"1": "1 -"},  # a quaternion has no unit
@@ -43,7 +44,21 @@ _UNITS = {
 }
 _KINDS = {"t": "time", **dict.fromkeys("xyz", "length"), "joint": "angle"}
 
-_WRAPPERS = {"field", "msg", "data", "header", "pose", "transform", "tool", "tcp", "ee", "actual", "measured", "state"}
+_WRAPPERS = {
+    "field",
+    "msg",
+    "data",
+    "header",
+    "tv",
+    "pose",
+    "transform",
+    "tool",
+    "tcp",
+    "ee",
+    "actual",
+    "measured",
+    "state",
+}
 _TIMES = {"t", "time", "times", "timestamp", "time_stamp", "stamp", "elapsed", "elapsed_time"}
 _TIME_PARTS = {word for word, unit in _UNITS["time"].items() if unit in ("s", "ms", "us", "ns") and len(word) > 1}
 _POSITIONS = ("", "p", "p_", "pos_", "position_", "translation_")
@@ -71,7 +86,10 @@ _NO_ANGLE = {  # words in the name of a joint's column that say what else it hol
 }
 _BRACKETS = re.compile(r"(?P<name>.*?)\s*(?:[\[(](?P<unit>[^\])]*)[\])]|\sin\s(?P<word>\w+))\s*")
 _NUMBERED = re.compile(r"(?:col(?:umn)?\s*)?\d+\s*[:=.)]\s*(?P<name>.+)", re.IGNORECASE)
+_OTHER_ROTATION = re.compile(r"(?:.*[_.])?(?:roll|pitch|yaw|euler\w*|r[xyz]|rot\w*|quat\w*|q_?[0-3])\b.*")
 _ENCLOSED = re.compile(r"^[(\[{]([^()\[\]{}]*)[)\]}]$")
+_UNITS_REMARK = re.compile(r"(?:(?:length|position|time|angle|joint)s?[ _])?units?\s*[:=]\s*(.*)")
+_OTHER_REMARK = re.compile(r"(?:task|source|date|version|format|(?:\w+[ _])?units?)\s*[:=].*", re.IGNORECASE)
 _PROSE_UNIT = re.compile(r"\bin\s+((?!in\b|min\b|h\b)[^\W\d]+)")
 _ORDER = re.compile(r"\b(xyzw|wxyz)\b", re.IGNORECASE)
 _NATIVE_MARK = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s*[#%][^\n]*\n)*?\s*[#%]\s*format:\s*" + FORMAT.encode() + rb"\b")
@@ -92,16 +110,6 @@ class Column:
     unit: str | None = None
     joint: str = ""
     not_angle: str = ""
-
-
-@dataclass(frozen=True)
-class SaidUnits:
-    """Units, and the order of quaternions, that a file states outside its column names; None: it states none."""
-
-    length: str | None = None
-    time: str | None = None
-    angle: str | None = None
-    quaternion_order: str | None = None
 
 
 def column_of(name: str) -> Column:
@@ -184,44 +192,18 @@ def named_columns(
     positions = angles = None
     if axes:
         unit = _one_unit(source, "length", names, units, axes, said.length)
-        positions = options.metres(source, in_space(values[:, axes]), unit)
+        in_space = np.pad(values[:, axes], ((0, 0), (0, 3 - len(axes))))  # planar motions get z = 0
+        positions = options.metres(source, in_space, unit)
     if joints:
         unit = _one_unit(source, "angle", names, units, joints, said.angle)
         angles = np.radians(values[:, joints]) if unit == "deg" else values[:, joints]
     quaternions = values[:, [place[part] for part in ("qw", "qx", "qy", "qz")]] if "qw" in place else None
     ignored = [name for name, column in zip(names, columns, strict=True) if not column.what]
     notes = (f"columns not used: {', '.join(ignored)}",) if ignored else ()
+    if quaternions is None and any(_OTHER_ROTATION.fullmatch(name.strip().lower()) for name in ignored):
+        notes = (f"columns not used: {', '.join(ignored)} (rotations are read only as qw qx qy qz)",)
     joint_names = tuple(columns[i].joint for i in joints)
     return RawDemonstration(source, times, positions, quaternions, angles, joint_names, options.task, notes=notes)
-
-
-def unnamed_columns(
-    source: str, values: Array, options: ReadOptions, said: SaidUnits | None = None
-) -> RawDemonstration:
-    """Sort the columns of a table without names by how many there are (see ``UNNAMED``).
-
-    Raises:
-        InputError: when that number has no meaning, or the options do not fit.
-    """
-    said = said or SaidUnits()
-    layout = UNNAMED.get(values.shape[1])
-    if layout is None:
-        raise FileFormatError(
-            f"{source}: {values.shape[1]} columns without names; known are {COUNTS}. Name them in a first line"
-        )
-    start, n = int(layout[0] == "t"), len(values)
-    times = options.seconds(source, values[:, 0], said.time) if start else options.even_times(source, n)
-    axes = slice(start, start + (2 if layout == "xy" else 3))
-    positions = in_space(options.metres(source, values[:, axes], said.length))
-    quaternions = None
-    if layout.endswith("q"):
-        quaternions = options.wxyz(source, values[:, start + 3 : start + 7], said.quaternion_order)
-    return RawDemonstration(source, times, positions, quaternions, task=options.task)
-
-
-def in_space(positions: Array) -> Array:
-    """Return positions (n, 3); planar positions (n, 2) get z = 0."""
-    return np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
 
 
 def _what_is_there(names: Sequence[str], columns: Sequence[Column]) -> str:
@@ -360,9 +342,9 @@ class TextTableReader(Reader):
 def _said_units(table: Table) -> SaidUnits:
     """Return what the remarks say of units (``# units: cm``, ``# time unit: ms``) and of the order of quaternions."""
     words: list[str] = []
-    for key, value in table.remarks.items():
-        if re.fullmatch(r"((length|position|time|angle|joint)s?[ _])?units?", key) is not None:
-            listed = [word for word in re.split(r"[\s,;]+", value.lower()) if word not in ("", "and", "si")]
+    for _, text in table.remark_lines:
+        if (match := _UNITS_REMARK.fullmatch(text.strip().lower())) is not None:
+            listed = [word for word in re.split(r"[\s,;()\[\]]+", match[1]) if word not in ("", "and", "si")]
             words += [word for word in listed if word != "in" or len(listed) == 1]
     known = {word: (kind, unit) for kind in _UNITS for word, unit in _UNITS[kind].items()}
     prose = [word for _, text in table.remark_lines for word in _PROSE_UNIT.findall(text.lower()) if word in known]
@@ -389,7 +371,8 @@ def _names_of(table: Table) -> tuple[str, ...] | None:
         return table.names
     width = table.values.shape[1]
     misfit: tuple[int, str] | None = None
-    for number, text in reversed(table.remark_lines):
+    remarks = [(number, text) for number, text in table.remark_lines if not _OTHER_REMARK.fullmatch(text.strip())]
+    for number, text in reversed(remarks):
         for part in dict.fromkeys(_ENCLOSED.sub(r"\1", one.strip()) for one in (text, text.partition(":")[2])):
             names = split_names(part)
             fits = len(names) == width and _looks_like_names(names)
@@ -402,12 +385,12 @@ def _names_of(table: Table) -> tuple[str, ...] | None:
                 return names
             if _looks_like_names(words):
                 misfit = misfit or (number, text)
-    listed = [name for _, text in table.remark_lines if (name := _listed_name(text)) is not None]
+    listed = [name for _, text in remarks if (name := _listed_name(text)) is not None]
     if len(listed) == width and _looks_like_names(listed):
         return tuple(listed)
     if misfit is None and _looks_like_names(listed):
-        misfit = table.remark_lines[0]
-    if misfit is None and table.names is not None and table.names_line is not None:
+        misfit = remarks[0]
+    if misfit is None and table.names is not None and table.names_line in dict(remarks):
         misfit = (table.names_line, " ".join(table.names))
     if misfit is not None:
         raise FileFormatError(
