@@ -15,6 +15,7 @@ from imitarm.capture.plausibility import (
     PLAUSIBLE_RATE,
     axes_that_fit,
     find_spikes,
+    hand_speed,
     joint_steps,
     length_unit_that_fits,
     repeats_previous,
@@ -47,6 +48,7 @@ _ARM = {
     side: np.array([JOINT[f"{part}_{side}"] for part in ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")])
     for side in SIDES
 }
+_TIPS = {JOINT[f"{part}_{side}"] for part in ("hand_tip", "thumb") for side in SIDES}
 _TRUNK = np.array([JOINT[name] for name in ("spine_base", "spine_mid", "spine_shoulder", "neck", "head")])
 
 
@@ -169,6 +171,7 @@ class _View:
             self.swapped += [i] if right[-1] is not skeleton.positions else []
         self.path = np.array(right)[self.later]
         self.spikes, self.spike_size = find_spikes(self.times[self.later], self.path)
+        self.hand_speed = hand_speed(self.times[self.later], self.path, self.spikes)
         self.other_axes = axes_that_fit(self.positions)
 
     def issue(self, severity: Severity, code: str, message: str, remedy: str, i: int | None = None) -> RecordingIssue:
@@ -177,19 +180,11 @@ class _View:
             return RecordingIssue(severity, code, message, remedy=remedy)
         return RecordingIssue(severity, code, message, self.frames[i], float(self.times[i] - self.times[0]), remedy)
 
-    def hand_speed(self) -> float:
-        """Return the speed of the faster hand, 95th percentile without spikes [m/s]; nan when none is seen."""
-        wrists = [JOINT[f"wrist_{side}"] for side in SIDES]
-        _, speed = joint_steps(self.times[self.later], self.path)
-        spiky = self.spikes[1:] | self.spikes[:-1]
-        speeds = [speed[~spiky[:, wrist] & np.isfinite(speed[:, wrist]), wrist] for wrist in wrists]
-        return max((float(np.percentile(s, 95.0)) for s in speeds if len(s) >= _FEW), default=np.nan)
-
     def unit_remedy(self) -> str:
         """Return which unit of time fits, or where to look when none does."""
         fit = time_unit_that_fits(1.0 / self.period, self.time_unit)
         if fit is None:
-            return "check the units of time and length"
+            return "look at the spikes and jumps; without them, check the units of time and length"
         name, factor = fit
         return (
             f"the times were read in units of {time_unit_name(self.time_unit)} and fit in {name} "
@@ -235,7 +230,7 @@ def _rate(view: _View) -> Iterator[RecordingIssue]:
     rate = 1.0 / view.period
     message = f"{rate:.1f} frames a second"
     if rate > PLAUSIBLE_RATE[1]:
-        speed = view.hand_speed()
+        speed = view.hand_speed
         quick = speed > _QUICK_HAND
         message += ", more than a skeleton camera delivers"
         message += f"; the hands move at up to {speed:.1f} m/s" if quick else ""
@@ -250,9 +245,9 @@ def _rate(view: _View) -> Iterator[RecordingIssue]:
 
 
 def _hand_speed(view: _View) -> Iterator[RecordingIssue]:
-    speed = view.hand_speed()
+    speed = view.hand_speed
     if speed > FASTEST_HAND:
-        message = f"the hands move at {speed:.0f} m/s (95th percentile), faster than a person's"
+        message = f"the hands move at {speed:.0f} m/s (90th percentile over three frames), faster than a person"
         yield view.issue("error", "hand-speed", message, view.unit_remedy())
 
 
@@ -305,7 +300,8 @@ def _spikes(view: _View) -> Iterator[RecordingIssue]:
         message = f"single-frame spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints leap away and "
         message += f"back, {JOINTS[joints[joint]]} by {size[i, joint]:.2f} m"
         remedy = "repair takes these joints as lost there"
-        yield view.issue("error", "spike", message, remedy, int(view.later[frames[0]]))
+        severity = _severity_of(joints, spikes)
+        yield view.issue(severity, "spike", message, remedy, int(view.later[frames[0]]))
 
 
 def _jumps(view: _View) -> Iterator[RecordingIssue]:
@@ -320,12 +316,18 @@ def _jumps(view: _View) -> Iterator[RecordingIssue]:
         message = f"{int(jump.any(axis=1).sum())} jumps that do not come back, the largest {size[i, joint]:.2f} m from "
         message += f"one frame to the next ({JOINTS[joints[joint]]}, {speed[i, joints[joint]]:.0f} m/s)"
         remedy = "cut there by trim, or record again"
-        yield view.issue("error", "jump", message, remedy, int(view.later[int(np.argmax(jump.any(axis=1))) + 1]))
+        first = int(np.argmax(jump.any(axis=1))) + 1
+        yield view.issue(_severity_of(joints, jump), "jump", message, remedy, int(view.later[first]))
 
 
 def _followed(view: _View) -> list[int]:
     """Return the joints that matter to a robot: those of the arm and of the trunk."""
     return [*_ARM[view.side].tolist(), *_TRUNK.tolist()]
+
+
+def _severity_of(joints: list[int], found: Mask) -> Severity:
+    """Return a warning when only finger tips and thumbs leap: they rotate the tool, but do not move it."""
+    return "error" if any(found[:, i].any() for i, joint in enumerate(joints) if joint not in _TIPS) else "warning"
 
 
 def _arm(view: _View) -> Iterator[RecordingIssue]:

@@ -18,9 +18,10 @@ PLAUSIBLE_LIMB = (0.15, 0.45)  # [m] upper arms and forearms of adults, with mar
 
 _TIME_UNITS = {"ns": 1e-9, "100 ns": 1e-7, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0}  # [s]
 _LENGTH_UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "dm": 0.1, "feet": 0.3048}  # [m]
-FASTEST_HAND = 10.0  # [m/s] faster than a person moves for a robot to follow; real gestures have at most 2.4
+FASTEST_HAND = 10.0  # [m/s] faster than a person moves for a robot to follow; real gestures have at most 2.2
 LARGEST_STEP = 0.3  # [m] from one frame to the next, if it is also faster than FASTEST_HAND
 _UPRIGHT = 0.5  # cosine of the largest angle between spine and vertical, as a median over the recording
+_SPAN, _LEAST_SPANS = 3, 10  # [frames] over which a speed is measured; number of speeds needed
 _SPIKE = 0.2  # [m] a smaller excursion is noise: arms in real gestures have up to 0.10
 _BONE_CHANGE = 0.12  # [m] of a bone's length in a spike
 _SPIKE_WIDTHS, _SPIKE_TIME = (1, 2, 3), 0.25  # [frames] a spike lasts, and [s] from the frame before to the one after
@@ -151,6 +152,26 @@ def joint_steps(times: Array, positions: Array) -> tuple[Array, Array]:
     step = np.linalg.norm(np.diff(positions, axis=0), axis=2)
     period = np.diff(times)[:, None]
     return step, np.where(period > 0.0, step / np.where(period > 0.0, period, 1.0), 0.0)
+
+
+def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
+    """Return how fast the faster hand moves [m/s]: the 90th percentile over three frames, without spikes.
+
+    Args:
+        times: shape (n,) [s], increasing.
+        positions: shape (n, 25, 3) [m].
+        spikes: whether each joint is in a spike, shape (n, 25).
+
+    Returns:
+        the speed; nan when no hand is seen in at least 10 places.
+    """
+    speeds = []
+    for wrist in (JOINT[f"wrist_{side}"] for side in SIDES):
+        moved = np.linalg.norm(positions[_SPAN:, wrist] - positions[:-_SPAN, wrist], axis=1)
+        known = np.isfinite(moved) & ~spikes[_SPAN:, wrist] & ~spikes[:-_SPAN, wrist]
+        if known.sum() >= _LEAST_SPANS:
+            speeds.append(float(np.percentile((moved / (times[_SPAN:] - times[:-_SPAN]))[known], 90.0)))
+    return max(speeds, default=math.nan)
 
 
 def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
