@@ -10,7 +10,7 @@ from imitarm.capture.skeleton import JOINTS, SIDES, HandState, Skeleton, Skeleto
 
 
 def skeletons(n=90, *, seed=3, rate=30.0, start=0.0, person=0, away=0.0):
-    """The truth of a made-up person who reaches about; ``away`` moves the person aside [m]."""
+    """The true motion of a synthetic person who reaches about; ``away`` moves the person aside [m]."""
     truth = reaching(Person.from_seed(seed), seed)
     frames = [truth(2.0 + i / rate) for i in range(n)]
     return [

@@ -1,4 +1,4 @@
-"""check: what is wrong with a recording of a person before a robot follows it; repaired: fixes what needs no guess."""
+"""check: what is wrong with a recording of a person; repaired: fixes what can be fixed without guessing."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ class _View:
         return RecordingIssue(severity, code, message, self.frames[i], float(self.times[i] - self.times[0]), remedy)
 
     def unit_remedy(self) -> str:
-        """Return which unit of time fits, or where to look when none does."""
+        """Return the unit of time that fits; when none does, what to look at instead."""
         fit = time_unit_that_fits(1.0 / self.period, self.time_unit)
         if fit is None:
             return "look at the spikes and jumps; without them, check the units of time and length"

@@ -20,7 +20,7 @@ _TORSO = np.array([JOINT[name] for name in ("spine_shoulder", "spine_mid", "neck
 
 
 class PersonFilter(SkeletonSource):
-    """One person of all whom a source sees.
+    """Passes on one person of a source that may see several.
 
     The first person seen is followed until they have been out of view for more than ``patience`` on the source's
     clock; everybody else is ignored. Only then is another person followed: after so long a gap every retargeter has
@@ -146,7 +146,7 @@ _DECIDING = _pairs(("shoulder", "hip", "elbow", "wrist"))
 
 
 def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
-    r"""Return the skeleton with its sides as they were in the frame before.
+    r"""Return the skeleton with left and right assigned as in the frame before.
 
     Let :math:`l, r` be the positions of a left and a right joint and :math:`l', r'` those in the frame before, a time t
     earlier. Sides are exchanged back when that shortens the motion since the frame before by more than limbs can move:
@@ -169,7 +169,7 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
 
 
 def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
-    """Return the skeleton with its sides as they were at ``before``, positions (25, 3) [m], a ``period`` [s] ago."""
+    """Return the skeleton with left and right as at ``before``, positions (25, 3) [m] a ``period`` [s] earlier."""
     if not (_gain(skeleton.positions, before, _DECIDING, _LEAST) > 0.0).any():  # nearly always
         return skeleton
     order = np.arange(len(JOINTS))
@@ -192,7 +192,7 @@ def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
 
 
 def _gain(now: Array, before: Array, pairs: NDArray[np.int64], margin: float) -> Array:
-    """Return how much closer joints are to where the other side was than to where they were, less ``margin`` / 2.
+    """Return how much closer each joint is to the other side's old position than to its own, minus ``margin`` / 2.
 
     Args:
         now: positions (25, 3) [m].
@@ -238,7 +238,7 @@ class SideMemory:
 
 
 class SideFilter(SkeletonSource):
-    """A source with left and right kept apart, for each person; see :func:`unswapped`.
+    """Passes on a source with left and right kept apart, for each person; see :func:`unswapped`.
 
     Only motion decides: the sides of the first frame are taken as right. After half a second without frames it starts
     anew; by then every retargeter has stopped.
@@ -275,7 +275,7 @@ class SideFilter(SkeletonSource):
 
 
 class RealtimeSource(SkeletonSource):
-    """A source that gives each skeleton no earlier than its time, counted from the first one.
+    """Delays a source, so that each skeleton comes no earlier than its time since the first one.
 
     Args:
         source: gives skeletons as fast as they are asked for.

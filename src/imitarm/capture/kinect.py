@@ -193,7 +193,7 @@ _TRACKING = np.array([Tracking.LOST, Tracking.INFERRED, Tracking.TRACKED, Tracki
 
 
 def _joint_indices() -> tuple[tuple[int, ...], ...]:
-    """Return for each of the 25 joints the SDK's joints whose middle it is."""
+    """Return, for each of the 25 joints, the indices of the SDK's joints; the joint is their middle."""
     named: dict[str, tuple[int, ...]] = {"spine_base": (0,), "spine_mid": (1,), "spine_shoulder": (4, 11)}
     named |= {"neck": (3,), "head": (26,)}  # spine_shoulder: between the clavicles
     arm = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
@@ -245,18 +245,18 @@ class AzureKinectSource(BodyCamera):
         self._wait_for_first(_AZURE_START, "does the body tracking SDK find its graphics card or, slower, its CPU mode")
 
     def _opened(self, driver: Any) -> None:
-        self._kept_alive("find the SDKs", lambda: driver.initialize_libraries(track_body=True))
+        self._call_driver("find the SDKs", lambda: driver.initialize_libraries(track_body=True))
         if self._k4a.k4a_device_get_installed_count() < 1:
             raise InputError(f"{self.name}: no Azure Kinect is plugged in; {_AZURE_NEEDS}; {INSTEAD}")
         settings = driver.Configuration()
         settings.color_resolution = driver.K4A_COLOR_RESOLUTION_OFF
         settings.depth_mode = driver.K4A_DEPTH_MODE_NFOV_UNBINNED
         settings.camera_fps = driver.K4A_FRAMES_PER_SECOND_30
-        self._device = self._kept_alive("open the camera", lambda: driver.start_device(config=settings))
-        self._tracker = self._kept_alive("start body tracking", driver.start_body_tracker)
+        self._device = self._call_driver("open the camera", lambda: driver.start_device(config=settings))
+        self._tracker = self._call_driver("start body tracking", driver.start_body_tracker)
 
-    def _kept_alive(self, what: str, call: Callable[[], Any]) -> Any:
-        """Call the driver and raise an error when it fails, where it would print a message and end the program."""
+    def _call_driver(self, what: str, call: Callable[[], Any]) -> Any:
+        """Call the driver; where it would print a message and end the program, raise an error."""
         said = io.StringIO()
         try:
             with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):

@@ -135,14 +135,14 @@ def _median(points: Array) -> Array:
 
 
 def repeats_previous(positions: Array) -> Mask:
-    """Return which frames after the first are, number by number, the one before; shape (n - 1,)."""
+    """Return which frames, after the first, repeat the one before in every digit; shape (n - 1,)."""
     same = (positions[1:] == positions[:-1]) | (np.isnan(positions[1:]) & np.isnan(positions[:-1]))
     seen = np.any(np.all(np.isfinite(positions[1:]), axis=2), axis=1)
     return np.asarray(same.all(axis=(1, 2)) & seen)
 
 
 def runs(repeated: Mask) -> list[tuple[int, int]]:
-    """Return first and last frame of each run of frames that are all the same."""
+    """Return the first and the last frame of each run of equal frames."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], repeated.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 

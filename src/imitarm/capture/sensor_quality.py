@@ -148,7 +148,7 @@ _LIMBS = {"upper arm": (0, 1), "forearm": (1, 2)}
 
 
 def guarded(recording: SkeletonRecording) -> SkeletonRecording:
-    """Return a recording with left and right kept apart, as a retargeter gets it."""
+    """Return a recording with left and right kept apart, which is what a retargeter gets."""
     return SkeletonRecording(list(SideFilter(recording)), name=recording.name)
 
 

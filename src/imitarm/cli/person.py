@@ -1,4 +1,4 @@
-"""What commands share that take a person's motion from a source: arguments, reading, and showing what is wrong."""
+"""Shared by all commands that read a person from a source: arguments, reading, and printing what is wrong."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def gather(
 
 
 def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton], list[str], Truth | None]:
-    """Read the person that ``source``, ``person``, ``seconds``, ``trim`` and ``pace`` of the arguments name.
+    """Read the person from the source, as the options ``person``, ``seconds``, ``trim`` and ``pace`` say.
 
     A recording is repaired first. What was changed and what is wrong is printed.
 
@@ -171,7 +171,7 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
 
 
 def _slow(truth: Truth, begin: float, pace: float) -> Truth:
-    """Return a motion that is slowed from a time on [s]."""
+    """Return the motion, slowed from the time ``begin`` [s] on."""
     return lambda time: truth(begin + pace * (time - begin))
 
 
