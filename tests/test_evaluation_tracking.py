@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
 from imitarm.evaluation.tracking import (
-    Hold,
+    EngagementPeriods,
     TrueArm,
     best_lag,
     elbow_angle_errors,
@@ -52,8 +52,8 @@ def obeying(true, hold, scale, lag=0.0):
     """A tool that does what the clutch's law says, a constant time late."""
     tool = np.tile(HOME, (len(TIMES), 1))
     for i in range(1, len(TIMES)):
-        if hold.led[i]:
-            e = hold.since[i]
+        if hold.engaged[i]:
+            e = hold.start[i]
             tool[i] = tool[e] + scale * (true.wrist_at(TIMES[i : i + 1] - lag)[0] - true.wrist[e])
         else:
             tool[i] = tool[i - 1]
@@ -73,33 +73,35 @@ def test_the_true_arm_is_the_persons_in_the_axes_of_the_base():
 
 
 def test_an_engagement_lasts_until_the_person_is_let_go():
-    hold = Hold.of(
+    hold = EngagementPeriods.of(
         states(("waiting", 3), ("following", 4), ("coasting", 1), ("stopped", 2), ("following", 2), ("holding", 1))
     )
     assert hold.count == 2
-    np.testing.assert_array_equal(hold.led.nonzero()[0], [3, 4, 5, 6, 7, 10, 11, 12])
-    np.testing.assert_array_equal(hold.since[hold.led], [2] * 5 + [9] * 3)
-    first = Hold.of(states(("waiting", 3), ("following", 4), ("stopped", 2), ("following", 2)), first_only=True)
-    assert first.led.sum() == 8
-    assert set(first.since) == {2}
-    assert Hold.of(states(("waiting", 9))).count == 0
+    np.testing.assert_array_equal(hold.engaged.nonzero()[0], [3, 4, 5, 6, 7, 10, 11, 12])
+    np.testing.assert_array_equal(hold.start[hold.engaged], [2] * 5 + [9] * 3)
+    first = EngagementPeriods.of(
+        states(("waiting", 3), ("following", 4), ("stopped", 2), ("following", 2)), first_only=True
+    )
+    assert first.engaged.sum() == 8
+    assert set(first.start) == {2}
+    assert EngagementPeriods.of(states(("waiting", 9))).count == 0
 
 
 @given(st.floats(0.0, 0.5), st.floats(0.3, 2.0))
 def test_a_constant_lag_is_found_and_taken_out(lag, scale):
-    true, hold = true_arm(), Hold.of(WHOLE)
+    true, hold = true_arm(), EngagementPeriods.of(WHOLE)
     tool = obeying(true, hold, scale, lag)
     found, left = best_lag(true, tool, hold, scale)
     assert found == pytest.approx(lag, abs=2e-3)
     assert left < 5e-4
     if lag > 0.05:
-        assert rms((tool - reference_positions(true, tool, hold, scale))[hold.led]) > 10.0 * left
+        assert rms((tool - reference_positions(true, tool, hold, scale))[hold.engaged]) > 10.0 * left
 
 
 def test_noise_is_left_when_the_lag_is_taken_out():
-    true, hold = true_arm(), Hold.of(WHOLE)
+    true, hold = true_arm(), EngagementPeriods.of(WHOLE)
     noise = np.random.default_rng(0).normal(0.0, 0.01, (len(TIMES), 3))
-    noise[hold.since[-1]] = 0.0
+    noise[hold.start[-1]] = 0.0
     found, left = best_lag(true, obeying(true, hold, 1.0, 0.2) + noise, hold, 1.0)
     assert found == pytest.approx(0.2, abs=0.02)
     assert left == pytest.approx(0.01 * np.sqrt(3.0), rel=0.05)
@@ -108,24 +110,24 @@ def test_noise_is_left_when_the_lag_is_taken_out():
 def test_each_engagement_begins_anew_and_the_first_one_forgives_nothing():
     true = true_arm()
     seen = states(("waiting", 51), ("following", 200), ("stopped", 200), ("following", 350))
-    hold, first = Hold.of(seen), Hold.of(seen, first_only=True)
+    hold, first = EngagementPeriods.of(seen), EngagementPeriods.of(seen, first_only=True)
     tool = obeying(true, hold, 1.0)
-    assert rms((tool - reference_positions(true, tool, hold, 1.0))[hold.led]) == pytest.approx(0.0, abs=1e-12)
-    assert rms((tool - reference_positions(true, tool, first, 1.0))[first.led]) > 0.01
+    assert rms((tool - reference_positions(true, tool, hold, 1.0))[hold.engaged]) == pytest.approx(0.0, abs=1e-12)
+    assert rms((tool - reference_positions(true, tool, first, 1.0))[first.engaged]) > 0.01
 
 
 def test_who_was_never_followed_has_no_lag():
-    true, hold = true_arm(), Hold.of(states(("waiting", 801)))
+    true, hold = true_arm(), EngagementPeriods.of(states(("waiting", 801)))
     assert np.isnan(best_lag(true, np.tile(HOME, (801, 1)), hold, 1.0)).all()
     still = true_arm(np.zeros((801, 3)))
-    lag, left = best_lag(still, np.tile(HOME, (801, 1)), Hold.of(WHOLE), 1.0)
+    lag, left = best_lag(still, np.tile(HOME, (801, 1)), EngagementPeriods.of(WHOLE), 1.0)
     assert np.isnan(lag)
     assert left == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize("orientation", ["hand", "upright", "fixed"])
 def test_rotations_are_those_of_the_clutch(orientation):
-    true, hold = true_arm(), Hold.of(WHOLE)
+    true, hold = true_arm(), EngagementPeriods.of(WHOLE)
     home = quaternion_exp(np.array([0.3, 2.0, -0.4]))
     quaternions = np.tile(home, (len(TIMES), 1))
     wanted = reference_rotations(true, quaternions, hold, orientation)
@@ -152,7 +154,7 @@ def arms(turns):
 
 def test_a_robot_that_turns_its_upper_arm_as_the_person_has_no_error():
     turns = quaternion_exp(0.5 * swinging(TIMES) / 0.1)
-    points, hold = arms(turns), Hold.of(WHOLE)
+    points, hold = arms(turns), EngagementPeriods.of(WHOLE)
     true = TrueArm(TIMES, points[:, 0], points[:, 1], points[:, 2], turns)
     robot = 1.4 * points + [0.0, 0.0, 0.3]  # longer, elsewhere, the same directions
     assert rms(elbow_direction_errors(true, robot, hold)) < 1e-9
@@ -169,10 +171,10 @@ def test_the_elbows_swing_about_the_line_to_the_wrist_is_its_error():
     axis = points[0, 2] / np.linalg.norm(points[0, 2])
     swung = points.copy()
     swung[51:, 1] = rotate(quaternion_exp(0.3 * axis), points[51:, 1])
-    np.testing.assert_allclose(elbow_angle_errors(true, swung, Hold.of(WHOLE))[51:], 0.3, atol=1e-9)
+    np.testing.assert_allclose(elbow_angle_errors(true, swung, EngagementPeriods.of(WHOLE))[51:], 0.3, atol=1e-9)
     straight = points.copy()
     straight[:, 1] = 0.5 * points[:, 2]
-    assert np.isnan(elbow_angle_errors(true, straight, Hold.of(WHOLE))).all()
+    assert np.isnan(elbow_angle_errors(true, straight, EngagementPeriods.of(WHOLE))).all()
 
 
 def test_settling_is_counted_from_the_end_of_the_motion():

@@ -1,1 +1,1 @@
-"""Measures on what was done: motion, tracking, limits, torque, clearance, and the intervals of rates and means."""
+"""Measures of a motion that was done, and their confidence intervals; for the CLI and the benchmark."""

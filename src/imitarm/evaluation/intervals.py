@@ -1,7 +1,7 @@
-"""How sure a figure is: bootstrap over persons, paired comparisons by sign flips, Holm's correction.
+"""Statistical uncertainty: bootstrap over persons, paired comparisons by sign flips, Holm's correction.
 
-Persons are resampled, never frames or recordings: recordings of one person are alike, and counting them as if they
-were not would make every interval too narrow.
+Persons are resampled, not frames or recordings: recordings of one person are similar, and treating them as independent
+would make every interval too narrow.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 _DRAWS = 10_000
-_EXACT = 14  # persons up to which all sign flips are tried; beyond, so many draws as above
+_EXACT = 14  # largest number of persons for which all sign flips are evaluated; beyond: _DRAWS
 _TINY = 1e-12
-_ALIKE, _COUNTS = 0.3, 2  # correlation of one person's trials before any is seen, and how many persons it counts as
-_FINEST = 1000  # steps of a rate at most, where persons have tried unequally often
+_ALIKE, _COUNTS = 0.3, 2  # prior correlation of one person's trials, and how many persons it counts as
+_FINEST = 1000  # largest number of steps of a rate, for unequal numbers of trials
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over persons and where it is with 95 % confidence.
+    """A mean over persons and its 95 % confidence interval.
 
     Attributes:
-        mean: over persons, each by the mean of the own recordings.
-        low: of the interval; nan with fewer than two persons.
-        high: of the interval.
-        persons: how many.
-        used: recordings that had a number.
-        of: recordings that there are.
+        mean: over persons, each represented by the mean of their recordings.
+        low: lower end; nan with fewer than two persons.
+        high: upper end.
+        persons: number of persons.
+        used: recordings with a value.
+        of: all recordings.
     """
 
     mean: float
@@ -45,16 +45,16 @@ class Interval:
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether all of the interval is on one side of zero."""
+        """Whether the whole interval is on one side of zero."""
         return self.low > 0.0 or self.high < 0.0
 
 
 Values = Mapping[tuple[int, Any], float]
-"""A measured number of each recording, by person and whatever else tells recordings apart; nan where there is none."""
+"""A measured value of each recording, by person and another key; nan where there is none."""
 
 
 def person_means(values: Values) -> Array:
-    """Return for each person the mean over the recordings that have a number, in the order of the persons."""
+    """Return for each person the mean over the recordings with a value, in the order of the persons."""
     persons: dict[int, list[float]] = {}
     for (person, _), value in sorted(values.items(), key=lambda item: (item[0][0], str(item[0][1]))):
         if math.isfinite(value):
@@ -81,8 +81,8 @@ def interval(values: Values, *, confidence: float = 0.95, seed: int = 0) -> Inte
 def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) -> tuple[float, float]:
     r"""Return the bootstrap interval of a mean, by percentiles.
 
-    A resampled mean of n samples varies by :math:`\sqrt{(n-1)/n}` too little, so its deviations are widened by the
-    inverse; with ten samples a plain percentile interval of "95 %" covers 90 %.
+    A resampled mean of n samples has a standard deviation that is too small by :math:`\sqrt{(n-1)/n}`, so its
+    deviations are multiplied by the inverse; with ten samples a plain "95 %" percentile interval covers only 90 %.
 
     Args:
         samples: shape (n,).
@@ -107,9 +107,9 @@ class Comparison:
     """One method against another on the same recordings.
 
     Attributes:
-        difference: ours less theirs, over the recordings for which both have a number.
-        relative: that difference over the size of the mean of theirs; nan where that is zero.
-        p: probability of so large a difference when there is none, by sign flips of the persons' differences.
+        difference: first method minus second, over the recordings for which both have a value.
+        relative: that difference relative to the absolute mean of the second; nan where that is zero.
+        p: probability of such a large difference if there is none, by sign flips of the persons' differences.
         corrected: the same after Holm's correction for the comparisons made together.
     """
 
@@ -123,8 +123,8 @@ def compare(ours: Values, theirs: Values) -> Comparison:
     """Compare two methods, paired over recordings.
 
     Args:
-        ours: of each recording.
-        theirs: of the same recordings.
+        ours: values of the first method, by recording.
+        theirs: values of the second method, for the same recordings.
     """
     both = {key: ours[key] - theirs[key] for key in ours if key in theirs}
     paired = {key: theirs[key] for key, value in both.items() if math.isfinite(value)}
@@ -135,21 +135,21 @@ def compare(ours: Values, theirs: Values) -> Comparison:
 
 
 def rate_interval(outcomes: Values) -> Interval:
-    r"""Return a success rate, the mean over persons of each one's own rate, and where it is with 95 % confidence.
+    r"""Return a success rate, the mean over persons of each one's own rate, with its 95 % interval.
 
-    Wilson's interval with :math:`N / D` trials instead of the N that there are (Rao and Scott, Biometrics 1992): trials
-    of one person are alike, and :math:`D = 1 + (m - 1) \rho` says how much less m of them tell than m of strangers.
-    :math:`\rho` is their correlation, from how much more persons' rates differ than those of alike persons would. A few
-    persons tell little of it, so it is mixed with a correlation of 0.3 that counts as much as two persons; where all
-    trials went alike, or there is one person, nothing is known of it and it is 0.3. N / D is never above N, nor below
-    the number of persons.
+    It is Wilson's interval with :math:`N / D` trials instead of the N actual ones (Rao and Scott, Biometrics 1992):
+    trials of one person are similar, and the design effect :math:`D = 1 + (m - 1) \rho` says how much less m of them
+    tell than trials of m persons. :math:`\rho` is their correlation, estimated from how much the persons' rates differ
+    beyond chance. A few persons estimate it poorly, so it is averaged with a prior correlation of 0.3 that counts as
+    two persons; when all trials had the same result, or there is only one person, it is 0.3. N / D is never above N,
+    nor below the number of persons.
 
-    Failures of one person say that persons differ, and one more of another that they don't; so by this alone a failure
-    more could make a claim firmer. The lower end is therefore the least of all results that are as good or better in
-    every trial, and the upper end the greatest of all that are as bad or worse.
+    Failures of one person indicate that persons differ, and one more failure of another person that they do not. So by
+    this alone, an additional failure could narrow the interval. The lower end is therefore the lowest of all results
+    that are at least as good in every trial, and the upper end the highest of all that are at least as bad.
 
     Args:
-        outcomes: of each trial, 1 when it went well, 0 when it did not.
+        outcomes: of each trial, 1 for success, 0 for failure.
     """
     rates = person_means(outcomes)
     n, used = len(rates), sum(math.isfinite(value) for value in outcomes.values())
@@ -164,15 +164,15 @@ def rate_interval(outcomes: Values) -> Interval:
 
 
 def _lower_end(rates: Array, each: float, step: int) -> float:
-    """Return the least lower end of all results in which every person has this rate or a better one.
+    """Return the lowest lower end of all results in which every person has this rate or a better one.
 
-    Of those with one and the same mean, the end is least where persons differ most: where whoever is best has become
-    perfect before another gets better (that one majorizes all others). So these are the only ones to look at.
+    Among those with the same mean, the end is lowest where persons differ most: where the best person becomes perfect
+    before another improves (that result majorises all others). So only these need to be examined.
 
     Args:
         rates: of the persons, shape (n,).
-        each: trials of a person, on average.
-        step: rates are looked at in steps of one over it.
+        each: trials per person, on average.
+        step: rates are examined in steps of one over it.
     """
     own = np.sort(rates)[::-1]
     room = 1.0 - own
@@ -183,11 +183,11 @@ def _lower_end(rates: Array, each: float, step: int) -> float:
 
 
 def _design_effect(rates: Array, each: float) -> Array:
-    """Return how many trials of like persons tell as much as one of a stranger, shape (k,).
+    """Return the design effect: how many trials of one person tell as much as one of an independent person, (k,).
 
     Args:
         rates: of n persons, in k results, shape (k, n).
-        each: trials of a person, on average.
+        each: trials per person, on average.
     """
     n, mean = rates.shape[1], rates.mean(axis=1)
     within, alike = mean * (1.0 - mean), np.full(len(rates), _ALIKE)
@@ -203,8 +203,8 @@ def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tup
     """Return the Wilson score interval of a rate (95 % by default).
 
     Args:
-        successes: how often it went well, 0 to ``trials``; neither need be whole.
-        trials: how often it was tried, at least 1.
+        successes: number of successes, 0 to ``trials``; neither need be an integer.
+        trials: number of trials, at least 1.
         z: normal quantile of the confidence.
     """
     p = min(max(successes / trials, 0.0), 1.0)
@@ -215,12 +215,12 @@ def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tup
 
 
 def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
-    """Return the two-sided probability of so large a mean when every difference could as well be of the other sign.
+    """Return the two-sided probability of such a large mean if every difference could have either sign.
 
-    Exact for up to 14 differences: all sign flips are tried. With n of them it can't be less than 2 / 2^n.
+    Exact for up to 14 differences: all sign flips are evaluated. With n of them it can't be less than 2 / 2^n.
 
     Args:
-        differences: one a person, shape (n,).
+        differences: one per person, shape (n,).
         seed: of the draws, when there are more.
 
     Returns:
@@ -240,7 +240,7 @@ def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Return probabilities corrected for having made so many comparisons (Holm 1979), in the order given."""
+    """Return probabilities corrected for multiple comparisons (Holm 1979), in the order given."""
     order = sorted(range(len(p)), key=lambda i: p[i])
     corrected, largest = [0.0] * len(p), 0.0
     for rank, i in enumerate(order):

@@ -1,4 +1,4 @@
-"""MappingMetrics: what a method made of a recording, as plain values; pure functions of the run (METHODS B)."""
+"""MappingMetrics: the measures of a retargeting as plain values; pure functions of the run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from imitarm.evaluation.motion import (
     violations,
 )
 from imitarm.evaluation.tracking import (
-    Hold,
+    EngagementPeriods,
     TrueArm,
     best_lag,
     elbow_angle_errors,
@@ -34,58 +34,60 @@ from imitarm.retarget.retargeter import Retargeting
 
 Array = NDArray[np.float64]
 
-_REST = 0.5  # [s] at the end, over which the last target is averaged
+_REST = 0.5  # [s] at the end: the last target is averaged over it
 
 
 @dataclass(frozen=True)
 class MappingMetrics:
-    """What a method made of a recording. What is not known is nan.
+    """The measures of a retargeting. Unknown values are nan.
 
-    The reference of tool and elbow is the clutch's law with the *true* hand from the moment the method engaged; each
-    engagement begins anew. Errors are taken over the frames in which the clutch is engaged, so read them beside
-    ``engaged_fraction``; ``tool_rms_from_first`` forgives nothing.
+    The reference of tool and elbow is the clutch's law with the *true* hand since the person began to lead; each
+    engagement starts anew. Errors are averaged over the frames in which the person led, so read them together with
+    ``engaged_fraction``; ``tool_rms_from_first`` includes everything.
 
     Attributes:
         duration: of the robot's motion [s].
-        following_fraction: share of the frames with state "following".
-        engaged_fraction: share of the frames in which the clutch is engaged: following, coasting, holding.
-        engagements: how often the clutch was engaged.
-        tool_rms: distance of the tool to the reference, as it is, lag included, root mean square [m].
-        tool_rms_without_lag: the same with the best constant lag taken out [m].
+        following_fraction: fraction of the frames with state "following".
+        engaged_fraction: fraction of the frames in which the person led: following, coasting, holding.
+        engagements: how often the person began to lead.
+        tool_rms: distance of the tool to the reference, including the lag, root mean square [m].
+        tool_rms_without_lag: the same after removing the best constant lag [m].
         lag: that lag [s].
-        tool_rms_from_first: distance to the reference of the first engagement over all frames after it, whatever
-            the state, lag included [m].
-        executed_rms: distance of the tool to the reference, lag included, when an arm that keeps its limits of
-            position, velocity and acceleration executes the commands [m]: nothing is gained by breaking them.
-        executed_rms_without_lag: the same with the best constant lag taken out [m].
+        tool_rms_from_first: distance to the reference of the first engagement over all frames after it, in any state,
+            including the lag [m].
+        executed_rms: distance of the tool to the reference, including the lag, when an arm that keeps its limits of
+            position, velocity and acceleration executes the commands [m]: commands beyond the limits bring no
+            advantage.
+        executed_rms_without_lag: the same after removing the best constant lag [m].
         target_rms: distance of the tool to the method's own target [m].
         orientation_rms: angle between the tool's rotation and the reference [rad].
-        elbow_direction_rms: angle between the robot's upper arm and where it should point, see
+        elbow_direction_rms: angle between the actual and the correct direction of the robot's upper arm, see
             :func:`~imitarm.evaluation.tracking.elbow_direction_errors` [rad].
         elbow_angle_rms: difference of the changes of the SEW angles of robot and person [rad].
         path_length: of the tool [m].
-        settling_time: from the end of the true hand's motion until the tool stays for 0.5 s within 1 cm of the
-            method's last target [s]; nan when it never does.
-        mean_torque: mean of the absolute torque of each joint [N m].
-        rms_torque: root mean square of each joint's torque [N m].
-        mean_gravity_torque: mean of the absolute torque that holds the weight alone [N m].
-        mean_motion_torque: mean of the absolute torque without the part that holds the weight [N m].
+        settling_time: from the end of the true hand's motion until the tool stays within 1 cm of the method's last
+            target for 0.5 s [s]; nan when it never does.
+        mean_torque: mean absolute torque of each joint [N m].
+        rms_torque: root mean square torque of each joint [N m].
+        mean_gravity_torque: mean absolute torque that holds the weight alone [N m].
+        mean_motion_torque: mean absolute torque without the part that holds the weight [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
-        gravity_effort: the same of the torques that hold the weight [N^2 m^2 s].
-        peak_torque_ratio: largest torque over the rated one.
-        position_violations: frames in which a joint is beyond its range, by finite differences of the positions alone
-            as all violations are.
-        velocity_violations: frames into which a joint moved too fast.
-        acceleration_violations: frames in which a joint changed its velocity too fast.
-        position_excess: by how much the worst joint is beyond its range [rad].
-        velocity_ratio: largest velocity over the one allowed.
-        acceleration_ratio: largest acceleration over the one allowed.
+        gravity_effort: the same for the torques that hold the weight [N^2 m^2 s].
+        peak_torque_ratio: largest torque relative to the rated one.
+        position_violations: frames in which a joint is outside its range; all violations are computed by finite
+            differences of the positions alone.
+        velocity_violations: frames in which a joint moved too fast.
+        acceleration_violations: frames in which the velocity of a joint changed too fast.
+        position_excess: largest distance of a joint from its range [rad].
+        velocity_ratio: largest velocity relative to its limit.
+        acceleration_ratio: largest acceleration relative to its limit.
         jerk_rms: of the tool's position [m/s^3].
         joint_jerk_rms: of all joints together [rad/s^3].
         spectral_arc_length: of the tool's speed; 0 is smoothest.
-        least_singular: smallest singular value of the tool's Jacobian on the way, 1 rad counting as 0.3 m [m/rad].
+        least_singular: smallest singular value of the tool's Jacobian during the motion, 1 rad counted as 0.3 m
+            [m/rad].
         teaching_time: time of a teacher that the method's corrections took [s]; 0 for methods without a teacher.
-        failures: faults that the method itself found and could not mend; 0 for methods that look for none.
+        failures: faults that the method itself detected and could not fix; 0 for methods that detect none.
     """
 
     duration: float
@@ -126,38 +128,38 @@ class MappingMetrics:
 
     @property
     def limit_violations(self) -> int:
-        """Frames that break a limit of position, velocity or acceleration, counted once for each kind of limit."""
+        """Frames that exceed a limit of position, velocity or acceleration, counted once for each kind of limit."""
         return self.position_violations + self.velocity_violations + self.acceleration_violations
 
 
 def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | None = None) -> MappingMetrics:
-    """Measure what a method made of a recording.
+    """Measure a retargeting.
 
     Args:
         run: of the method.
         correspondence: that the method was given.
-        true: where the person's arm was at the times of the run, or, for a method that slows the motion afterwards, at
-            the moments that it reproduces; None when it is not known, as with a real camera: what needs it is nan.
+        true: the person's arm at the times of the run, or, for a method that slows the motion down, at its shown times;
+            None when it is unknown, as with a real camera: whatever needs it is nan.
 
     Raises:
         InputError: when the run is shorter than 4 control periods or a joint position is not finite.
     """
     motion = ArmMotion.of(run.arm, run.times, run.joints)
-    hold = Hold.of(run.states)
+    periods = EngagementPeriods.of(run.states)
     broken = violations(run.arm, run.joints, motion.dt)
     speed = np.linalg.norm(np.diff(motion.tool, axis=0), axis=1) / motion.dt
-    tool_rms, without_lag, lag, from_first, turned, upper_arm, swing = _tracking(
-        run, motion, hold, correspondence, true
+    tool_rms, without_lag, lag, from_first, rotation, upper_arm, swing = _tracking(
+        run, motion, periods, correspondence, true
     )
-    executed_rms, executed_without_lag = _executed(run, motion, hold, correspondence, true)
+    executed_rms, executed_without_lag = _executed(run, motion, periods, correspondence, true)
     targets = run.targets[0]
     aimed = np.isfinite(targets).all(axis=1)
     moving = motion.torques - motion.gravity
     return MappingMetrics(
         duration=float(run.times[-1] - run.times[0]),
         following_fraction=float(np.mean(run.states == "following")),
-        engaged_fraction=float(np.mean(hold.led)),
-        engagements=hold.count,
+        engaged_fraction=float(np.mean(periods.engaged)),
+        engagements=periods.count,
         tool_rms=tool_rms,
         tool_rms_without_lag=without_lag,
         lag=lag,
@@ -165,11 +167,11 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
         executed_rms=executed_rms,
         executed_rms_without_lag=executed_without_lag,
         target_rms=rms((motion.tool - targets)[aimed]),
-        orientation_rms=turned,
+        orientation_rms=rotation,
         elbow_direction_rms=upper_arm,
         elbow_angle_rms=swing,
         path_length=path_length(motion.tool),
-        settling_time=_settling(run, motion, hold, correspondence, true),
+        settling_time=_settling(run, motion, periods, correspondence, true),
         mean_torque=_each(np.abs(motion.torques).mean(axis=0)),
         rms_torque=_each(np.sqrt(np.mean(motion.torques**2, axis=0))),
         mean_gravity_torque=_each(np.abs(motion.gravity).mean(axis=0)),
@@ -193,51 +195,63 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
 
 
 def _tracking(
-    run: Retargeting, motion: ArmMotion, hold: Hold, correspondence: Correspondence, true: TrueArm | None
+    run: Retargeting,
+    motion: ArmMotion,
+    periods: EngagementPeriods,
+    correspondence: Correspondence,
+    true: TrueArm | None,
 ) -> tuple[float, ...]:
-    """Return what is measured against the true arm, in the order of the fields."""
-    if true is None or not hold.led.any():
+    """Return the measures that compare with the true arm, in the order of the fields."""
+    if true is None or not periods.engaged.any():
         return (math.nan,) * 7
-    scale, led = correspondence.scale, hold.led
-    first = Hold.of(run.states, first_only=True)
-    lag, without_lag = best_lag(true, motion.tool, hold, scale)
-    rotations = reference_rotations(true, motion.quaternions, hold, correspondence.orientation)
-    swing = elbow_angle_errors(true, motion.sew, hold)
+    scale, engaged = correspondence.scale, periods.engaged
+    first = EngagementPeriods.of(run.states, first_only=True)
+    lag, without_lag = best_lag(true, motion.tool, periods, scale)
+    rotations = reference_rotations(true, motion.quaternions, periods, correspondence.orientation)
+    swing = elbow_angle_errors(true, motion.sew, periods)
     return (
-        rms((motion.tool - reference_positions(true, motion.tool, hold, scale))[led]),
+        rms((motion.tool - reference_positions(true, motion.tool, periods, scale))[engaged]),
         without_lag,
         lag,
-        rms((motion.tool - reference_positions(true, motion.tool, first, scale))[first.led]),
-        rms(rotation_errors(motion.quaternions, rotations)[led]),
-        rms(elbow_direction_errors(true, motion.sew, hold)[led]),
-        rms(swing[led & np.isfinite(swing)]),
+        rms((motion.tool - reference_positions(true, motion.tool, first, scale))[first.engaged]),
+        rms(rotation_errors(motion.quaternions, rotations)[engaged]),
+        rms(elbow_direction_errors(true, motion.sew, periods)[engaged]),
+        rms(swing[engaged & np.isfinite(swing)]),
     )
 
 
 def _executed(
-    run: Retargeting, motion: ArmMotion, hold: Hold, correspondence: Correspondence, true: TrueArm | None
+    run: Retargeting,
+    motion: ArmMotion,
+    periods: EngagementPeriods,
+    correspondence: Correspondence,
+    true: TrueArm | None,
 ) -> tuple[float, float]:
-    """Return how far an arm that keeps its limits is from the reference: as it is, and without lag."""
-    if true is None or not hold.led.any():
+    """Return the error of an arm that keeps its limits, with and without its lag."""
+    if true is None or not periods.engaged.any():
         return math.nan, math.nan
     tool = run.arm.tool_path(execute_within_limits(run.arm, run.joints, motion.dt))[0]
-    off = tool - reference_positions(true, tool, hold, correspondence.scale)
-    return rms(off[hold.led]), best_lag(true, tool, hold, correspondence.scale)[1]
+    off = tool - reference_positions(true, tool, periods, correspondence.scale)
+    return rms(off[periods.engaged]), best_lag(true, tool, periods, correspondence.scale)[1]
 
 
 def _settling(
-    run: Retargeting, motion: ArmMotion, hold: Hold, correspondence: Correspondence, true: TrueArm | None
+    run: Retargeting,
+    motion: ArmMotion,
+    periods: EngagementPeriods,
+    correspondence: Correspondence,
+    true: TrueArm | None,
 ) -> float:
     """Return the settling time; the last target is the mean of the method's own over its last half second."""
-    if true is None or not hold.led.any():
+    if true is None or not periods.engaged.any():
         return math.nan
     late = run.times >= run.times[-1] - _REST
     targets = run.targets[0][late]
     targets = targets[np.isfinite(targets).all(axis=1)]
     if len(targets) == 0:
-        if not hold.led[-1]:
+        if not periods.engaged[-1]:
             return math.nan
-        targets = reference_positions(true, motion.tool, hold, correspondence.scale)[late]
+        targets = reference_positions(true, motion.tool, periods, correspondence.scale)[late]
     end = motion_end(run.times, true.wrist)
     return settling_time(run.times, motion.tool, targets.mean(axis=0), end)
 

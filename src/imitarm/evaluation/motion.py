@@ -1,4 +1,4 @@
-"""What the joint positions alone tell of a robot's motion: path, torques, limits, smoothness, singularity."""
+"""Measures of a robot's motion from the joint positions alone: path, torques, limits, smoothness, singularity."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from imitarm.kinematics.ik_problem import ROTATION_LENGTH
 
 Array = NDArray[np.float64]
 
-HIGHEST = 20.0  # [Hz] of the spectrum that counts for smoothness
-QUIET = 0.05  # what is smaller than this share of the spectrum's beginning does not count
-_PADDING = 4  # powers of two by which a spectrum is drawn finer
-_ROUNDING = 1e-6  # share by which a limit of velocity or acceleration may be passed: what rounding does to differences
-_ROUNDED = 1e-9  # [rad] the same of a position
+HIGHEST = 20.0  # [Hz] highest frequency that counts for smoothness
+QUIET = 0.05  # smaller amplitudes, relative to the first, do not count
+_PADDING = 4  # powers of two by which the spectrum is refined
+_ROUNDING = 1e-6  # relative tolerance of velocity and acceleration limits: rounding of differences
+_ROUNDED = 1e-9  # [rad] tolerance of a position limit
 
 
 @dataclass(frozen=True, eq=False)
 class ArmMotion:
-    """A motion of an arm, and what belongs to each of its postures.
+    """A joint motion of an arm, with the quantities of each posture.
 
     Attributes:
         dt: sampling period [s].
-        joints: shape (n, n_joints) [rad].
-        tool: positions of the tool, shape (n, 3) [m].
+        joints: joint positions, shape (n, n_joints) [rad].
+        tool: positions of the tool in the base frame, shape (n, 3) [m].
         quaternions: rotations of the tool, wxyz, shape (n, 4).
-        sew: shoulder, elbow and wrist, shape (n, 3, 3) [m]; nan for an arm that does not say where they are.
-        torques: that the motion takes, by inverse dynamics, shape (n, n_joints) [N m].
-        gravity: the part of them that holds the weight, shape (n, n_joints) [N m].
-        least_singular: smallest singular value of the tool's Jacobian, 1 rad counting as 0.3 m, shape (n,) [m/rad].
+        sew: shoulder, elbow and wrist, shape (n, 3, 3) [m]; nan for an arm without these landmarks.
+        torques: required for the motion, by inverse dynamics, shape (n, n_joints) [N m].
+        gravity: the part of them that holds the arm's weight, shape (n, n_joints) [N m].
+        least_singular: smallest singular value of the tool's Jacobian, 1 rad counted as 0.3 m, shape (n,) [m/rad].
     """
 
     dt: float
@@ -46,9 +46,9 @@ class ArmMotion:
 
     @classmethod
     def of(cls, arm: ArmModel, times: ArrayLike, joints: ArrayLike) -> ArmMotion:
-        """Take a motion apart.
+        """Compute them from joint positions.
 
-        Velocity and acceleration are central differences of the positions; the motion begins at rest.
+        Velocity and acceleration are central differences of the positions.
 
         Args:
             arm: whose motion.
@@ -71,7 +71,7 @@ class ArmMotion:
         n, marked, site = len(t), arm.landmarks is not None, arm.site("tool")
         tool, quaternions, sew = np.empty((n, 3)), np.empty((n, 4)), np.full((n, 3, 3), np.nan)
         jacobians, torques, gravity = np.empty((n, 6, arm.n_joints)), np.empty_like(q), np.empty_like(q)
-        for i, posture in enumerate(q):  # all of one posture at once: its kinematics is computed once
+        for i, posture in enumerate(q):  # one posture at a time: its kinematics is computed once
             pose = arm.tool_pose(posture)
             tool[i], quaternions[i] = pose.position, pose.quaternion
             jacobians[i] = arm.at(posture).site_jacobian(site)
@@ -86,15 +86,15 @@ class ArmMotion:
 
 @dataclass(frozen=True)
 class Violations:
-    """In how many frames a motion is beyond what its arm allows, and by how much.
+    """In how many frames a motion exceeds the limits of its arm, and by how much.
 
     Attributes:
-        position: frames in which a joint is beyond its range.
-        velocity: frames into which a joint moved faster than it may.
-        acceleration: frames in which a joint's velocity changed faster than it may.
-        position_excess: by how much the worst joint is beyond its range [rad]; 0 when none is.
-        velocity_ratio: largest velocity over the one allowed.
-        acceleration_ratio: largest acceleration over the one allowed.
+        position: frames in which a joint is outside its range.
+        velocity: frames in which a joint moved too fast.
+        acceleration: frames in which the velocity of a joint changed too fast.
+        position_excess: largest distance of a joint from its range [rad]; 0 when all are inside.
+        velocity_ratio: largest velocity relative to its limit.
+        acceleration_ratio: largest acceleration relative to its limit.
     """
 
     position: int
@@ -106,7 +106,7 @@ class Violations:
 
 
 def violations(arm: ArmModel, joints: ArrayLike, dt: float) -> Violations:
-    """Count what breaks a limit, by finite differences of the positions alone; the motion begins at rest.
+    """Count the frames that exceed a limit, by finite differences of the positions alone; the motion starts at rest.
 
     Args:
         arm: whose limits.
@@ -135,19 +135,20 @@ def path_length(positions: ArrayLike) -> float:
 
 
 def jerk_rms(positions: ArrayLike, dt: float) -> float:
-    """Return the root mean square over time of the length of the third difference of (n, d), in its unit over s^3."""
+    """Return the RMS over time of the norm of the third difference of (n, d) / dt^3, in its unit per s^3."""
     jerk = np.diff(np.asarray(positions, dtype=float), 3, axis=0) / dt**3
     return float(np.sqrt(np.mean(np.sum(jerk * jerk, axis=1))))
 
 
 def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
-    r"""Return how smooth a motion is by the length of its speed's spectrum: 0 is smoothest (METHODS F).
+    r"""Return the smoothness of a motion as the arc length of its speed's spectrum; 0 is smoothest.
 
     .. math:: -\int_0^{\omega_c} \sqrt{\left(\tfrac{1}{\omega_c}\right)^2
               + \left(\tfrac{d\hat V}{d\omega}\right)^2}\, d\omega, \qquad \hat V = |V(\omega)| / |V(0)|
 
-    with :math:`\omega_c` the largest frequency up to 20 Hz where :math:`\hat V` is above 0.05. It depends on how many
-    movements a recording holds, so compare only motions of one recording.
+    with :math:`\omega_c` the largest frequency up to 20 Hz at which :math:`\hat V` exceeds 0.05 (Balasubramanian et
+    al., IEEE Trans. Biomed. Eng. 2012). The value depends on the number of movements in a recording, so compare only
+    motions of the same recording.
 
     Args:
         speed: of a point, shape (n,) [m/s].

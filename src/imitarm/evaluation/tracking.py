@@ -1,4 +1,4 @@
-"""How well a robot's tool and elbow follow a person's, measured against where the person's arm truly was."""
+"""How well a robot's tool and elbow follow a person's arm, compared with its true or its measured positions."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from imitarm.retarget.human_arm import hand_rotation
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LAGS = np.round(np.arange(-0.10, 0.801, 0.01), 2)  # [s] among which the best constant lag is sought
-_BENT = 0.04  # squared sine of the angle at an elbow below which where it is on its circle is not asked
+LAGS = np.round(np.arange(-0.10, 0.801, 0.01), 2)  # [s] candidates for the best constant lag
+_BENT = 0.04  # squared sine of an elbow angle below which the SEW angle is poorly defined
 _MOVES = 1e-3  # [m] a hand that moves less has no lag
 _STILL = 1e-3  # [m] a target that moves less has no lag
 _FOLLOWS = 0.5  # of the target's own motion (RMS); a tool with a larger error does not follow
@@ -33,14 +33,14 @@ _FOLLOWS = 0.5  # of the target's own motion (RMS); a tool with a larger error d
 
 @dataclass(frozen=True, eq=False)
 class TrueArm:
-    """Where a person's arm truly was, in the axes of the robot's base.
+    """Where a person's arm was, in the axes of the robot's base.
 
     Attributes:
-        times: of each sample of the run it is compared with, shape (n,) [s]; they never go back.
+        times: of each sample of the run it is compared with, shape (n,) [s]; non-decreasing.
         shoulder: shape (n, 3) [m].
         elbow: shape (n, 3) [m].
         wrist: shape (n, 3) [m].
-        hand: rotation, wxyz, shape (n, 4).
+        hand: rotation, quaternion wxyz, shape (n, 4).
     """
 
     times: Array
@@ -51,12 +51,12 @@ class TrueArm:
 
     @classmethod
     def of(cls, truth: Truth, times: ArrayLike, correspondence: Correspondence, *, start: float = 0.0) -> TrueArm:
-        """Ask a person in motion where the arm was.
+        """Sample the true positions of a simulated or captured person.
 
         Args:
-            truth: the person; asked in the order of the times.
+            truth: the person's skeleton over time; called in the order of the times.
             times: of a run, shape (n,) [s].
-            correspondence: which arm, and how the sensor stands.
+            correspondence: which arm, and the pose of the sensor.
             start: the person's time at the run's time 0, which is that of its first skeleton [s].
         """
         t = np.asarray(times, dtype=float)
@@ -66,12 +66,12 @@ class TrueArm:
 
     @classmethod
     def from_points(cls, times: ArrayLike, points: ArrayLike, correspondence: Correspondence) -> TrueArm:
-        """Take an arm's points over time.
+        """Convert an arm's points over time.
 
         Args:
             times: shape (n,) [s].
             points: shoulder, elbow, wrist, hand, hand tip, thumb, in the sensor's frame, shape (n, 6, 3) [m].
-            correspondence: how the sensor stands.
+            correspondence: the pose of the sensor.
         """
         t, points = np.asarray(times, dtype=float), correspondence.sensor_to_base.apply(points)
         hands, hand = np.empty((len(t), 3, 3)), np.eye(3)
@@ -82,26 +82,26 @@ class TrueArm:
         return cls(t, points[:, 0], points[:, 1], points[:, 2], matrix_to_quaternion(hands))
 
     def wrist_at(self, times: Array) -> Array:
-        """Return where the wrist was at times (m,) [s], shape (m, 3) [m]; beyond the ends where it was there."""
+        """Return the position of the wrist at times (m,) [s], shape (m, 3) [m]; beyond the ends that of the end."""
         return np.column_stack([np.interp(times, self.times, column) for column in self.wrist.T])
 
 
 def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Correspondence) -> TrueArm:
-    """Return a person's arm as a recording shows it, noise and all, between its frames by straight lines.
+    """Return a person's arm as a recording shows it, with its noise, linearly interpolated between frames.
 
-    Measured against it a method can't be better than the camera, and a smooth one looks a little worse than it is.
+    Compared with it, no method can be better than the camera, and a smooth method appears slightly worse than it is.
 
     Args:
-        skeletons: in the order of their times.
+        skeletons: in order of time.
         times: since the first skeleton, shape (n,) [s].
-        correspondence: which arm, and how the sensor stands.
+        correspondence: which arm, and the pose of the sensor.
 
     Raises:
         TaskFailedError: when shoulder, elbow and wrist are never seen together.
     """
     arms = [arm for arm in (skeleton.arm(correspondence.side) for skeleton in skeletons) if arm.seen]
     if not arms:
-        raise TaskFailedError(f"the {correspondence.side} arm is never seen; choose the other by --side")
+        raise TaskFailedError(f"the {correspondence.side} arm is never seen; choose the other one (--side)")
     t = np.asarray(times, dtype=float)
     at = np.array([arm.time for arm in arms]) - skeletons[0].time
     points = correspondence.sensor_to_base.apply(np.array([arm.points for arm in arms]).reshape(-1, 3))
@@ -119,82 +119,86 @@ def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Co
 
 
 @dataclass(frozen=True, eq=False)
-class Hold:
-    """When a run followed the person, and what it took hold of.
+class EngagementPeriods:
+    """When the person led during a run, and from where.
 
     Attributes:
-        led: whether the clutch is engaged, shape (n,).
-        since: for each frame the frame just before the clutch was engaged, shape (n,); meaningless while it is not.
-        count: how often it was engaged.
+        engaged: whether the person led, shape (n,).
+        start: for each frame the frame just before the person began to lead, shape (n,); undefined where nobody led.
+        count: how often the person began to lead.
     """
 
-    led: Mask
-    since: NDArray[np.intp]
+    engaged: Mask
+    start: NDArray[np.intp]
     count: int
 
     @classmethod
-    def of(cls, states: ArrayLike, *, first_only: bool = False) -> Hold:
-        """Find it in the states of a run, shape (n,).
+    def of(cls, states: ArrayLike, *, first_only: bool = False) -> EngagementPeriods:
+        """Find the engagements in the states of a run, shape (n,).
 
         Args:
             states: values of :class:`~imitarm.retarget.engagement.EngagementState`.
-            first_only: judge all that comes after the first engagement by it, as if the person had never been let go.
+            first_only: treat everything after the first engagement as one engagement, as if the person had never been
+                lost.
         """
-        led = engaged_samples(states)
-        begins = np.flatnonzero(led & ~np.concatenate([[False], led[:-1]]))
-        frames = np.arange(len(led))
+        engaged = engaged_samples(states)
+        begins = np.flatnonzero(engaged & ~np.concatenate([[False], engaged[:-1]]))
+        frames = np.arange(len(engaged))
         if len(begins) == 0:
-            return cls(led, np.zeros(len(led), dtype=np.intp), 0)
+            return cls(engaged, np.zeros(len(engaged), dtype=np.intp), 0)
         if first_only:
-            before = np.full(len(led), max(int(begins[0]) - 1, 0), dtype=np.intp)
+            before = np.full(len(engaged), max(int(begins[0]) - 1, 0), dtype=np.intp)
             return cls(frames >= begins[0], before, 1)
         which = np.maximum(np.searchsorted(begins, frames, side="right") - 1, 0)
-        return cls(led, np.maximum(begins[which] - 1, 0), len(begins))
+        return cls(engaged, np.maximum(begins[which] - 1, 0), len(begins))
 
 
-def reference_positions(true: TrueArm, tool: Array, hold: Hold, scale: float, lag: float = 0.0) -> Array:
-    r"""Return where the tool should be by the clutch's law with the true hand (METHODS A.5).
+def reference_positions(
+    true: TrueArm, tool: Array, periods: EngagementPeriods, scale: float, lag: float = 0.0
+) -> Array:
+    r"""Return the correct position of the tool: the clutch's law with the true hand (docs/retargeting.md).
 
     .. math:: p(t) = p_{home} + \rho\,(W(t - lag) - W(t_e))
 
-    with :math:`t_e` the moment the clutch engaged, and :math:`p_{home}` where the tool was then.
+    with :math:`t_e` the time at which the person began to lead, and :math:`p_{home}` the position of the tool at that
+    time.
 
     Args:
         true: the person's arm, in the axes of the base.
-        tool: where the tool was, shape (n, 3) [m].
-        hold: when the clutch was engaged.
+        tool: positions of the tool, shape (n, 3) [m].
+        periods: when the person led.
         scale: rho.
         lag: by which the tool may be late [s].
 
     Returns:
-        shape (n, 3) [m]; meaningless where the clutch is not engaged.
+        shape (n, 3) [m]; undefined where nobody led.
     """
-    return tool[hold.since] + scale * (true.wrist_at(true.times - lag) - true.wrist[hold.since])
+    return tool[periods.start] + scale * (true.wrist_at(true.times - lag) - true.wrist[periods.start])
 
 
-def reference_rotations(true: TrueArm, quaternions: Array, hold: Hold, orientation: str) -> Array:
-    """Return how the tool should be turned by the clutch's law with the true hand, wxyz, shape (n, 4).
+def reference_rotations(true: TrueArm, quaternions: Array, periods: EngagementPeriods, orientation: str) -> Array:
+    """Return the correct rotation of the tool: the clutch's law with the true hand, quaternions wxyz, shape (n, 4).
 
     Args:
         true: the person's arm, in the axes of the base.
         quaternions: of the tool, wxyz, shape (n, 4).
-        hold: when the clutch was engaged.
+        periods: when the person led.
         orientation: ``"hand"``, ``"upright"`` or ``"fixed"``, see
             :class:`~imitarm.retarget.correspondence.Correspondence`.
     """
-    home = quaternions[hold.since]
+    home = quaternions[periods.start]
     if orientation == "fixed":
         return home
-    turn = quaternion_multiply(true.hand, quaternion_conjugate(true.hand[hold.since]))
+    rotation = quaternion_multiply(true.hand, quaternion_conjugate(true.hand[periods.start]))
     if orientation == "upright":
-        turn = turn * np.array([1.0, 0.0, 0.0, 1.0])
-        length = np.linalg.norm(turn, axis=1, keepdims=True)
-        turn = np.where(length < 1e-9, [1.0, 0.0, 0.0, 0.0], turn / np.maximum(length, 1e-9))
-    return quaternion_multiply(turn, home)
+        rotation = rotation * np.array([1.0, 0.0, 0.0, 1.0])
+        length = np.linalg.norm(rotation, axis=1, keepdims=True)
+        rotation = np.where(length < 1e-9, [1.0, 0.0, 0.0, 0.0], rotation / np.maximum(length, 1e-9))
+    return quaternion_multiply(rotation, home)
 
 
 def rms(errors: ArrayLike) -> float:
-    """Return the root mean square of numbers (n,) or of the lengths of vectors (n, d); nan of none."""
+    """Return the root mean square of numbers (n,) or of the norms of vectors (n, d); nan if there are none."""
     values = np.asarray(errors, dtype=float)
     if len(values) == 0:
         return float("nan")
@@ -202,17 +206,17 @@ def rms(errors: ArrayLike) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
-def best_lag(true: TrueArm, tool: Array, hold: Hold, scale: float) -> tuple[float, float]:
-    """Return the constant lag with which the tool follows best [s], and the RMS error that is left then [m].
+def best_lag(true: TrueArm, tool: Array, periods: EngagementPeriods, scale: float) -> tuple[float, float]:
+    """Return the constant lag with which the tool follows best [s], and the remaining RMS error [m].
 
-    The lags from -0.1 to 0.8 s are tried, and the least of the parabola through the best and its neighbours is taken.
-    Both are nan when the clutch was never engaged; the lag also when the hand did not move.
+    Lags from -0.1 to 0.8 s are tried; the result is the minimum of the parabola through the best and its neighbours.
+    Both are nan when nobody ever led; the lag is also nan when the hand did not move.
     """
-    led = hold.led
-    if not led.any():
+    engaged = periods.engaged
+    if not engaged.any():
         return float("nan"), float("nan")
-    errors = np.array([rms((tool - reference_positions(true, tool, hold, scale, lag))[led]) for lag in LAGS])
-    if not np.ptp(true.wrist[led], axis=0).max() > _MOVES:
+    errors = np.array([rms((tool - reference_positions(true, tool, periods, scale, lag))[engaged]) for lag in LAGS])
+    if not np.ptp(true.wrist[engaged], axis=0).max() > _MOVES:
         return float("nan"), float(errors[np.argmin(np.abs(LAGS))])
     i = int(np.argmin(errors))
     if i in {0, len(LAGS) - 1}:
@@ -221,11 +225,11 @@ def best_lag(true: TrueArm, tool: Array, hold: Hold, scale: float) -> tuple[floa
     curved = before - 2.0 * here + after
     shift = 0.5 * (before - after) / curved if curved > 0.0 else 0.0
     lag = float(LAGS[i] + shift * (LAGS[1] - LAGS[0]))
-    return lag, rms((tool - reference_positions(true, tool, hold, scale, lag))[led])
+    return lag, rms((tool - reference_positions(true, tool, periods, scale, lag))[engaged])
 
 
 def target_lag(times: ArrayLike, tool: ArrayLike, targets: ArrayLike) -> float:
-    """Return the constant lag with which a tool follows its target best [s], among those from 0 to 0.8 s.
+    """Return the constant lag with which a tool follows its target best [s], from 0 to 0.8 s.
 
     Args:
         times: evenly spaced, shape (n,) [s].
@@ -233,65 +237,66 @@ def target_lag(times: ArrayLike, tool: ArrayLike, targets: ArrayLike) -> float:
         targets: shape (n, 3) [m]; nan where there is none.
 
     Returns:
-        nan when there is no target, it does not move, or the tool is so far from it at any lag that it does not
-        follow: farther than half of what the target goes about its middle (RMS).
+        nan when there is no target, it does not move, or the tool does not follow it: at every lag its error exceeds
+        half of the target's own motion about its mean (RMS).
     """
     t, p, aim = (np.asarray(values, dtype=float) for values in (times, tool, targets))
     known = np.isfinite(aim).all(axis=1)
     if not known.any() or not np.ptp(aim[known], axis=0).max() > _STILL:
         return float("nan")
-    goes = rms(aim[known] - aim[known].mean(axis=0))
+    motion = rms(aim[known] - aim[known].mean(axis=0))
     dt, errors = float(t[1] - t[0]), {}
-    for lag in np.abs(LAGS[LAGS >= 0.0]):  # there is a -0.0 among them
+    for lag in np.abs(LAGS[LAGS >= 0.0]):  # abs: there is a -0.0 among them
         steps = round(float(lag) / dt)
         both = known[: len(p) - steps]  # the target then, the tool now
         if both.any():
             errors[float(lag)] = rms((p[steps:] - aim[: len(p) - steps])[both])
     best = min(errors, key=errors.__getitem__)
-    return best if errors[best] < _FOLLOWS * goes else float("nan")
+    return best if errors[best] < _FOLLOWS * motion else float("nan")
 
 
 def rotation_errors(first: Array, second: Array) -> Array:
-    """Return the angles between rotations, wxyz (n, 4), shape (n,) [rad]."""
+    """Return the angles between rotations, quaternions wxyz (n, 4), shape (n,) [rad]."""
     both = quaternion_multiply(quaternion_conjugate(first), second)
     return 2.0 * np.arctan2(np.linalg.norm(both[:, 1:], axis=1), np.abs(both[:, 0]))
 
 
-def elbow_direction_errors(true: TrueArm, sew: Array, hold: Hold) -> Array:
-    """Return the angle between where the robot's upper arm points and where it should, shape (n,) [rad].
+def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) -> Array:
+    """Return the angle between the actual and the correct direction of the robot's upper arm, shape (n,) [rad].
 
-    It should have turned since the clutch engaged by the smallest rotation that turned the person's upper arm.
+    Since the person began to lead, it should have rotated by the smallest rotation that took the person's upper arm
+    from its direction then to that now.
 
     Args:
         true: the person's arm, in the axes of the base.
         sew: the robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
-        hold: when the clutch was engaged.
+        periods: when the person led.
     """
     person, robot = _unit(true.elbow - true.shoulder), _unit(sew[:, 1] - sew[:, 0])
-    wanted = _turned(person[hold.since], person, robot[hold.since])
+    wanted = _rotated(person[periods.start], person, robot[periods.start])
     return np.arctan2(np.linalg.norm(np.cross(wanted, robot), axis=1), np.sum(wanted * robot, axis=1))
 
 
-def elbow_angle_errors(true: TrueArm, sew: Array, hold: Hold) -> Array:
-    """Return by how much the robot's SEW angle changed otherwise than the person's since the clutch engaged.
+def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) -> Array:
+    """Return the difference of the changes of the SEW angles of robot and person since the person began to lead.
 
     Args:
         true: the person's arm, in the axes of the base.
         sew: the robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
-        hold: when the clutch was engaged.
+        periods: when the person led.
 
     Returns:
-        shape (n,) [rad], 0 to pi; nan where one of the arms is so straight that its elbow's angle says little.
+        shape (n,) [rad], 0 to pi; nan where one of the arms is so straight that its elbow angle is poorly defined.
     """
     person = sew_derivatives(true.shoulder, true.elbow, true.wrist)
     robot = sew_derivatives(sew[:, 0], sew[:, 1], sew[:, 2])
-    off = (robot.angle - robot.angle[hold.since]) - (person.angle - person.angle[hold.since])
+    off = (robot.angle - robot.angle[periods.start]) - (person.angle - person.angle[periods.start])
     bent = (person.bend > _BENT) & (robot.bend > _BENT)
     return np.where(bent, np.abs(np.angle(np.exp(1j * np.nan_to_num(off)))), np.nan)
 
 
 def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, rest: float = 0.5) -> float:
-    """Return when a point came within ``radius`` [m] of where it was, on average, in the last ``rest`` seconds.
+    """Return when a point came within ``radius`` [m] of its mean position in the last ``rest`` seconds.
 
     Args:
         times: shape (n,) [s].
@@ -308,18 +313,18 @@ def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, res
 def settling_time(
     times: ArrayLike, positions: ArrayLike, goal: ArrayLike, end: float, radius: float = 0.01, stay: float = 0.5
 ) -> float:
-    """Return how long after ``end`` a point comes within ``radius`` of the goal to stay there for ``stay`` seconds.
+    """Return how long after ``end`` a point comes within ``radius`` of the goal and stays there for ``stay`` seconds.
 
     Args:
         times: evenly spaced, shape (n,) [s].
         positions: shape (n, 3) [m].
         goal: shape (3,) [m].
-        end: when the motion that leads there was over [s].
+        end: when the motion towards the goal was over [s].
         radius: [m].
         stay: [s].
 
     Returns:
-        [s], at least 0; nan when it does not come, or the recording is over before it has stayed.
+        [s], at least 0; nan when it never does, or the recording ends before it has stayed.
     """
     t = np.asarray(times, dtype=float)
     inside = np.linalg.norm(np.asarray(positions, dtype=float) - np.asarray(goal, dtype=float), axis=1) <= radius
@@ -335,8 +340,8 @@ def _unit(vectors: Array) -> Array:
         return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _turned(before: Array, after: Array, vectors: Array) -> Array:
-    """Return vectors (n, 3) turned by the smallest rotations that turn unit vectors ``before`` into ``after``."""
+def _rotated(before: Array, after: Array, vectors: Array) -> Array:
+    """Return vectors (n, 3) rotated by the smallest rotations that take unit vectors ``before`` to ``after``."""
     both = before + after
-    share = np.sum(both * vectors, axis=1) / np.maximum(1.0 + np.sum(before * after, axis=1), 1e-12)
-    return vectors - share[:, None] * both + 2.0 * np.sum(before * vectors, axis=1, keepdims=True) * after
+    factor = np.sum(both * vectors, axis=1) / np.maximum(1.0 + np.sum(before * after, axis=1), 1e-12)
+    return vectors - factor[:, None] * both + 2.0 * np.sum(before * vectors, axis=1, keepdims=True) * after
