@@ -76,7 +76,7 @@ def test_every_near_pair_has_its_row(arm, seed, spin):
     rng = np.random.default_rng(seed)
     q = arm.home + 0.3 * rng.normal(size=arm.n_joints)
     scene = near_scene(arm, q, rng, angular_velocity=spin)
-    rows = ClearanceLimit(arm, 0.02, rate=5.0, influence=0.1).rows(q, scene)
+    rows = ClearanceLimit(arm, 0.02, rate=5.0, retreat_rate=5.0, influence=0.1).rows(q, scene)
     expected = all_rows(arm, q, scene, 0.02, 5.0, 0.1)
     assert len(expected[1]) > 10
     np.testing.assert_allclose(sorted_rows(rows.matrix, rows.lower), sorted_rows(*expected), atol=1e-8)
@@ -90,7 +90,7 @@ def test_rows_equal_the_finite_difference_of_the_clearance(arm, spin):
         for _ in range(5):
             q = arm.home + 0.3 * rng.normal(size=arm.n_joints)
             scene = Scene(None, near_scene(arm, q, rng, [kind], angular_velocity=spin).obstacles[:1])
-            rows = ClearanceLimit(arm, 0.02, rate=0.0).rows(q, scene)
+            rows = ClearanceLimit(arm, 0.02, rate=0.0, retreat_rate=0.0).rows(q, scene)
             if rows is None:
                 continue
             qd = rng.normal(size=arm.n_joints)

@@ -85,13 +85,7 @@ class SafetyFilter:
         self.arm, self.dt, self.clearance = arm, dt, clearance
         self.solver = IKSolver(arm, limits, dt=dt, method=method)
         self._obstacles = None if clearance is None else ClearanceLimit(arm, clearance + allowance)
-        self._own = None if self_clearance is None else SelfClearance(arm, self_clearance).watch(dt)
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin a new run."""
-        if self._own is not None:
-            self._own.reset()
+        self._own = None if self_clearance is None else SelfClearance(arm, self_clearance)
 
     def step(self, command: Command, q: ArrayLike, velocity: ArrayLike | None, scene: Scene) -> SafetyStep:
         """Return the joint velocity for one control period.

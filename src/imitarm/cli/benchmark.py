@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from imitarm.benchmark import avoidance, real_motions
+from imitarm.benchmark import avoidance, placements, real_motions
 from imitarm.benchmark.experiment import METHODS, Result
 from imitarm.benchmark.mapping import MappingBenchmark, tables, write_tables
 from imitarm.benchmark.mapping_tables import TEST, Results
@@ -18,9 +18,11 @@ from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.running import LOCAL, run_all
 from imitarm.benchmark.tables import Place, Table
 from imitarm.cli.outputs import check_outputs, same_place
+from imitarm.cli.robot_options import add_robot_options
 from imitarm.cli.run_scene import provenance
 from imitarm.cli.screen import progress_bar, remark, say, show_table
 from imitarm.errors import InputError
+from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
 
 EPILOG = """\
@@ -30,6 +32,7 @@ examples:
   imitarm benchmark mapping --methods modern thesis --people 4 --no-live
   imitarm benchmark mapping --methods modern thesis --no-replay --sigma 5
   imitarm benchmark avoidance --seeds 200
+  imitarm benchmark placements --skill pour.json --robot panda --tool gripper --seeds 100
   imitarm benchmark people recordings person.mp4
 
 'mapping' saves each result in the folder --out; after Ctrl-C the same command continues where it stopped.
@@ -81,6 +84,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     other.add_argument("--methods", nargs="+", choices=ADAPTERS, default=list(ADAPTERS))
     _add_fill(other)
     other.set_defaults(benchmark=_avoidance)
+    placed = parsers.add_parser("placements", help="policies on a simulated arm, among seeded obstacles on the path")
+    placed.add_argument("--skill", type=Path, metavar="FILE", help="default: the packaged sweep, Sawyer and brush")
+    placed.add_argument("--policies", nargs="+", choices=POLICIES, default=["acfra"], metavar="NAME")
+    placed.add_argument("--seeds", type=int, default=50, metavar="N", help="placements; default: 50")
+    placed.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
+    placed.add_argument("--jobs", type=int, default=1, metavar="N", help="processes; default: 1")
+    placed.add_argument("--list", action="store_true", help="also list each placement in which a policy did not arrive")
+    add_robot_options(placed)
+    _add_fill(placed)
+    placed.set_defaults(benchmark=_placements)
     people = parsers.add_parser("people", help="recordings of real people lead the simulated arms")
     people.add_argument(
         "data", type=Path, metavar="DATA", help="folder of real recordings, with kinect_gestures and mocap_arm"
@@ -158,6 +171,31 @@ def _avoidance(arguments: argparse.Namespace) -> int:
             on_done=lambda finished, of: bar.update(task, completed=finished, total=of),
         )
     _report([table], place, [code_version()])
+    return 0
+
+
+def _placements(arguments: argparse.Namespace) -> int:
+    """Run the placements benchmark and print its table."""
+    if arguments.seeds < 1 or arguments.first < 0 or arguments.jobs < 1:
+        raise InputError("--seeds and --jobs must be at least 1, and --first at least 0")
+    place = _place(arguments, "placements")
+    with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
+        if arguments.skill is None:
+            setup = placements.packaged_setup(Path(folder))
+        else:
+            setup = placements.Setup(str(arguments.skill), arguments.robot, arguments.tool)
+        task = bar.add_task("reproducing", total=None)
+        results = placements.run_placements(
+            arguments.policies,
+            [setup],
+            range(arguments.first, arguments.first + arguments.seeds),
+            jobs=arguments.jobs,
+            progress=lambda done, of: bar.update(task, completed=done, total=of),
+        )
+    _report([placements.placement_table(results)], place, [code_version()])
+    for result in results if arguments.list else []:
+        if result.outcome != "arrived":
+            say(f"{result.policy}, seed {result.seed}: {result.outcome}: {result.reason}")
     return 0
 
 

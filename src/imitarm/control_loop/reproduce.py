@@ -90,7 +90,6 @@ def reproduce(
     keeper = SafetyFilter(robot.arm, dt=dt) if safety is None else safety
     if keeper.dt != dt:
         raise InputError(f"reproduce: the safety filter was made for dt {keeper.dt:g} s, not {dt:g} s")
-    keeper.reset()
     log = _Log(robot)
     policy.reset(Observation(0.0, log.state, log.tool_to_base, observe(0.0)))
     finished, last = False, Command(np.zeros(6))
@@ -104,7 +103,7 @@ def reproduce(
             if not isinstance(last, Command):
                 raise InputError(f"{type(policy).__name__}.step must return a Command, got {last!r}")
             scene = observation.scene.now(k * dt)
-            kept = keeper.step(last, log.state.q, robot.velocity, scene)
+            kept = keeper.step(last, robot.set_point, robot.velocity, scene)
             robot.move(kept.velocity, dt)
             step = log.take(robot, scene, last, kept)
             if on_step is not None:

@@ -15,8 +15,11 @@ from imitarm.kinematics.reach_of_links import meeting_links
 Array = NDArray[np.float64]
 Indices = NDArray[np.int_]
 
-_LOOK, _LOOK_AT_LATEST = 0.03, 0.05  # [s] after which a loop looks for what is near when it has time, or has not
-_INFLUENCE = 0.15  # [m] beyond the clearance, links farther apart get no row
+_SEARCH, _SEARCH_AT_LATEST = 0.03, 0.05  # [s] after which near links are searched for when there is time, or is not
+_INFLUENCE = 0.15  # [m] beyond the clearance: two links farther apart have no row
+_NEAR = 0.06  # [m] beyond the clearance: every two spheres nearer than this have a row
+_MOST = 64  # rows of such spheres at most, the nearest
+_RETREAT_RATE = 25.0  # [1/s] how fast missing clearance is regained
 
 
 class SelfClearance:
@@ -27,8 +30,10 @@ class SelfClearance:
 
     .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
 
-    and a row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets it shrink no faster than exponentially (METHODS A.9).
-    Every two links that are near have one row, for their nearest spheres; of those the ``n_rows`` nearest are taken.
+    and a row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets it shrink no faster than exponentially. Where the
+    distance is below the clearance it must grow, at 25/s in place of :math:`\xi`. Every two spheres within 6 cm of the
+    clearance have a row, at most the 64 nearest; so have the nearest spheres of each of the ``n_rows`` nearest pairs of
+    links within 15 cm.
 
     Not watched are links that are joined by a joint, links that their joints' limits keep apart
     (:func:`~imitarm.kinematics.reach_of_links.meeting_links`), and spheres that are nearer than the clearance in the
@@ -69,7 +74,7 @@ class SelfClearance:
         self._starts = np.flatnonzero(np.diff(pair_of_links[order], prepend=-1))
         ends = [*self._starts.tolist(), len(order)][1:]
         self._groups = [slice(a, b) for a, b in zip(self._starts.tolist(), ends, strict=True)]
-        self._near = np.float32(clearance + _INFLUENCE)
+        self._near, self._close = np.float32(clearance + _INFLUENCE), np.float32(clearance + _NEAR)
 
     def _centers(self, q: ArrayLike) -> Array:
         """Return where all spheres are, those of the base last, shape (m, 3) [m]."""
@@ -95,13 +100,13 @@ class SelfClearance:
         return float((np.linalg.norm(centers[self._outer] - centers[self._inner], axis=1) - self._sums).min())
 
     def nearest(self, q: ArrayLike) -> tuple[Indices, Array]:
-        """Return the nearest spheres of every two links that are near, the nearest first.
+        """Return the spheres that have a row, two by two, the nearest first.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
 
         Returns:
-            indices of the two spheres (k, 2), and their distances (k,) [m]; at most ``n_rows``.
+            indices of the two spheres (k, 2), and their distances (k,) [m].
         """
         outer, inner, _, _, distances = self._found(q)
         return np.stack((outer, inner), axis=1), distances
@@ -113,17 +118,33 @@ class SelfClearance:
             q: joint positions, shape (n_joints,) [rad].
 
         Returns:
-            at most ``n_rows`` rows; None when nothing is near.
+            None when nothing is near.
+        """
+        found = self.near(q)
+        return None if found is None else Rows(found[0], self.lower(found[1]))
+
+    def near(self, q: ArrayLike) -> tuple[Array, Array] | None:
+        """Return the gradients of the near distances (k, n_joints) [m/rad], and the room beyond the clearance (k,) [m].
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+
+        Returns:
+            None when nothing is near.
         """
         outer, inner, centers, normals, distances = self._found(q)
         if not len(outer):
             return None
-        rows = self.arm.cover.parting(self.arm.at(q).data, outer, inner, centers, normals)
-        return Rows(rows, -self._gain * (distances - self.clearance))
+        gradients = self.arm.cover.parting(self.arm.at(q).data, outer, inner, centers, normals)
+        return gradients, distances - self.clearance
 
-    def watch(self, dt: float = 0.01) -> SelfWatch:
-        """Return the same for a control loop with period ``dt`` [s], at a fifth of the price."""
-        return SelfWatch(self, self._gain, dt)
+    def lower(self, room: Array) -> Array:
+        """Return the least rate (k,) [m/s] at which each distance may change, for the room (k,) [m] that it has."""
+        return np.where(room < 0.0, -_RETREAT_RATE, -self._gain) * room
+
+    def periodic(self, dt: float = 0.01) -> PeriodicSelfClearance:
+        """Return the same for a control loop with period ``dt`` [s], at a fifth of the cost."""
+        return PeriodicSelfClearance(self, dt)
 
     def _found(self, q: ArrayLike) -> tuple[Indices, Indices, Array, Array, Array]:
         """Return the nearest pairs: outer and inner spheres, centres of the outer, normals and distances."""
@@ -136,6 +157,11 @@ class SelfClearance:
                 if least[group] < self._near:
                     part = self._groups[group]
                     best.append(part.start + int(coarse[part].argmin()))
+            close = np.flatnonzero(coarse < self._close)
+            if len(close) > _MOST:
+                close = close[np.argpartition(coarse[close], _MOST)[:_MOST]]
+            chosen = np.union1d(close, np.array(best, dtype=np.intp))
+            best = chosen[coarse[chosen].argsort()].tolist()
         outer, inner = self._outer[best], self._inner[best]
         outer_centers = centers[outer]
         between = outer_centers - centers[inner]
@@ -156,40 +182,39 @@ class SelfClearance:
         return distances
 
 
-class SelfWatch:
-    r"""Rows of a :class:`SelfClearance` for a control loop: the nearest links are looked for every 30 to 50 ms.
+class PeriodicSelfClearance:
+    r"""Rows of a :class:`SelfClearance` for a control loop that has little time: searched for every 30 to 50 ms.
 
-    In between the distances follow from the joints' motion, :math:`d(q) \approx d_0 + \nabla d\,(q - q_0)`. What that
-    leaves out in 50 ms is less than 8 mm with every joint at 1 rad/s, and grows with the square of the speed.
+    In between the distances follow from the joints' motion, :math:`d(q) \approx d_0 + \nabla d\,(q - q_0)`. The
+    error of that within 50 ms is less than 8 mm with every joint at 1 rad/s, and grows with the square of the speed.
 
     Args:
         own: what is watched.
-        gain: xi [1/s].
         dt: control period [s].
     """
 
-    def __init__(self, own: SelfClearance, gain: float, dt: float) -> None:
-        self._own, self._gain = own, gain
-        self._every, self._latest = max(round(_LOOK / dt), 1), max(round(_LOOK_AT_LATEST / dt), 1)
+    def __init__(self, own: SelfClearance, dt: float) -> None:
+        self._own = own
+        self._every, self._latest = max(round(_SEARCH / dt), 1), max(round(_SEARCH_AT_LATEST / dt), 1)
         self.reset()
 
     def reset(self) -> None:
-        """Look anew in the next step."""
+        """Search again in the next step."""
         self._age = self._latest
-        self._rows: Rows | None = None
+        self._found: tuple[Array, Array] | None = None
         self._at: Array = np.zeros(0)
 
-    def rows(self, q: Array, *, time_to_look: bool = True) -> Rows | None:
+    def rows(self, q: Array, *, may_search: bool = True) -> Rows | None:
         """Return inequalities on the joint velocity as ``SelfClearance.rows`` does; None when nothing is near.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
-            time_to_look: whether this step has time for a new look.
+            may_search: whether this step has time for a search; one that is overdue takes place all the same.
         """
         self._age += 1
-        if self._age > self._latest or (time_to_look and self._age > self._every):  # from 1 on, the look's own step
-            self._rows, self._at, self._age = self._own.rows(q), q.copy(), 1
-        if self._rows is None:
+        if self._age > self._latest or (may_search and self._age > self._every):
+            self._found, self._at, self._age = self._own.near(q), q.copy(), 1
+        if self._found is None:
             return None
-        matrix, lower, price = self._rows
-        return Rows(matrix, lower - self._gain * matrix.dot(q - self._at), price)
+        matrix, room = self._found
+        return Rows(matrix, self._own.lower(room + matrix.dot(q - self._at)))

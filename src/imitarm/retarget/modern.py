@@ -124,7 +124,7 @@ class ModernRetargeter(Retargeter):
         self._solver = IKSolver(arm, limits, dt=dt)
         self._rotation_length, self._max_speed = rotation_length, max_speed
         self._elbow = elbow if known else 0.0
-        self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).watch(dt)
+        self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).periodic(dt)
         self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
         super().__init__(arm, correspondence, dt=dt, scene=scene)
 
@@ -236,7 +236,7 @@ class ModernRetargeter(Retargeter):
     def _drive(self, twist: Array, elbow: ElbowTask | None, *, engaged: bool = True) -> None:
         """Move the reference by one step of inverse kinematics; an arm that nobody leads does not move by itself."""
         obstacles = self._obstacles.rows(self._q, self.scene)
-        own = None if self._own is None else self._own.rows(self._q, time_to_look=not self._seeing)
+        own = None if self._own is None else self._own.rows(self._q, may_search=not self._seeing)
         rows = ([] if obstacles is None else [obstacles]) + ([] if own is None else [own])
         if not engaged:  # whatever is too close already is corrected once the person leads
             rows = [Rows(part.matrix, np.minimum(part.lower, 0.0)) for part in rows]

@@ -23,7 +23,8 @@ class ClearanceLimit:
 
     .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - \xi h
 
-    lets the room shrink at most exponentially: it never gets below zero, and where it is negative it must grow. Every
+    lets the room shrink at most exponentially: it never gets below zero. Where it is negative, because links move on
+    arcs and control steps are finite, it must grow back, at ``retreat_rate`` in place of :math:`\xi`. Every
     sphere within ``influence`` of an obstacle has a row; none is left out. The spheres stand out from the shapes
     they cover, so the true distance is never smaller than the one that is used.
 
@@ -32,15 +33,25 @@ class ClearanceLimit:
         clearance: required distance of every link to every obstacle [m].
         rate: ``xi``, the fraction of the room that may be used up per second [1/s].
         influence: room beyond which a sphere has no row [m].
+        retreat_rate: fraction of missing room that is regained per second [1/s].
 
     Raises:
         InputError: when ``arm`` is not an ArmModel, or a number is not finite or is negative.
     """
 
-    def __init__(self, arm: ArmModel, clearance: float, *, rate: float = 6.0, influence: float = 0.15) -> None:
+    def __init__(
+        self,
+        arm: ArmModel,
+        clearance: float,
+        *,
+        rate: float = 6.0,
+        influence: float = 0.15,
+        retreat_rate: float = 25.0,
+    ) -> None:
         self.arm = instance(arm, ArmModel, "ClearanceLimit: arm")
         self.clearance = finite_number(clearance, "ClearanceLimit: clearance", "m", at_least=0.0)
         self.rate = finite_number(rate, "ClearanceLimit: rate", "1/s", at_least=0.0)
+        self.retreat_rate = finite_number(retreat_rate, "ClearanceLimit: retreat_rate", "1/s", at_least=0.0)
         self.influence = finite_number(influence, "ClearanceLimit: influence", "m", above=0.0)
         cover = arm.cover
         self._cover = cover
@@ -76,5 +87,7 @@ class ClearanceLimit:
             velocity += np.cross(packed.angular_velocities.T[:, obstacle], arms, axis=0)
         velocity *= normal
         lower = np.add.reduce(velocity, axis=0)
-        lower -= self.rate * (distance - self._reduced.take(sphere))
+        room = distance - self._reduced.take(sphere)
+        lower -= self.rate * room
+        lower -= (self.retreat_rate - self.rate) * np.minimum(room, 0.0)
         return Rows(self._cover.speeds(data, sphere, points, normal), lower)

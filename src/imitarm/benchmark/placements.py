@@ -1,0 +1,259 @@
+"""Policies on a simulated arm, among seeded obstacles on the path: who arrives, who waits, who touches.
+
+Each placement puts one to three obstacles on the learned path of a skill. Every policy reproduces the skill there,
+behind the same safety filter, and the simulator's own geometry measures what happens.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.benchmark.families import random_obstacle
+from imitarm.benchmark.tables import Table
+from imitarm.control_loop import reproduce
+from imitarm.errors import InfeasibleError, InputError, UnreachableError
+from imitarm.evaluation.intervals import wilson_interval
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.posture import find_posture
+from imitarm.policies import POLICIES
+from imitarm.robots import SimulatedRobot
+from imitarm.safety import SafetyFilter
+from imitarm.scene import Obstacle, Scene
+from imitarm.skills import Skill
+
+Array = NDArray[np.float64]
+
+OUTCOMES = ("arrived", "refused", "waited", "too near", "touched", "stopped")
+"""What can come of a placement: arrived with the clearance kept; refused before any motion; not finished in time;
+finished, but nearer than required; contact, also of the arm with itself; a protective stop or a failure."""
+
+CLEARANCE = 0.02  # [m] required
+_DT = 0.01  # [s]
+_PATIENCE = 4.0  # a reproduction may take this many times as long as the demonstrations
+_SPREAD = 0.02  # [m] standard deviation of an obstacle's centre about the path
+_FREE_ENDS = 0.01  # [m] beyond the clearance, that an obstacle leaves to the tool at start and goal
+_TRIES = 200
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is reproduced, by what arm.
+
+    Attributes:
+        skill: path of a skill file.
+        robot: name of an arm, or a path.
+        tool: name of a tool, or a path; None: none.
+    """
+
+    skill: str
+    robot: str
+    tool: str | None
+
+
+@dataclass(frozen=True)
+class PlacementResult:
+    """What came of one policy in one placement.
+
+    Attributes:
+        policy: its name.
+        setup: what was reproduced.
+        seed: of the placement.
+        outcome: one of :data:`OUTCOMES`.
+        clearance: smallest measured distance of arm and tool to an obstacle [m]; nan without a motion.
+        duration: of the motion over that of the skill; nan without a motion.
+        planning: wall time until the policy answered or refused [s].
+        reason: in words.
+    """
+
+    policy: str
+    setup: Setup
+    seed: int
+    outcome: str
+    clearance: float
+    duration: float
+    planning: float
+    reason: str
+
+
+def placement(skill: Skill, arm: ArmModel, seed: int) -> Scene:
+    """Return a scene with one to three obstacles on the learned path, clear of the tool at both ends.
+
+    Args:
+        skill: whose path.
+        arm: whose tool must be clear at start and goal.
+        seed: of the scene; every third has one obstacle.
+
+    Raises:
+        InputError: when the tool leaves no place for an obstacle.
+    """
+    rng = np.random.default_rng([31, seed])
+    path = skill.generate()
+    count = 1 + seed % 3
+    chosen: list[Obstacle] = []
+    for _ in range(_TRIES):
+        sample = int(rng.integers(round(0.15 * len(path)), round(0.85 * len(path))))
+        obstacle = random_obstacle(rng, path.positions[sample] + _SPREAD * rng.normal(size=3), planar=False)
+        if _end_clearance(skill, arm, obstacle) >= CLEARANCE + _FREE_ENDS:
+            chosen.append(obstacle)
+        if len(chosen) == count:
+            return Scene(None, tuple(chosen))
+    raise InputError(f"placement {seed}: no place for {count} obstacles between start and goal of {skill!r}")
+
+
+def _end_clearance(skill: Skill, arm: ArmModel, obstacle: Obstacle) -> float:
+    rotation = arm.tool_pose(arm.home).quaternion
+    nearest = np.inf
+    for end in (skill.start_, skill.goal_):
+        pose = Pose(end.position, end.quaternion if skill.gmr_.has_orientation_ else rotation)
+        distance = obstacle.signed_distance(pose.apply(arm.tool_spheres[:, :3])) - arm.tool_spheres[:, 3]
+        nearest = min(nearest, float(distance.min()))
+    return nearest
+
+
+def run_placement(policy: str, setup: Setup, seed: int) -> PlacementResult:
+    """Let one policy reproduce a skill in one placement.
+
+    Raises:
+        InputError: when the skill or the arm can't be loaded.
+        UnknownNameError: when the policy or the arm is not known.
+    """
+    skill, arm, start = _prepared(setup)
+    scene = placement(skill, arm, seed)
+    robot = SimulatedRobot(arm, scene=scene, q=start)
+    spheres = arm.tool_spheres if skill.gmr_.has_orientation_ else [[0.0, 0.0, 0.0, arm.tool_radius]]
+    decides = POLICIES[policy].build(skill, tool_spheres=spheres, clearance=CLEARANCE)
+    began, planned = time.perf_counter(), [np.nan]
+
+    def on_step(_step: object) -> None:
+        if np.isnan(planned[0]):
+            planned[0] = time.perf_counter() - began
+
+    safety = SafetyFilter(arm, dt=_DT, clearance=CLEARANCE)
+    try:
+        rollout = reproduce(
+            decides, robot, scene.at, dt=_DT, safety=safety, timeout=_PATIENCE * skill.duration_, on_step=on_step
+        )
+    except InfeasibleError as refusal:
+        spent = time.perf_counter() - began
+        return PlacementResult(policy, setup, seed, "refused", np.nan, np.nan, spent, str(refusal))
+    duration = rollout.trajectory.duration / skill.duration_
+    outcome = _outcome(rollout.success, rollout.reason, bool(rollout.details.get("contacts")))
+    return PlacementResult(
+        policy, setup, seed, outcome, float(rollout.min_clearance), duration, planned[0], rollout.reason
+    )
+
+
+def _outcome(success: bool, reason: str, contact: bool) -> str:
+    if contact:
+        return "touched"
+    if success:
+        return "arrived"
+    for start, outcome in (("not finished", "waited"), ("clearance fell", "too near")):
+        if reason.startswith(start):
+            return outcome
+    return "stopped"
+
+
+@lru_cache(maxsize=8)
+def _prepared(setup: Setup) -> tuple[Skill, ArmModel, Array]:
+    skill, arm = Skill.load(setup.skill), ArmModel.load(setup.robot, tool=setup.tool)
+    rotation = arm.tool_pose(arm.home).quaternion
+    end = skill.start_
+    try:
+        start = find_posture(arm, Pose(end.position, end.quaternion if skill.gmr_.has_orientation_ else rotation))
+    except UnreachableError as error:
+        raise InputError(f"{setup.skill}: {error}; choose another robot for this skill") from error
+    return skill, arm, start
+
+
+def run_placements(
+    policies: Sequence[str],
+    setups: Sequence[Setup],
+    seeds: Iterable[int],
+    *,
+    jobs: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[PlacementResult]:
+    """Run every policy in every placement; the results do not depend on the number of processes.
+
+    Args:
+        policies: names in :data:`~imitarm.policies.POLICIES`.
+        setups: skills with their arms.
+        seeds: of the placements.
+        jobs: processes.
+        progress: called with the number of placements that are done, and of all.
+
+    Raises:
+        InputError: when a skill or an arm can't be loaded, or several processes are asked for without joblib.
+    """
+    work = [(policy, setup, seed) for setup in setups for seed in seeds for policy in policies]
+    done: list[PlacementResult] = []
+    with contextlib.ExitStack() as stack:
+        results: Iterable[PlacementResult]
+        if jobs == 1:
+            results = (run_placement(*one) for one in work)
+        else:
+            joblib = _joblib()
+            pool = stack.enter_context(joblib.Parallel(n_jobs=jobs, return_as="generator"))
+            results = pool(joblib.delayed(run_placement)(*one) for one in work)
+        for result in results:
+            done.append(result)
+            if progress is not None:
+                progress(len(done), len(work))
+    return done
+
+
+def _joblib() -> Any:
+    try:
+        import joblib  # noqa: PLC0415 (an extra)
+    except ModuleNotFoundError as error:
+        raise InputError("several processes need joblib: pip install 'imitarm[benchmark]', or use --jobs 1") from error
+    return joblib
+
+
+def placement_table(results: Sequence[PlacementResult]) -> Table:
+    """Return one row for each policy: how often each outcome came, and how near the arm was."""
+    rows = []
+    for policy in dict.fromkeys(result.policy for result in results):
+        own = [result for result in results if result.policy == policy]
+        counts = [sum(result.outcome == outcome for result in own) for outcome in OUTCOMES]
+        low, high = wilson_interval(counts[0], len(own))
+        nearest = [1e3 * r.clearance for r in own if r.outcome == "arrived" and np.isfinite(r.clearance)]
+        refusals = [1e3 * r.planning for r in own if r.outcome == "refused"]
+        rows.append(
+            (
+                policy,
+                str(len(own)),
+                f"{100 * counts[0] / len(own):.0f} % ({100 * low:.0f} to {100 * high:.0f})",
+                *map(str, counts[1:]),
+                f"{min(nearest):.1f}" if nearest else "-",
+                f"{np.median(refusals):.0f}" if refusals else "-",
+            )
+        )
+    headings = ["policy", "placements>", "arrived", *(f"{name}>" for name in OUTCOMES[1:])]
+    return Table(
+        "Placements of one to three obstacles on the learned path",
+        (*headings, "smallest clearance when arrived [mm]>", "time to refuse, median [ms]>"),
+        tuple(rows),
+        f"A simulated arm, {1e3 * CLEARANCE:.0f} mm required of every part of it; intervals: Wilson, 95 %.",
+    )
+
+
+def packaged_setup(folder: Path) -> Setup:
+    """Learn the packaged sweep, save it in ``folder`` and return it with the Sawyer and its brush."""
+    from imitarm.demonstrations import align, read  # noqa: PLC0415 (only here)
+    from imitarm.tasks.sweep import DEMONSTRATIONS  # noqa: PLC0415 (only here)
+
+    place = folder / "sweep.json"
+    Skill().fit(align(read(DEMONSTRATIONS))).save(place)
+    return Setup(str(place), "sawyer", "brush")
