@@ -6,6 +6,7 @@ import argparse
 import importlib.util
 import shlex
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
