@@ -12,6 +12,7 @@ import pytest
 
 from imitarm import ArmModel, InputError, SimulatedRobot
 from imitarm.errors import FileFormatError
+from imitarm.evaluation.motion import ArmMotion
 from imitarm.kinematics.arm_joints import DEFAULT_MAX_VELOCITY
 from imitarm.kinematics.spheres import COLLISION_GROUP
 
@@ -223,6 +224,16 @@ def test_odd_limits_are_refused_with_joint_and_line(load, text, said):
     message = str(caught.value)
     assert said in message and f"line {line}" in message
     assert "'odd'" in message or "xacro" in message
+
+
+def test_reading_a_file_writes_nothing_into_the_current_folder(load, tmp_path, monkeypatch):
+    """MuJoCo logs its warnings there."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    with pytest.raises(InputError):
+        load(limits(lower=0, upper=0, effort=5, velocity=1))
+    assert not list(here.iterdir())
 
 
 @pytest.mark.parametrize("values", [{"effort": 0, "velocity": 0}, {}])
@@ -584,3 +595,12 @@ def test_a_damaged_file_is_refused_or_its_arm_has_finite_figures(load, text):
         assert np.isfinite(arm.jacobian(arm.home)).all()
         assert np.isfinite(arm.max_velocity).all() and (arm.max_velocity > 0.0).all() and (arm.max_torque > 0.0).all()
     assert min(outcomes.values()) > 10
+
+
+def test_a_motion_without_masses_is_measured_without_torques(load):
+    times, joints = np.linspace(0.0, 1.0, 11), np.linspace(np.full(6, 0.2), np.full(6, 0.4), 11)
+    with_masses = ArmMotion.of(load(robot(SIX)), times, joints)
+    without = ArmMotion.of(load(robot(SIX.replace(INERTIAL, "", 1)), "b.urdf"), times, joints)
+    assert np.array_equal(without.tool, with_masses.tool)
+    assert np.isnan(without.torques).all() and np.isnan(without.gravity).all()
+    assert np.isfinite(with_masses.torques).all()

@@ -70,15 +70,17 @@ class ArmMotion:
         acceleration[0], acceleration[-1] = acceleration[1], acceleration[-2]
         n, marked, site = len(t), arm.landmarks is not None, arm.site("tool")
         tool, quaternions, sew = np.empty((n, 3)), np.empty((n, 4)), np.full((n, 3, 3), np.nan)
-        jacobians, torques, gravity = np.empty((n, 6, arm.n_joints)), np.empty_like(q), np.empty_like(q)
+        jacobians = np.empty((n, 6, arm.n_joints))
+        torques, gravity = np.full_like(q, np.nan), np.full_like(q, np.nan)  # unknown for an arm without masses
         for i, posture in enumerate(q):  # one posture at a time: its kinematics is computed once
             pose = arm.tool_pose(posture)
             tool[i], quaternions[i] = pose.position, pose.quaternion
             jacobians[i] = arm.at(posture).site_jacobian(site)
             if marked:
                 sew[i] = arm.sew_points(posture)
-            torques[i] = arm.inverse_dynamics(posture, velocity[i], acceleration[i])
-            gravity[i] = arm.gravity_torque(posture)
+            if arm.has_masses:
+                torques[i] = arm.inverse_dynamics(posture, velocity[i], acceleration[i])
+                gravity[i] = arm.gravity_torque(posture)
         jacobians[:, 3:] *= ROTATION_LENGTH
         least = np.asarray(np.linalg.svd(jacobians, compute_uv=False)[:, -1], dtype=float)
         return cls(dt, q, tool, quaternions, sew, torques, gravity, least)

@@ -246,6 +246,11 @@ class ArmModel(ArmKinematics):
         """Return the Jacobians of the spheres' centers, shape (m, 3, n_joints) [m/rad]."""
         return self.cover.jacobians(self.at(q).data)
 
+    @property
+    def has_masses(self) -> bool:
+        """Whether every moving link has a mass and an inertia, as torques and simulation need."""
+        return not self._mass_faults
+
     def check_dynamics(self) -> None:
         """Do nothing if every moving link has a mass and an inertia, as torques and simulation need.
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -15,8 +16,15 @@ from numpy.typing import NDArray
 
 from imitarm.errors import FileFormatError, InputError, UnknownNameError
 from imitarm.files.xml_tree import XmlElement, read_xml
-from imitarm.kinematics.arm_home import check_keyframe, complete_home, take_keyframe
-from imitarm.kinematics.arm_joints import arm_end, chain_to, check_joints, read_limits
+from imitarm.kinematics.arm_joints import (
+    arm_end,
+    chain_to,
+    check_joints,
+    check_keyframe,
+    complete_home,
+    read_limits,
+    take_keyframe,
+)
 from imitarm.kinematics.arm_meshes import find_meshes
 from imitarm.kinematics.spheres import COLLISION_GROUP
 
@@ -172,7 +180,8 @@ def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _P
     _check_numbers(path, root)
     try:
         known = path.suffix.lower() in {".xml", ".urdf"}
-        spec = mujoco.MjSpec.from_file(str(path)) if known else mujoco.MjSpec.from_string(path.read_text())
+        with _no_engine_log():
+            spec = mujoco.MjSpec.from_file(str(path)) if known else mujoco.MjSpec.from_string(path.read_text())
     except ValueError as error:
         raise FileFormatError(f"{path}: {_one_line(error)}") from error
     spec.compiler.fusestatic = False
@@ -190,12 +199,24 @@ def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _P
     for mesh in list(spec.meshes):
         if mesh.name not in used:
             spec.delete(mesh)
-    find_meshes(spec, path, root, package_path)
+    if spec.meshes:
+        find_meshes(spec, path, root, package_path)
     _name_all(spec)
     _separate_contact_shapes(spec)
     faults = _replace_unusable_masses(spec, path, root)
     _check_sizes(compiled(spec, path), path, root)
     return _Part(spec, root, faults)
+
+
+@contextmanager
+def _no_engine_log() -> Iterator[None]:
+    """Keep MuJoCo from writing its warnings into the current folder; what it warns of is checked in this module."""
+    former = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(former)
 
 
 def _check_kind(path: Path, root: XmlElement) -> None:

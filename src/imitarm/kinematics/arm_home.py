@@ -1,19 +1,15 @@
-"""The home of an arm: the keyframe of its file, or a usable posture that is found."""
+"""A usable posture to begin in, for an arm whose file has no keyframe."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from imitarm.errors import FileFormatError
-from imitarm.files.xml_tree import XmlElement
-from imitarm.kinematics.arm_joints import HINGE, SLIDE, mimics, place
 from imitarm.kinematics.spheres import COLLISION_GROUP
 
 Array = NDArray[np.float64]
@@ -24,77 +20,22 @@ _WELL_BENT = 0.1  # [m/rad] smallest singular value of a home; less for an arm s
 _USUAL_REACH = 0.8  # [m]
 _APART = 0.02  # [m] between links at home
 _AS_GOOD = 0.98  # of the score: less is a loss
-_ANGLE_LENGTH = 0.3  # [m/rad] a rotation of 1 rad counts as much as a displacement of 0.3 m
+_ROTATION_LENGTH = 0.3  # [m/rad] a rotation of 1 rad counts as much as a displacement of 0.3 m
 
 
-def take_keyframe(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[dict[str, float], str]:
-    """Return positions by joint of the keyframe ``home``, else of the first one, and its name; remove all keyframes."""
-    keys = list(spec.keys)
-    home: dict[str, float] = {}
-    index = next((i for i, key in enumerate(keys) if key.name == "home"), 0)
-    name = keys[index].name if keys else ""
-    if keys:
-        for joint in range(model.njnt):
-            if int(model.jnt_type[joint]) in {HINGE, SLIDE}:
-                home[model.joint(joint).name] = float(model.key_qpos[index, model.jnt_qposadr[joint]])
-    for key in keys:  # their lengths would be wrong once a tool with joints is attached
-        spec.delete(key)
-    return home, name
-
-
-def check_keyframe(
-    home: Mapping[str, float], name: str, model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root: XmlElement
-) -> None:
-    """Refuse a keyframe outside the limits of the arm's joints.
-
-    Raises:
-        FileFormatError: naming the keyframe, its line, the joint and its limits.
-    """
-    for joint in joints:
-        index = model.joint(joint).id
-        low, high = model.jnt_range[index]
-        value = home.get(joint, low)
-        if model.jnt_limited[index] and not low - 1e-6 <= value <= high + 1e-6:
-            keys = [e for e in root.walk() if e.tag == "key" and e.get("name") == name]
-            line = f" (line {keys[0].line})" if keys else ""
-            raise FileFormatError(
-                f"{place(path, root, joint)} is at {value:.4g} in the keyframe {name!r}{line}, outside its limits "
-                f"[{low:.4g}, {high:.4g}]; correct the keyframe, or remove it to have a posture chosen"
-            )
-
-
-def complete_home(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, joints: tuple[str, ...], given: Mapping[str, float], tool_prefix: str
-) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return a position for every joint of ``model``, and notes on it.
-
-    Joints that are given keep their values. A tool's fingers are open; other joints that do not belong to the arm
-    stand in the middle of their ranges, coupled ones as their leader says. The arm's own joints stand in the middle
-    of their ranges too where that is a usable posture: away from singularities and with the links apart. Else the
-    most usable of many postures is taken.
-    """
-    home: dict[str, float] = {}
-    for index in range(model.njnt):
-        name, (low, high) = model.joint(index).name, model.jnt_range[index]
-        if name in given:
-            home[name] = given[name]
-        elif not model.jnt_limited[index]:
-            home[name] = 0.0
-        else:
-            home[name] = float(high) if name.startswith(tool_prefix) else 0.5 * float(low + high)
-    for (follower, leader), (offset, factor) in mimics(spec).items():
-        if follower not in given and follower in home and leader in home:
-            home[follower] = offset + factor * home[leader]
-    if all(name in given for name in joints):
-        return home, ()
-    posture, notes = _usable_posture(model, joints, home)
-    return {**home, **dict(zip(joints, posture.tolist(), strict=True))}, notes
-
-
-def _usable_posture(
+def usable_posture(
     model: mujoco.MjModel, joints: tuple[str, ...], home: Mapping[str, float]
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return the middle of the ranges if it is a usable posture, else the best of many, shape (n_joints,)."""
+    """Return the middle of the ranges if it is a usable posture, else the best of many, and notes.
+
+    Args:
+        model: a compiled model with a site ``flange``.
+        joints: names of the arm's joints.
+        home: positions of all joints of the model by name, those of the arm in the middle of their ranges.
+
+    Returns:
+        the posture, shape (n_joints,) [rad], and what the user should know about it.
+    """
     search = _HomeSearch(model, joints, home)
     middle = np.array([home[name] for name in joints])
     needed = _WELL_BENT * min(1.0, search.reach / _USUAL_REACH)
@@ -125,7 +66,7 @@ class _HomeSearch:
         self._bodies = [int(model.jnt_bodyid[i]) for i in ids]
         self._flange, self._moved = model.site("flange").id, False
         limited = model.jnt_limited[ids].astype(bool)
-        slides = model.jnt_type[ids] == SLIDE
+        slides = model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE
         far = np.where(slides, 1.0, math.pi)
         self._low = np.where(limited, np.maximum(model.jnt_range[ids, 0], -far), -far)
         self._high = np.where(limited, np.minimum(model.jnt_range[ids, 1], far), far)
@@ -158,7 +99,7 @@ class _HomeSearch:
         mujoco.mj_comPos(self._model, self._move(q))
         mujoco.mj_jacSite(self._model, self._data, self._jacobian[:3], self._jacobian[3:], self._flange)
         linear, angular = self._jacobian[:3, self._dofs], self._jacobian[3:, self._dofs]
-        stacked = np.vstack([linear, _ANGLE_LENGTH * angular])
+        stacked = np.vstack([linear, _ROTATION_LENGTH * angular])
         smallest = [float(np.linalg.svd(part, compute_uv=False)[-1]) for part in (linear, stacked)]
         return smallest[0], smallest[1]
 

@@ -1,4 +1,4 @@
-"""The joints of an arm: which joints of a file belong to it, and what their limits are."""
+"""The joints of an arm: which joints of a file belong to it, their limits, and where they stand at home."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from imitarm.errors import FileFormatError, InputError
 from imitarm.files.xml_tree import XmlElement
+from imitarm.kinematics.arm_home import usable_posture
 
 Array = NDArray[np.float64]
 
@@ -358,3 +359,70 @@ def _located(names: list[str], all_names: tuple[str, ...], root: XmlElement) -> 
 
 def _listed(names: list[str]) -> str:
     return ", ".join(names) if len(names) <= 6 else f"{', '.join(names[:5])} and {len(names) - 5} more"
+
+
+# Home
+
+
+def take_keyframe(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[dict[str, float], str]:
+    """Return positions by joint of the keyframe ``home``, else of the first one, and its name; remove all keyframes."""
+    keys = list(spec.keys)
+    home: dict[str, float] = {}
+    index = next((i for i, key in enumerate(keys) if key.name == "home"), 0)
+    name = keys[index].name if keys else ""
+    if keys:
+        for joint in range(model.njnt):
+            if int(model.jnt_type[joint]) in {HINGE, SLIDE}:
+                home[model.joint(joint).name] = float(model.key_qpos[index, model.jnt_qposadr[joint]])
+    for key in keys:  # their lengths would be wrong once a tool with joints is attached
+        spec.delete(key)
+    return home, name
+
+
+def check_keyframe(
+    home: Mapping[str, float], name: str, model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root: XmlElement
+) -> None:
+    """Refuse a keyframe outside the limits of the arm's joints.
+
+    Raises:
+        FileFormatError: naming the keyframe, its line, the joint and its limits.
+    """
+    for joint in joints:
+        index = model.joint(joint).id
+        low, high = model.jnt_range[index]
+        value = home.get(joint, low)
+        if model.jnt_limited[index] and not low - 1e-6 <= value <= high + 1e-6:
+            keys = [e for e in root.walk() if e.tag == "key" and e.get("name") == name]
+            line = f" (line {keys[0].line})" if keys else ""
+            raise FileFormatError(
+                f"{place(path, root, joint)} is at {value:.4g} in the keyframe {name!r}{line}, outside its limits "
+                f"[{low:.4g}, {high:.4g}]; correct the keyframe, or remove it to have a posture chosen"
+            )
+
+
+def complete_home(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, joints: tuple[str, ...], given: Mapping[str, float], tool_prefix: str
+) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return a position for every joint of ``model``, and notes on it.
+
+    Joints that are given keep their values. A tool's fingers are open; other joints that do not belong to the arm
+    stand in the middle of their ranges, coupled ones as their leader says. The arm's own joints stand in the middle
+    of their ranges too where that is a usable posture: away from singularities and with the links apart. Else the
+    most usable of many postures is taken.
+    """
+    home: dict[str, float] = {}
+    for index in range(model.njnt):
+        name, (low, high) = model.joint(index).name, model.jnt_range[index]
+        if name in given:
+            home[name] = given[name]
+        elif not model.jnt_limited[index]:
+            home[name] = 0.0
+        else:
+            home[name] = float(high) if name.startswith(tool_prefix) else 0.5 * float(low + high)
+    for (follower, leader), (offset, factor) in mimics(spec).items():
+        if follower not in given and follower in home and leader in home:
+            home[follower] = offset + factor * home[leader]
+    if all(name in given for name in joints):
+        return home, ()
+    posture, notes = usable_posture(model, joints, home)
+    return {**home, **dict(zip(joints, posture.tolist(), strict=True))}, notes
