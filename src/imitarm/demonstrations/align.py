@@ -44,6 +44,9 @@ _LEVER = 0.1  # [m] distance that counts as much as a rotation of 1 rad
 _SMOOTHING = 0.04  # half width of the window that smooths a warp, as a fraction of the duration
 _SLOWEST = 0.1  # lowest pace of a demonstration's clock, as a fraction of the common pace
 
+_HELD = 0.2  # fraction of rows that repeat the row before, above which values count as held
+_FEWEST_HELD = 5  # number of separate repeats, likewise: one long pause is not a held value
+_QUANTA = 4.0  # steps of a held value are larger than this many least digits; rounded values step by one or two
 _WINDOW = 0.2  # [s] over which positions are averaged
 _LONGEST_WINDOW = 0.1  # of the duration, likewise when samples are noisy
 _STILL = 1e-4  # [m] within this distance the tool still stands, whatever its speed
@@ -226,6 +229,24 @@ def _moving(times: Array, values: Array, still: float) -> tuple[int, int] | None
     first = np.searchsorted(times, times[start[0]] - _MARGIN)
     last = np.searchsorted(times, times[len(times) - 1 - end[0]] + _MARGIN, side="right") - 1
     return int(first), int(last)
+
+
+def held_rows(values: Array) -> NDArray[np.bool_]:
+    """Return which rows of one recorded quantity (n, d) only repeat a held value, shape (n,)."""
+    none = np.zeros(len(values), dtype=bool)
+    steps = np.abs(np.diff(values, axis=0))
+    same = np.asarray(~(steps > 0.0).any(axis=1))
+    changes = np.flatnonzero(~same)
+    if len(changes) <= _FEWEST_HELD:
+        return none
+    repeats = np.diff(changes) > 1  # between two changes the value was held
+    moving = same[changes[0] : changes[-1] + 1]
+    if repeats.sum() < max(_FEWEST_HELD, 0.1 * len(repeats)) or moving.mean() < _HELD:
+        return none
+    largest = steps[changes].max(axis=1)
+    if np.median(largest) <= _QUANTA * float(np.min(steps[steps > 0.0])):
+        return none
+    return np.concatenate([[False], same])
 
 
 def smooth_speed(times: Array, values: Array, window: float = _WINDOW) -> tuple[Array, Array]:

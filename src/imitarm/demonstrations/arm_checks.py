@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.demonstrations.align import smooth_slope
-from imitarm.demonstrations.raw import Finding, Usable
+from imitarm.demonstrations.raw import Finding, ValidRows
 from imitarm.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _MARGIN = 5e-3  # [m] by which measured positions may exceed the reach
 _DEGREES = 2.5 * np.pi  # [rad] no joint rotates farther, so these are degrees
 
 
-def check_arm(motion: Usable, arm: ArmModel) -> Iterator[Finding]:
+def check_arm(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
     """Find joints of another arm, in degrees, beyond limits or too fast, and positions out of reach."""
     if motion.joints is None:
         yield from _check_reach(motion, arm)
@@ -68,7 +68,7 @@ def check_arm(motion: Usable, arm: ArmModel) -> Iterator[Finding]:
         )
 
 
-def _check_reach(motion: Usable, arm: ArmModel) -> Iterator[Finding]:
+def _check_reach(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
     centre, radius = reach(arm)
     distance = np.linalg.norm(motion.positions - centre, axis=1)
     row = int(np.argmax(distance))

@@ -1,34 +1,42 @@
 """Lint: list what is wrong with demonstrations before a skill is learned from them.
 
-Each check yields findings. This module checks each demonstration by itself: the numbers in its file, then its motion.
-``arm_checks.py`` checks it against an arm, ``set_checks.py`` checks the demonstrations against each other.
+Each check yields findings. Here are the checks of one motion, and of the motions against each other: two are enough to
+find that one runs backwards, stops early, ends elsewhere or goes another way round. The mean of such demonstrations is
+a motion that nobody has shown. Checks of the numbers in a file are in ``raw.py``, checks against an arm in
+``arm_checks.py``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.demonstrations.align import moving_rows, noise_level, smooth_speed, turns
+from imitarm.demonstrations.align import (
+    barycentre_warps,
+    features,
+    moving_rows,
+    noise_level,
+    rotation_paths,
+    smooth_speed,
+    to_common_ends,
+    turns,
+)
 from imitarm.demonstrations.arm_checks import check_arm
-from imitarm.demonstrations.raw import LENGTH_TOLERANCE, SEVERITIES, Finding, RawDemonstration, Usable
+from imitarm.demonstrations.raw import RAW_CHECKS, SEVERITIES, Finding, RawDemonstration, Severity, ValidRows
 from imitarm.demonstrations.reading import LENGTH_UNITS
-from imitarm.demonstrations.set_checks import SET_CHECKS
 from imitarm.errors import InputError
-from imitarm.trajectory import Demonstration
+from imitarm.kinematics.pose import quaternion_conjugate, quaternion_log, quaternion_multiply
+from imitarm.trajectory import Demonstration, Trajectory
 
 if TYPE_CHECKING:
     from imitarm.kinematics.arm import ArmModel
 
 Array = NDArray[np.float64]
 
-_EPOCH = 1e8  # [s] later times are dates (after 1973), not times since the start
-_FEW = 20  # samples
-_LONGEST_STEP = 0.5  # [s] between samples
-_STEPS = (2e-4, _LONGEST_STEP)  # [s] between samples of usual recorders
 _GAP_STEPS = 5.0  # a gap is longer than this many usual steps
 _GAP = 0.05  # [s] and longer than this
 _IDLE = 0.3  # [s] shortest standing at an end that is reported
@@ -40,6 +48,22 @@ _FAR = 3.0  # [m] farther than arms reach
 _TINY = 5e-3  # [m] motions smaller than this are rare
 _NO_MOTION = 1e-4  # [m]
 _FAST = 3.0  # [m/s] faster than an arm is guided by hand
+_DURATION_RATIO = 2.0
+_FLAT = 1e-3  # [m] standard deviation below which there is no motion in a direction
+_FEWEST = 4  # demonstrations that are needed to recognise an outlier
+_OUTLIER_RATIO = 3.0  # times as far from the medoid as is usual
+_OUTLIER_SPREADS = 6.0  # and so many robust standard deviations farther
+_OUTLIER_DISTANCE = 0.02  # [m] and at least so far
+_OUTLIER_ANGLE = 0.2  # [rad] likewise
+_APART = 0.02  # [m] smallest difference between demonstrations that is reported
+_ENDS_APART = 0.25  # of the size of the motion, likewise of starts and goals
+_PATHS_APART = 0.2  # of the size of the motion, likewise of paths between the same ends
+_ROTATIONS_APART = 0.6  # [rad] likewise of rotations
+_GROUP_RATIO = 2.5  # two groups are so many times farther apart than neighbours within a group
+_SHORT = {"goal": 0.12, "start": 0.2}  # fraction of the motion that an incomplete demonstration lacks, at least
+_DIFFERENT = 0.1  # of the size of the motion: smallest mean distance between a motion and a reversed one
+_ROTATED = 0.1  # [rad] smallest difference between demonstrations that only rotate
+_ON_PATH = 0.35  # an incomplete motion ends this much nearer to the path of another one than to its end
 
 
 def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: ArmModel | None = None) -> list[Finding]:
@@ -59,13 +83,13 @@ def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: Arm
     if not demonstrations:
         raise InputError("lint: no demonstrations; read some first")
     findings: list[Finding] = []
-    motions: list[Usable] = []
+    motions: list[ValidRows] = []
     for one in demonstrations:
         raw = RawDemonstration.of(one) if isinstance(one, Demonstration) else one
         for raw_check in RAW_CHECKS:
             findings += raw_check(raw)
         try:
-            motion = Usable.of(raw.with_poses(arm))
+            motion = ValidRows.of(raw.with_poses(arm))
         except InputError as error:
             message = str(error).removeprefix(f"{raw.source}: ")
             findings.append(raw.finding("error", "no-positions", message, "give the arm that was recorded"))
@@ -84,129 +108,10 @@ def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: Arm
     return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
 
 
-# --- the numbers in a file
-
-
-def check_rows(raw: RawDemonstration) -> Iterator[Finding]:
-    """Find numbers that are not finite, and recordings with few samples."""
-    invalid = np.flatnonzero(raw.not_finite())
-    if len(invalid):
-        yield raw.finding(
-            "error",
-            "not-finite",
-            f"{len(invalid)} of {len(raw)} rows hold nan or inf",
-            "fix the file, or read it with repair=True to drop those rows",
-            int(invalid[0]),
-        )
-    if len(raw) < _FEW:
-        yield raw.finding(
-            "warning", "few-samples", f"only {len(raw)} samples", f"record at 50 Hz or faster, {_FEW} samples or more"
-        )
-
-
-def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
-    """Find time stamps that do not increase, that are dates, or that are not in seconds."""
-    late = np.flatnonzero(raw.late())
-    if len(late):
-        row = int(late[0])
-        yield raw.finding(
-            "error",
-            "non-monotonic-stamps",
-            f"{len(late)} time stamps are not later than those before; the first is {raw.times[row]:.6g} s "
-            f"after {np.nanmax(raw.times[:row]):.6g} s",
-            "record again, or read it with repair=True to drop those rows",
-            row,
-        )
-    times = raw.times[~raw.not_finite()]
-    if len(times) < 3:
-        return
-    if np.abs(times).max() > _EPOCH:
-        yield raw.finding(
-            "note",
-            "epoch-stamps",
-            f"time stamps are dates ({times[0]:.0f} s), not seconds since the start",
-            "none needed: align subtracts the first",
-            0,
-        )
-    step = float(np.median(np.diff(np.sort(times))))
-    if step > _LONGEST_STEP:
-        fits = [
-            f'time_units="{name}" (a sample every {step * factor:.3g} s)'
-            for name, factor in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
-            if _STEPS[0] <= step * factor <= _STEPS[1]
-        ]
-        yield raw.finding(
-            "error",
-            "time-units",
-            f"samples are {step:.4g} s apart, {(times[-1] - times[0]) / 60:.4g} min in all; these are hardly seconds",
-            f"read it with {' or '.join(fits)}" if fits else "check which column holds the time, and its unit",
-        )
-
-
-def check_quaternions(raw: RawDemonstration) -> Iterator[Finding]:
-    """Find quaternions whose length is not one, and signs that flip."""
-    if raw.quaternions is None:
-        return
-    q = np.where(raw.not_finite()[:, None], np.nan, raw.quaternions)
-    length = np.nan_to_num(np.linalg.norm(q, axis=1), nan=1.0)
-    off = np.abs(length - 1.0)
-    worst = int(np.argmax(off))
-    if off[worst] > LENGTH_TOLERANCE:
-        first = int(np.flatnonzero(off > LENGTH_TOLERANCE)[0])
-        yield raw.finding(
-            "error",
-            "no-rotation",
-            f"{int(np.sum(off > LENGTH_TOLERANCE))} quaternions do not have length 1; the first has length "
-            f"{length[first]:.3g}",
-            "check which columns hold the quaternion",
-            first,
-        )
-    elif off[worst] > 0.1 * LENGTH_TOLERANCE:
-        yield raw.finding(
-            "warning",
-            "quaternion-length",
-            f"quaternions have length {length.min():.4f} to {length.max():.4f}; they are scaled to 1 when read",
-            "write them with more digits",
-            worst,
-        )
-    flips = np.flatnonzero(np.sum(q[1:] * q[:-1], axis=1) < 0.0) + 1
-    if len(flips):
-        yield raw.finding(
-            "note",
-            "quaternion-flips",
-            f"{len(flips)} times the quaternion's sign flips (q and -q are the same rotation)",
-            "none needed: signs are made continuous when read",
-            int(flips[0]),
-        )
-
-
-def check_held(raw: RawDemonstration) -> Iterator[Finding]:
-    """Find values that are sampled and held: a recorder that runs faster than its sensor."""
-    held = raw.held()
-    if held.any():
-        rows = (len(raw) - 1) / max(1, int((~held).sum()) - 1)
-        yield raw.finding(
-            "warning",
-            "held-values",
-            f"{held.sum()} of {len(raw)} rows repeat the row before: each value is held for about {rows:.2g} rows",
-            "read it with thin=True to drop the repeated rows",
-            int(np.flatnonzero(held)[0]),
-        )
-
-
-def check_notes(raw: RawDemonstration) -> Iterator[Finding]:
-    """Pass on what the reader left out or assumed."""
-    for note in raw.notes:
-        yield raw.finding("note", "reader", note, "none, unless it matters to you")
-
-
-RAW_CHECKS = (check_rows, check_stamps, check_quaternions, check_held, check_notes)
-
-
 # --- one motion
 
 
-def check_gaps(motion: Usable) -> Iterator[Finding]:
+def check_gaps(motion: ValidRows) -> Iterator[Finding]:
     """Find times without samples."""
     steps = np.diff(motion.times)
     gaps = np.flatnonzero(steps > max(_GAP, _GAP_STEPS * float(np.median(steps))))
@@ -214,17 +119,13 @@ def check_gaps(motion: Usable) -> Iterator[Finding]:
         longest = int(gaps[np.argmax(steps[gaps])])
         moved = float(np.linalg.norm(motion.positions[longest + 1] - motion.positions[longest]))
         count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
-        yield motion.finding(
-            "warning",
-            "gap",
-            f"{count} of {steps[longest]:.3g} s (usual step {np.median(steps):.3g} s), "
-            f"in which the tool moved {1e3 * moved:.0f} mm",
-            "record again, or accept a straight line across it",
-            longest + 1,
-        )
+        message = f"{count} of {steps[longest]:.3g} s (usual step {np.median(steps):.3g} s), "
+        message += f"in which the tool moved {1e3 * moved:.0f} mm"
+        remedy = "record again, or accept a straight line across it"
+        yield motion.finding("warning", "gap", message, remedy, longest + 1)
 
 
-def check_idle(motion: Usable) -> Iterator[Finding]:
+def check_idle(motion: ValidRows) -> Iterator[Finding]:
     """Find standing before and after the motion, and motions that never move."""
     rows = moving_rows(motion.times, motion.positions, motion.quaternions)
     if rows is None:
@@ -240,7 +141,7 @@ def check_idle(motion: Usable) -> Iterator[Finding]:
         yield motion.finding("note", "idle-tail", message, "none needed: align trims it", rows[1])
 
 
-def check_jumps(motion: Usable) -> Iterator[Finding]:
+def check_jumps(motion: ValidRows) -> Iterator[Finding]:
     """Find steps that are much faster than those around them: lost samples, glitches, a tracker that switched."""
     remedy = "record again, or cut the file before or after it"
     jumps, size = _jumps(motion.times, motion.positions, _JUMP_DISTANCE)
@@ -272,7 +173,7 @@ def _jumps(times: Array, values: Array, floor: float) -> tuple[NDArray[np.int64]
     return jumps + 1, size[jumps]
 
 
-def check_units(motion: Usable) -> Iterator[Finding]:
+def check_units(motion: ValidRows) -> Iterator[Finding]:
     """Find lengths that can't be metres, and offer every unit that fits."""
     distance = np.abs(motion.positions).max(axis=1)
     extent = float(np.ptp(motion.positions, axis=0).max())
@@ -286,12 +187,11 @@ def check_units(motion: Usable) -> Iterator[Finding]:
         remedy = f"read it with {' or '.join(fits)}" if fits else "check which columns hold the position"
         yield motion.finding("error", "units", f"{distance[row]:.4g} m from the base: hardly metres", remedy, row)
     elif _NO_MOTION < extent < _TINY and motion.quaternions is None:
-        yield motion.finding(
-            "warning", "units", f"the whole motion is {1e3 * extent:.2g} mm large", "check units: were they metres?"
-        )
+        message = f"the whole motion is {1e3 * extent:.2g} mm large"
+        yield motion.finding("warning", "units", message, "check units: were they metres?")
 
 
-def check_speed(motion: Usable) -> Iterator[Finding]:
+def check_speed(motion: ValidRows) -> Iterator[Finding]:
     """Find motions that are faster than a person guides an arm."""
     speed, _ = smooth_speed(motion.times, motion.positions)
     fast = float(np.percentile(speed, 95))
@@ -301,3 +201,249 @@ def check_speed(motion: Usable) -> Iterator[Finding]:
 
 
 MOTION_CHECKS = (check_gaps, check_idle, check_jumps, check_units, check_speed)
+
+
+# --- motions against each other
+
+
+def check_number(motions: Sequence[ValidRows]) -> Iterator[Finding]:
+    """Find that there is only one demonstration."""
+    if len(motions) == 1:
+        message = "only one demonstration: it does not show how exact each part of the motion must be"
+        yield motions[0].finding("warning", "single", message, "show the motion three times or more")
+
+
+def check_kinds(motions: Sequence[ValidRows]) -> Iterator[Finding]:
+    """Find rotations, joints or a third dimension in some demonstrations only."""
+    rotations, joints = ([getattr(m, what) is not None for m in motions] for what in ("quaternions", "joints"))
+    count = f"of {len(motions)} demonstrations have"
+    if any(rotations) and not all(rotations):
+        message = f"{sum(rotations)} {count} rotations, this one has none"
+        yield motions[rotations.index(False)].finding("error", "mixed-rotations", message, "leave it out")
+    if any(joints) and not all(joints):
+        message = f"{sum(joints)} {count} joints, this one has none"
+        yield motions[joints.index(False)].finding("note", "mixed-joints", message, "none: skills ignore joints")
+    flat = [bool(np.ptp(m.positions[:, 2]) == 0.0) for m in motions]
+    deep = [float(np.ptp(m.positions[:, 2])) > _FLAT for m in motions]
+    if any(flat) and any(deep):
+        message = f"{sum(flat)} of {len(flat)} demonstrations are planar (z does not change), the others are not"
+        remedy = "do not mix recordings with and without z"
+        yield motions[flat.index(True)].finding("warning", "mixed-dimensions", message, remedy)
+
+
+def check_durations(motions: Sequence[ValidRows]) -> Iterator[Finding]:
+    """Find that some take much longer than others."""
+    durations = np.array([motion.duration for motion in motions])
+    if durations.max() > _DURATION_RATIO * durations.min():
+        slow = int(np.argmax(durations))
+        message = f"takes {durations[slow]:.2f} s, another one {durations.min():.2f} s"
+        remedy = "align makes them equal; check that all show the whole motion"
+        yield motions[slow].finding("warning", "durations", message, remedy)
+
+
+def check_plane(motions: Sequence[ValidRows]) -> Iterator[Finding]:
+    """Find directions in which no demonstration moves."""
+    positions = np.concatenate([motion.positions for motion in motions])
+    deviations, directions = np.linalg.svd(positions - positions.mean(axis=0), full_matrices=False)[1:]
+    deviations = deviations / np.sqrt(len(positions))
+    flat = deviations < _FLAT
+    if flat.any() and deviations[0] > _FLAT:
+        normal = directions[-1] * np.sign(directions[-1][np.argmax(np.abs(directions[-1]))])
+        shape = "in a plane, normal" if flat.sum() == 1 else "on a straight line, across"
+        vector = " ".join(f"{x:.2f}" for x in normal + 0.0)
+        message = f"all motions lie {shape} ({vector}), within {1e3 * deviations[flat].max():.2g} mm"
+        yield Finding("note", "planar", message, remedy="none needed: that direction is kept constant when learning")
+
+
+def check_agreement(motions: Sequence[ValidRows]) -> Iterator[Finding]:
+    """Find demonstrations that run backwards, are incomplete, end elsewhere, or take another path than the others."""
+    trajectories = [one for motion in motions if (one := motion.moving_part()) is not None]
+    if len(trajectories) < len(motions) or len(motions) < 2:
+        return
+    scale = _Scale(1e3, "mm", _APART)
+    paths = np.stack([_by_length(one.positions) for one in trajectories])
+    size = float(np.median(np.linalg.norm(np.ptp(paths, axis=1), axis=1)))
+    if size < _FLAT:  # the tool only rotates
+        if any(one.quaternions is None for one in trajectories):
+            return
+        scale = _Scale(float(np.degrees(1.0)), "degrees", _ROTATED)
+        paths = np.stack([_by_length(path) for path in rotation_paths(trajectories)])
+        size = float(np.median(np.linalg.norm(np.ptp(paths, axis=1), axis=1)))
+    odd: set[int] = set()
+    found = [*_backwards(paths, size, motions, scale), *_incomplete(paths, size, motions, scale)]
+    for i, message, code, remedy in found:
+        if i not in odd:
+            odd.add(i)
+            yield motions[i].finding("error", code, message, remedy)
+    rest = [i for i in range(len(motions)) if i not in odd]
+    if len(rest) >= 2:
+        positions, rotations = _aligned([trajectories[i] for i in rest])
+        yield from _groups([motions[i] for i in rest], positions, rotations, size)
+        if len(rest) >= _FEWEST:
+            yield from _outliers([motions[i] for i in rest], positions, rotations)
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """How differences are reported: a factor, its unit, and the smallest difference that counts [m] or [rad]."""
+
+    factor: float
+    unit: str
+    smallest: float
+
+
+_Odd = tuple[int, str, str, str]  # which demonstration, message, code, remedy
+
+
+def _by_length(positions: Array) -> Array:
+    """Return the path (n, 3) at equal distances along it, whatever its pace."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    even = np.linspace(0.0, length[-1], len(positions))
+    return np.stack([np.interp(even, length, column) for column in positions.T], axis=1)
+
+
+def _mean_distance(paths: Array, others: Array) -> Array:
+    """Return the mean distance between each of ``paths`` and each of ``others``, shape (m, m)."""
+    return np.asarray(np.linalg.norm(paths[:, None] - others[None], axis=3).mean(axis=2))
+
+
+def _backwards(paths: Array, size: float, motions: Sequence[ValidRows], scale: _Scale) -> Iterator[_Odd]:
+    """Find motions that fit the most typical one much better when they are reversed."""
+    forward, backward = _mean_distance(paths, paths), _mean_distance(paths[:, ::-1], paths)
+    typical = int(np.argmin(forward.sum(axis=1)))
+    differs = forward[:, typical] > max(scale.smallest, _DIFFERENT * size)
+    for i in np.flatnonzero((backward < 0.5 * forward)[:, typical] & differs):
+        message = f"runs in the opposite direction to {motions[typical].name}"
+        yield int(i), message, "direction", "leave it out, or learn each direction as a skill of its own"
+
+
+def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: _Scale) -> Iterator[_Odd]:
+    """Find motions that stop, or begin, in the middle of the path of others."""
+    m, n, _ = paths.shape
+    for end, verb in (("goal", "stops"), ("start", "begins")):
+        along = paths if end == "goal" else paths[:, ::-1]  # towards the end in question
+        to_path = np.linalg.norm(along[:, None, -1:] - along[None], axis=3)  # of each end to each path (m, m, n)
+        nearest = np.argmin(to_path, axis=2)
+        apart = to_path[:, :, -1]
+        short = (
+            (apart > max(scale.smallest, _SHORT[end] * size))
+            & (to_path.min(axis=2) < _ON_PATH * apart)
+            & (nearest < (1.0 - _SHORT[end]) * (n - 1))
+        )
+        for i in range(m):
+            whole = np.flatnonzero(short[i] & ~short.any(axis=1))
+            if len(whole) and 2 * short[i].sum() >= m - 1:
+                done = nearest[i, whole[0]] / (n - 1)
+                percent = 100.0 * (done if verb == "stops" else 1.0 - done)
+                message = f"{verb} at {percent:.0f} % of the path of {motions[whole[0]].name}, "
+                message += f"{scale.factor * apart[i, whole[0]]:.0f} {scale.unit} from its {end}"
+                yield i, message, "incomplete", "leave it out, or record the whole motion again"
+
+
+def _aligned(trajectories: Sequence[Trajectory]) -> tuple[Array, Array | None]:
+    """Return positions (m, n, 3) and rotations (m, n, 4), or None, at corresponding times."""
+    if any(one.quaternions is None for one in trajectories):
+        trajectories = [Trajectory(one.times, one.positions) for one in trajectories]
+    warps = barycentre_warps(features(trajectories), n_iterations=4)
+    warped = [one.at(warp * one.duration) for one, warp in zip(trajectories, warps, strict=True)]
+    rotations = [q for _, q in warped if q is not None]
+    return np.stack([p for p, _ in warped]), np.stack(rotations) if rotations else None
+
+
+def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | None, size: float) -> Iterator[Finding]:
+    """Find demonstrations that fall apart in two groups: by starts, goals, paths between them, or rotations."""
+    between = to_common_ends(positions)
+    kinds: list[tuple[str, Severity, str, Array, float, float, str]] = [
+        ("ends", "warning", "starts", _largest(positions[:, :1]), _ENDS_APART * size, 1e3, "mm"),
+        ("ends", "warning", "goals", _largest(positions[:, -1:]), _ENDS_APART * size, 1e3, "mm"),
+        ("two-paths", "error", "paths between the same ends", _largest(between), _PATHS_APART * size, 1e3, "mm"),
+    ]
+    if rotations is not None:
+        apart = np.stack([_angles(rotations, q).max(axis=1) for q in rotations])
+        kinds.append(("two-rotations", "warning", "rotations", apart, _ROTATIONS_APART, np.degrees(1.0), "degrees"))
+    for code, severity, what, distance, floor, factor, unit in kinds:
+        split = _split(distance, floor if unit == "degrees" else max(_APART, floor))
+        if split is None:
+            continue
+        group, gap = split
+        few, many = sorted((np.flatnonzero(group), np.flatnonzero(~group)), key=len)
+        if code != "ends" and len(few) == 1 and len(motions) >= _FEWEST:
+            continue  # one among many is an outlier
+        groups = f"of {_names(motions, few)} and of {_names(motions, many)}"
+        message = f"the {what} {groups} are {factor * gap:.0f} {unit} apart"
+        remedy = "learn each group as a skill of its own: the mean of both is a motion that nobody has shown"
+        yield motions[few[0]].finding(severity, code, message, remedy)
+
+
+def _largest(paths: Array) -> Array:
+    """Return the largest distance between paths (m, n, 3) at equal times, shape (m, m)."""
+    return np.asarray(np.linalg.norm(paths[:, None] - paths[None], axis=3).max(axis=2))
+
+
+def _angles(rotations: Array, reference: Array) -> Array:
+    """Return the angles between rotations (m, n, 4) and reference rotations (n, 4), shape (m, n) [rad]."""
+    back = quaternion_conjugate(reference)
+    return np.stack([np.linalg.norm(quaternion_log(quaternion_multiply(q, back)), axis=1) for q in rotations])
+
+
+def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | None:
+    """Return one of two groups as a mask (m,), and the gap between both; None when there is one group.
+
+    The gap is the longest link of the minimum spanning tree. It must exceed ``floor``, and with more than two
+    demonstrations the next longest link by a factor: then neighbours are much nearer within the groups.
+    """
+    m = len(distance)
+    nearest, inside, links = distance[0].copy(), np.arange(m) == 0, []
+    while not inside.all():
+        new = int(np.argmin(np.where(inside, np.inf, nearest)))
+        links.append(float(nearest[new]))
+        inside[new] = True
+        nearest = np.minimum(nearest, distance[new])
+    links.sort()
+    if links[-1] <= floor or (m > 2 and links[-1] <= _GROUP_RATIO * links[-2] and not links[-2] > floor):
+        return None
+    group = np.arange(m) == 0
+    for _ in range(m):
+        group = (distance[group] < links[-1]).any(axis=0)
+    return group, links[-1]
+
+
+def _names(motions: Sequence[ValidRows], which: NDArray[np.int64]) -> str:
+    """Return up to three names, and how many more there are."""
+    names = [motions[i].name for i in which]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def _outliers(motions: Sequence[ValidRows], positions: Array, rotations: Array | None) -> Iterator[Finding]:
+    """Find the demonstration whose path, once aligned, differs from all others.
+
+    Distances are measured from the medoid, the demonstration that is nearest to all others. At least four
+    demonstrations are needed to know what is usual.
+    """
+    distance = _mean_distance(positions, positions)
+    center = int(np.argmin(np.sum(distance, axis=1)))
+    for i in _unlike(distance[center], center, _OUTLIER_DISTANCE):
+        usual = float(np.median(np.delete(distance[center], center)))
+        message = f"is {1e3 * distance[center, i]:.0f} mm from the most typical one ({motions[center].raw.source}), "
+        message += f"usual are {1e3 * usual:.0f} mm"
+        yield motions[i].finding("warning", "outlier", message, "check it; leave it out if it shows something else")
+    if rotations is None:
+        return
+    angle = _angles(rotations, rotations[center]).mean(axis=1)
+    for i in _unlike(angle, center, _OUTLIER_ANGLE):
+        message = f"is rotated by {np.degrees(angle[i]):.0f} degrees from the most typical one "
+        message += f"({motions[center].raw.source}), usual are {np.degrees(np.median(np.delete(angle, center))):.0f}"
+        remedy = "check it, and the order of its quaternions (wxyz or xyzw)"
+        yield motions[i].finding("warning", "rotation-outlier", message, remedy)
+
+
+def _unlike(distance: Array, center: int, floor: float) -> list[int]:
+    """Return the demonstrations that are unusually far from the medoid ``center``, of distances (n,)."""
+    others = np.delete(distance, center)
+    usual = float(np.median(others))
+    spread = 1.4826 * float(np.median(np.abs(others - usual)))
+    limit = max(floor, _OUTLIER_RATIO * usual, usual + _OUTLIER_SPREADS * spread)
+    return [int(i) for i in np.flatnonzero(distance > limit)]
+
+
+SET_CHECKS = (check_number, check_kinds, check_durations, check_plane, check_agreement)

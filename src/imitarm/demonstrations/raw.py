@@ -1,8 +1,9 @@
-"""A demonstration as it was recorded, with its faults; its valid rows; and what lint reports about it."""
+"""A demonstration as it was recorded, and the checks of the numbers in its file."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Literal
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.demonstrations.align import moving_rows
+from imitarm.demonstrations.align import held_rows, moving_rows
 from imitarm.errors import FileFormatError, InputError
 from imitarm.trajectory import Demonstration, Trajectory
 
@@ -22,14 +23,16 @@ Severity = Literal["error", "warning", "note"]
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
-LENGTH_TOLERANCE = 0.05  # files with two decimals hold quaternions this far from length one
+_LENGTH_TOLERANCE = 0.05  # files with two decimals hold quaternions this far from length one
 _ABSURD_DISTANCE = 1e5  # [m] no unit of length turns a robot's reach into this
 _BOUND = 1e30  # larger numbers come from damaged files, and overflow when squared
 _MAX_DROPPED = 0.1  # largest fraction of rows that `repair` may drop
 _SAMPLES = 100  # of each motion, when motions are compared
-_HELD = 0.2  # fraction of rows that repeat the row before, above which values count as held
-_FEWEST_HELD = 5  # number of separate repeats, likewise: one long pause is not a held value
-_QUANTA = 4.0  # steps of a held value are larger than this many least digits; rounded values step by one or two
+
+_EPOCH = 1e8  # [s] later times are dates (after 1973), not times since the start
+_FEW = 20  # samples
+_LONGEST_STEP = 0.5  # [s] between samples
+_STEPS = (2e-4, _LONGEST_STEP)  # [s] between samples of usual recorders
 
 _GENERIC_JOINT = re.compile(r"(?:j|joint|q|a|axis)_?\d+", re.IGNORECASE)
 _NUMBER_AT_END = re.compile(r"(\d+)$")
@@ -193,7 +196,7 @@ class RawDemonstration:
         nor is rounding: the value must be held many times during the motion, and must change by more than its last
         digits between.
         """
-        masks = [_held(part) for part in (self.positions, self.quaternions, self.joints) if part is not None]
+        masks = [held_rows(part) for part in (self.positions, self.quaternions, self.joints) if part is not None]
         return max(masks, key=lambda mask: int(mask.sum()), default=np.zeros(len(self), dtype=bool))
 
     def thinned(self) -> RawDemonstration:
@@ -237,10 +240,8 @@ class RawDemonstration:
         far = np.abs(raw.positions[keep]).max(axis=1) > _ABSURD_DISTANCE
         if far.any():
             row = int(keep[np.flatnonzero(far)[0]])
-            raise FileFormatError(
-                f"{raw.where(row)}: no robot reaches position {raw.positions[row].tolist()} m; check which columns "
-                "hold the position"
-            )
+            position = f"position {raw.positions[row].tolist()} m"
+            raise FileFormatError(f"{raw.where(row)}: no robot reaches {position}; check which columns hold it")
         quaternions = None if raw.quaternions is None else _unit(raw, keep)
         source = raw.source + (f" ({bad.sum()} of {len(raw)} rows dropped)" if bad.any() else "")
         return Demonstration(
@@ -252,40 +253,20 @@ class RawDemonstration:
         )
 
 
-def _held(values: Array) -> NDArray[np.bool_]:
-    """Return which rows of one recorded quantity (n, d) repeat a held value, shape (n,)."""
-    none = np.zeros(len(values), dtype=bool)
-    steps = np.abs(np.diff(values, axis=0))
-    same = np.asarray(~(steps > 0.0).any(axis=1))
-    changes = np.flatnonzero(~same)
-    if len(changes) <= _FEWEST_HELD:
-        return none
-    repeats = np.diff(changes) > 1  # between two changes the value was held
-    moving = same[changes[0] : changes[-1] + 1]
-    if repeats.sum() < max(_FEWEST_HELD, 0.1 * len(repeats)) or moving.mean() < _HELD:
-        return none
-    largest = steps[changes].max(axis=1)
-    if np.median(largest) <= _QUANTA * float(np.min(steps[steps > 0.0])):
-        return none
-    return np.concatenate([[False], same])
-
-
 def _unit(raw: RawDemonstration, keep: NDArray[np.int64]) -> Array:
     """Return the quaternions of rows ``keep`` scaled to length one."""
     assert raw.quaternions is not None
     quaternions = raw.quaternions[keep]
     length = np.linalg.norm(quaternions, axis=1)
-    bad = np.flatnonzero(np.abs(length - 1.0) > LENGTH_TOLERANCE)
+    bad = np.flatnonzero(np.abs(length - 1.0) > _LENGTH_TOLERANCE)
     if len(bad):
-        raise FileFormatError(
-            f"{raw.where(int(keep[bad[0]]))}: quaternion of length {length[bad[0]]:.3g}, must be 1; check which "
-            "columns hold it"
-        )
+        what = f"quaternion of length {length[bad[0]]:.3g}, must be 1; check which columns hold it"
+        raise FileFormatError(f"{raw.where(int(keep[bad[0]]))}: {what}")
     return np.asarray(quaternions / length[:, None])
 
 
 @dataclass(frozen=True, eq=False)
-class Usable:
+class ValidRows:
     """The valid rows of a raw demonstration: finite, each later than the one before, and not a repeated held value.
 
     Attributes:
@@ -305,7 +286,7 @@ class Usable:
     joints: Array | None
 
     @classmethod
-    def of(cls, raw: RawDemonstration) -> Usable | None:
+    def of(cls, raw: RawDemonstration) -> ValidRows | None:
         """Choose the valid rows; None when fewer than 5 are left or there are no positions."""
         if raw.positions is None:
             return None
@@ -350,3 +331,119 @@ class Usable:
     def finding(self, severity: Severity, code: str, message: str, remedy: str, index: int | None = None) -> Finding:
         """Return a finding about sample ``index`` of the valid ones."""
         return self.raw.finding(severity, code, message, remedy, None if index is None else int(self.rows[index]))
+
+
+def check_rows(raw: RawDemonstration) -> Iterator[Finding]:
+    """Find numbers that are not finite, and recordings with few samples."""
+    invalid = np.flatnonzero(raw.not_finite())
+    if len(invalid):
+        yield raw.finding(
+            "error",
+            "not-finite",
+            f"{len(invalid)} of {len(raw)} rows hold nan or inf",
+            "fix the file, or read it with repair=True to drop those rows",
+            int(invalid[0]),
+        )
+    if len(raw) < _FEW:
+        yield raw.finding(
+            "warning", "few-samples", f"only {len(raw)} samples", f"record at 50 Hz or faster, {_FEW} samples or more"
+        )
+
+
+def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
+    """Find time stamps that do not increase, that are dates, or that are not in seconds."""
+    late = np.flatnonzero(raw.late())
+    if len(late):
+        row = int(late[0])
+        yield raw.finding(
+            "error",
+            "non-monotonic-stamps",
+            f"{len(late)} time stamps are not later than those before; the first is {raw.times[row]:.6g} s "
+            f"after {np.nanmax(raw.times[:row]):.6g} s",
+            "record again, or read it with repair=True to drop those rows",
+            row,
+        )
+    times = raw.times[~raw.not_finite()]
+    if len(times) < 3:
+        return
+    if np.abs(times).max() > _EPOCH:
+        yield raw.finding(
+            "note",
+            "epoch-stamps",
+            f"time stamps are dates ({times[0]:.0f} s), not seconds since the start",
+            "none needed: align subtracts the first",
+            0,
+        )
+    step = float(np.median(np.diff(np.sort(times))))
+    if step > _LONGEST_STEP:
+        fits = [
+            f'time_units="{name}" (a sample every {step * factor:.3g} s)'
+            for name, factor in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
+            if _STEPS[0] <= step * factor <= _STEPS[1]
+        ]
+        yield raw.finding(
+            "error",
+            "time-units",
+            f"samples are {step:.4g} s apart, {(times[-1] - times[0]) / 60:.4g} min in all; these are hardly seconds",
+            f"read it with {' or '.join(fits)}" if fits else "check which column holds the time, and its unit",
+        )
+
+
+def check_quaternions(raw: RawDemonstration) -> Iterator[Finding]:
+    """Find quaternions whose length is not one, and signs that flip."""
+    if raw.quaternions is None:
+        return
+    q = np.where(raw.not_finite()[:, None], np.nan, raw.quaternions)
+    length = np.nan_to_num(np.linalg.norm(q, axis=1), nan=1.0)
+    off = np.abs(length - 1.0)
+    worst = int(np.argmax(off))
+    if off[worst] > _LENGTH_TOLERANCE:
+        first = int(np.flatnonzero(off > _LENGTH_TOLERANCE)[0])
+        yield raw.finding(
+            "error",
+            "no-rotation",
+            f"{int(np.sum(off > _LENGTH_TOLERANCE))} quaternions do not have length 1; the first has length "
+            f"{length[first]:.3g}",
+            "check which columns hold the quaternion",
+            first,
+        )
+    elif off[worst] > 0.1 * _LENGTH_TOLERANCE:
+        yield raw.finding(
+            "warning",
+            "quaternion-length",
+            f"quaternions have length {length.min():.4f} to {length.max():.4f}; they are scaled to 1 when read",
+            "write them with more digits",
+            worst,
+        )
+    flips = np.flatnonzero(np.sum(q[1:] * q[:-1], axis=1) < 0.0) + 1
+    if len(flips):
+        yield raw.finding(
+            "note",
+            "quaternion-flips",
+            f"{len(flips)} times the quaternion's sign flips (q and -q are the same rotation)",
+            "none needed: signs are made continuous when read",
+            int(flips[0]),
+        )
+
+
+def check_held(raw: RawDemonstration) -> Iterator[Finding]:
+    """Find values that are sampled and held: a recorder that runs faster than its sensor."""
+    held = raw.held()
+    if held.any():
+        rows = (len(raw) - 1) / max(1, int((~held).sum()) - 1)
+        yield raw.finding(
+            "warning",
+            "held-values",
+            f"{held.sum()} of {len(raw)} rows repeat the row before: each value is held for about {rows:.2g} rows",
+            "read it with thin=True to drop the repeated rows",
+            int(np.flatnonzero(held)[0]),
+        )
+
+
+def check_notes(raw: RawDemonstration) -> Iterator[Finding]:
+    """Pass on what the reader left out or assumed."""
+    for note in raw.notes:
+        yield raw.finding("note", "reader", note, "none, unless it matters to you")
+
+
+RAW_CHECKS = (check_rows, check_stamps, check_quaternions, check_held, check_notes)
