@@ -313,11 +313,12 @@ def _jumps(view: _View) -> Iterator[RecordingIssue]:
     if jump.any():
         size = np.where(jump, step[:, joints], 0.0)
         i, joint = divmod(int(np.argmax(size)), len(joints))
-        message = f"{int(jump.any(axis=1).sum())} jumps that do not come back, the largest {size[i, joint]:.2f} m from "
+        count = int(jump.any(axis=1).sum())
+        message = f"{count} jump{'' if count == 1 else 's'} without return, the largest {size[i, joint]:.2f} m from "
         message += f"one frame to the next ({JOINTS[joints[joint]]}, {speed[i, joints[joint]]:.0f} m/s)"
         remedy = "cut there by trim, or record again"
         first = int(np.argmax(jump.any(axis=1))) + 1
-        yield view.issue(_severity_of(joints, jump), "jump", message, remedy, int(view.later[first]))
+        yield view.issue("warning", "jump", message, remedy, int(view.later[first]))
 
 
 def _followed(view: _View) -> list[int]:
