@@ -53,6 +53,8 @@ class DMPState(NamedTuple):
         target: the motion that was asked for: its start, goal and duration.
         rotation: state of the rotation; None when none was learned.
         steps: length of the steps so far, as a fraction of the duration, and their number; None when they differed.
+        checked: ``motion`` itself when it is known to be finite. A step checks a state that was changed by hand, and
+            spends no time on one that comes from the step before.
     """
 
     motion: Array
@@ -60,6 +62,7 @@ class DMPState(NamedTuple):
     target: MovingTarget
     rotation: RotationState | None = None
     steps: tuple[float, int] | None = None
+    checked: Array | None = None
 
     @property
     def position(self) -> Array:
@@ -307,47 +310,43 @@ class DMP:
             InputError: when an argument is not finite or of a wrong shape, ``dt`` is not above 0 or above
                 100 durations, or ``patience`` is not above 0.
         """
-        self._check_fitted()
-        instance(state, DMPState, "DMP.step: state")
-        if not math.isfinite(sum(state.motion.ravel().tolist())):
-            raise InputError("DMP.step: state must hold finite numbers; begin again from a valid state")
-        target, steps = state.target, state.steps
+        if type(state) is not DMPState:
+            instance(state, DMPState, "DMP.step: state")
+        before, fraction, target, rotation, steps, checked = state
+        if checked is not before:
+            self._check_fitted()
+            finite_array(before, (2, 3), "DMP.step: motion of the state")
         if goal is not None:
-            goal = finite_vector(goal, 3, "DMP.step: goal", "m")
-            if not np.array_equal(goal, target.goal):
-                target = self._target(target.start, goal.copy(), target.duration, target.adjustment)
+            asked = finite_vector(goal, 3, "DMP.step: goal", "m")
+            if not np.array_equal(asked, target.goal):
+                target = self._target(target.start, asked.copy(), target.duration, target.adjustment)
                 steps = None
-        T = target.duration
-        h = finite_number(dt, "DMP.step: dt", "s", above=0.0, at_most=_LONGEST_STEP * T) / T
-        if measured is not None:
-            lag = finite_vector(measured, 3, "DMP.step: measured", "m") - state.motion[0]
-            h /= 1.0 + math.hypot(*lag) / finite_number(patience, "DMP.step: patience", "m", above=0.0)
-        h = max(h, _SHORTEST_STEP)
+        h = dt / target.duration if type(dt) is float else 0.0
+        if not _SHORTEST_STEP < h <= 1.0 or measured is not None:
+            h = _step_length(dt, target.duration, before[0], measured, patience)
         done = 0
         if steps is not None:
             done = steps[1] if steps[0] == h else -1
-        elif state.fraction > 0.0:
+        elif fraction > 0.0:
             done = -1
         plan = target.plan(self.gains_, h) if done >= 0 else None
         if plan is not None and done < len(plan.pushes):
-            motion = plan.transition.dot(state.motion) + plan.pushes[done]  # dot: @ is slower on small arrays
+            motion = plan.transition.dot(before) + plan.pushes[done]  # dot: @ is slower on small arrays
         else:
             one = propagator(self.gains_, h, self.n_basis)
-            y = target.at(np.exp(-DECAY * (state.fraction + one.instants)))
-            motion = one.transition.dot(state.motion) + one.drive.dot(y)
+            y = target.at(np.exp(-DECAY * (fraction + one.instants)))
+            motion = one.transition.dot(before) + one.drive.dot(y)
         angular = None
         if coupling is not None:
-            acceleration = _acceleration(function(coupling, "DMP: coupling")(state.motion[0], state.motion[1] / T)) * (
-                T * T
-            )
+            T = target.duration
+            acceleration = _acceleration(coupling, before[0], before[1] / T) * (T * T)
             motion += propagator(self.gains_, h, self.n_basis).push[:, None] * acceleration[:3]
             angular = acceleration[3:] if len(acceleration) == 6 else None
-        rotation = state.rotation
         if rotation is not None and self.orientation_ is not None:
             rotation = self.orientation_.step(rotation, h, angular)
         if done < 0:
-            return DMPState(motion, state.fraction + h, target, rotation, None)
-        return DMPState(motion, (done + 1) * h, target, rotation, (h, done + 1))
+            return DMPState(motion, fraction + h, target, rotation, None, motion)
+        return DMPState(motion, (done + 1) * h, target, rotation, (h, done + 1), motion)
 
     def generate(
         self,
@@ -420,8 +419,18 @@ def _position(value: Pose | ArrayLike | None, default: Array, what: str) -> Arra
     return finite_vector(value, 3, f"DMP: {what} (a Pose or a position)", "m").copy()
 
 
-def _acceleration(value: ArrayLike) -> Array:
-    acceleration = finite_array(value, (None,), "DMP: acceleration that coupling returns", "m/s^2, rad/s^2")
+def _step_length(dt: float, duration: float, position: Array, measured: ArrayLike | None, patience: float) -> float:
+    """Return a step as a fraction of the duration, slowed down by a lag."""
+    h = finite_number(dt, "DMP.step: dt", "s", above=0.0, at_most=_LONGEST_STEP * duration) / duration
+    if measured is not None:
+        lag = finite_vector(measured, 3, "DMP.step: measured", "m") - position
+        h /= 1.0 + math.hypot(*lag) / finite_number(patience, "DMP.step: patience", "m", above=0.0)
+    return max(h, _SHORTEST_STEP)
+
+
+def _acceleration(coupling: Coupling, position: Array, velocity: Array) -> Array:
+    added = function(coupling, "DMP: coupling")(position, velocity)
+    acceleration = finite_array(added, (None,), "DMP: acceleration that coupling returns", "m/s^2, rad/s^2")
     if len(acceleration) not in (3, 6):
         raise InputError(f"DMP: coupling must return 3 or 6 numbers, got {len(acceleration)}")
     return acceleration

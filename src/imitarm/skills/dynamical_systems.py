@@ -220,11 +220,11 @@ class PlannedSteps(NamedTuple):
 
     Attributes:
         transition: of one step, shape (2, 2).
-        pushes: what the target adds in each step, shape (n, 2, 3).
+        pushes: what the target adds, for each of the n steps an array of shape (2, 3).
     """
 
     transition: Array
-    pushes: Array
+    pushes: list[Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +275,7 @@ class MovingTarget:
             else:
                 n = int(np.ceil(1.0 / step))
                 y = self.at(np.exp(-0.5 * DECAY * step / m * np.arange(2 * n * m + 1)))
-            plan = PlannedSteps(one.transition, np.asarray(one.drive @ np.moveaxis(targets_by_step(one, y), 0, 1)))
+            plan = PlannedSteps(one.transition, list(one.drive @ np.moveaxis(targets_by_step(one, y), 0, 1)))
             self._plans[step] = plan
         return plan
 
