@@ -80,14 +80,14 @@ class ClearanceLimit:
         if pairs is None:
             return None
         obstacle, sphere, distance, normal = pairs
-        points = centers.T.take(sphere, axis=1)
-        velocity = packed.velocities.T.take(obstacle, axis=1)
-        if packed.rotating:  # the nearest surface point moves at v + w x (p - origin); its offset along n adds nothing
-            arms = points - packed.positions.T[:, obstacle]
-            velocity += np.cross(packed.angular_velocities.T[:, obstacle], arms, axis=0)
-        velocity *= normal
-        lower = np.add.reduce(velocity, axis=0)
+        points = centers.take(sphere, axis=0).T
         room = distance - self._reduced.take(sphere)
-        lower -= self.rate * room
+        lower = -self.rate * room
         lower -= (self.retreat_rate - self.rate) * np.minimum(room, 0.0)
+        if not packed.still:
+            velocity = packed.velocities.take(obstacle, axis=0).T
+            if packed.rotating:  # the nearest surface point p moves at v + w x (p - origin); c - p is along n
+                arms = points - packed.positions.take(obstacle, axis=0).T
+                velocity = velocity + np.cross(packed.angular_velocities.take(obstacle, axis=0).T, arms, axis=0)
+            lower += np.einsum("ij,ij->j", velocity, normal)
         return Rows(self._cover.speeds(data, sphere, points, normal), lower)

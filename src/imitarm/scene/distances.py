@@ -362,9 +362,9 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
     if not len(near):
         return None
     if len(near) < len(flat):
-        place, point, distance, normal = place[near], point[near], distance[near], normal[:, near]
+        place, point, distance, normal = (x.take(near, axis=-1) for x in (place, point, distance, normal))
     base = np.einsum("jk,kji->ik", normal, frames.to_own.take(place, axis=0))
-    return NearPairs(packed._order[place], point, distance, base)
+    return NearPairs(packed._order.take(place), point, distance, base)
 
 
 def _evaluate(
