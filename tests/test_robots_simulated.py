@@ -256,8 +256,8 @@ def test_an_arm_from_elsewhere_without_the_collision_group_has_clearance(tmp_pat
     "options, error, message",
     [
         ({"control": "magic"}, UnknownNameError, "position, torque"),
-        ({"timestep": 0.01}, InputError, "500 Hz"),
-        ({"timestep": 0.0}, InputError, "500 Hz"),
+        ({"timestep": 0.01}, InputError, "timestep must be a finite number above 0 and of at most 0.002"),
+        ({"timestep": 0.0}, InputError, "timestep must be a finite number above 0 and of at most 0.002"),
         ({"q": np.zeros(6)}, InputError, "q must be 7 numbers"),
         ({"q": np.full(7, 9.0)}, InputError, "right_j0 at 9.0000 rad is outside"),
     ],
@@ -271,7 +271,7 @@ def test_bad_commands_are_named(arm):
     robot = SimulatedRobot(arm)
     with pytest.raises(InputError, match=r"multiple of the timestep 0\.002"):
         robot.move(np.zeros(7), 0.005)
-    with pytest.raises(InputError, match="wrench must be 6"):
+    with pytest.raises(InputError, match="wrench must be"):
         robot.guide([0.0, 0.0, np.nan, 0.0, 0.0, 0.0], DT)
     with pytest.raises(InputError, match="q must be finite"):
         robot.reset(np.full(7, np.nan))

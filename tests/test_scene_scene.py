@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
@@ -101,3 +104,79 @@ def test_list_becomes_a_tuple():
     obstacles.clear()
     assert len(scene.obstacles) == 1
     assert isinstance(scene.obstacles, tuple)
+
+
+def test_what_a_tracker_knows_is_kept():
+    covariance = np.diag([1e-4, 2e-4, 3e-4])
+    seen = Sphere([0.5, 0, 0], 0.1, velocity=[1.0, 0, 0], covariance=covariance, track_id=7)
+    scene = Scene(None, [seen, Sphere([0, 0, 0], 0.1)], stamp=2.0)
+    later = scene.at(2.5)
+    assert later.stamp == 2.5
+    np.testing.assert_array_equal(later.packed.stamps, [2.0, 2.0])  # when they were seen
+    np.testing.assert_array_equal(later.packed.track_ids, [7, -1])
+    np.testing.assert_array_equal(later.packed.covariances, [covariance, np.zeros((3, 3))])
+    np.testing.assert_allclose(later.packed.positions[0], [1.0, 0, 0])
+    assert later.obstacles[0].track_id == 7
+    np.testing.assert_array_equal(later.obstacles[0].covariance, covariance)
+    assert later.obstacles[1] is scene.obstacles[1]  # it stands
+    np.testing.assert_allclose(later.at(3.0).obstacles[0].center, [1.5, 0, 0])
+    np.testing.assert_allclose(later.at(2.0).obstacles[0].center, [0.5, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"covariance": np.diag([1.0, -1.0, 1.0])}, "covariance must be symmetric and positive"),
+        ({"covariance": [[1, 2, 0], [0, 1, 0], [0, 0, 1]]}, "covariance must be symmetric"),
+        ({"covariance": np.eye(2)}, "covariance must be an array of shape"),
+        ({"covariance": np.full((3, 3), np.nan)}, "covariance must be finite"),
+        ({"track_id": -1}, "track_id must be a whole number"),
+        ({"track_id": 1.5}, "track_id must be a whole number"),
+        ({"angular_velocity": [0, 0, np.inf]}, "angular_velocity must be finite"),
+        ({"angular_velocity": 3.0}, "angular_velocity must be 3 numbers"),
+    ],
+)
+def test_what_no_tracker_can_know_is_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        Sphere([0, 0, 0], 0.1, **change)
+
+
+def test_a_predicted_scene_can_be_copied_and_sent(scene):
+    later = scene.at(0.7)
+    points = np.random.default_rng(3).normal(size=(20, 3))
+    for twin in (pickle.loads(pickle.dumps(later)), copy.deepcopy(later)):
+        np.testing.assert_allclose(twin.distances(points), later.distances(points), atol=1e-12)
+        assert [type(o) for o in twin.obstacles] == [type(o) for o in scene.obstacles]
+    assert not hasattr(later, "no such thing")
+
+
+def test_repr_names_the_obstacles():
+    scene = Scene(
+        GOAL, [Sphere([0, 0, 0.5], 0.1, name="<ball>", velocity=[0.1, 0, 0])] * 6, fixtures=[Box(GOAL, [1, 1, 1])]
+    )
+    assert repr(scene) == (
+        'Scene(sphere "<ball>", sphere "<ball>", sphere "<ball>", sphere "<ball>", 2 more, goal [0.5, 0.0, 0.3], stamp 0 s)'
+    )
+    assert repr(Scene()) == "Scene(no obstacles, stamp 0 s)"
+    table = scene._repr_html_()
+    assert "&lt;ball&gt;" in table
+    assert "0.1 m/s" in table
+    assert "fixtures" in table
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -0.01, "5 mm", None, [0.1, 0.2]])
+def test_check_refuses_a_radius_that_is_none(scene, bad):
+    with pytest.raises(InputError, match="tool_radius must be a finite number"):
+        scene.check(bad)
+
+
+@pytest.mark.parametrize("bad", [np.nan, None, "now", [1.0]])
+def test_a_time_that_is_none_is_refused(bad):
+    with pytest.raises(InputError, match="stamp must be a finite number"):
+        Scene(stamp=bad)
+    with pytest.raises(InputError, match="time must be a finite number"):
+        Scene().at(bad)
+    with pytest.raises(InputError, match="index must be a whole number"):
+        Scene().name_of(bad)
+    with pytest.raises(InputError, match=r"fixtures"):
+        Scene(fixtures=[bad])

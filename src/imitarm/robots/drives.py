@@ -1,4 +1,4 @@
-"""The drives of a simulated arm: position servos, computed torque, the free drive of hand guiding; the gripper's."""
+"""The drives of a simulated arm (position servos, computed torque, hand guiding) and of its gripper."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ SERVO_FREQUENCY = 60.0  # [rad/s] stiffness of the position servos: K = w^2 time
 COMPUTED_FREQUENCY = 40.0  # [rad/s] of the computed-torque error dynamics
 GRIPPER = "tool/opening"  # the actuator of a mounted gripper
 FINGER_SPEED = 0.12  # [m/s] at which a gripper's opening changes, as electric parallel grippers do
-_DRY_FRICTION_SPEED = 0.02  # [rad/s] below it the drives take only a part of the dry friction for granted
-_LIGHTENED_FRICTION = 0.7  # share of the dry friction that a free drive takes off the hand
-_GUIDED_DAMPING = 0.05  # [s/rad] damping of a guided joint over its rated torque
+_DRY_FRICTION_SPEED = 0.02  # [rad/s] below it the drives compensate only a part of the dry friction
+_LIGHTENED_FRICTION = 0.7  # fraction of the dry friction that is compensated in hand guiding
+_GUIDED_DAMPING = 0.05  # [s/rad] damping of a guided joint per rated torque
 
 
 def add_drives(spec: mujoco.MjSpec, arm: ArmModel) -> None:
-    """Give every joint of the arm one drive with its rated torque, instead of any actuator it had.
+    """Give every joint of the arm one drive with its rated torque, in place of its own actuators.
 
     Args:
         spec: the world that holds the arm; changed in place.
-        arm: whose joints and torques.
+        arm: its joints and rated torques are used.
     """
     for actuator in list(spec.actuators):
         if actuator.target in arm.joint_names:
@@ -46,8 +46,9 @@ def add_drives(spec: mujoco.MjSpec, arm: ArmModel) -> None:
 class Drives:
     """One drive for each joint; every method makes one physics step.
 
-    ``M`` is the inertia matrix with the rotors, ``h`` gravity and Coriolis torques, ``f`` the joints' viscous and dry
-    friction at ``v_d``, ``q_d``, ``v_d``, ``a_d`` the set-point. Torques beyond the rated ones are cut off.
+    ``M`` is the inertia matrix with the rotors, ``h`` the torques of gravity and Coriolis forces, and ``f`` the joints'
+    viscous and dry friction at ``v_d``. ``q_d``, ``v_d`` and ``a_d`` are the set-point. The rated torques are never
+    exceeded.
 
     Args:
         model: the compiled world, with the drives that :func:`add_drives` has added.
@@ -86,7 +87,7 @@ class Drives:
 
     @property
     def torque(self) -> Array:
-        """Torques that the drives give, shape (n,) [N m]."""
+        """Torques of the drives, shape (n,) [N m]."""
         return np.asarray(self._data.actuator_force[self._ids])
 
     @property
@@ -100,10 +101,10 @@ class Drives:
         return float("nan") if self._gripper is None else float(self._model.actuator_ctrlrange[self._gripper, 1])
 
     def grasp(self, opening: float) -> None:
-        """Let the gripper's servo go to ``opening`` [m] at 0.12 m/s; it presses with at most its own force.
+        """Move the gripper to ``opening`` [m] at 0.12 m/s; its servo presses with at most its rated force.
 
         Raises:
-            InputError: when there is no gripper, or it does not open so far.
+            InputError: when there is no gripper, or the opening is out of its range.
         """
         if self._gripper is None:
             raise InputError(f"grasp: this world has no gripper (no actuator {GRIPPER!r}); load the arm with one")
@@ -113,7 +114,7 @@ class Drives:
         self._opening_wanted = float(opening)
 
     def hold(self) -> None:
-        """Give the torque that holds the arm still, and let a gripper's servos keep its opening; without a step."""
+        """Hold the arm still and keep the opening of the gripper, without a physics step."""
         self._use_servos(False)
         self._data.ctrl[self._servos] = self._data.actuator_length[self._servos]
         self._opening_wanted = None
@@ -124,8 +125,8 @@ class Drives:
         """Step with a stiff servo at each joint: ``tau = K (q_d - q) + D (v_d - v) + M a_d + h + f``.
 
         ``K`` is diagonal, 60^2 times the diagonal of ``M`` at the arm's home posture, and ``D = 2 K / 60``.
-        What is fed forward goes into the servo's position command, so that the torque limit cuts the sum; the damping
-        is part of the drive, and the implicit integrator keeps it stable.
+        The feed-forward torque is part of the servo's position command, so that the torque limit applies to the sum.
+        The damping is part of the drive, so that the implicit integrator keeps it stable.
         """
         self._prepare(True)
         forward = self._inertia_times(a_d) + self._data.qfrc_bias[self._dof] + self._friction(v_d)
@@ -133,7 +134,7 @@ class Drives:
         mujoco.mj_step(self._model, self._data)
 
     def computed_torque(self, q_d: Array, v_d: Array, a_d: Array) -> None:
-        """Step with ``tau = M (a_d + w^2 (q_d - q) + 2 w (v_d - v)) + h + f``, ``w`` = 40 rad/s: softer than servos."""
+        """Step with ``tau = M (a_d + w^2 (q_d - q) + 2 w (v_d - v)) + h + f``, with ``w`` = 40 rad/s."""
         self._prepare(False)
         mujoco.mj_step1(self._model, self._data)
         w = COMPUTED_FREQUENCY
@@ -142,7 +143,7 @@ class Drives:
         mujoco.mj_step2(self._model, self._data)
 
     def free(self, force: Array, torque: Array, site: int) -> None:
-        """Step with ``tau = h + 0.7 c sign(v) - D v``, ``c`` the dry friction, while a hand pulls at a site.
+        """Step with ``tau = h + 0.7 c sign(v) - D v``, with ``c`` the dry friction, while a hand pulls at a site.
 
         Args:
             force: of the hand, in the base frame, shape (3,) [N].
@@ -160,14 +161,14 @@ class Drives:
         d.qfrc_applied[:] = 0.0
 
     def _prepare(self, stiff: bool) -> None:
-        """Before a step: let the drives be what they are to be, and the fingers go on."""
+        """Before a step: switch the drives to their mode and move the set-point of the fingers on."""
         self._use_servos(stiff)
         if self._opening_wanted is not None:
             now, most = float(self._data.ctrl[self._gripper]), FINGER_SPEED * self._model.opt.timestep
             self._data.ctrl[self._gripper] = now + min(max(self._opening_wanted - now, -most), most)
 
     def _use_servos(self, stiff: bool) -> None:
-        """Let the drives be position servos, or plain sources of torque."""
+        """Switch the drives to position servos, or to plain sources of torque."""
         if stiff is self._stiff:
             return
         self._stiff = stiff
@@ -183,6 +184,6 @@ class Drives:
         return self._torque[self._dof]
 
     def _friction(self, velocity: Array) -> Array:
-        """Return the torque (n,) [N m] that the joints' friction takes at ``velocity``."""
+        """Return the torque of the joints' friction (n,) [N m] at ``velocity``."""
         dry = self._model.dof_frictionloss[self._dof] * np.tanh(velocity / _DRY_FRICTION_SPEED)
         return np.asarray(self._model.dof_damping[self._dof] * velocity + dry)

@@ -1,4 +1,4 @@
-"""A simulated robot: the arm with its real inertias and limits in a MuJoCo world, driven at joint level."""
+"""SimulatedRobot: the arm with its real inertias and limits in a MuJoCo world, driven at joint level."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from imitarm.robots.world import (
 )
 from imitarm.scene import MovingScene, Scene
 from imitarm.scene.motion import Motion
-from imitarm.validation import instance
+from imitarm.validation import finite_number, finite_vector, instance
 
 Array = NDArray[np.float64]
 Control = Literal["position", "torque"]
 
 
 class SimulatedRobot(Robot):
-    """An arm in a MuJoCo world, with drives that give at most their rated torques.
+    """An arm in a MuJoCo world, with drives that are limited to their rated torques.
 
-    Both kinds of control follow the set-point ``q_d(t)`` with gravity, inertia and friction fed forward, see
-    :class:`~imitarm.robots.drives.Drives`: ``"position"`` with a stiff servo at each joint, ``"torque"`` with computed
-    torque, the softer of the two. Between two calls of :meth:`move` nothing moves, and the same commands always
-    give the same motion.
+    Both kinds of control follow the set-point ``q_d(t)`` and feed gravity, inertia and friction forward, see
+    :class:`~imitarm.robots.drives.Drives`: ``"position"`` is a stiff servo at each joint, ``"torque"`` is computed
+    torque and softer. Time advances only within :meth:`move` and :meth:`guide`, and the same commands always give the
+    same motion.
 
     Attributes:
         model: the compiled world.
-        data: its state; read it, and let the robot change it.
+        data: its state; only to be read.
         scene_at_start: the scene at time 0.
         contacts: names of the pairs that have touched since the last reset: arm geom and obstacle, arm geom and
             fixture, or two geoms of different links of the arm (a self-contact).
@@ -81,8 +81,8 @@ class SimulatedRobot(Robot):
         """
         if control not in get_args(Control):
             raise UnknownNameError.among("control", control, get_args(Control))
-        if not 0.0 < timestep <= 0.002:
-            raise InputError(f"SimulatedRobot: timestep must be in (0, 0.002] s (500 Hz or faster), got {timestep!r}")
+        timestep = finite_number(timestep, "SimulatedRobot: timestep", "s", above=0.0, at_most=0.002)
+        arm = instance(arm, ArmModel, "SimulatedRobot: arm")
         arm.check_dynamics()
         scene = Scene() if scene is None else instance(scene, Scene, "SimulatedRobot: scene")
         if world is None and not scene.fixtures:
@@ -133,7 +133,7 @@ class SimulatedRobot(Robot):
         self._moving = isinstance(self._source, MovingScene) or any(obstacle.moves for obstacle in scene.obstacles)
 
     def reset(self, q: ArrayLike | None = None) -> ArmState:
-        """Put everything back to time 0, and the arm at rest at ``q``.
+        """Return the world to time 0, with the arm at rest at ``q``.
 
         Args:
             q: joint angles, shape (n_joints,) [rad]; None for those given at construction.
@@ -176,8 +176,8 @@ class SimulatedRobot(Robot):
     def grasp(self, opening: float) -> None:
         """Begin to move the fingers of a mounted gripper; see :meth:`~imitarm.robots.robot.Robot.grasp`.
 
-        The opening that is asked for changes at 0.12 m/s. The servo presses with its stiffness times what is missing,
-        at most with the force its file allows. :meth:`reset` forgets it.
+        The commanded opening changes at 0.12 m/s. The servo presses with its stiffness times the distance that is left,
+        at most with the force that its file allows. :meth:`reset` cancels the command.
         """
         self._drives.grasp(opening)
 
@@ -188,7 +188,7 @@ class SimulatedRobot(Robot):
 
     @property
     def widest_opening(self) -> float:
-        """Opening of the gripper when it is wide open [m]; nan without a gripper."""
+        """Largest opening of the gripper [m]; nan without a gripper."""
         return self._drives.widest_opening
 
     def clearance(self) -> float:
@@ -236,9 +236,8 @@ class SimulatedRobot(Robot):
     def guide(self, wrench: ArrayLike, dt: float) -> ArmState:
         """Let a hand lead the arm by its tool for ``dt`` seconds while the drives carry the arm's weight.
 
-        They also take off most of the dry friction and damp a little, see
-        :meth:`~imitarm.robots.drives.Drives.free`: what robot arms call zero gravity or free drive. Afterwards the
-        set-point is where the arm is.
+        Makers of robot arms call this zero gravity or free drive. The drives also compensate most of the dry friction
+        and damp a little, see :meth:`~imitarm.robots.drives.Drives.free`. Afterwards the set-point is where the arm is.
 
         Args:
             wrench: force [N] then torque [N m] of the hand on the tool's tip, in the base frame, shape (6,).
@@ -250,9 +249,7 @@ class SimulatedRobot(Robot):
         Raises:
             InputError: when ``wrench`` is not six finite numbers.
         """
-        pull = np.asarray(wrench, dtype=float)
-        if pull.shape != (6,) or not np.isfinite(pull).all():
-            raise InputError(f"guide: wrench must be 6 finite numbers [N, N m], got {wrench!r}")
+        pull = finite_vector(wrench, 6, "guide: wrench", "N, N m")
         for _ in range(self._steps(dt)):
             self._drives.free(pull[:3], pull[3:], self._tool)
             self._after_step()
@@ -262,13 +259,13 @@ class SimulatedRobot(Robot):
         return state
 
     def _steps(self, dt: float) -> int:
-        n = round(dt / self.model.opt.timestep)
+        n = round(finite_number(dt, "dt", "s") / self.model.opt.timestep)
         if n < 1 or abs(n * self.model.opt.timestep - dt) > 1e-9:
             raise InputError(f"dt must be a multiple of the timestep {self.model.opt.timestep:g} s, got {dt!r}")
         return n
 
     def _after_step(self) -> None:
-        """Note contacts and move what moves."""
+        """Record contacts and move the obstacles."""
         touching = self._gauge.touching(self.data)
         if touching:
             self.contact_steps += 1

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply, quaternion_to_matrix
-from imitarm.scene.formulas import DEPTH, FAMILIES, ROUNDS, SLABS, Formula, Parameters, Polytope, hull_formula
+from imitarm.scene.formulas import DEPTH, FAMILIES, ROUNDS, SLABS, Formula, Parameters, Polytope
 from imitarm.validation import finite_array
 
 Array = NDArray[np.float64]
@@ -189,7 +189,7 @@ class PackedObstacles:
                 order += members.tolist()
         for i, polytope in enumerate(self.polytopes):
             if polytope is not None:
-                families.append(_Members(hull_formula(polytope), slice(len(order), len(order) + 1), ()))
+                families.append(_Members(polytope.formula, slice(len(order), len(order) + 1), ()))
                 order.append(i)
         return np.array(order, dtype=np.intp), families
 
@@ -362,9 +362,10 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
     if not len(near):
         return None
     if len(near) < len(flat):
-        place, point, distance, normal = (x.take(near, axis=-1) for x in (place, point, distance, normal))
+        place, point, distance = place.take(near), point.take(near), distance.take(near)
+        normal = normal.take(near, axis=1)
     base = np.einsum("jk,kji->ik", normal, frames.to_own.take(place, axis=0))
-    return NearPairs(packed._order.take(place), point, distance, base)
+    return NearPairs(packed._order[place], point, distance, base)
 
 
 def _evaluate(

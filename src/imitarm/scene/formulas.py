@@ -312,6 +312,11 @@ class Polytope:
             np.einsum("ij,ij->i", starts, starts),
         )
 
+    def formula(self, q: Array, gradient: bool) -> tuple[Array, Array | None]:
+        """Return distances and normals as the other formulas do, see the module."""
+        distance, rows = self.distance_and_normal(np.ascontiguousarray(q.reshape(3, -1).T))
+        return distance.reshape(q.shape[1:]), rows.T.reshape(q.shape) if gradient else None
+
     def distance_and_normal(self, q: Array) -> tuple[Array, Array]:
         """Return signed distances (n,) and unit gradients (n, 3) at ``q`` (n, 3), both in the own frame."""
         if len(q) > _BLOCK:
@@ -368,13 +373,3 @@ def _edges(vertices: Array, triangles: NDArray[np.intp], facing: Array) -> tuple
     keep[twin + 1] = False
     keep[twin[flat]] = False
     return vertices[pairs[keep, 0]], vertices[pairs[keep, 1]]
-
-
-def hull_formula(polytope: Polytope) -> Formula:
-    """Return the formula of one convex hull."""
-
-    def formula(q: Array, gradient: bool) -> tuple[Array, Array | None]:
-        distance, rows = polytope.distance_and_normal(np.ascontiguousarray(q.reshape(3, -1).T))
-        return distance.reshape(q.shape[1:]), rows.T.reshape(q.shape) if gradient else None
-
-    return formula

@@ -34,7 +34,7 @@ MAX_RATE = 100.0  # [rad/s]
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def checked_vector(value: object, what: str, *, limit: float, unit: str) -> Array:
+def checked_vector(value: object, what: str, *, limit: float, unit: str = "") -> Array:
     """Return three finite numbers of magnitude at most ``limit`` as a read-only array."""
     vector = np.array(finite_vector(value, 3, what, unit))
     if np.abs(vector).max() > limit:

@@ -14,7 +14,7 @@ from imitarm.html_table import html_table
 from imitarm.kinematics.pose import Pose
 from imitarm.scene.distances import PackedObstacles, checked_points, distances, distances_and_gradients
 from imitarm.scene.obstacle import Array, Obstacle, pack
-from imitarm.validation import finite_number
+from imitarm.validation import finite_number, whole_number
 
 _LISTED = 4  # obstacles that a short repr names
 
@@ -191,14 +191,14 @@ class Scene:
         return np.asarray(self.distances(points).argmin(axis=0))
 
     def name_of(self, index: SupportsIndex) -> str:
-        """Return how messages call obstacle ``index``: ``box "tin"``, or ``box 1`` when it has no name.
+        """Return the name of obstacle ``index`` in messages: ``box "tin"``, or ``box 1`` when it has no name.
 
         Unnamed obstacles are counted by shape, from 1, in the order of ``obstacles``.
 
         Raises:
             InputError: when there is no such obstacle.
         """
-        i = index.__index__()
+        i = whole_number(index, "name_of: index")
         if not 0 <= i < len(self.obstacles):
             raise InputError(f"obstacle {i} does not exist; the scene has {len(self.obstacles)}")
         obstacle = self.obstacles[i]

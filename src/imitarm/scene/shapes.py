@@ -215,7 +215,7 @@ class HalfSpace(Obstacle):
     def __post_init__(self) -> None:
         super().__post_init__()
         point = checked_vector(self.point, f"{self._label}: point", limit=MAX_COORDINATE, unit="m")
-        normal = checked_vector(self.normal, f"{self._label}: normal", limit=np.inf, unit="m")
+        normal = checked_vector(self.normal, f"{self._label}: normal", limit=np.inf)
         length = np.linalg.norm(normal)
         if length < TINY:
             raise InputError(f"{self._label}: normal must have a direction, got {self.normal!r}")
