@@ -154,9 +154,8 @@ def test_repr_names_the_obstacles():
     scene = Scene(
         GOAL, [Sphere([0, 0, 0.5], 0.1, name="<ball>", velocity=[0.1, 0, 0])] * 6, fixtures=[Box(GOAL, [1, 1, 1])]
     )
-    assert repr(scene) == (
-        'Scene(sphere "<ball>", sphere "<ball>", sphere "<ball>", sphere "<ball>", 2 more, goal [0.5, 0.0, 0.3], stamp 0 s)'
-    )
+    four = ", ".join(['sphere "<ball>"'] * 4)
+    assert repr(scene) == f"Scene({four}, 2 more, goal [0.5, 0.0, 0.3], stamp 0 s)"
     assert repr(Scene()) == "Scene(no obstacles, stamp 0 s)"
     table = scene._repr_html_()
     assert "&lt;ball&gt;" in table
