@@ -604,3 +604,8 @@ def test_a_motion_without_masses_is_measured_without_torques(load):
     assert np.array_equal(without.tool, with_masses.tool)
     assert np.isnan(without.torques).all() and np.isnan(without.gravity).all()
     assert np.isfinite(with_masses.torques).all()
+
+
+def test_home_is_bent_even_if_the_last_joint_does_not_move_the_flange(load):
+    arm = load(robot(limb("a_", 3)))
+    assert np.linalg.svd(arm.jacobian(arm.home)[:3], compute_uv=False)[1] > 0.03

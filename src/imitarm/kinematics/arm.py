@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +21,6 @@ from imitarm.kinematics.spheres import SphereCover
 from imitarm.validation import finite_number, finite_vector, flag, instance, text
 
 Array = NDArray[np.float64]
-Columns = slice | NDArray[np.int32]
 
 _FLOAT64 = np.dtype(np.float64)
 
@@ -45,6 +45,16 @@ class ArmState:
     time: float
 
     def __post_init__(self) -> None:
+        q, velocity, torque, time = self.q, self.velocity, self.torque, self.time
+        if (  # the usual case is decided here: robots make a state in every control step
+            type(q) is type(velocity) is type(torque) is np.ndarray
+            and q.dtype is velocity.dtype is torque.dtype is _FLOAT64
+            and type(time) is float
+            and len(q.shape) == 1
+            and q.shape == velocity.shape == torque.shape
+            and math.isfinite(sum(q.tolist()) + sum(velocity.tolist()) + sum(torque.tolist()) + time)
+        ):
+            return
         n = len(self.q) if isinstance(self.q, np.ndarray | list | tuple) else 0
         for name, unit in (("q", "rad"), ("velocity", "rad/s"), ("torque", "N m")):
             object.__setattr__(self, name, finite_vector(getattr(self, name), n, f"ArmState: {name}", unit))

@@ -74,8 +74,8 @@ class _HomeSearch:
         pairs, probes = self._link_pairs(), self.candidates()[:: _SAMPLES // 8]
         # Shapes that overlap in every posture are drawn too large or belong together; they say nothing about a home.
         self._pairs = [pair for pair in pairs if any(self._distance(pair, q) >= _APART for q in probes)]
-        # An arm whose last joints do not move the flange has a linear part that is always singular.
-        self._linear_counts = any(self._singular_values(q)[0] > 1e-6 for q in probes)
+        values = [self._singular_values(q) for q in probes]
+        self._ranks = [max(1, *(int(np.sum(each[part] > 1e-6)) for each in values)) for part in (0, 1)]
         anchors = self._move(np.array([home[name] for name in joints])).xanchor[ids]
         ends = np.vstack([anchors, self._data.site_xpos[self._flange]])
         self.reach = float(np.linalg.norm(np.diff(ends, axis=0), axis=1).sum())  # [m] along the links
@@ -89,19 +89,18 @@ class _HomeSearch:
         """Return how far a posture is from a singular one [m/rad]; 0 where singular.
 
         It is the smallest singular value of the flange's Jacobian, whose rotations are weighted by 0.3 m, and of its
-        linear part: an arm with few joints may lose a direction while it can still rotate.
+        linear part: an arm with few joints may lose a direction while it can still rotate. Singular values that are 0
+        in every posture do not count: an arm of three joints can't move its flange in all directions.
         """
-        linear, whole = self._singular_values(q)
-        return min(linear, whole) if self._linear_counts else whole
+        return min(float(values[rank - 1]) for values, rank in zip(self._singular_values(q), self._ranks, strict=True))
 
-    def _singular_values(self, q: Array) -> tuple[float, float]:
-        """Return the smallest singular values of the Jacobian's linear part and of the whole Jacobian."""
+    def _singular_values(self, q: Array) -> tuple[Array, Array]:
+        """Return the singular values of the Jacobian's linear part and of the whole Jacobian, largest first."""
         mujoco.mj_comPos(self._model, self._move(q))
         mujoco.mj_jacSite(self._model, self._data, self._jacobian[:3], self._jacobian[3:], self._flange)
         linear, angular = self._jacobian[:3, self._dofs], self._jacobian[3:, self._dofs]
         stacked = np.vstack([linear, _ROTATION_LENGTH * angular])
-        smallest = [float(np.linalg.svd(part, compute_uv=False)[-1]) for part in (linear, stacked)]
-        return smallest[0], smallest[1]
+        return np.linalg.svd(linear, compute_uv=False), np.linalg.svd(stacked, compute_uv=False)
 
     def score(self, q: Array) -> float:
         """Return how good a home is: far from singular, not near limits, the flange not below the base."""
