@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from imitarm.capture.recording import SkeletonRecording, read_recording
+from imitarm.capture.skeleton import JOINT
 from imitarm.capture.stream import UdpSource
 from imitarm.cli import main
 from recording_samples import Listed, changed, exchanged, same, skeletons
@@ -170,3 +171,48 @@ def test_skeletons_are_sent_at_the_pace_at_which_they_happened(tmp_path, capsys)
     assert "nobody listened to" in capsys.readouterr().err
     assert main(["capture", str(path), "--send", "nowhere"]) == 2
     assert "'nowhere' is no address" in capsys.readouterr().err
+
+
+def microseconds(frames):
+    return [changed(s, time=0.1 * s.time) for s in frames]
+
+
+def z_up(frames):
+    return [changed(s, positions=s.positions @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])) for s in frames]
+
+
+def frozen(frames):
+    return [changed(s, positions=frames[60].positions) if 60 < i < 150 else s for i, s in enumerate(frames)]
+
+
+def with_spikes(frames):
+    leap = np.zeros((25, 3))
+    leap[[JOINT["elbow_right"], JOINT["wrist_right"], JOINT["hand_right"]], 2] = 0.8
+    return [changed(s, positions=s.positions + leap) if i % 40 == 20 else s for i, s in enumerate(frames)]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "code", "retargeted"),
+    [
+        (
+            microseconds,
+            "frame-rate",
+            "units of 100 ns and fit in us (30.0 frames a second): multiply them by 10",
+        ),
+        (z_up, "axes", "take x, z, -y of the file as x, y, z"),
+        (frozen, "frozen", "repaired: dropped 89 frames that repeat the one before, for up to 2.97 s on end"),
+        (with_spikes, "spike", "repaired: took joints as lost in 6 frames with a spike"),
+    ],
+)
+def test_an_implausible_recording_is_reported_by_capture_and_by_retarget(spoil, code, retargeted, tmp_path, capsys):
+    frames = spoil(skeletons(240, seed=5))
+    rows = [np.column_stack([s.positions, s.tracking]).ravel() for s in frames]
+    lines = [
+        ",".join([str(round(1e7 * s.time)), *(f"{x:.6f}" for x in row)]) for s, row in zip(frames, rows, strict=True)
+    ]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(lines))
+    assert main(["capture", str(path), "--check"]) == 2
+    assert code in capsys.readouterr().out
+    main(["retarget", str(path), "--orientation", "fixed"])
+    assert retargeted in " ".join(capsys.readouterr().err.split())
