@@ -352,7 +352,7 @@ class GMR:
         demonstrations by some millimetres. The nominal path corrects both ends by smooth steps:
 
         .. math::
-            x_0(t) = \hat x(t) + b(t / w_1) (x_{start} - \hat x(0)) + b((T - t) / w_K) (x_{goal} - \hat x(T)), \quad
+            \bar x(t) = \hat x(t) + b(t / w_1) (x_{start} - \hat x(0)) + b((T - t) / w_K) (x_{goal} - \hat x(T)), \quad
             b(u) = 1 - 10 u^3 + 15 u^4 - 6 u^5
 
         The widths :math:`w_1 = \mu_1^t` and :math:`w_K = T - \mu_K^t` reach from the ends to the centres of the first

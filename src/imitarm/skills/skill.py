@@ -193,7 +193,7 @@ class Skill:
         :meth:`~imitarm.skills.gmr.GMR.nominal`. Another start or goal changes it as the primitive's adjustment
         ``"progress"`` does:
 
-        .. math:: x(t) = x_0(t) + (1 - p(t)) \delta_{start} + p(t) \delta_{goal}
+        .. math:: x(t) = \bar x(t) + (1 - p(t)) \delta_{start} + p(t) \delta_{goal}
 
         with p the fraction of the path that is done. The rotation changes along a minimum-jerk profile.
 
