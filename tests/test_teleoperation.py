@@ -7,8 +7,11 @@ from imitarm.capture.sources import followed
 from imitarm.capture.stream import SkeletonSender, UdpSource
 from imitarm.demonstrations.recorder import DemonstrationRecorder
 from imitarm.kinematics.arm import ArmModel
-from imitarm.retarget import Correspondence, ModernRetargeter
+from imitarm.kinematics.pose import Pose
+from imitarm.retarget import RETARGETERS, Correspondence, ModernRetargeter
 from imitarm.robots import SimulatedRobot
+from imitarm.safety import SafetyFilter
+from imitarm.scene import Box, Scene
 from imitarm.teleoperation.loop import INTERRUPTED, Teleoperation
 from imitarm.trajectory import Demonstration
 from imitarm.transmission.messages import Status
@@ -55,6 +58,31 @@ def test_a_robot_here_is_led_within_its_limits():
     assert one.tally.speed <= 1.0 and one.tally.acceleration <= 1.0 + 1e-9
     assert_within_limits(robot.steps)
     np.testing.assert_allclose(robot.set_point, one.retargeter.latest.q, atol=2e-3)
+
+
+def clearance(q, obstacle):
+    """Distance of the arm to an obstacle [m]."""
+    centers, radii = ARM.collision_spheres(q)
+    return float((obstacle.signed_distance(centers) - radii).min())
+
+
+def test_a_method_that_looks_after_nothing_is_kept_clear_by_the_filter():
+    """M3 knows neither the arm's own links nor obstacles; the loop's filter does."""
+    tool = ARM.tool_pose(ARM.home).position
+    table = Box(Pose(tool - np.array([0.0, 0.0, 0.39]), [1.0, 0.0, 0.0, 0.0]), [0.4, 1.2, 0.6])
+    assert clearance(ARM.home, table) > 0.02
+    scene = Scene(None, [table])
+    blind, kept = Paper(), Paper()
+    postures: dict[int, list[np.ndarray]] = {}
+    for robot, safety in ((blind, SafetyFilter(ARM, clearance=None)), (kept, SafetyFilter(ARM, clearance=0.01))):
+        one = loop(robot, safety=safety)
+        one.retargeter = RETARGETERS["m3"](ARM, Correspondence(orientation="fixed"), dt=DT, scene=scene)
+        lead(one, 5.0, each=lambda k, r=robot: postures.setdefault(id(r), []).append(r.q.copy()))
+        assert one.tally.doing["following"] > 300
+        if robot is kept:
+            assert one.tally.filtered > 0
+    assert min(clearance(q, table) for q in postures[id(blind)]) < 0.0
+    assert min(clearance(q, table) for q in postures[id(kept)]) > 0.008
 
 
 def test_the_hand_leads_the_gripper():

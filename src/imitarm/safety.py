@@ -101,8 +101,10 @@ class SafetyFilter:
             InputError: when a shape is wrong or a number is not finite.
         """
         position = np.asarray(q, dtype=float)
-        tasks = _tasks(command)
         rows = self._rows(position, scene)
+        if command.joint_velocity is not None and self._admits(position, command.joint_velocity, velocity, rows):
+            return SafetyStep(command.joint_velocity, 0.0, 0.0, True)
+        tasks = _tasks(command)
         allowed = self.solver.solve(position, tasks, velocity=velocity, rows=rows)
         missing = max((float((part.lower - part.matrix @ allowed).max()) for part in rows), default=-math.inf)
         changed = 0.0
@@ -110,6 +112,12 @@ class SafetyFilter:
             alone = self.solver.solve(position, tasks, velocity=velocity)
             changed = float(np.linalg.norm(allowed - alone))
         return SafetyStep(allowed, changed, max(missing, 0.0), missing <= _KEPT)
+
+    def _admits(self, q: Array, wanted: Array, velocity: ArrayLike | None, rows: list[Rows]) -> bool:
+        """Return whether a joint velocity keeps everything as it is."""
+        box = self.solver.problem(q, JointVelocityTask(wanted), velocity).box
+        inside = bool((wanted >= box.lower).all() and (wanted <= box.upper).all())
+        return inside and all(bool((part.matrix @ wanted >= part.lower).all()) for part in rows)
 
     def _rows(self, q: Array, scene: Scene) -> list[Rows]:
         obstacles = None if self._obstacles is None else self._obstacles.rows(q, scene)

@@ -29,7 +29,7 @@ _MAX_SPEED = {"dls": 0.6, "dls_small_angle": 0.6, "qp": 2.0, "svd": 0.6}  # [m/s
 _NULL = 1e-12  # squared singular values below this belong to directions in which the arm can't move
 _FILTER = 0.06  # [m/rad] "svd": directions with a smaller singular value are damped, by up to this much
 _EFFORT, _CHANGE = 1e-5, 1e-6  # "qp": weights of the joint velocity and of its change beside a task of weight 1
-_TINY_ROW = 1e-9
+_TINY_ROW = 1e-6
 _ROUNDING = 1e-8  # [rad/s]
 _CLEAR = 1e-3  # squared singular values above this can be factored without losing half of the digits
 _VIOLATED = 1e-9
@@ -317,7 +317,10 @@ def _least_cost(box: Box, matrix: Array | None, least: Array | None, hessian: Ar
     lower[:n], lower[n:], upper[:n], upper[n:] = box.lower, least, box.upper, 1e30
     velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, _plain(len(lower)))
     if status <= 0 and len(least):
-        nearest, lower[n:] = _least_violation(box, matrix, least)
+        moved = np.sqrt(np.einsum("ij,ij->i", matrix, matrix)) > _TINY_ROW  # no velocity changes the other rows
+        matrix, least = matrix[moved], least[moved]
+        nearest, reached = _least_violation(box, matrix, least)
+        lower, upper = np.append(box.lower, reached), np.append(box.upper, np.full(len(reached), 1e30))
         velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, _plain(len(lower)))
         if status <= 0:
             velocity, status = nearest, 1
@@ -334,7 +337,7 @@ def _least_violation(box: Box, matrix: Array, least: Array) -> tuple[Array, Arra
     its answers violate rows that can be kept (version 0.11, in a third of random problems).
     """
     m, n = matrix.shape
-    lengths = np.maximum(np.sqrt(np.einsum("ij,ij->i", matrix, matrix)), _TINY_ROW)
+    lengths = np.sqrt(np.einsum("ij,ij->i", matrix, matrix))
     hessian = np.diag(np.append(np.full(n, _EFFORT), np.ones(m)))
     rows = np.hstack([matrix / lengths[:, None], np.eye(m)])
     lower, upper = np.full(n + 2 * m, -1e30), np.full(n + 2 * m, 1e30)

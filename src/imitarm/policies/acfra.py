@@ -170,8 +170,9 @@ class ACFRA(Policy):
     def _command(self, twist: Array, speed: float, lag: float, end: float) -> Command:
         assert self.adaptation is not None
         progress = self._phase / end
-        if speed < _STANDS and self._phase < end:
-            reason = f"the tool is {1e3 * lag:.0f} mm behind its path"
+        if (speed < _STANDS and self._phase < end) or (self._phase >= end and lag > self._arrival):
+            what = "behind its path" if self._phase < end else "from the end of its path"
+            reason = f"the tool is {1e3 * lag:.0f} mm {what}"
             return Command(twist, progress=progress, status=Status.WAITING, reason=reason)
         displaced = float(np.interp(self._phase, self.adaptation.trajectory.times, self._displaced))
         if displaced > _DISPLACED:

@@ -13,6 +13,8 @@ from imitarm.validation import finite_number, instance
 
 Array = NDArray[np.float64]
 
+_UNMOVED = 1e-6  # [m/rad] a joint that changes a distance by less does not change it
+
 
 class ClearanceLimit:
     r"""Inequalities on the joint velocity that keep every link, and the tool, clear of every obstacle.
@@ -66,7 +68,8 @@ class ClearanceLimit:
             scene: the obstacles, as predicted for now, with their velocities.
 
         Returns:
-            One row for each pair of a sphere and an obstacle within ``influence``; None when there is none.
+            One row for each pair of a sphere and an obstacle within ``influence``, except those that are too near and
+            whose distance no joint can change; None when there is no pair.
 
         Raises:
             InputError: when ``q`` is not n_joints finite numbers.
@@ -90,4 +93,8 @@ class ClearanceLimit:
                 arms = points - packed.positions.take(obstacle, axis=0).T
                 velocity = velocity + np.cross(packed.angular_velocities.take(obstacle, axis=0).T, arms, axis=0)
             lower += np.einsum("ij,ij->j", velocity, normal)
-        return Rows(self._cover.speeds(data, sphere, points, normal), lower)
+        matrix = self._cover.speeds(data, sphere, points, normal)
+        if lower.max() > 0.0:  # a link that no joint moves away, such as one that turns in place above a table
+            moved = (np.abs(matrix).max(axis=1) > _UNMOVED) | (lower <= 0.0)
+            matrix, lower = matrix[moved], lower[moved]
+        return Rows(matrix, lower)

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from imitarm.capture.skeleton import Skeleton, SkeletonSource
 from imitarm.capture.stream import Arrival, UdpSource
+from imitarm.command import Command
 from imitarm.demonstrations.recorder import DemonstrationRecorder
 from imitarm.kinematics.arm import ArmState
 from imitarm.retarget import Retargeter, RetargetStep
 from imitarm.robots import Robot, UdpRobot
+from imitarm.safety import SafetyFilter
 from imitarm.transmission.datagram import now_ns
 from imitarm.transmission.latency import LatencyLog
 from imitarm.transmission.messages import Status
@@ -63,6 +65,8 @@ class Tally:
         frames: skeletons that were used.
         doing: steps in each of the retargeter's states and in :data:`INTERRUPTED`.
         clamped: steps in which the robot changed the command, by limit.
+        filtered: steps in which the safety filter changed the command for a clearance.
+        unsafe: steps in which no joint velocity kept every limit and clearance.
         speed: largest velocity of the set-point over its limit.
         acceleration: largest acceleration of the set-point over its limit.
         interruptions: how often the robot could not be led any more.
@@ -76,6 +80,8 @@ class Tally:
     frames: int = 0
     doing: Counter[str] = field(default_factory=Counter)
     clamped: Counter[str] = field(default_factory=Counter)
+    filtered: int = 0
+    unsafe: int = 0
     speed: float = 0.0
     acceleration: float = 0.0
     interruptions: int = 0
@@ -95,6 +101,8 @@ class Teleoperation:
         source: skeletons of one person, live or in real time.
         retargeter: the method.
         robot: to lead.
+        safety: what every command passes through, whatever the method; None: one that keeps the limits of the arm, its
+            links 10 mm apart, and touches nothing in the retargeter's scene.
         stream: the stream that ``source`` is fed by, for the latencies; None: it is none.
         recorder: is given the robot's motion from when the person first took hold.
         operator: is told at every step why a served robot can't be led, and whether it is stopped; answers whether it
@@ -110,6 +118,7 @@ class Teleoperation:
         retargeter: Retargeter,
         robot: Robot,
         *,
+        safety: SafetyFilter | None = None,
         stream: UdpSource | None = None,
         recorder: DemonstrationRecorder | None = None,
         operator: Callable[[str, bool], bool] | None = None,
@@ -119,6 +128,7 @@ class Teleoperation:
     ) -> None:
         self.source, self.retargeter, self.robot = source, retargeter, robot
         self.tally = Tally()
+        self.safety = SafetyFilter(robot.arm, dt=retargeter.dt) if safety is None else safety
         self._stream, self._recorder = stream, recorder
         self._operator, self._on_step = operator, on_step
         self._clock_ns = clock_ns
@@ -245,8 +255,13 @@ class Teleoperation:
         retargeter.step(skeleton, robot.state().q)
         ready = self._clock_ns()
         self._grasp(retargeter.latest.closed)
-        robot.move(retargeter.latest.velocity + _FOLLOW * (before - robot.set_point), retargeter.dt)
+        wanted = retargeter.latest.velocity + _FOLLOW * (before - robot.set_point)
+        command = Command(np.zeros(6), joint_velocity=wanted)
+        kept = self.safety.step(command, robot.set_point, robot.velocity, retargeter.scene)
+        robot.move(kept.velocity, retargeter.dt)
         self.tally.clamped.update(robot.clamped)
+        self.tally.filtered += kept.changed > 0.0
+        self.tally.unsafe += not kept.safe
         if skeleton is not None and self._arrival is not None:
             self._note(self._arrival, taken, ready, self._clock_ns())
 
