@@ -102,9 +102,9 @@ def test_what_can_not_be_aligned():
         align([motion(), still])
     with pytest.raises(InputError, match="no demonstrations"):
         align([])
-    with pytest.raises(InputError, match="at least 10 samples, got 3"):
+    with pytest.raises(InputError, match=r"at least 10 .*got 3"):
         align([motion()], n=3)
-    with pytest.raises(UnknownNameError, match="unknown method of alignment 'magic'; known: dtw, resample"):
+    with pytest.raises(UnknownNameError, match=r"unknown method of alignment 'magic'.*; known: dtw, resample"):
         align([motion()], method="magic")
     with pytest.raises(InputError, match="bare has none"):
         align([motion(rotations=True), motion(source="bare")])

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from demonstration_samples import motion, path
-from imitarm.demonstrations import READERS, Reader, files_of, lint, read, read_raw
+from imitarm.demonstrations import READERS, RawDemonstration, Reader, align, files_of, lint, read, read_raw
 from imitarm.errors import FileFormatError, InputError, UnknownNameError
 
 
@@ -83,11 +83,11 @@ def test_the_content_decides_and_a_name_must_not_lie(tmp_path):
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"units": "yd"}, UnknownNameError, "unknown unit of length 'yd'; known: cm, ft, in, m, mm"),
+        ({"units": "yd"}, UnknownNameError, "unknown unit of length 'yd'.*; known: cm, ft, in, m, mm"),
         ({"time_units": "days"}, UnknownNameError, "unknown unit of time"),
         ({"quaternion_order": "zyxw"}, UnknownNameError, "unknown quaternion order"),
-        ({"duration": 0.0}, InputError, "duration must be a positive number"),
-        ({"rate": float("nan")}, InputError, "rate must be a positive number"),
+        ({"duration": 0.0}, InputError, "duration must be a finite number above 0"),
+        ({"rate": float("nan")}, InputError, "rate must be a finite number above 0"),
         ({"duration": 1.0, "rate": 2.0}, InputError, "not both"),
         ({"duration": 1.0}, InputError, "time stamps of its own"),
     ],
@@ -212,3 +212,38 @@ def test_whatever_is_done_to_a_file_it_is_read_or_refused(tmp_path_factory, kind
         lint(read_raw(file, **options))
     except FileFormatError as error:
         assert kind in str(error)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: read(5),
+        lambda: read([3.0]),
+        lambda: read("x.csv", repair="yes"),
+        lambda: read("x.csv", thin=1),
+        lambda: read("x.csv", units=["m"]),
+        lambda: read("x.csv", duration="ten"),
+        lambda: read("x.csv", rate=True),
+        lambda: read("x.csv", duration=np.ones(2)),
+        lambda: read("x.csv", task=3),
+        lambda: lint(None),
+        lambda: lint(motion()),
+        lambda: lint([1]),
+        lambda: lint([motion()], arm="sawyer"),
+        lambda: align([motion()], n=20.5),
+        lambda: align([motion()], n=float("nan")),
+        lambda: align([motion()], n=10**9),
+        lambda: align([motion()], method=2),
+        lambda: align([RawDemonstration.of(motion())]),
+        lambda: RawDemonstration("a", np.arange(4.0), np.ones((5, 3))),
+        lambda: RawDemonstration("a", np.arange(4.0), np.ones((4, 2))),
+        lambda: RawDemonstration("a", np.arange(4.0), None, np.ones((4, 3))),
+        lambda: RawDemonstration("a", np.arange(4.0), joints=np.ones((4, 2)), joint_names=("a",)),
+        lambda: RawDemonstration("a", ["x", "y"]),
+        lambda: RawDemonstration("a", []),
+        lambda: RawDemonstration(3, np.arange(4.0)),
+    ],
+)
+def test_arguments_of_the_wrong_kind_are_refused(call):
+    with pytest.raises(InputError):
+        call()

@@ -144,14 +144,14 @@ def test_motions_that_only_rotate_are_compared_by_rotation():
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_clean_motions_belong_together(n):
-    for seed in range(4):
-        family = motions(6, noise=1e-3, spread=0.01, seed=seed, rotations=bool(seed % 2))
+    for seed in range(2):
+        family = motions(5, noise=1e-3, spread=0.01, seed=seed, rotations=bool(seed % 2))
         for few in itertools.combinations(family, n):
             assert worrying(list(few)) == []
 
 
 def test_pairs_of_real_recordings_belong_together(real_data):
     for name in ("bottle2shelf", "letter_e", "letter_l"):
-        family = read_raw(real_data / "panda_kinesthetic" / f"{name}.npy", units="cm", duration=10.0)
+        family = read_raw(real_data / "panda_kinesthetic" / f"{name}.npy", units="cm", duration=10.0)[::2]
         for few in itertools.combinations(family, 2):
             assert worrying(list(few)) == []

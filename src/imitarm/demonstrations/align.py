@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.errors import InputError, UnknownNameError
+from imitarm.errors import InputError
 from imitarm.kinematics.pose import (
     continuous_signs,
     mean_quaternion,
@@ -32,6 +32,7 @@ from imitarm.kinematics.pose import (
     quaternion_multiply,
 )
 from imitarm.trajectory import Demonstration, Trajectory
+from imitarm.validation import choice, sequence, whole_number
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -40,6 +41,7 @@ Method = Literal["dtw", "resample"]
 METHODS = ("dtw", "resample")
 
 _BACK, _ASIDE = np.array([2, 1, 1, 0]), np.array([0, -1, 1, 0])  # steps: both, a only, b only, arrived
+_MOST_SAMPLES = 10_000  # warping takes memory in proportion to the square of them
 _LEVER = 0.1  # [m] distance that counts as much as a rotation of 1 rad
 _SMOOTHING = 0.04  # half width of the window that smooths a warp, as a fraction of the duration
 _SLOWEST = 0.1  # lowest pace of a demonstration's clock, as a fraction of the common pace
@@ -115,11 +117,9 @@ def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Meth
 
 def compute_alignment(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Method = "dtw") -> Alignment:
     """Align as :func:`align` does, and also return what was changed; arguments and errors are the same."""
-    if method not in METHODS:
-        raise UnknownNameError.among("method of alignment", method, METHODS)
-    if n < 10:
-        raise InputError(f"align: n must be at least 10 samples, got {n}")
-    if not demonstrations:
+    choice(method, METHODS, "method of alignment")
+    n = whole_number(n, "align: n", at_least=10, at_most=_MOST_SAMPLES)
+    if not sequence(demonstrations, Demonstration, "align: demonstrations"):
         raise InputError("align: no demonstrations; read some first")
     if len({one.trajectory.quaternions is None for one in demonstrations}) > 1:
         without = next(one for one in demonstrations if one.trajectory.quaternions is None)

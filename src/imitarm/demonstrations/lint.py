@@ -1,9 +1,8 @@
 """Lint: list what is wrong with demonstrations before a skill is learned from them.
 
-Each check yields findings. Here are the checks of one motion, and of the motions against each other: two are enough to
-find that one runs backwards, stops early, ends elsewhere or goes another way round. The mean of such demonstrations is
-a motion that nobody has shown. Checks of the numbers in a file are in ``raw.py``, checks against an arm in
-``arm_checks.py``.
+Each check yields findings. Here are the checks of one motion, and of the motions against each other: the mean of
+demonstrations that run backwards, stop early, end elsewhere or take another path is a motion that nobody has shown.
+Checks of the numbers in a file are in ``raw.py``, checks against an arm in ``arm_checks.py``.
 """
 
 from __future__ import annotations
@@ -26,11 +25,20 @@ from imitarm.demonstrations.align import (
     turns,
 )
 from imitarm.demonstrations.arm_checks import check_arm
-from imitarm.demonstrations.raw import RAW_CHECKS, SEVERITIES, Finding, RawDemonstration, Severity, ValidRows
+from imitarm.demonstrations.raw import (
+    RAW_CHECKS,
+    SEVERITIES,
+    Finding,
+    RawDemonstration,
+    Severity,
+    ValidRows,
+    check_arm_model,
+)
 from imitarm.demonstrations.reading import LENGTH_UNITS
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_log, quaternion_multiply
 from imitarm.trajectory import Demonstration, Trajectory
+from imitarm.validation import sequence
 
 if TYPE_CHECKING:
     from imitarm.kinematics.arm import ArmModel
@@ -78,14 +86,15 @@ def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: Arm
         Findings, errors first, then warnings, then notes; empty when nothing was found.
 
     Raises:
-        InputError: when there are no demonstrations.
+        InputError: when there are no demonstrations, or something else was given.
     """
-    if not demonstrations:
+    check_arm_model(arm, "lint: arm")
+    if not sequence(demonstrations, object, "lint: demonstrations"):
         raise InputError("lint: no demonstrations; read some first")
     findings: list[Finding] = []
     motions: list[ValidRows] = []
     for one in demonstrations:
-        raw = RawDemonstration.of(one) if isinstance(one, Demonstration) else one
+        raw = RawDemonstration.of(one)
         for raw_check in RAW_CHECKS:
             findings += raw_check(raw)
         try:
@@ -106,9 +115,6 @@ def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: Arm
         for set_check in SET_CHECKS:
             findings += set_check(motions)
     return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
-
-
-# --- one motion
 
 
 def check_gaps(motion: ValidRows) -> Iterator[Finding]:
@@ -201,9 +207,6 @@ def check_speed(motion: ValidRows) -> Iterator[Finding]:
 
 
 MOTION_CHECKS = (check_gaps, check_idle, check_jumps, check_units, check_speed)
-
-
-# --- motions against each other
 
 
 def check_number(motions: Sequence[ValidRows]) -> Iterator[Finding]:
@@ -389,8 +392,8 @@ def _angles(rotations: Array, reference: Array) -> Array:
 def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | None:
     """Return one of two groups as a mask (m,), and the gap between both; None when there is one group.
 
-    The gap is the longest link of the minimum spanning tree. It must exceed ``floor``, and with more than two
-    demonstrations the next longest link by a factor: then neighbours are much nearer within the groups.
+    The gap is the longest link of the minimum spanning tree. It must exceed ``floor``, and the next longest link by a
+    factor: then neighbours are much nearer within the groups.
     """
     m = len(distance)
     nearest, inside, links = distance[0].copy(), np.arange(m) == 0, []
@@ -415,11 +418,7 @@ def _names(motions: Sequence[ValidRows], which: NDArray[np.int64]) -> str:
 
 
 def _outliers(motions: Sequence[ValidRows], positions: Array, rotations: Array | None) -> Iterator[Finding]:
-    """Find the demonstration whose path, once aligned, differs from all others.
-
-    Distances are measured from the medoid, the demonstration that is nearest to all others. At least four
-    demonstrations are needed to know what is usual.
-    """
+    """Find demonstrations that, once aligned, are unusually far from the medoid, the one nearest to all others."""
     distance = _mean_distance(positions, positions)
     center = int(np.argmin(np.sum(distance, axis=1)))
     for i in _unlike(distance[center], center, _OUTLIER_DISTANCE):

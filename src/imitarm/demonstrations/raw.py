@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from imitarm.demonstrations.align import held_rows, moving_rows
 from imitarm.errors import FileFormatError, InputError
 from imitarm.trajectory import Demonstration, Trajectory
+from imitarm.validation import instance, real_array, text
 
 if TYPE_CHECKING:
     from imitarm.kinematics.arm import ArmModel
@@ -89,6 +90,9 @@ class RawDemonstration:
         task: name of the task.
         lines: line of the text file of each row, from 1, shape (n,); None when the file is not text.
         notes: what the reader left out or assumed.
+
+    Raises:
+        InputError: when an array has another shape or does not hold numbers, or joints and names do not agree.
     """
 
     source: str
@@ -101,10 +105,25 @@ class RawDemonstration:
     lines: NDArray[np.int64] | None = None
     notes: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        what = f"RawDemonstration {text(self.source, 'RawDemonstration: source')}"
+        n = len(times := real_array(self.times, (None,), f"{what}: times", "s"))
+        if n == 0:
+            raise InputError(f"{what}: holds no samples; record it again")
+        object.__setattr__(self, "times", times)
+        for name, columns in (("positions", 3), ("quaternions", 4), ("joints", None)):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, real_array(getattr(self, name), (n, columns), f"{what}: {name}"))
+        n_joints = 0 if self.joints is None else self.joints.shape[1]
+        if len(self.joint_names) != n_joints:
+            raise InputError(f"{what}: {n_joints} columns of joints need as many joint_names, got {self.joint_names}")
+
     @classmethod
-    def of(cls, demonstration: Demonstration) -> RawDemonstration:
-        """Return a demonstration as if it had just been read."""
-        motion = demonstration.trajectory
+    def of(cls, demonstration: Demonstration | RawDemonstration) -> RawDemonstration:
+        """Return a demonstration as if it had just been read; a raw one as it is."""
+        if isinstance(demonstration, RawDemonstration):
+            return demonstration
+        motion = instance(demonstration, Demonstration, "a demonstration").trajectory
         return cls(
             demonstration.source,
             motion.times,
@@ -165,6 +184,7 @@ class RawDemonstration:
         Raises:
             InputError: when the arm is needed and is not given, or is another one.
         """
+        check_arm_model(arm, "arm")
         if self.positions is not None:
             return self
         if arm is None:
@@ -253,6 +273,12 @@ class RawDemonstration:
         )
 
 
+def check_arm_model(arm: object, what: str) -> None:
+    """Raise InputError unless ``arm`` is an ArmModel or None, whose module is not imported for this."""
+    if arm is not None and not hasattr(arm, "tool_path"):
+        raise InputError(f"{what} must be an ArmModel, got {arm!r:.60}; load it with ArmModel.load('sawyer')")
+
+
 def _unit(raw: RawDemonstration, keep: NDArray[np.int64]) -> Array:
     """Return the quaternions of rows ``keep`` scaled to length one."""
     assert raw.quaternions is not None
@@ -337,17 +363,12 @@ def check_rows(raw: RawDemonstration) -> Iterator[Finding]:
     """Find numbers that are not finite, and recordings with few samples."""
     invalid = np.flatnonzero(raw.not_finite())
     if len(invalid):
-        yield raw.finding(
-            "error",
-            "not-finite",
-            f"{len(invalid)} of {len(raw)} rows hold nan or inf",
-            "fix the file, or read it with repair=True to drop those rows",
-            int(invalid[0]),
-        )
+        message = f"{len(invalid)} of {len(raw)} rows hold nan or inf"
+        remedy = "fix the file, or read it with repair=True to drop those rows"
+        yield raw.finding("error", "not-finite", message, remedy, int(invalid[0]))
     if len(raw) < _FEW:
-        yield raw.finding(
-            "warning", "few-samples", f"only {len(raw)} samples", f"record at 50 Hz or faster, {_FEW} samples or more"
-        )
+        remedy = f"record at 50 Hz or faster, {_FEW} samples or more"
+        yield raw.finding("warning", "few-samples", f"only {len(raw)} samples", remedy)
 
 
 def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
@@ -355,25 +376,16 @@ def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
     late = np.flatnonzero(raw.late())
     if len(late):
         row = int(late[0])
-        yield raw.finding(
-            "error",
-            "non-monotonic-stamps",
-            f"{len(late)} time stamps are not later than those before; the first is {raw.times[row]:.6g} s "
-            f"after {np.nanmax(raw.times[:row]):.6g} s",
-            "record again, or read it with repair=True to drop those rows",
-            row,
-        )
+        message = f"{len(late)} time stamps are not later than those before; the first is {raw.times[row]:.6g} s "
+        message += f"after {np.nanmax(raw.times[:row]):.6g} s"
+        remedy = "record again, or read it with repair=True to drop those rows"
+        yield raw.finding("error", "non-monotonic-stamps", message, remedy, row)
     times = raw.times[~raw.not_finite()]
     if len(times) < 3:
         return
     if np.abs(times).max() > _EPOCH:
-        yield raw.finding(
-            "note",
-            "epoch-stamps",
-            f"time stamps are dates ({times[0]:.0f} s), not seconds since the start",
-            "none needed: align subtracts the first",
-            0,
-        )
+        message = f"time stamps are dates ({times[0]:.0f} s), not seconds since the start"
+        yield raw.finding("note", "epoch-stamps", message, "none needed: align subtracts the first", 0)
     step = float(np.median(np.diff(np.sort(times))))
     if step > _LONGEST_STEP:
         fits = [
@@ -381,12 +393,10 @@ def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
             for name, factor in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
             if _STEPS[0] <= step * factor <= _STEPS[1]
         ]
-        yield raw.finding(
-            "error",
-            "time-units",
-            f"samples are {step:.4g} s apart, {(times[-1] - times[0]) / 60:.4g} min in all; these are hardly seconds",
-            f"read it with {' or '.join(fits)}" if fits else "check which column holds the time, and its unit",
-        )
+        minutes = (times[-1] - times[0]) / 60.0
+        message = f"samples are {step:.4g} s apart, {minutes:.4g} min in all; these are hardly seconds"
+        remedy = f"read it with {' or '.join(fits)}" if fits else "check which column holds the time, and its unit"
+        yield raw.finding("error", "time-units", message, remedy)
 
 
 def check_quaternions(raw: RawDemonstration) -> Iterator[Finding]:
@@ -399,31 +409,17 @@ def check_quaternions(raw: RawDemonstration) -> Iterator[Finding]:
     worst = int(np.argmax(off))
     if off[worst] > _LENGTH_TOLERANCE:
         first = int(np.flatnonzero(off > _LENGTH_TOLERANCE)[0])
-        yield raw.finding(
-            "error",
-            "no-rotation",
-            f"{int(np.sum(off > _LENGTH_TOLERANCE))} quaternions do not have length 1; the first has length "
-            f"{length[first]:.3g}",
-            "check which columns hold the quaternion",
-            first,
-        )
+        n = int(np.sum(off > _LENGTH_TOLERANCE))
+        message = f"{n} quaternions do not have length 1; the first has length {length[first]:.3g}"
+        yield raw.finding("error", "no-rotation", message, "check which columns hold the quaternion", first)
     elif off[worst] > 0.1 * _LENGTH_TOLERANCE:
-        yield raw.finding(
-            "warning",
-            "quaternion-length",
-            f"quaternions have length {length.min():.4f} to {length.max():.4f}; they are scaled to 1 when read",
-            "write them with more digits",
-            worst,
-        )
+        message = f"quaternions have length {length.min():.4f} to {length.max():.4f}; they are scaled to 1 when read"
+        yield raw.finding("warning", "quaternion-length", message, "write them with more digits", worst)
     flips = np.flatnonzero(np.sum(q[1:] * q[:-1], axis=1) < 0.0) + 1
     if len(flips):
-        yield raw.finding(
-            "note",
-            "quaternion-flips",
-            f"{len(flips)} times the quaternion's sign flips (q and -q are the same rotation)",
-            "none needed: signs are made continuous when read",
-            int(flips[0]),
-        )
+        message = f"{len(flips)} times the quaternion's sign flips (q and -q are the same rotation)"
+        remedy = "none needed: signs are made continuous when read"
+        yield raw.finding("note", "quaternion-flips", message, remedy, int(flips[0]))
 
 
 def check_held(raw: RawDemonstration) -> Iterator[Finding]:
@@ -431,13 +427,9 @@ def check_held(raw: RawDemonstration) -> Iterator[Finding]:
     held = raw.held()
     if held.any():
         rows = (len(raw) - 1) / max(1, int((~held).sum()) - 1)
-        yield raw.finding(
-            "warning",
-            "held-values",
-            f"{held.sum()} of {len(raw)} rows repeat the row before: each value is held for about {rows:.2g} rows",
-            "read it with thin=True to drop the repeated rows",
-            int(np.flatnonzero(held)[0]),
-        )
+        message = f"{held.sum()} of {len(raw)} rows repeat the row before: each value is held for about {rows:.2g} rows"
+        remedy = "read it with thin=True to drop the repeated rows"
+        yield raw.finding("warning", "held-values", message, remedy, int(np.flatnonzero(held)[0]))
 
 
 def check_notes(raw: RawDemonstration) -> Iterator[Finding]:

@@ -7,7 +7,6 @@ invalid.
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from abc import ABC, abstractmethod
@@ -20,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.demonstrations.raw import RawDemonstration
-from imitarm.errors import FileFormatError, InputError, UnknownNameError
+from imitarm.errors import FileFormatError, InputError
 from imitarm.files.table import kind_of, read_bytes
 from imitarm.registry import Registry
 from imitarm.trajectory import Demonstration
+from imitarm.validation import choice, finite_number, flag, text
 
 if TYPE_CHECKING:
     from imitarm.kinematics.arm import ArmModel
@@ -68,13 +68,14 @@ class ReadOptions:
             ("unit of time", self.time_units, TIME_UNITS),
             ("quaternion order", self.quaternion_order, QUATERNION_ORDERS),
         ):
-            if name is not None and name not in known:
-                raise UnknownNameError.among(kind, name, known)
+            if name is not None:
+                choice(name, known, kind)
         for what, value in (("duration", self.duration), ("rate", self.rate)):
-            if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"{what} must be a positive number, got {value!r}")
+            if value is not None:
+                finite_number(value, what, above=0.0)
         if self.duration is not None and self.rate is not None:
             raise InputError("give duration or rate, not both: each follows from the other")
+        text(self.task, "task")
 
     def metres(self, source: str, positions: Array, said: str | None = None) -> Array:
         """Return ``positions`` in metres; ``said`` is the unit that the file itself names.
@@ -190,6 +191,9 @@ def files_of(paths: Paths) -> list[str]:
     """
     if isinstance(paths, str | os.PathLike):
         paths = [paths]
+    paths = list(paths) if isinstance(paths, Iterable) else [paths]
+    if not all(isinstance(path, str | os.PathLike) for path in paths):
+        raise InputError(f"paths must be a file, a folder or several of them, got {paths!r:.80}")
     files: list[str] = []
     for path in [os.fspath(path) for path in paths]:
         if Path(path).is_dir():
@@ -223,6 +227,7 @@ def read_raw(
         InputError: when a file can't be opened or an option does not fit it.
         FileFormatError: when a file can't be understood; the message names file, place and remedy.
     """
+    flag(thin, "read: thin")
     options = ReadOptions(units, time_units, duration, rate, quaternion_order, task)
     raw = [one for path in files_of(paths) for one in _reader_of(path).read(path, options)]
     return [one.thinned() for one in raw] if thin else raw
@@ -264,6 +269,7 @@ def read(
         InputError: when a file can't be opened or an option does not fit it.
         FileFormatError: when a file is damaged or can't be understood; the message names file, line and remedy.
     """
+    flag(repair, "read: repair")
     raw = read_raw(
         paths,
         units=units,
