@@ -84,13 +84,13 @@ def quaternion_log(q: ArrayLike) -> Array:
 def quaternion_to_matrix(q: ArrayLike) -> Array:
     """Return rotation matrices (..., 3, 3) of unit quaternions wxyz (..., 4)."""
     q = np.asarray(q, dtype=float)
-    w, x, y, z = q.tolist() if q.ndim == 1 else np.moveaxis(q, -1, 0)
+    w, x, y, z = q.tolist() if q.ndim == 1 else q.reshape(-1, 4).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.array(rows) if q.ndim == 1 else np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.array(rows) if q.ndim == 1 else np.array(rows).transpose(2, 0, 1).reshape(*q.shape[:-1], 3, 3)
 
 
 def matrix_to_quaternion(matrix: ArrayLike) -> Array:

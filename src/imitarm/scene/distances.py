@@ -78,7 +78,6 @@ class PackedObstacles:
         stamps: when each obstacle was seen, shape (n,) [s].
         track_ids: the number of its track, shape (n,); -1 without one.
         polytopes: faces and edges of each convex hull; None for other kinds.
-        radii: of the sphere around ``positions`` that holds the solid, shape (n,) [m]; inf for a half-space.
     """
 
     kinds: NDArray[np.int8]
@@ -91,7 +90,6 @@ class PackedObstacles:
     stamps: Array
     track_ids: NDArray[np.int64]
     polytopes: tuple[Polytope | None, ...]
-    radii: Array
 
     @classmethod
     def of(
@@ -118,7 +116,6 @@ class PackedObstacles:
             np.array(stamps, dtype=float).reshape(n),
             np.array(track_ids, dtype=np.int64).reshape(n),
             tuple(solid.polytope for solid in solids),
-            np.array([_bounding_radius(solid) for solid in solids], dtype=float),
         )
 
     def __len__(self) -> int:
@@ -157,7 +154,6 @@ class PackedObstacles:
         values = moved.__dict__
         values.update(self.__dict__)
         values.pop("_frames", None)
-        values.pop("_single", None)
         values.update(changes)
         return moved
 
@@ -172,21 +168,26 @@ class PackedObstacles:
         return bool(self.angular_velocities.any())
 
     @cached_property
+    def radii(self) -> Array:
+        """Of the sphere around ``positions`` that holds each solid, shape (n,) [m]; inf for a half-space."""
+        rows = zip(self.kinds.tolist(), self.sizes.tolist(), self.polytopes, strict=True)
+        return np.array([_bounding_radius(KINDS[kind], size, polytope) for kind, size, polytope in rows])
+
+    @cached_property
     def _sorted(self) -> tuple[Indices, list[_Members]]:
         """The order of the obstacles, family by family, and the families; every hull is a family of its own."""
-        names = np.array([KINDS[kind] for kind in self.kinds], dtype=str)
-        round_, slab = np.isin(names, ROUNDS.kinds), np.isin(names, SLABS.kinds)
-        if slab.any():
-            slab, round_ = slab | round_, round_ & False  # rounded boxes too: fewer and longer calls
+        names = [KINDS[kind] for kind in self.kinds.tolist()]
+        merged = any(name in SLABS.kinds for name in names)  # then spheres and capsules are taken as rounded boxes
         order: list[int] = []
         families: list[_Members] = []
         for family in FAMILIES:
-            chosen = {ROUNDS: round_, SLABS: slab}.get(family, np.isin(names, family.kinds))
-            members = np.flatnonzero(chosen)
-            if len(members):
+            kinds = family.kinds + (ROUNDS.kinds if merged and family is SLABS else ())
+            members = [] if merged and family is ROUNDS else [i for i, name in enumerate(names) if name in kinds]
+            if members:
                 places = slice(len(order), len(order) + len(members))
-                families.append(_Members(family.formula, places, family.prepare(names[members], self.sizes[members])))
-                order += members.tolist()
+                parameters = family.prepare([names[i] for i in members], self.sizes[members])
+                families.append(_Members(family.formula, places, parameters))
+                order += members
         for i, polytope in enumerate(self.polytopes):
             if polytope is not None:
                 families.append(_Members(polytope.formula, slice(len(order), len(order) + 1), ()))
@@ -222,16 +223,34 @@ class PackedObstacles:
             self._kept[:] = [(reach, limit * limit)]
         return self._kept[0][1]
 
-    @cached_property
-    def _single(self) -> tuple[Formula, Array | None, Array, list[Array | None]]:
-        """For a pack of one: the formula, the rotation into the own frame, its centre (3, 1), the parameters.
 
-        The rotation is None where there is none.
-        """
-        frames = self._frames
-        to_own = frames.to_own[0] if self.quaternions[0, 1:].any() else None
-        family = self._families[0]
-        return family.formula, to_own, frames.center[:, 0], _every(family.parameters, 0)
+class Single(NamedTuple):
+    """One obstacle, ready for distances.
+
+    Attributes:
+        formula: of its family.
+        to_own: rotation of base vectors into the own frame, shape (3, 3); None when there is none.
+        center: of the obstacle, in its own rotation, shape (3, 1) [m].
+        parameters: of the formula.
+    """
+
+    formula: Formula
+    to_own: Array | None
+    center: Array
+    parameters: list[Array | None]
+
+    @classmethod
+    def of(cls, solid: Solid) -> Single:
+        """Prepare ``solid``."""
+        to_own = quaternion_to_matrix(solid.quaternion).T if solid.quaternion[1:].any() else None
+        center = np.array((solid.position if to_own is None else to_own @ solid.position)[:, None])
+        if solid.polytope is not None:
+            return cls(solid.polytope.formula, to_own, center, [])
+        if solid.kind == "half_space":
+            center[2] -= DEPTH
+        family = next(family for family in FAMILIES if solid.kind in family.kinds)
+        parameters = family.prepare([solid.kind], np.array([solid.size], dtype=float))
+        return cls(family.formula, to_own, center, _every(parameters, 0))
 
 
 def checked_points(points: ArrayLike) -> Array:
@@ -269,27 +288,21 @@ def distances_and_gradients(
 ) -> tuple[Array, Array]:
     """Return :func:`distances` and their gradients with respect to the points.
 
-    Args:
-        packed: as for :func:`distances`.
-        points: as for :func:`distances`.
-        times: as for :func:`distances`.
+    The arguments and errors are those of :func:`distances`.
 
     Returns:
         Distances (n, ...) [m] and unit vectors (n, ..., 3) in the base frame.
-
-    Raises:
-        InputError: when a shape is wrong or a number is not finite.
     """
     distance, gradient = _evaluate(packed, points, times, True)
     assert gradient is not None
     return distance, gradient
 
 
-def single_distance(packed: PackedObstacles, points: ArrayLike, gradient: bool) -> tuple[Array, Array | None]:
-    """Return what :func:`distances_and_gradients` does for a pack of one, without the first axis, and quicker.
+def single_distance(single: Single, points: ArrayLike, gradient: bool) -> tuple[Array, Array | None]:
+    """Return the distances of one obstacle, and their gradients if ``gradient``; for many calls with few points.
 
     Args:
-        packed: one obstacle.
+        single: the obstacle.
         points: in the base frame, shape (..., 3) [m].
         gradient: whether to return the gradients too.
 
@@ -300,7 +313,7 @@ def single_distance(packed: PackedObstacles, points: ArrayLike, gradient: bool) 
         InputError: when the last axis of ``points`` has not length 3 or a number is not finite.
     """
     p = checked_points(points)
-    formula, to_own, center, parameters = packed._single
+    formula, to_own, center, parameters = single
     columns = (p if p.ndim == 2 else p.reshape(-1, 3)).T
     if to_own is None:
         q = np.subtract(columns, center, order="C")
@@ -372,9 +385,6 @@ def _evaluate(
     packed: PackedObstacles, points: ArrayLike, times: ArrayLike | None, gradient: bool
 ) -> tuple[Array, Array | None]:
     p = checked_points(points)
-    if times is None and len(packed) == 1:
-        single, normal = single_distance(packed, p, gradient)
-        return single[None], None if normal is None else normal[None]
     if times is None:
         shape = p.shape[:-1]
         distance, normals = _at_once(packed, p.reshape(-1, 3), None, gradient)
@@ -428,15 +438,14 @@ def _take(parameters: Parameters, members: Indices) -> list[Array | None]:
     return [None if p is None else p.take(members, axis=-1) for p in parameters]
 
 
-def _bounding_radius(solid: Solid) -> float:
-    a, b, c = (float(x) for x in solid.size)
-    return {
-        "sphere": a,
-        "box": 0.5 * math.hypot(a, b, c),
-        "capsule": a + 0.5 * b,
-        "cylinder": math.hypot(a, 0.5 * b),
-        "cone": math.hypot(a, 0.5 * b),
-        "ellipsoid": max(a, b, c),
-        "convex_hull": math.inf if solid.polytope is None else solid.polytope.radius,
-        "half_space": math.inf,
-    }[solid.kind]
+def _bounding_radius(kind: str, size: list[float], polytope: Polytope | None) -> float:
+    a, b, c = size
+    if polytope is not None:
+        return polytope.radius
+    if kind == "half_space":
+        return math.inf
+    if kind == "box":
+        return 0.5 * math.hypot(a, b, c)
+    if kind == "capsule":
+        return a + 0.5 * b
+    return max(a, b, c) if kind in {"sphere", "ellipsoid"} else math.hypot(a, 0.5 * b)  # else a cylinder or a cone

@@ -6,7 +6,7 @@ against ``q``. It returns signed distances (...) [m] and outward unit normals (3
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -58,8 +58,8 @@ def rounds(q: Array, gradient: bool, radius: Array, half: Array | None) -> tuple
     return distance, q
 
 
-def _prepare_rounds(kinds: NDArray[np.str_], sizes: Array) -> Parameters:
-    return sizes[:, 0].copy(), 0.5 * sizes[:, 1] if (kinds == "capsule").any() else None
+def _prepare_rounds(kinds: Sequence[str], sizes: Array) -> Parameters:
+    return sizes[:, 0].copy(), 0.5 * sizes[:, 1] if "capsule" in kinds else None
 
 
 def slabs(
@@ -108,7 +108,7 @@ def slabs(
     return distance, out
 
 
-def _prepare_slabs(kinds: NDArray[np.str_], sizes: Array) -> Parameters:
+def _prepare_slabs(kinds: Sequence[str], sizes: Array) -> Parameters:
     half, rounding = np.zeros((3, len(kinds))), np.zeros(len(kinds))
     for i, (kind, size) in enumerate(zip(kinds, sizes, strict=True)):
         if kind == "box":
@@ -120,8 +120,8 @@ def _prepare_slabs(kinds: NDArray[np.str_], sizes: Array) -> Parameters:
         else:  # a sphere or a capsule
             rounding[i] = size[0]
             half[2, i] = 0.5 * size[1]
-    turned = kinds == "cylinder"
-    return half, rounding if rounding.any() else None, turned if turned.any() else None
+    turned = np.array([kind == "cylinder" for kind in kinds])
+    return half, rounding if rounding.any() else None, turned if "cylinder" in kinds else None
 
 
 def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor: Array) -> tuple[Array, Array | None]:
@@ -161,7 +161,7 @@ def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor:
     return distance, np.copysign(normal, q, out=normal) if gradient else None
 
 
-def _prepare_ellipsoids(_kinds: NDArray[np.str_], sizes: Array) -> Parameters:
+def _prepare_ellipsoids(_kinds: Sequence[str], sizes: Array) -> Parameters:
     semi_axes = np.ascontiguousarray(sizes.T)
     shortest = semi_axes.min(axis=0)
     floor = np.zeros_like(semi_axes)
@@ -211,7 +211,7 @@ def cones(
     return distance, full
 
 
-def _prepare_cones(_kinds: NDArray[np.str_], sizes: Array) -> Parameters:
+def _prepare_cones(_kinds: Sequence[str], sizes: Array) -> Parameters:
     radius, height, _ = np.ascontiguousarray(sizes.T)
     slant = np.hypot(radius, height)
     return radius, height, slant, np.stack([height, radius]) / slant
@@ -228,7 +228,7 @@ class Family(NamedTuple):
 
     kinds: tuple[str, ...]
     formula: Formula
-    prepare: Callable[[NDArray[np.str_], Array], Parameters]
+    prepare: Callable[[Sequence[str], Array], Parameters]
 
 
 ROUNDS = Family(("sphere", "capsule"), rounds, _prepare_rounds)

@@ -19,6 +19,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_exp, quaternion_multiply
 from imitarm.scene.distances import (
     PackedObstacles,
+    Single,
     Solid,
     checked_points,
     single_distance,
@@ -121,6 +122,11 @@ class Obstacle(ABC):
         """The obstacle in an error message."""
         return f'{type(self).__name__} "{self.name}"' if self.name else type(self).__name__
 
+    def _forget(self) -> None:
+        """Drop what was worked out for the present pose; for a fresh copy."""
+        for key in ("packed", "_single"):
+            self.__dict__.pop(key, None)
+
     def _set(self, **values: object) -> None:
         for key, value in values.items():
             if isinstance(value, np.ndarray):
@@ -131,6 +137,10 @@ class Obstacle(ABC):
     def packed(self) -> PackedObstacles:
         """The obstacle as a :class:`~imitarm.scene.distances.PackedObstacles` of one, at time 0."""
         return pack((self,), 0.0)
+
+    @cached_property
+    def _single(self) -> Single:
+        return Single.of(self.solid())
 
     def signed_distance(self, points: ArrayLike) -> Array:
         """Return the distance to the surface, negative inside.
@@ -144,7 +154,7 @@ class Obstacle(ABC):
         Raises:
             InputError: when the last axis has not length 3 or a number is not finite.
         """
-        return single_distance(self.packed, points, False)[0]
+        return single_distance(self._single, points, False)[0]
 
     def gradient(self, points: ArrayLike) -> Array:
         """Return the gradient of :meth:`signed_distance`: unit vectors, shape (..., 3).
@@ -169,7 +179,7 @@ class Obstacle(ABC):
         Raises:
             InputError: when the last axis has not length 3 or a number is not finite.
         """
-        distance, gradient = single_distance(self.packed, points, True)
+        distance, gradient = single_distance(self._single, points, True)
         assert gradient is not None
         return distance, gradient
 
@@ -213,7 +223,7 @@ class Obstacle(ABC):
         if not self.moves or dt == 0.0:
             return self
         moved = copy.copy(self)  # keeps the checked fields and the faces of a hull, which motion does not change
-        moved.__dict__.pop("packed", None)
+        moved._forget()
         turn = quaternion_exp(dt * self.angular_velocity) if self.angular_velocity.any() else None
         moved._move(dt * self.velocity, turn)
         return moved
@@ -232,7 +242,7 @@ class Obstacle(ABC):
         if stays and (velocity == self.velocity).all() and (angular_velocity == self.angular_velocity).all():
             return self
         placed = copy.copy(self)
-        placed.__dict__.pop("packed", None)
+        placed._forget()
         placed._set(velocity=velocity.copy(), angular_velocity=angular_velocity.copy())
         turns = (quaternion != before.quaternion).any()
         turn = quaternion_multiply(quaternion, quaternion_conjugate(before.quaternion)) if turns else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import InputError
-from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply, rotate
+from imitarm.kinematics.pose import quaternion_multiply, rotate
 from imitarm.scene.distances import Solid
 from imitarm.scene.formulas import TINY, Polytope, lengths
 from imitarm.scene.obstacle import (
@@ -308,8 +309,10 @@ class ConvexHull(Obstacle):
 
 def rotation_from_z(axis: Array) -> Array:
     """Return a quaternion wxyz (4,) that turns z into the direction of ``axis`` (3,)."""
-    across = np.cross([0.0, 0.0, 1.0], axis)
-    sine = float(np.linalg.norm(across))
-    if sine < 1e-12 * float(np.linalg.norm(axis)):
-        return UPRIGHT if axis[2] >= 0.0 else np.array([0.0, 1.0, 0.0, 0.0])
-    return quaternion_exp(np.arctan2(sine, axis[2]) / sine * across)
+    x, y, z = axis.tolist()
+    across = math.hypot(x, y)
+    if across < 1e-12 * abs(z):
+        return UPRIGHT if z >= 0.0 else np.array([0.0, 1.0, 0.0, 0.0])
+    half = 0.5 * math.atan2(across, z)
+    sine = math.sin(half) / across
+    return np.array([math.cos(half), -sine * y, sine * x, 0.0])
