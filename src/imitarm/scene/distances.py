@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 KINDS = ("sphere", "box", "capsule", "cylinder", "cone", "ellipsoid", "convex_hull", "half_space")
+_OF_THE_POSE = frozenset(("positions", "_frames", "_ahead", "_shapes"))
 
 
 class Solid(NamedTuple):
@@ -103,13 +104,11 @@ class PackedObstacles:
     ) -> PackedObstacles:
         """Stack ``solids``; the other arguments are the attributes of these names."""
         n = len(solids)
-        kinds = np.array([KINDS.index(solid.kind) for solid in solids], dtype=np.int8)
-        sizes = np.array([solid.size for solid in solids], dtype=float).reshape(n, 3)
         return cls(
-            kinds,
+            np.array([KINDS.index(solid.kind) for solid in solids], dtype=np.int8),
             np.array([solid.position for solid in solids], dtype=float).reshape(n, 3),
             np.array([solid.quaternion for solid in solids], dtype=float).reshape(n, 4),
-            sizes,
+            np.array([solid.size for solid in solids], dtype=float).reshape(n, 3),
             np.array(velocities, dtype=float).reshape(n, 3),
             np.array(angular_velocities, dtype=float).reshape(n, 3),
             np.array(covariances, dtype=float).reshape(n, 3, 3),
@@ -129,8 +128,7 @@ class PackedObstacles:
         if self.rotating:
             turned = quaternion_multiply(quaternion_exp(dt * self.angular_velocities), self.quaternions)
             return self._copy(positions=positions, quaternions=turned)
-        frames = self._frames
-        return self._copy(positions=positions, _frames=frames._replace(center=frames.center + dt * frames.velocity))
+        return self._copy(positions=positions, _ahead=(self._frames, dt))
 
     def placed(
         self, positions: Array, quaternions: Array, velocities: Array, angular_velocities: Array, stamp: float
@@ -149,13 +147,16 @@ class PackedObstacles:
 
     def _copy(self, **changes: object) -> PackedObstacles:
         """Return a copy with other poses, which keeps what was worked out for the shapes."""
-        self._sorted, self._kept  # noqa: B018  worked out once, for all copies
         moved = object.__new__(PackedObstacles)
-        values = moved.__dict__
-        values.update(self.__dict__)
-        values.pop("_frames", None)
-        values.update(changes)
+        moved.__dict__.update(self._shapes)
+        moved.__dict__.update(changes)
         return moved
+
+    @cached_property
+    def _shapes(self) -> dict[str, object]:
+        """All values that do not depend on the poses, for copies."""
+        self._sorted, self._kept, self.radii  # noqa: B018  worked out once, for all copies
+        return {key: value for key, value in self.__dict__.items() if key not in _OF_THE_POSE}
 
     @cached_property
     def still(self) -> bool:
@@ -194,17 +195,12 @@ class PackedObstacles:
                 order.append(i)
         return np.array(order, dtype=np.intp), families
 
-    @property
-    def _order(self) -> Indices:
-        return self._sorted[0]
-
-    @property
-    def _families(self) -> list[_Members]:
-        return self._sorted[1]
-
     @cached_property
     def _frames(self) -> _Frames:
-        order = self._order
+        if "_ahead" in self.__dict__:
+            frames, dt = self.__dict__["_ahead"]
+            return frames._replace(center=frames.center + dt * frames.velocity)
+        order = self._sorted[0]
         to_own = np.ascontiguousarray(quaternion_to_matrix(self.quaternions[order]).transpose(0, 2, 1))
         rows = np.ascontiguousarray(to_own.transpose(1, 0, 2)).reshape(-1, 3)
         center, velocity = (np.einsum("nij,nj->in", to_own, v[order]) for v in (self.positions, self.velocities))
@@ -219,7 +215,7 @@ class PackedObstacles:
     def _limits(self, reach: Array) -> Array:
         """Return the squared distance from each obstacle's origin (n, m) within which a point may be in ``reach``."""
         if not self._kept or self._kept[0][0] is not reach:
-            limit = reach + self.radii[self._order, None]
+            limit = reach + self.radii[self._sorted[0], None]
             self._kept[:] = [(reach, limit * limit)]
         return self._kept[0][1]
 
@@ -361,13 +357,15 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
         return None
     place, point = np.divmod(flat, m)
     q = every.reshape(3, -1).take(flat, axis=1)
-    if len(packed._families) == 1:
-        formula, _, parameters = packed._families[0]
+    if len(packed._sorted[1]) == 1:
+        formula, _, parameters = packed._sorted[1][0]
         distance, normal = formula(q, True, *_take(parameters, place))
     else:
         distance, normal = np.empty(len(flat)), np.empty((3, len(flat)))
-        starts = np.searchsorted(place, [family.places.start for family in packed._families]).tolist()
-        for (formula, places, parameters), a, b in zip(packed._families, starts, [*starts[1:], len(flat)], strict=True):
+        starts = np.searchsorted(place, [family.places.start for family in packed._sorted[1]]).tolist()
+        for (formula, places, parameters), a, b in zip(
+            packed._sorted[1], starts, [*starts[1:], len(flat)], strict=True
+        ):
             if a < b:
                 column = place[a:b] - places.start
                 distance[a:b], normal[:, a:b] = formula(q[:, a:b], True, *_take(parameters, column))
@@ -378,7 +376,7 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
         place, point, distance = place.take(near), point.take(near), distance.take(near)
         normal = normal.take(near, axis=1)
     base = np.einsum("jk,kji->ik", normal, frames.to_own.take(place, axis=0))
-    return NearPairs(packed._order[place], point, distance, base)
+    return NearPairs(packed._sorted[0][place], point, distance, base)
 
 
 def _evaluate(
@@ -419,12 +417,12 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
     else:
         q.reshape(3, n, len(times), m // len(times))[...] -= (frames.center + frames.velocity * times)[..., None]
     distance, gradients = np.empty((n, m)), np.empty((n, m, 3)) if gradient else None
-    for formula, places, parameters in packed._families:
+    for formula, places, parameters in packed._sorted[1]:
         part, normal = formula(q[:, places], gradient, *_every(parameters, slice(None)))
-        distance[packed._order[places]] = part
+        distance[packed._sorted[0][places]] = part
         if gradients is not None and normal is not None:
             for i, place in enumerate(range(places.start, places.stop)):
-                np.dot(normal[:, i].T, frames.to_own[place], out=gradients[packed._order[place]])
+                np.dot(normal[:, i].T, frames.to_own[place], out=gradients[packed._sorted[0][place]])
     return distance, gradients
 
 
