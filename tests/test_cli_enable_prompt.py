@@ -27,7 +27,7 @@ class Keyboard:
         """Type, and wait until it has been read."""
         before = operator._typed.qsize()
         self.keys.put(typed)
-        until = time.monotonic() + 10
+        until = time.monotonic() + 120.0
         while time.monotonic() < until and operator._typed.qsize() == before and not operator._ended:
             time.sleep(0.001)
 

@@ -1,16 +1,17 @@
 from __future__ import annotations
 
+import contextlib
+import math
 import socket
 import threading
-import time
 
 import numpy as np
 import pytest
 
-from imitarm.errors import InputError
+from imitarm.errors import InputError, TaskFailedError
 from imitarm.robots import RobotServer, UdpRobot
-from imitarm.transmission.messages import Status
-from wire_samples import ARM, N, Paper, Served, assert_within_limits
+from imitarm.transmission.messages import Mode, Status
+from wire_samples import ARM, Clock, N, Paper, Sender, Served, assert_within_limits, command
 
 
 def test_it_listens_to_this_machine_only_unless_told_otherwise():
@@ -37,21 +38,62 @@ def test_missed_periods_make_the_next_step_longer_but_not_long():
     served.kill()
 
 
-def test_in_real_time_it_goes_at_its_rate_and_is_braked_at_the_end():
-    robot = Paper()
-    with RobotServer(robot, 0) as server:
-        running = threading.Thread(target=server.run, args=(0.6,))
-        running.start()
-        with UdpRobot(ARM, server.address) as client:
-            client.enable(5.0)
-            until = time.monotonic() + 0.2
-            while time.monotonic() < until:
-                client.move(np.full(N, 0.3), 0.01)
-                time.sleep(0.01)
-            running.join()
-    assert server.supervisor.status in (Status.FOLLOWING, Status.SLOWING, Status.STOPPED)
+def test_it_keeps_its_rate_follows_commands_and_is_braked_at_the_end():
+    """On a clock that only goes on while the server waits, so that the machine's load changes nothing."""
+    robot, clock = Paper(), Clock()
+
+    def wait(_, seconds):
+        clock.ns += math.ceil(1e9 * seconds)
+        return False
+
+    with (
+        RobotServer(robot, 0, clock_ns=clock, wait=wait) as server,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
+    ):
+        sender, statuses = Sender(server.supervisor), []
+
+        def lead(server):
+            statuses.append(server.supervisor.status)
+            if len(statuses) == 1:
+                enable = command(Mode.ENABLE, challenge=server.supervisor.challenge)
+                client.sendto(sender.bytes(enable, clock()), server.address)
+            elif len(statuses) < 100:
+                q, velocity = robot.set_point + 0.002, np.full(N, 0.3)
+                client.sendto(sender.bytes(command(Mode.MOVE, q, velocity), clock()), server.address)
+
+        server.run(0.6, on_step=lead)
+    assert len(statuses) == server.pace.ticks == 151 and server.pace.overruns == 0  # every 4 ms, from 0 to 0.6 s
+    assert statuses[50] == Status.FOLLOWING and statuses[-1] == Status.SLOWING  # silence since 0.4 s
+    assert np.abs(np.array([velocity for _, velocity, _ in robot.steps])).max() > 0.2
     assert not robot.velocity.any()
-    assert server.pace.ticks >= 140
+    assert_within_limits(robot.steps)
+
+
+def test_in_real_time_a_client_leads_it():
+    """It goes on until the client has seen the arm move, however long a busy machine takes."""
+    robot, moved = Paper(), threading.Event()
+
+    def until_moved(_):
+        if moved.is_set():
+            raise StopIteration
+
+    def run():
+        with contextlib.suppress(StopIteration):
+            server.run(on_step=until_moved)
+
+    with RobotServer(robot, 0) as server:
+        running = threading.Thread(target=run)
+        running.start()
+        try:
+            with UdpRobot(ARM, server.address, timeout=60.0) as client:
+                while not robot.velocity.any():
+                    client.enable(60.0)  # again, when a command was so late that the arm has stopped
+                    with contextlib.suppress(TaskFailedError):
+                        for _ in range(5):
+                            client.move(np.full(N, 0.3), 0.01)
+        finally:
+            moved.set()
+            running.join()
     assert_within_limits(robot.steps)
 
 

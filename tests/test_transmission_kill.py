@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.skipif(os.name == "nt", reason="needs signals"), pytes
 
 ARM = ArmModel.load("sawyer", tool="gripper")
 N = ARM.n_joints
-PATIENCE = 60.0  # [s] a busy machine may be slow; nothing here depends on how quick it is
+PATIENCE = 300.0  # [s] a busy machine may be slow; nothing here depends on how fast it is
 
 
 def free_port():
@@ -158,8 +158,12 @@ def test_each_process_may_be_killed_and_started_again_and_the_arm_never_jumps(st
     stage.wait_for_motion()
 
     stage.kill("capture")
-    stage.wait("rest", lambda: np.abs(stage.steps()[3][-1]).max() < 1e-3)
-    assert stage.steps()[1][-1] == Status.FOLLOWING  # held by the retargeter, which lives
+
+    def held():  # by the retargeter, which lives: at rest, and not because the robot has stopped itself
+        _, status, _, velocity = stage.steps()
+        return np.abs(velocity[-1]).max() < 1e-3 and status[-1] == Status.FOLLOWING
+
+    stage.wait("rest", held)
     stage.start_capture()
     stage.wait_for_motion()
 

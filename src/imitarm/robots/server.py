@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
+from socket import socket
 from typing import Self
 
 from imitarm.errors import InputError
@@ -33,8 +33,9 @@ class RobotServer:
             open it to a network only where everybody may move the robot.
         rate: periods a second [Hz], at least 100; a simulated robot needs a multiple of its timestep.
         on_event: is told in words when the robot is enabled, slows, stops.
-        clock_ns: the time [ns].
-        sleep: waits some seconds.
+        clock_ns: returns the time [ns].
+        wait: waits until a datagram has arrived, at most some seconds, and returns whether one has; with a simulated
+            clock it lets the time pass.
 
     Attributes:
         address: where it listens.
@@ -54,12 +55,12 @@ class RobotServer:
         rate: float = 250.0,
         on_event: Callable[[str], None] | None = None,
         clock_ns: Callable[[], int] = now_ns,
-        sleep: Callable[[float], None] = time.sleep,
+        wait: Callable[[socket, float], bool] = wait_for,
     ) -> None:
         if not 100.0 <= rate <= 1000.0:
             raise InputError(f"RobotServer: rate must be between 100 and 1000 Hz, got {rate!r}")
-        self._clock_ns = clock_ns
-        self.pace = Pace(1.0 / rate, sleep=sleep)
+        self._clock_ns, self._wait = clock_ns, wait
+        self.pace = Pace(1.0 / rate, clock_ns=clock_ns)
         self.supervisor = Supervisor(robot, 1.0 / rate, on_event=on_event)
         self._most = max(int(_MADE_UP * rate), 1)
         self._asked: dict[Address, None] = {}
@@ -93,11 +94,11 @@ class RobotServer:
             seconds: None: without end.
             on_step: is called after every period.
         """
-        until = None if seconds is None else time.monotonic() + seconds
+        until = None if seconds is None else self._clock_ns() + round(1e9 * seconds)
         try:
-            while until is None or time.monotonic() < until:
+            while until is None or self._clock_ns() < until:
                 while (left := self.pace.left) > 0.0:
-                    if wait_for(self._socket, left):
+                    if self._wait(self._socket, left):
                         self.receive()
                 self.step(self.pace.tick())
                 if on_step is not None:
