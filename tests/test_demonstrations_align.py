@@ -17,14 +17,14 @@ def height_of_the_mean(demonstrations):
 
 
 def test_a_peak_that_unaligned_demonstrations_flatten_is_recovered():
-    """METHODS C: a 0.10 m peak came out as 0.080 m when nothing was aligned."""
+    """Without alignment, the mean of these motions is 0.085 m high at most, although each is 0.10 m high."""
     samples = motions(8)
     assert height_of_the_mean(align(samples, method="resample")) < 0.085
     assert height_of_the_mean(align(samples)) > 0.098
     assert height_of_the_mean(align(motions(8, noise=1e-3))) > 0.098
 
 
-def test_what_is_learnt_has_the_peak():
+def test_what_is_learned_has_the_peak():
     prediction = GMR(20).fit(align(motions(8))).predict(np.linspace(0.0, 6.0, 400))[0]
     assert prediction[:, 2].max() - prediction[0, 2] > 0.096
     flat = GMR(20).fit(align(motions(8), method="resample")).predict(np.linspace(0.0, 6.0, 400))[0]

@@ -62,7 +62,7 @@ def test_the_medoid_is_the_one_in_the_middle():
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 def test_a_known_warp_is_undone(noise):
-    """After warping, every demonstration is at the same phase at the same moment."""
+    """After warping, every demonstration is at the same phase at the same time."""
     bends = [-0.12, -0.07, 0.0, 0.03, 0.08, 0.12]
     samples = [motion(bend=bend, noise=noise, seed=i, n=400) for i, bend in enumerate(bends)]
     warps = barycentre_warps(features([one.trajectory.resample(200) for one in samples]))

@@ -37,7 +37,7 @@ def test_it_becomes_a_demonstration(tmp_path):
     assert "# source: udp:7400" in path.read_text() and [p.name for p in tmp_path.iterdir()] == ["reach.csv"]
 
 
-def test_what_has_been_written_can_be_read_at_any_moment(tmp_path):
+def test_what_has_been_written_can_be_read_at_any_time(tmp_path):
     recorder = record(tmp_path / "reach.csv")
     assert len(Demonstration.load(tmp_path / "reach.csv.part")) == 40
     recorder.close()

@@ -307,7 +307,7 @@ def _by_length(positions: Array) -> Array:
 
 def _mean_distance(paths: Array, others: Array) -> Array:
     """Return the mean distance between each of ``paths`` and each of ``others``, shape (m, m)."""
-    return np.asarray(np.linalg.norm(paths[:, None] - others[None], axis=3).mean(axis=2))
+    return np.stack([np.linalg.norm(others - path, axis=2).mean(axis=1) for path in paths])
 
 
 def _backwards(paths: Array, size: float, motions: Sequence[ValidRows], scale: _Scale) -> Iterator[_Odd]:
@@ -325,14 +325,11 @@ def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: 
     m, n, _ = paths.shape
     for end, verb in (("goal", "stops"), ("start", "begins")):
         along = paths if end == "goal" else paths[:, ::-1]  # towards the end in question
-        to_path = np.linalg.norm(along[:, None, -1:] - along[None], axis=3)  # of each end to each path (m, m, n)
-        nearest = np.argmin(to_path, axis=2)
-        apart = to_path[:, :, -1]
-        short = (
-            (apart > max(scale.smallest, _SHORT[end] * size))
-            & (to_path.min(axis=2) < _ON_PATH * apart)
-            & (nearest < (1.0 - _SHORT[end]) * (n - 1))
-        )
+        distances = (np.linalg.norm(along - path[-1], axis=2) for path in along)  # of one end to all paths (m, n)
+        found = [(np.argmin(d, axis=1), d.min(axis=1), d[:, -1]) for d in distances]
+        nearest, least, apart = (np.stack(part) for part in zip(*found, strict=True))
+        short = (apart > max(scale.smallest, _SHORT[end] * size)) & (least < _ON_PATH * apart)
+        short &= nearest < (1.0 - _SHORT[end]) * (n - 1)
         for i in range(m):
             whole = np.flatnonzero(short[i] & ~short.any(axis=1))
             if len(whole) and 2 * short[i].sum() >= m - 1:
@@ -380,7 +377,7 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
 
 def _largest(paths: Array) -> Array:
     """Return the largest distance between paths (m, n, 3) at equal times, shape (m, m)."""
-    return np.asarray(np.linalg.norm(paths[:, None] - paths[None], axis=3).max(axis=2))
+    return np.stack([np.linalg.norm(paths - path, axis=2).max(axis=1) for path in paths])
 
 
 def _angles(rotations: Array, reference: Array) -> Array:
