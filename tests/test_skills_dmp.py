@@ -10,7 +10,7 @@ from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_exp, quaternion_log, quaternion_multiply
 from imitarm.skills import DMP, DMPState, Gains
 from imitarm.skills.dynamical_systems import MovingTarget
-from imitarm.skills.quaternion_dmp import RotationState
+from imitarm.skills.rotations import RotationState
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]

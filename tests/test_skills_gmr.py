@@ -16,7 +16,7 @@ from imitarm.skills import (
     ellipsoid_scale,
 )
 from imitarm.skills.gmr import samples_of
-from imitarm.skills.rotation_reference import RotationReference
+from imitarm.skills.rotations import RotationReference
 from imitarm.trajectory import Demonstration, Trajectory
 from skill_samples import shown as sweeps
 

@@ -23,7 +23,7 @@ from imitarm.skills import (
     Skill,
     ellipsoid_scale,
 )
-from imitarm.skills.rotation_reference import RotationReference
+from imitarm.skills.rotations import RotationReference
 from imitarm.trajectory import Demonstration, Trajectory
 from skill_samples import shown
 

@@ -19,7 +19,7 @@ from imitarm.demonstrations import Alignment, compute_alignment, files_of
 from imitarm.demonstrations.align import METHODS
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.skills import FitQuality, PoorFitWarning, Skill
-from imitarm.skills.selection import NUMBERS
+from imitarm.skills.mixture_fitting import NUMBERS
 from imitarm.trajectory import Demonstration
 
 EPILOG = """\

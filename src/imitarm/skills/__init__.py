@@ -7,8 +7,8 @@ from imitarm.skills.dynamical_systems import GAINS, Gains
 from imitarm.skills.fit_quality import DemonstrationDistance, FitQuality, PoorFitWarning
 from imitarm.skills.gmm import DegenerateAxisWarning, GaussianMixture, ellipsoid_scale
 from imitarm.skills.gmr import GMR, SingleDemonstrationWarning, UnalignedWarning
-from imitarm.skills.quaternion_dmp import QuaternionDMP
 from imitarm.skills.rhythmic_dmp import RhythmicDMP
+from imitarm.skills.rotations import QuaternionDMP
 from imitarm.skills.skill import Skill
 
 __all__ = [

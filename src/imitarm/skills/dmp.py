@@ -11,19 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
-from imitarm.skills.dmp_fit import fit_weights, progress_at
 from imitarm.skills.dynamical_systems import (
     ADJUSTMENTS,
     DECAY,
     Adjustment,
     Gains,
     MovingTarget,
+    fit_weights,
     phase_basis,
+    progress_at,
     propagator,
     roll_out,
-    rotodilatation,
 )
-from imitarm.skills.quaternion_dmp import QuaternionDMP, RotationState
+from imitarm.skills.rotations import QuaternionDMP, RotationState, rotodilatation
 from imitarm.trajectory import Trajectory
 from imitarm.validation import (
     choice,
@@ -103,8 +103,8 @@ class DMP:
     K = 139.26, D = 28 have a damping ratio of 1.186. Written differently, the spring follows a moving target
     ``y(s) = g - (g - x_0) s + f(s)`` that ends at the goal.
 
-    **Fitting** (:func:`~imitarm.skills.dmp_fit.fit_weights`) is ridge regression on the positions: nothing measured is
-    differentiated, samples may lie at any times, and the motion is at the goal when the duration is over.
+    **Fitting** (:func:`~imitarm.skills.dynamical_systems.fit_weights`) is ridge regression on the positions: nothing
+    measured is differentiated, samples may lie at any times, and the motion is at the goal when the duration is over.
 
     **Another start or goal.** With ``p`` the fraction of the path that is done (a primitive from 0 to 1 with weights
     w_p), ``adjustment`` selects the weights:

@@ -10,13 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv
 
 from imitarm.errors import InputError
-from imitarm.skills.em import (
+from imitarm.skills.mixture_fitting import (
     LOG_2PI,
     expectation_maximisation,
     log_densities,
     normalise,
     quadratic_features,
-    responsibilities_by_seeds,
     responsibilities_by_segments,
 )
 from imitarm.validation import choice, finite_array, finite_number, real_array, whole_number
@@ -62,7 +61,7 @@ class GaussianMixture:
 
     * Columns are standardised internally, so the result does not depend on the units.
     * ``init="time"`` starts from the best division of column 0 into K segments
-      (:func:`~imitarm.skills.em.responsibilities_by_segments`). It is deterministic and suits samples [t; x].
+      (:func:`~imitarm.skills.mixture_fitting.responsibilities_by_segments`). It is deterministic, and right for [t; x].
     * A column that does not move (a planar task has a constant z) does not influence the other columns. It is listed
       in ``degenerate_axes_`` and reported by a :class:`DegenerateAxisWarning`.
 
@@ -181,7 +180,7 @@ class GaussianMixture:
         rng = np.random.default_rng(self.random_state)
         starts = responsibilities_by_segments(features, column, [self.n_components]) if self.init == "time" else []
         while len(starts) < self.n_init:
-            starts.append(responsibilities_by_seeds(Z, self.n_components, rng))
+            starts.append(_responsibilities_by_seeds(Z, self.n_components, rng))
         return np.stack(starts)
 
     def _fixed_score(self, X: Array) -> Array:
@@ -284,3 +283,20 @@ def _table(X: ArrayLike, what: str) -> Array:
     if bad.any():
         raise InputError(f"{what}: row {int(np.flatnonzero(bad)[0])} of X is not finite; remove or repair it")
     return table
+
+
+def _responsibilities_by_seeds(Z: Array, n_components: int, rng: np.random.Generator, n_lloyd: int = 5) -> Array:
+    """Return the responsibilities (K, n) of k-means++ (Arthur and Vassilvitskii 2007) and a few Lloyd iterations."""
+    seeds = Z[rng.integers(len(Z), size=1)]
+    nearest = np.sum((Z - seeds[0]) ** 2, axis=1)
+    while len(seeds) < n_components:
+        total = nearest.sum()
+        pick = rng.choice(len(Z), size=1, p=nearest / total if total > 0.0 else None)
+        seeds = np.concatenate([seeds, Z[pick]])
+        nearest = np.minimum(nearest, np.sum((Z - Z[pick]) ** 2, axis=1))
+    for _ in range(n_lloyd):
+        labels = np.argmin(np.sum(seeds**2, axis=1)[:, None] - 2.0 * seeds @ Z.T, axis=0)
+        members = np.asarray(labels == np.arange(n_components)[:, None], dtype=float)
+        number = members.sum(axis=1, keepdims=True)
+        seeds = np.where(number > 0.0, members @ Z / np.maximum(number, 1.0), seeds)
+    return members

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import mean_quaternion
 from imitarm.skills.gmm import DegenerateAxisWarning, GaussianMixture
-from imitarm.skills.rotation_reference import RotationReference, left_jacobian
-from imitarm.skills.selection import MORE_NUMBERS, NUMBERS, Candidate, choose, try_numbers_of_components
+from imitarm.skills.mixture_fitting import MORE_NUMBERS, NUMBERS, Candidate, choose, try_numbers_of_components
+from imitarm.skills.rotations import RotationReference, left_jacobian
 from imitarm.trajectory import Demonstration, Trajectory
 from imitarm.validation import (
     choice,
@@ -62,14 +62,14 @@ class GMR:
 
     When the demonstrations have quaternions, x has six columns: the position [m] and a rotation vector [rad] from a
     reference rotation, which moves with the motion when that rotates far
-    (:class:`~imitarm.skills.rotation_reference.RotationReference`).
+    (:class:`~imitarm.skills.rotations.RotationReference`).
 
     Times are counted from the first sample. Outside the demonstrated span the ends are held, because the linear pieces
     would drift away.
 
     Args:
         n_components: number K of Gaussians, or ``"auto"``: the smallest K that reproduces left-out demonstrations as
-            well as any and has little bias, see :func:`~imitarm.skills.selection.choose`.
+            well as any and has little bias, see :func:`~imitarm.skills.mixture_fitting.choose`.
         candidates: the numbers that ``"auto"`` tries; None: 2 to 16, and more while the bias is large.
         reg_covar: as in GaussianMixture.
         n_init: as in GaussianMixture.
@@ -137,9 +137,6 @@ class GMR:
 
         Times may start anywhere: the first time of each demonstration is subtracted. Durations that differ by more than
         1 % are scaled to their median, with an :class:`UnalignedWarning`.
-
-        Args:
-            demonstrations: at least one.
 
         Raises:
             InputError: when there is no demonstration, only some have quaternions, or there are fewer samples than
@@ -399,10 +396,9 @@ class GMR:
 def samples_of(
     demonstrations: Sequence[Demonstration | Trajectory],
 ) -> tuple[list[Array], RotationReference | None, float]:
-    """Return the samples of each demonstration as a table.
+    """Return the samples of each demonstration as a table, with times from the first sample to the median duration.
 
-    Times are counted from the first sample and scaled to the median duration. Rotations, when all demonstrations have
-    them, become rotation vectors from a common reference.
+    Rotations, when all demonstrations have them, become rotation vectors from a common reference.
 
     Returns:
         Tables of rows [t, x, y, z] or [t, x, y, z, r1, r2, r3], the reference of the rotations or None, and the

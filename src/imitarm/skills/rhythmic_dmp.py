@@ -13,7 +13,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
 from imitarm.skills.dmp import number_of_steps
 from imitarm.skills.dynamical_systems import Gains, propagator, roll_out
-from imitarm.skills.rotation_reference import RotationReference
+from imitarm.skills.rotations import RotationReference
 from imitarm.trajectory import Trajectory
 from imitarm.validation import finite_number, finite_vector, function, instance, whole_number
 

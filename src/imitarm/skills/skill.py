@@ -19,7 +19,7 @@ from imitarm.skills.dmp import DMP
 from imitarm.skills.dynamical_systems import Adjustment, Gains
 from imitarm.skills.fit_quality import FitQuality, PoorFitWarning, evaluate_fit
 from imitarm.skills.gmr import GMR
-from imitarm.skills.quaternion_dmp import with_other_ends
+from imitarm.skills.rotations import with_other_ends
 from imitarm.skills.skill_file import dmp_of, fit_of, gmr_of, read_skill, write_skill
 from imitarm.trajectory import Demonstration, Trajectory
 from imitarm.validation import choice, file_path, finite_array, finite_number, finite_numbers, sequence, text

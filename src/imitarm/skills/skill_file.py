@@ -24,9 +24,8 @@ from imitarm.skills.dmp import DMP
 from imitarm.skills.dynamical_systems import Gains
 from imitarm.skills.fit_quality import DemonstrationDistance, FitQuality
 from imitarm.skills.gmr import GMR
-from imitarm.skills.quaternion_dmp import QuaternionDMP
-from imitarm.skills.rotation_reference import RotationReference
-from imitarm.skills.selection import Candidate
+from imitarm.skills.mixture_fitting import Candidate
+from imitarm.skills.rotations import QuaternionDMP, RotationReference
 
 FORMAT = "imitarm skill"
 VERSION = 2  # 2 added ends and fit; files of version 1 are read as well

@@ -148,7 +148,7 @@ class SceneResult:
 
 
 class Candidate(Protocol):
-    """A number of components that was tried: :class:`imitarm.skills.selection.Candidate`."""
+    """A number of components that was tried: :class:`imitarm.skills.mixture_fitting.Candidate`."""
 
     @property
     def n_components(self) -> int:

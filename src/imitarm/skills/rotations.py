@@ -1,31 +1,154 @@
-"""Movement primitive of the rotation, for rotations of any angle."""
+"""Rotations in skills: rotation vectors from a reference rotation for mixtures, and a primitive."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import BSpline, make_lsq_spline
+from scipy.interpolate import BSpline, CubicSpline, make_lsq_spline
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import (
     checked_unit_quaternions,
     continuous_signs,
+    mean_quaternion,
     quaternion_conjugate,
     quaternion_exp,
     quaternion_log,
     quaternion_multiply,
+    slerp,
 )
 from imitarm.skills.dynamical_systems import Gains, propagator
 from imitarm.trajectory import Trajectory
-from imitarm.validation import finite_array, finite_number, finite_vector, flag, instance, whole_number
+from imitarm.validation import (
+    finite_array,
+    finite_number,
+    finite_numbers,
+    finite_vector,
+    flag,
+    instance,
+    whole_number,
+)
 
 Array = NDArray[np.float64]
 
+_CLOSED = 0.1  # net motion below this fraction of the path length gives no direction to rotate and stretch by
+_FARTHEST = np.deg2rad(120.0)  # from the reference; beyond 180 degrees the logarithm goes the other way round
+_KEYS = (1, 5, 9, 17, 33)  # numbers of key rotations that are tried
 _DEGREE = 3
 _END_WEIGHT = 100.0  # the first and the last sample count so much more than the others
+
+
+@dataclass(frozen=True, eq=False)
+class RotationReference:
+    """A reference rotation, fixed or moving with time, in whose tangent space other rotations are vectors.
+
+    A rotation ``R`` near the reference ``R_ref(t)`` has the rotation vector ``r = log(R R_ref(t)^T)`` [rad] in the base
+    frame. A fixed reference suffices while every rotation is well within 180 degrees of it. A longer rotation needs a
+    reference that moves: a cubic spline through a few key quaternions, normalised.
+
+    Attributes:
+        times: of the keys [s], strictly increasing, shape (m,); a single key is a fixed reference.
+        quaternions: keys wxyz with continuous signs, shape (m, 4).
+
+    Raises:
+        InputError: when shapes disagree, a number is not finite, a quaternion is not of length one, or the times do not
+            increase.
+    """
+
+    times: Array
+    quaternions: Array
+
+    def __post_init__(self) -> None:
+        times = finite_array(self.times, (None,), "RotationReference: times", "s").copy()
+        given = finite_array(self.quaternions, (len(times), 4), "RotationReference: quaternions")
+        quaternions = checked_unit_quaternions(given, "RotationReference: quaternions")
+        if np.allclose(quaternions, given, rtol=0.0, atol=1e-12):
+            quaternions = given.copy()  # normalising again would change the last bit
+        quaternions = continuous_signs(quaternions)
+        if len(times) < 1 or np.any(np.diff(times) <= 0.0):
+            raise InputError("RotationReference: times must be at least one number, each later than the one before [s]")
+        times.setflags(write=False)
+        quaternions.setflags(write=False)
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "quaternions", quaternions)
+
+    @cached_property
+    def _spline(self) -> CubicSpline:
+        return CubicSpline(self.times, self.quaternions)
+
+    def at(self, times: ArrayLike) -> Array:
+        """Return the reference (n, 4) wxyz at ``times`` (n,) [s]; outside the keys, the nearest one is held."""
+        t = finite_numbers(times, "RotationReference: times", "s")
+        if len(self.times) == 1:
+            return np.repeat(self.quaternions, len(t), axis=0)
+        q = self._spline(np.clip(t, self.times[0], self.times[-1]))
+        return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
+
+    def to_vectors(self, times: ArrayLike, quaternions: ArrayLike) -> Array:
+        """Return rotation vectors (n, 3) [rad] of rotations (n, 4) wxyz at ``times`` (n,); signs do not matter."""
+        reference = self.at(times)
+        q = finite_array(quaternions, (len(reference), 4), "RotationReference: quaternions")
+        return quaternion_log(quaternion_multiply(q, quaternion_conjugate(reference)))
+
+    def to_quaternions(self, times: ArrayLike, vectors: ArrayLike) -> Array:
+        """Return rotations (n, 4) wxyz, with continuous signs, of rotation vectors (n, 3) [rad] at ``times`` (n,)."""
+        reference = self.at(times)
+        r = finite_array(vectors, (len(reference), 3), "RotationReference: vectors", "rad")
+        return continuous_signs(quaternion_multiply(quaternion_exp(r), reference))
+
+    @classmethod
+    def among(cls, demonstrations: Sequence[tuple[Array, Array]]) -> RotationReference:
+        """Return the simplest reference that has all demonstrated rotations within 120 degrees.
+
+        That is the mean rotation, or else a spline through the mean rotations at 5, 9, 17 or 33 times.
+
+        Args:
+            demonstrations: times (n,) [s] from a common zero, and quaternions (n, 4) wxyz, of each demonstration.
+
+        Raises:
+            InputError: when demonstrations differ so much at the same time that there is no such reference.
+        """
+        end = min(float(times[-1]) for times, _ in demonstrations)
+        farthest = np.inf
+        for m in _KEYS:
+            keys = np.linspace(0.0, end, m) if m > 1 else np.zeros(1)
+            if m == 1:
+                quaternions = mean_quaternion(np.concatenate([q for _, q in demonstrations]))[None]
+            else:
+                at_keys = np.stack([slerp(keys, times, q) for times, q in demonstrations])
+                quaternions = np.stack([mean_quaternion(at_keys[:, k]) for k in range(m)])
+            reference = cls(keys, quaternions)
+            angles = [np.linalg.norm(reference.to_vectors(t, q), axis=1).max() for t, q in demonstrations]
+            if max(angles) <= _FARTHEST:
+                return reference
+            farthest = min(farthest, float(max(angles)))
+        worst = int(np.argmax(angles))
+        raise InputError(
+            f"orientations differ by up to {np.rad2deg(farthest):.0f} degrees at the same time, most in demonstration "
+            f"{worst}: the demonstrations do not rotate in the same way. Align them first, learn them as separate "
+            "skills, or show them with a tool that keeps its orientation (imitarm retarget --orientation fixed)"
+        )
+
+
+def left_jacobian(vectors: Array) -> Array:
+    """Return ``J`` (n, 3, 3) with ``exp(r + d) = exp(J d) exp(r)`` to first order, for rotation vectors (n, 3) [rad].
+
+    It transforms a covariance of rotation vectors to one of small rotations in the base frame, ``J Sigma J^T``.
+    """
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    o = np.zeros_like(x)
+    cross = np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], -2)
+    return np.asarray(np.eye(3) + a * cross + b * (cross @ cross))
 
 
 class RotationState(NamedTuple):
@@ -241,3 +364,30 @@ def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, go
     blend = u**3 * (10.0 + u * (6.0 * u - 15.0))
     q = quaternion_multiply(quaternion_exp(blend * goal_change), quaternions)
     return continuous_signs(quaternion_multiply(quaternion_exp((1.0 - blend) * start_change), q))
+
+
+def rotodilatation(learned: Array, asked: Array, path_length: float) -> Array:
+    """Return the smallest rotation, times a factor, that takes ``learned`` to ``asked``, shape (3, 3).
+
+    After Ginesi, Sansonetto and Fiorini (2019), "DMP++". A motion that comes back to near its start gives no direction
+    to rotate and no length to stretch by: the result is then the identity.
+
+    Args:
+        learned: from the learned start to the learned goal, shape (3,) [m].
+        asked: from the start to the goal of the new motion, shape (3,) [m].
+        path_length: of the learned motion [m].
+    """
+    a, b = float(np.linalg.norm(learned)), float(np.linalg.norm(asked))
+    if a <= _CLOSED * path_length or a == 0.0:
+        return np.eye(3)
+    if b == 0.0:
+        return np.zeros((3, 3))
+    u, v = learned / a, asked / b
+    cosine = float(u @ v)
+    if cosine < -1.0 + 1e-9:  # straight back: 180 degrees about any perpendicular axis
+        axis = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
+        axis /= np.linalg.norm(axis)
+        return np.asarray((b / a) * (2.0 * np.outer(axis, axis) - np.eye(3)))
+    w = np.cross(u, v)
+    cross = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    return np.asarray((b / a) * (np.eye(3) + cross + cross @ cross / (1.0 + cosine)))
