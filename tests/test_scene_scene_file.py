@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from imitarm.errors import FileFormatError, ImitarmError, InputError
 from imitarm.kinematics.pose import Pose, quaternion_exp, rotate
-from imitarm.scene import OBSTACLES, Box, ConvexHull, Obstacle, Scene, Sphere, load_scene, save_scene
+from imitarm.scene import OBSTACLES, Box, ConvexHull, HalfSpace, Obstacle, Scene, Sphere, load_scene, save_scene
 from scene_shapes import KINDS, random_obstacle, random_pose
 
 PAGE = Path(__file__).parents[1] / "docs" / "scene.md"
@@ -267,12 +267,12 @@ BAD = {
     "future version": ("format: imitarm-scene\nversion: 2\n", "version is 2, but this imitarm reads version 1; update"),
     "version as yes": ("format: imitarm-scene\nversion: yes\n", "version is True"),
     "unknown top key": (HEAD + "obstacle: []\n", 'the top level: unknown key "obstacle" (did you mean "obstacles"?)'),
-    "top keys listed": (HEAD + "walls: []\n", '"walls"; known keys: format, version, units, goal, obstacles'),
+    "top keys listed": (HEAD + "walls: []\n", '"walls"; known keys: format, version, units, stamp, goal, obstacles'),
     "key that is no text": (HEAD + "1: 2\n", 'unknown key "1"'),
     "unknown unit": (HEAD + "units: inch\n", "units: unknown unit 'inch'; known: m, cm, mm"),
     "unit near miss": (HEAD + "units: CM\n", '(did you mean "cm"?)'),
     "unit a number": (HEAD + "units: 1\n", "units: unknown unit 1"),
-    "obstacles a mapping": (HEAD + "obstacles: {type: box}\n", "obstacles: must be a list; begin each obstacle with"),
+    "obstacles a mapping": (HEAD + "obstacles: {type: box}\n", "obstacles: must be a list; begin each entry with"),
     "entry a number": (
         HEAD + "obstacles: [3]\n",
         "obstacles[0]: must have the key type and the shape's own keys, got 3",
@@ -465,3 +465,32 @@ def test_hull_keeps_all_its_points(tmp_path):
     points = np.vstack([np.eye(3), np.zeros(3), [0.1, 0.1, 0.1]])
     save_scene(Scene(None, [ConvexHull(points)]), tmp_path / "scene.yaml")
     np.testing.assert_array_equal(load_scene(tmp_path / "scene.yaml").obstacles[0].points, points)
+
+
+def test_stamp_fixtures_and_half_spaces_are_read_back(tmp_path):
+    floor, pedestal = HalfSpace([0, 0, -0.75], name="floor"), Box(Pose.identity(), [0.2, 0.2, 0.7])
+    wall = HalfSpace([1, 0, 0], [-1, 0.5, 0], angular_velocity=[0, 0, 0.1])
+    save_scene(Scene(None, [wall], stamp=12.5, fixtures=[floor, pedestal]), tmp_path / "scene.yaml")
+    back = load_scene(tmp_path / "scene.yaml")
+    assert back.stamp == 12.5
+    assert [fixture.name for fixture in back.fixtures] == ["floor", ""]
+    np.testing.assert_array_equal(back.obstacles[0].angular_velocity, [0, 0, 0.1])
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    np.testing.assert_allclose(back.distances(points)[0], wall.signed_distance(points), atol=1e-12)
+
+
+def test_a_half_space_in_other_units(tmp_path):
+    text = HEAD + "units: mm\nobstacles:\n- {type: half_space, point: [0, 0, -50], normal: [0, 0, 1]}\n"
+    floor = read(tmp_path, text + "fixtures:\n- {type: sphere, center: [0, 0, 100], radius: 20}\n").obstacles[0]
+    np.testing.assert_allclose(floor.signed_distance([0, 0, 1.0]), 1.05)
+
+
+def test_wrong_stamps_and_fixtures_are_refused(tmp_path):
+    for line, expected in (
+        ("stamp: soon", "stamp must be"),
+        ("stamp: .nan", "stamp must be a finite number"),
+        ("stamp: [1, 2]", "stamp must be"),
+        ("fixtures: floor", "fixtures: must be a list"),
+        ("fixtures:\n- {type: sphere, radius: 1}", 'fixtures[0] (sphere): key "center" is missing'),
+    ):
+        assert expected in message_of(tmp_path, HEAD + line + "\n")

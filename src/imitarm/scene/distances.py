@@ -49,12 +49,12 @@ class _Members(NamedTuple):
     """The obstacles of a pack that share one distance formula."""
 
     formula: Formula
-    places: slice  # in ``PackedObstacles._order``
+    places: slice  # in the order of ``PackedObstacles._sorted``
     parameters: Parameters  # of the formula, each of shape (..., number of members)
 
 
 class _Frames(NamedTuple):
-    """The own frames of obstacles, family by family, in the order of ``PackedObstacles._order``."""
+    """The own frames of obstacles, family by family, in the order of ``PackedObstacles._sorted``."""
 
     to_own: Array  # rotation of base vectors into each own frame, shape (n, 3, 3)
     rows: Array  # the same, stacked for one product with many points: axis first, shape (3 n, 3)

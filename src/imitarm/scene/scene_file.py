@@ -33,7 +33,7 @@ _SMALLEST = 1e-3  # [m] of an obstacle; smaller sizes are in another unit
 _NEAREST = 0.02  # [m] in a scene in cm or mm, something is farther from the base than this, which stands there
 _POINTS = ("center", "start", "end", "point", "normal", "points")  # keys that are no sizes
 
-_TOP = ("format", "version", "units", "goal", "obstacles")
+_TOP = ("format", "version", "units", "stamp", "goal", "obstacles", "fixtures")
 _ROTATIONS = ("quaternion", "rpy_degrees", "yaw_degrees")
 _COMMON = ("name", "velocity", "angular_velocity")
 _UNWRITTEN = ("covariance", "track_id")  # set by trackers only
@@ -82,7 +82,11 @@ def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "units": "m"}
     if scene.goal is not None:
         content["goal"] = _pose_entry(scene.goal)
+    if scene.stamp:
+        content["stamp"] = scene.stamp
     content["obstacles"] = [_obstacle_entry(obstacle) for obstacle in scene.obstacles]
+    if scene.fixtures:
+        content["fixtures"] = [_obstacle_entry(fixture) for fixture in scene.fixtures]
     text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
     aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -169,14 +173,18 @@ def _scene(content: object) -> Scene:
     if not isinstance(units, str) or units not in UNITS:
         raise InputError(f"units: unknown unit {_shown(units)}{_suggestion(units, UNITS)}; known: {', '.join(UNITS)}")
     goal = content.get("goal")
-    entries = content.get("obstacles")
-    if entries is not None and not isinstance(entries, list):
-        raise InputError("obstacles: must be a list; begin each obstacle with a dash")
     pose = None if goal is None else _goal(goal, UNITS[units])
-    obstacles = tuple(_obstacle(entry, i, UNITS[units]) for i, entry in enumerate(entries or []))
+    obstacles, fixtures = (_obstacles(content, key, UNITS[units]) for key in ("obstacles", "fixtures"))
     if units != "m":
-        _check_distances(pose, obstacles, units)
-    return Scene(pose, obstacles)
+        _check_distances(pose, (*obstacles, *fixtures), units)
+    return Scene(pose, obstacles, _scaled(content.get("stamp", 0.0), "stamp", 1.0, 0), fixtures)
+
+
+def _obstacles(content: Mapping[Any, Any], key: str, metres: float) -> tuple[Obstacle, ...]:
+    entries = content.get(key)
+    if entries is not None and not isinstance(entries, list):
+        raise InputError(f"{key}: must be a list; begin each entry with a dash")
+    return tuple(_obstacle(entry, f"{key}[{i}]", metres) for i, entry in enumerate(entries or []))
 
 
 def _check_distances(goal: Pose | None, obstacles: Iterable[Obstacle], units: str) -> None:
@@ -199,8 +207,7 @@ def _goal(entry: object, metres: float) -> Pose:
     return _pose(entry, "goal", metres)
 
 
-def _obstacle(entry: object, index: int, metres: float) -> Obstacle:
-    where = f"obstacles[{index}]"
+def _obstacle(entry: object, where: str, metres: float) -> Obstacle:
     if not isinstance(entry, Mapping):
         raise InputError(f"{where}: must have the key type and the shape's own keys, got {_shown(entry)}")
     shape = _shape(entry.get("type"), where)
