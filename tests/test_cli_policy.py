@@ -45,9 +45,19 @@ def package(tmp_path_factory):
 
 def imitarm(package, *arguments):
     paths = os.pathsep.join([str(package), os.environ.get("PYTHONPATH", "")]).strip(os.pathsep)
-    command = [sys.executable, "-c", "import sys; from imitarm.cli import main; sys.exit(main(sys.argv[1:]))", *arguments]
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from imitarm.cli import main; sys.exit(main(sys.argv[1:]))",
+        *arguments,
+    ]
     return subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": paths, "COLUMNS": "200"}, cwd=package, capture_output=True, text=True
+        command,
+        env={**os.environ, "PYTHONPATH": paths, "COLUMNS": "200"},
+        cwd=package,
+        capture_output=True,
+        text=True,
+        check=False,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import InputError
-from imitarm.validation import finite_vector
+from imitarm.validation import finite_number, finite_vector
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class Command:
             if value is not None:
                 n = len(value) if isinstance(value, np.ndarray | list | tuple) else 0
                 object.__setattr__(self, name, finite_vector(value, max(n, 1), f"Command: {name}", unit))
-        if self.elbow is not None and not math.isfinite(self.elbow):
-            raise InputError(f"Command: elbow must be a finite angle [rad] or None, got {self.elbow!r}")
+        if self.elbow is not None:
+            object.__setattr__(self, "elbow", finite_number(self.elbow, "Command: elbow", "rad"))
         if not isinstance(self.status, Status):
             raise InputError(f"Command: status must be a Status such as Status.NOMINAL, got {self.status!r}")

@@ -40,6 +40,8 @@ class Registry(Mapping[str, Item], Generic[Item]):
             UnknownNameError: when there is no such member; the message lists all names.
             InputError: when a package that adds the member can't be imported.
         """
+        if not isinstance(name, str):
+            raise UnknownNameError.among(self.kind, name, self._places())
         if name not in self._loaded:
             places = self._places()
             if name not in places:

@@ -18,6 +18,7 @@ from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, Task, TwistTask
 from imitarm.scene.clearance_limit import ClearanceLimit
 from imitarm.scene.scene import Scene
+from imitarm.validation import finite_number, finite_vector, instance
 
 Array = NDArray[np.float64]
 
@@ -82,9 +83,13 @@ class SafetyFilter:
         limits: Sequence[Limit] | None = None,
         method: str = "qp",
     ) -> None:
-        self.arm, self.dt, self.clearance = arm, dt, clearance
         self.solver = IKSolver(arm, limits, dt=dt, method=method)
-        self._obstacles = None if clearance is None else ClearanceLimit(arm, clearance + allowance)
+        self.arm, self.dt = arm, self.solver.dt
+        self.clearance = (
+            None if clearance is None else finite_number(clearance, "SafetyFilter: clearance", "m", at_least=0.0)
+        )
+        allowance = finite_number(allowance, "SafetyFilter: allowance", "m", at_least=0.0)
+        self._obstacles = None if self.clearance is None else ClearanceLimit(arm, self.clearance + allowance)
         self._own = None if self_clearance is None else SelfClearance(arm, self_clearance)
 
     def step(self, command: Command, q: ArrayLike, velocity: ArrayLike | None, scene: Scene) -> SafetyStep:
@@ -100,7 +105,9 @@ class SafetyFilter:
         Raises:
             InputError: when a shape is wrong or a number is not finite.
         """
-        position = np.asarray(q, dtype=float)
+        instance(command, Command, "SafetyFilter.step: command")
+        instance(scene, Scene, "SafetyFilter.step: scene")
+        position = finite_vector(q, self.arm.n_joints, "SafetyFilter.step: q", "rad")
         rows = self._rows(position, scene)
         if command.joint_velocity is not None and self._admits(position, command.joint_velocity, velocity, rows):
             return SafetyStep(command.joint_velocity, 0.0, 0.0, True)

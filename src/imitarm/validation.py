@@ -185,7 +185,8 @@ def choice(value: Any, names: Iterable[str], what: str) -> str:
     """
     known = tuple(names)
     if not isinstance(value, str) or value not in known:
-        raise UnknownNameError(f"unknown {what} {_shown(value)}; known: {', '.join(sorted(known))}")
+        shown = repr(value) if isinstance(value, str) else _shown(value)
+        raise UnknownNameError(f"unknown {what} {shown}; known: {', '.join(sorted(known))}")
     return value
 
 

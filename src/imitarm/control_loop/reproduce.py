@@ -19,6 +19,7 @@ from imitarm.robots.robot import Robot
 from imitarm.safety import SafetyFilter, SafetyStep
 from imitarm.scene import Scene
 from imitarm.trajectory import Rollout, Trajectory
+from imitarm.validation import finite_number
 
 Array = NDArray[np.float64]
 
@@ -85,7 +86,8 @@ def reproduce(
         InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not answer with a Command.
         InfeasibleError: passed on from ``policy.reset``; the robot has not moved.
     """
-    if not 0.0 < dt <= timeout < np.inf:
+    dt, timeout = finite_number(dt, "reproduce: dt", "s"), finite_number(timeout, "reproduce: timeout", "s")
+    if not 0.0 < dt <= timeout:
         raise InputError(f"reproduce: needs 0 < dt <= timeout [s], got dt {dt!r} and timeout {timeout!r}")
     keeper = SafetyFilter(robot.arm, dt=dt) if safety is None else safety
     if keeper.dt != dt:

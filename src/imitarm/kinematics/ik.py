@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lapack
 
-from imitarm.errors import InputError, UnknownNameError
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_problem import Box, IKProblem, Rows
 from imitarm.kinematics.limits import JointLimits, Limit
-from imitarm.kinematics.tasks import PostureTask, Task, TwistTask, joint_vector
+from imitarm.kinematics.tasks import PostureTask, Task, TwistTask
+from imitarm.validation import choice, finite_number, finite_vector, instance, sequence
 
 Array = NDArray[np.float64]
 
@@ -93,12 +94,12 @@ class IKSolver:
     def __init__(
         self, arm: ArmModel, limits: Sequence[Limit] | None = None, *, dt: float = 0.01, method: str = "qp"
     ) -> None:
-        if method not in METHODS:
-            raise UnknownNameError.among("IK method", method, METHODS)
-        if not 0.0 < dt < math.inf:
-            raise InputError(f"IKSolver: dt must be a positive time [s], got {dt}")
-        self.arm, self.method, self.dt = arm, method, float(dt)
-        self.limits: tuple[Limit, ...] = (JointLimits(arm),) if limits is None else tuple(limits)
+        choice(method, METHODS, "IK method")
+        self.arm, self.method = instance(arm, ArmModel, "IKSolver: arm"), method
+        self.dt = finite_number(dt, "IKSolver: dt", "s", above=0.0)
+        self.limits: tuple[Limit, ...] = (
+            (JointLimits(arm),) if limits is None else sequence(limits, Limit, "IKSolver: limits")  # type: ignore[type-abstract]
+        )
         if method != "qp" and any(limit.soft for limit in self.limits):
             soft = ", ".join(type(limit).__name__ for limit in self.limits if limit.soft)
             raise InputError(f"IKSolver: method {method!r} can't keep {soft}; use method='qp', or leave it out")
@@ -156,9 +157,9 @@ class IKSolver:
     ) -> IKProblem:
         """Return what the methods solve; same arguments and errors as :meth:`solve`."""
         arm = self.arm
+        memory = arm.at(q)
         position = np.asarray(q, dtype=float)
-        memory = arm.at(position)
-        previous = None if velocity is None else joint_vector(velocity, arm.n_joints, "solve_ik: velocity")
+        previous = None if velocity is None else finite_vector(velocity, arm.n_joints, "solve_ik: velocity", "rad/s")
         problem = IKProblem(arm, memory, position, previous, self.dt, self._free, [], [], self._max_speed, self._scaled)
         first: Task
         others: Sequence[Task]
@@ -185,13 +186,15 @@ class IKSolver:
                 problem.box = Box(np.maximum(lower, part.lower), np.minimum(upper, part.upper))
         if others:
             self._add_tasks(problem, others)
-        if rows:
+        if rows is not None:
             problem.rows += self._checked_rows(rows)
         return problem
 
     def _add_tasks(self, problem: IKProblem, tasks: Sequence[Task]) -> None:
         """Add what more tasks ask for."""
         for task in tasks:
+            if not hasattr(task, "rows"):
+                raise InputError(f"solve_ik: tasks must be tasks such as TwistTask(twist), got {task!r}")
             if self.method != "qp":
                 if not (isinstance(task, PostureTask) and problem.tasks) or problem.posture is not None:
                     raise InputError(
@@ -207,17 +210,26 @@ class IKSolver:
             raise InputError("solve_ik: no task asks for anything; put a TwistTask first")
 
     def _checked_rows(self, rows: Rows | Sequence[Rows]) -> list[Rows]:
-        if self.method != "qp":
-            raise InputError(f"solve_ik: method {self.method!r} can't keep rows; use method='qp'")
         given: Sequence[Rows] = (rows,) if isinstance(rows, Rows) else rows
         checked = []
         n = self.arm.n_joints
+        if not isinstance(given, list | tuple) or not all(isinstance(part, Rows) for part in given):
+            raise InputError(f"solve_ik: rows must be Rows(matrix, lower) or several of them, got {rows!r}")
+        if self.method != "qp" and len(given):
+            raise InputError(f"solve_ik: method {self.method!r} can't keep rows; use method='qp'")
         for part in given:
-            matrix, lower = np.asarray(part.matrix, dtype=float), np.asarray(part.lower, dtype=float)
-            if lower.ndim != 1 or matrix.shape != (len(lower), n):
-                raise InputError(f"solve_ik: rows need shapes (m, {n}) and (m,), got {matrix.shape}, {lower.shape}")
-            if not math.isfinite(float(np.vdot(matrix, matrix)) + sum(lower.tolist())) or not part.price > 0.0:
-                raise InputError("solve_ik: rows must be finite numbers, with a price above 0")
+            try:
+                matrix, lower = np.asarray(part.matrix, dtype=float), np.asarray(part.lower, dtype=float)
+                fits = lower.ndim == 1 and matrix.shape == (len(lower), n) and part.price > 0.0
+            except (TypeError, ValueError) as error:
+                raise InputError(f"solve_ik: rows must be arrays of numbers, with a price above 0: {error}") from error
+            if not fits:
+                raise InputError(
+                    f"solve_ik: rows need shapes (m, {n}) and (m,) and a price above 0, "
+                    f"got {matrix.shape}, {lower.shape} and {part.price}"
+                )
+            if not math.isfinite(float(np.vdot(matrix, matrix)) + sum(lower.tolist())):
+                raise InputError("solve_ik: rows must be finite numbers")
             if len(lower):
                 checked.append(Rows(matrix, lower, part.price))
         return checked
@@ -257,7 +269,10 @@ def solve_ik(
         UnknownNameError: when the method is not known.
         InputError: when a shape is wrong, a number is not finite, or the method does not take such tasks or limits.
     """
-    solver = _solver(arm, dt, method) if limits is None else IKSolver(arm, limits, dt=dt, method=method)
+    try:
+        solver = _solver(arm, dt, method) if limits is None else IKSolver(arm, limits, dt=dt, method=method)
+    except TypeError:  # not hashable: let the constructor say what is wrong
+        solver = IKSolver(arm, limits, dt=dt, method=method)
     return solver.solve(q, tasks, velocity=velocity, rows=rows)
 
 

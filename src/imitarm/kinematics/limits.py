@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_problem import Box, IKProblem, Rows
+from imitarm.validation import instance
 
 Array = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class JointLimits(Limit):
     """
 
     def __init__(self, arm: ArmModel) -> None:
-        self.arm = arm
+        self.arm = instance(arm, ArmModel, "JointLimits: arm")
         self._boxes: dict[float, _VelocityBox] = {}
 
     def restrict(self, problem: IKProblem) -> Box:
@@ -133,7 +134,7 @@ class ElbowSingularityLimit(Limit):
     """
 
     def __init__(self, arm: ArmModel) -> None:
-        marked = arm.required_landmarks()
+        marked = instance(arm, ArmModel, "ElbowSingularityLimit: arm").required_landmarks()
         self._joint = joint = marked.elbow
         self._straight = marked.elbow_straight
         self._acceleration, self._most = float(arm.max_acceleration[joint]), float(arm.max_velocity[joint])

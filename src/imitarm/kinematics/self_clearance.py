@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_problem import Rows
 from imitarm.kinematics.reach_of_links import meeting_links
+from imitarm.validation import finite_number, instance, whole_number
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int_]
@@ -50,11 +50,10 @@ class SelfClearance:
     """
 
     def __init__(self, arm: ArmModel, clearance: float = 0.02, *, n_rows: int = 6, gain: float = 5.0) -> None:
-        if not (0.0 <= clearance < math.inf and n_rows >= 1 and 0.0 < gain < math.inf):
-            raise InputError(
-                "SelfClearance: needs clearance >= 0 [m], n_rows >= 1 and gain > 0 [1/s], "
-                f"got {clearance}, {n_rows} and {gain}"
-            )
+        clearance = finite_number(clearance, "SelfClearance: clearance", "m", at_least=0.0)
+        n_rows = whole_number(n_rows, "SelfClearance: n_rows", at_least=1)
+        gain = finite_number(gain, "SelfClearance: gain", "1/s", above=0.0)
+        instance(arm, ArmModel, "SelfClearance: arm")
         self.arm, self.clearance = arm, clearance
         self._n_rows, self._gain = n_rows, gain
         cover = arm.cover

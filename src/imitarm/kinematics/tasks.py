@@ -18,6 +18,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_problem import ROTATION_LENGTH, IKProblem, TaskRows
 from imitarm.kinematics.sew import one_angle
+from imitarm.validation import finite_number, finite_vector, text
 
 Array = NDArray[np.float64]
 
@@ -61,19 +62,18 @@ class TwistTask(NamedTuple):
 
     def rows(self, problem: IKProblem) -> TaskRows:
         """Return the weighted Jacobian (6, n_joints) and the clamped, weighted twist (6,)."""
-        weights, scale, effort, site = _scales(self.rotation_length, self.frame, problem.arm, problem.scaled)
-        target = np.asarray(self.twist, dtype=float)
-        if target.shape != (6,):
-            raise InputError(f"TwistTask: twist must be 6 finite numbers (linear, angular), got {self.twist!r}")
-        target = target * weights
+        try:
+            weights, scale, effort, site = _scales(self.rotation_length, self.frame, problem.arm, problem.scaled)
+        except TypeError:  # not hashable
+            lengths = tuple(finite_vector(self.rotation_length, 3, "TwistTask: rotation_length", "m").tolist())
+            weights, scale, effort, site = _scales(lengths, text(self.frame, "frame"), problem.arm, problem.scaled)
+        target = finite_vector(self.twist, 6, "TwistTask: twist", "m/s, rad/s") * weights
         square = float(target.dot(target))
-        if not math.isfinite(square):
-            raise InputError(f"TwistTask: twist must be 6 finite numbers (linear, angular), got {self.twist!r}")
-        most = problem.max_speed if self.max_speed is None else self.max_speed
-        if not most >= 0.0:
-            raise InputError(f"TwistTask: max_speed must be a speed [m/s], 0 or more, got {most}")
-        if square > most * most:
-            target *= most / math.sqrt(square)
+        most = problem.max_speed
+        if self.max_speed is not None:
+            most = finite_number(self.max_speed, "TwistTask: max_speed", "m/s", at_least=0.0)
+        if not square <= most * most:
+            target *= most / math.hypot(*target.tolist())
         return TaskRows(problem.memory.site_jacobian(site) * scale, target, effort)
 
 
@@ -90,7 +90,7 @@ class JointVelocityTask(NamedTuple):
 
     def rows(self, problem: IKProblem) -> TaskRows:
         """Return a scaled identity (n_joints, n_joints) and the scaled velocity."""
-        velocity = joint_vector(self.velocity, len(problem.q), "JointVelocityTask: velocity")
+        velocity = finite_vector(self.velocity, len(problem.q), "JointVelocityTask: velocity", "rad/s")
         root = _root(self.weight, "JointVelocityTask")
         return TaskRows(_scaled_eye(len(velocity), root), root * velocity)
 
@@ -110,9 +110,8 @@ class PostureTask(NamedTuple):
 
     def drift(self, problem: IKProblem) -> Array:
         """Return the wanted joint velocity inside the box, shape (n_joints,) [rad/s]."""
-        if not math.isfinite(self.gain):
-            raise InputError(f"PostureTask: gain must be a finite number [1/s], got {self.gain}")
-        drift = self.gain * (joint_vector(self.q, len(problem.q), "PostureTask: q") - problem.q)
+        gain = finite_number(self.gain, "PostureTask: gain", "1/s")
+        drift = gain * (finite_vector(self.q, len(problem.q), "PostureTask: q", "rad") - problem.q)
         return np.minimum(np.maximum(drift, problem.box.lower), problem.box.upper)
 
     def rows(self, problem: IKProblem) -> TaskRows:
@@ -153,7 +152,12 @@ class ElbowTask(NamedTuple):
     def rows(self, problem: IKProblem) -> TaskRows | None:
         """Return one row along the self-motion; None where the angle is not defined or there is no self-motion."""
         angle, weight, confidence, gain, max_rate, convention = self
-        if not (math.isfinite(angle) and weight >= 0.0 and confidence >= 0.0 and gain >= 0.0 and max_rate >= 0.0):
+        try:
+            usable = math.isfinite(angle + weight + confidence + gain + max_rate)
+            usable = usable and min(weight, confidence, gain, max_rate) >= 0.0
+        except (TypeError, ValueError, OverflowError):
+            usable = False
+        if not usable:
             raise InputError(f"ElbowTask: needs a finite angle and other numbers that are not negative, got {self!r}")
         if not problem.tasks:
             raise InputError("ElbowTask: must follow a task for the tool, such as TwistTask, in the list of tasks")
@@ -205,18 +209,6 @@ def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] 
     return direction / length, length, by_tool
 
 
-def joint_vector(values: ArrayLike, n: int, what: str) -> Array:
-    """Return ``n`` finite numbers as an array.
-
-    Raises:
-        InputError: when they are not; the message begins with ``what``.
-    """
-    array = np.asarray(values, dtype=float)
-    if array.shape != (n,) or not math.isfinite(sum(array.tolist())):
-        raise InputError(f"{what} must be {n} finite numbers, got {values!r}")
-    return array
-
-
 @lru_cache(maxsize=64)
 def _landmark_sites(arm: ArmModel) -> NDArray[np.intp]:
     """Return the indices of the sites that mark shoulder, elbow and wrist."""
@@ -224,9 +216,7 @@ def _landmark_sites(arm: ArmModel) -> NDArray[np.intp]:
 
 
 def _root(weight: float, task: str) -> float:
-    if not 0.0 <= weight < math.inf:
-        raise InputError(f"{task}: weight must be a finite number, 0 or more, got {weight}")
-    return math.sqrt(weight)
+    return math.sqrt(finite_number(weight, f"{task}: weight", at_least=0.0))
 
 
 @lru_cache(maxsize=64)
@@ -237,7 +227,7 @@ def _scales(
     try:
         lengths = np.broadcast_to(np.asarray(rotation_length, dtype=float), 3)
         usable = bool(np.isfinite(lengths).all() and lengths.min() > 0.0)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         usable = False
     if not usable:
         raise InputError(f"TwistTask: rotation_length must be one or three positive lengths [m], got {rotation_length}")

@@ -15,7 +15,7 @@ from imitarm.policies.policy import Observation, Policy
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
 from imitarm.trajectory import Trajectory
-from imitarm.validation import finite_number
+from imitarm.validation import finite_number, text
 
 Array = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class ACFRA(Policy):
         allowance: float = 0.002,
     ) -> None:
         super().__init__(skill, tool_spheres=tool_spheres, clearance=clearance, forbidden=forbidden)
-        self._refuses = ADAPTERS[method].refuses
+        self._refuses = ADAPTERS[text(method, "ACFRA: method")].refuses
         self._options = {
             "method": method,
             "tool_radius": tool_radius,
@@ -84,9 +84,12 @@ class ACFRA(Policy):
             "forbidden": forbidden,
             "pinned": pinned,
         }
-        self._gain, self._arrival = gain, arrival
+        self._gain = finite_number(gain, "ACFRA: gain", "1/s", above=0.0)
+        self._arrival = finite_number(arrival, "ACFRA: arrival", "m", above=0.0)
         self._allowance = finite_number(allowance, "ACFRA: allowance", "m", at_least=0.0)
-        self._patience = max(clearance, _LEAST_PATIENCE) if patience is None else patience
+        self._patience = max(self.clearance, _LEAST_PATIENCE)
+        if patience is not None:
+            self._patience = finite_number(patience, "ACFRA: patience", "m", above=0.0)
         self.adaptation: Adaptation | None = None
         self._phase, self._void = 0.0, ""
 

@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,11 +27,9 @@ from imitarm.policies.least_detour import (
 )
 from imitarm.registry import Registry
 from imitarm.scene.scene import Scene
+from imitarm.skills.skill import Skill
 from imitarm.trajectory import Trajectory
 from imitarm.validation import finite_array, finite_number, instance, text
-
-if TYPE_CHECKING:
-    from imitarm.skills.skill import Skill
 
 Array = NDArray[np.float64]
 
@@ -222,6 +220,7 @@ def adapt(
     """
     began = time.perf_counter()
     adapter = ADAPTERS[text(method, "method")]
+    instance(skill, Skill, "skill")
     instance(scene, Scene, "scene")
     if start is not None:
         instance(start, Pose, "start")

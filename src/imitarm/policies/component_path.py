@@ -99,9 +99,9 @@ class ComponentPath:
             pinned: further times [s] at which the path must not move, for example a contact; each becomes a sample.
 
         Raises:
-            InputError: when there are fewer than 10 samples, or a pinned time is outside the motion.
+            InputError: when there are fewer than 10 or more than 100 000 samples, or a pinned time is outside.
         """
-        n_samples = whole_number(n_samples, "n_samples", at_least=10)
+        n_samples = whole_number(n_samples, "n_samples", at_least=10, at_most=100_000)
         duration = skill.duration_
         pins = finite_array(pinned, (None,), "pinned", "s")
         outside = pins[(pins < 0.0) | (pins > duration)]

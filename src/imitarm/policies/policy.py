@@ -15,6 +15,7 @@ from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import Pose
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
+from imitarm.validation import finite_array, finite_number, instance
 
 Array = NDArray[np.float64]
 
@@ -35,6 +36,12 @@ class Observation:
     state: ArmState
     tool_to_base: Pose
     scene: Scene
+
+    def __post_init__(self) -> None:
+        finite_number(self.time, "Observation: time", "s")
+        instance(self.state, ArmState, "Observation: state")
+        instance(self.tool_to_base, Pose, "Observation: tool_to_base")
+        instance(self.scene, Scene, "Observation: scene")
 
 
 class Policy(ABC):
@@ -65,9 +72,11 @@ class Policy(ABC):
         clearance: float = 0.02,
         forbidden: ArrayLike = (),
     ) -> None:
-        self.skill = skill
-        self.tool_spheres = None if tool_spheres is None else np.asarray(tool_spheres, dtype=float)
-        self.clearance = clearance
+        self.skill = instance(skill, Skill, "Policy: skill")
+        self.tool_spheres = (
+            None if tool_spheres is None else finite_array(tool_spheres, (None, 4), "Policy: tool_spheres", "m")
+        )
+        self.clearance = finite_number(clearance, "Policy: clearance", "m", at_least=0.0)
         self.forbidden = forbidden
 
     @classmethod

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.errors import InputError, UnknownNameError
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.kinematics.pose import Pose, matrix_to_quaternion
 from imitarm.robots.clearance import ClearanceGauge
@@ -27,7 +27,7 @@ from imitarm.robots.world import (
 )
 from imitarm.scene import MovingScene, Scene
 from imitarm.scene.motion import Motion
-from imitarm.validation import finite_number, finite_vector, instance
+from imitarm.validation import choice, finite_number, finite_vector, instance
 
 Array = NDArray[np.float64]
 Control = Literal["position", "torque"]
@@ -79,8 +79,7 @@ class SimulatedRobot(Robot):
             InputError: when ``control`` is unknown, ``timestep`` is not in (0, 0.002], ``q`` has a wrong shape or
                 is beyond the joints' limits, or a link of the arm has no usable mass.
         """
-        if control not in get_args(Control):
-            raise UnknownNameError.among("control", control, get_args(Control))
+        choice(control, get_args(Control), "control")
         timestep = finite_number(timestep, "SimulatedRobot: timestep", "s", above=0.0, at_most=0.002)
         arm = instance(arm, ArmModel, "SimulatedRobot: arm")
         arm.check_dynamics()
@@ -277,6 +276,6 @@ class SimulatedRobot(Robot):
 
 
 def _checked_start(arm: ArmModel, q: ArrayLike) -> Array:
-    start = np.array(q, dtype=float)
+    start = finite_vector(q, arm.n_joints, "SimulatedRobot: q", "rad").copy()
     arm.check_limits(start)
     return start

@@ -12,7 +12,6 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from pathlib import Path
 from reprlib import repr as _shown  # a few items only, however much a file holds
 from typing import Any
 
@@ -24,6 +23,7 @@ from imitarm.errors import FileFormatError, InputError
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
 from imitarm.scene.obstacle import Obstacle
 from imitarm.scene.scene import Scene
+from imitarm.validation import file_path, instance
 
 FORMAT = "imitarm-scene"
 VERSION = 1
@@ -53,7 +53,7 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         FileFormatError: when it is not a scene file or something in it is wrong; the message names the file, the
             entry and the key, and lists what is known there.
     """
-    path = Path(path)
+    path = file_path(path, "path")
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except OSError as error:
@@ -78,7 +78,8 @@ def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     Raises:
         InputError: when an obstacle's shape is in no registry, or the file can't be written.
     """
-    path = Path(path)
+    instance(scene, Scene, "scene")
+    path = file_path(path, "path")
     content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "units": "m"}
     if scene.goal is not None:
         content["goal"] = _pose_entry(scene.goal)
