@@ -207,8 +207,8 @@ def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> R
         rotates: whether the skill rotates the tool, so that spheres beside the tip can be planned for.
     """
     rng = np.random.default_rng([31, seed])
-    family = RANDOM_FAMILIES[int(rng.choice(len(RANDOM_FAMILIES), p=[0.2, 0.14, 0.16, 0.14, 0.08, 0.08, 0.08, 0.12]))]
-    planar = rng.random() < 0.45
+    family = RANDOM_FAMILIES[int(rng.choice(len(RANDOM_FAMILIES), p=[0.1, 0.1, 0.3, 0.12, 0.06, 0.06, 0.16, 0.1]))]
+    planar = rng.random() < (0.8 if family == "gap" else 0.45)
     forbidden = HORIZONTAL_ONLY if planar else NOT_DOWN if rng.random() < 0.3 else ()
     kind = rng.random()
     if kind < 0.4:
@@ -222,9 +222,15 @@ def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> R
         spheres = np.column_stack([along[:, None] * direction, np.full(len(along), rng.uniform(0.005, 0.025))])
     clearance = float(rng.choice([0.0, 0.001, 0.005, 0.02]))
     reach = float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3])) + clearance
-    obstacles = _MAKERS[family](rng, path, duration, planar, reach)
-    if family != "moving" and rng.random() < 0.15:
-        obstacles += _on_the_path(rng, path, duration, planar, reach)[:1]
+    may_cover = rng.random() < 0.1
+    ends = path[[0, -1]]
+    for _ in range(30):
+        obstacles = _MAKERS[family](rng, path, duration, planar, reach)
+        if family != "moving" and rng.random() < 0.15:
+            obstacles += _on_the_path(rng, path, duration, planar, reach)[:1]
+        at_ends = [(o.signed_distance(ends[0]), o.after(duration).signed_distance(ends[1])) for o in obstacles]
+        if may_cover or np.min(at_ends) > reach:
+            break
     pinned = (float(rng.uniform(0.2, 0.8) * duration),) if rng.random() < 0.1 else ()
     n_samples = 50 if rng.random() < 0.15 else 200
     return RandomScene(seed, family, Scene(None, obstacles), spheres, clearance, forbidden, pinned, n_samples)
@@ -285,9 +291,9 @@ def _gap(rng: np.random.Generator, path: Array, duration: float, planar: bool, r
     ahead = path[min(at + 5, len(path) - 1)] - path[at - 5]
     yaw = np.array([0.0, 0.0, np.arctan2(ahead[1], ahead[0])])
     across = quaternion_to_matrix(quaternion_exp(yaw))[:, 1]
-    width = max(2.0 * reach + rng.uniform(-0.03, 0.05), 0.002)
+    width = max(2.0 * reach + rng.uniform(-0.04, 0.03), 0.002)
     centre = path[at] + rng.uniform(-0.06, 0.06) * across
-    thick, high = rng.uniform(0.004, 0.06), rng.choice([0.15, 1.6])
+    thick, high = rng.uniform(0.004, 0.06), rng.choice([0.15, 1.6], p=[0.2, 0.8])
     return tuple(
         Box(Pose(centre + side * 0.5 * (width + 2.0) * across, quaternion_exp(yaw)), np.array([thick, 2.0, high]))
         for side in (1.0, -1.0)
@@ -327,14 +333,15 @@ def _thin(rng: np.random.Generator, path: Array, duration: float, planar: bool, 
 def _enclosing(
     rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float
 ) -> tuple[Obstacle, ...]:
-    """Walls on several sides, as in a shelf or a box: some with no exit."""
+    """Walls on several sides of a point of the path, as in a shelf or a box: some have no exit."""
     at, ahead = _heading(rng, path)
+    at = int(rng.choice([0, at, len(path) - 1]))
     yaw = np.array([0.0, 0.0, np.arctan2(ahead[1], ahead[0])])
     frame = quaternion_to_matrix(quaternion_exp(yaw))
     half, thick = rng.uniform(0.08, 0.3), rng.uniform(0.01, 0.05)
     made = []
-    for axis, side in ((0, 1.0), (1, 1.0), (1, -1.0), (2, 1.0), (2, -1.0)):
-        if rng.random() < 0.85:
+    for axis, side in ((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, 1.0), (2, -1.0)):
+        if rng.random() < 0.93:
             size = np.full(3, 2.0 * half)
             size[axis] = thick
             made.append(Box(Pose(path[at] + side * half * frame[:, axis], quaternion_exp(yaw)), size))

@@ -1,0 +1,630 @@
+"""Is there a path at all? An oracle for refusals, which shares nothing with the search of the product.
+
+It looks at displacements of the nominal path, one grid of them for each of many times (layers), and gives one of three
+answers:
+
+* **impossible**: a proof. A box of the grid counts as free when any point of it might be, at any time of an interval.
+  If even so no chain of boxes leads from the start to the goal, no continuous displacement does.
+* **possible**: a path was found and verified. Cells count as free when their centre is; moves between neighbours and
+  between layers are bounded from below by tangents. The cheapest chain is then fitted by sums of the skill's
+  components or, where these are too wide, of hat functions in time.
+* **undecided**: neither, at the finest grid.
+
+The limits are those that the product states: no sample is displaced by more than 0.5 m, no step is longer than 8 times
+the longest step of the nominal path, fixed times do not move, and nothing moves in forbidden directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+from itertools import pairwise
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from imitarm.kinematics.pose import rotate, slerp
+from imitarm.scene.obstacle import Obstacle, PosedObstacle
+from imitarm.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+MAX_DISPLACEMENT = 0.5  # [m] as the product states it
+MAX_STEP_RATIO = 8.0  # as the product states it
+_SEARCH_GRIDS = {1: ((0.5, 0.002),), 2: ((0.2, 0.01), (0.5, 0.01), (0.5, 0.004)), 3: ((0.2, 0.02), (0.5, 0.025))}
+_PROOF_SIZES = {1: (0.004, 0.002, 0.0005), 2: (0.008, 0.0007, 0.0025), 3: (0.025, 0.002, 0.0125)}  # coarse, flat, fine
+_PROOF_INTERVALS = {1: 400, 2: 150, 3: 80}
+_MAX_FRAMES = 3
+_SEARCH_LAYERS = 67
+_LATERAL_SWEEPS = 16  # cells that a chain may move sideways within a layer
+_CHANGE_COST = 20.0  # [1/m]
+_AWAY_COST = 2.0  # [1/m^2] at each layer
+_FIT_ROUNDS = 12
+_DENSE = 4000
+
+
+class Answer(Enum):
+    """What the oracle found."""
+
+    IMPOSSIBLE = "impossible"
+    POSSIBLE = "possible"
+    UNDECIDED = "undecided"
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """A scene as the oracle sees it.
+
+    Attributes:
+        nominal: the nominal path, n samples.
+        basis: influence of the skill's components on the samples, shape (n, n_components).
+        obstacles: where they are at time 0; they keep their velocity.
+        spheres: of the tool, rows x y z r, shape (m, 4) [m].
+        clearance: required [m].
+        forbidden: directions in which nothing may move, shape (k, 3).
+        fixed_times: at which the path must not move [s].
+    """
+
+    nominal: Trajectory
+    basis: Array
+    obstacles: tuple[Obstacle, ...]
+    spheres: Array
+    clearance: float
+    forbidden: Array
+    fixed_times: tuple[float, ...]
+
+    def at(self, times: Array) -> tuple[Array, Array]:
+        """Return the tip (m, 3) and the centres of the spheres relative to it (n_spheres, m, 3) at times (m,)."""
+        tip, quaternions = self.nominal.at(times)
+        if quaternions is None:
+            return tip, np.zeros((len(self.spheres), len(times), 3))
+        rotations = slerp(times, self.nominal.times, np.asarray(self.nominal.quaternions))
+        return tip, np.stack([rotate(rotations, np.broadcast_to(s[:3], (len(times), 3))) for s in self.spheres])
+
+    def axes(self) -> Array:
+        """Return an orthonormal basis (d, 3) of the displacements that are not ruled out altogether."""
+        if not len(self.forbidden):
+            return np.eye(3)
+        unit = self.forbidden / np.linalg.norm(self.forbidden, axis=1, keepdims=True)
+        both = unit[(unit @ unit.T).min(axis=1) < -1.0 + 1e-9]
+        if not len(both):
+            return np.eye(3)
+        _, size, rows = np.linalg.svd(both)
+        return np.asarray(rows[int(np.sum(size > 1e-6)) :])
+
+
+def separation(question: Question, times: Array, positions: Array) -> float:
+    """Return the smallest proven distance [m] along a path, less the required clearance.
+
+    A point is at least ``u . p - max_x u . x`` away from a convex obstacle, for any unit vector u; the maximum over the
+    points x of the obstacle is its support function. Nothing else of the product's geometry is trusted: its gradient
+    only proposes u.
+
+    Args:
+        question: obstacles, spheres and clearance.
+        times: of the path [s], shape (n,).
+        positions: of the tip, a polyline, shape (n, 3) [m].
+    """
+    dense = np.unique(np.concatenate([np.linspace(times[0], times[-1], _DENSE), times]))
+    tip = np.stack([np.interp(dense, times, column) for column in positions.T], axis=1)
+    _, relative = question.at(dense)
+    lowest = np.inf
+    for obstacle in question.obstacles:
+        for sphere, offset in zip(question.spheres, relative, strict=True):
+            points = tip + offset - dense[:, None] * obstacle.velocity
+            u = obstacle.gradient(points)
+            u = u / np.linalg.norm(u, axis=1, keepdims=True)
+            gap = np.einsum("nd,nd->n", u, points - obstacle.support(u)) - sphere[3]
+            lowest = min(lowest, float(gap.min()))
+    return lowest - question.clearance
+
+
+def answer(question: Question) -> Answer:
+    """Decide whether a path exists."""
+    axes = question.axes()
+    grids = _grids(question, axes) if len(axes) else iter(())
+    coarse = next(grids, None)
+    if coarse is not None and _impossible(question, coarse):
+        return Answer.IMPOSSIBLE
+    if _solved(question, axes):
+        return Answer.POSSIBLE
+    if coarse is None or any(_impossible(question, cells) for cells in grids):
+        return Answer.IMPOSSIBLE
+    return Answer.UNDECIDED
+
+
+def _solved(question: Question, axes: Array) -> bool:
+    """Tell whether a path is found and verified."""
+    if separation(question, question.nominal.times, question.nominal.positions) >= -1e-9:
+        return True
+    if not len(axes):
+        return False
+    for reach, h in _SEARCH_GRIDS[len(axes)]:
+        chain = _chain(question, axes, reach, h)
+        if chain is not None and _fits(question, axes, chain):
+            return True
+    return False
+
+
+# ------------------------------------------------------------------------------------------------- proof of absence
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Boxes that fill a region of positions.
+
+    Attributes:
+        frame: rows are the directions of the edges, an orthonormal basis of the permitted plane, line or space, (d, 3).
+        size: of a box along each edge, shape (d,) [m].
+        lowest: coordinates of the lowest corner of all, shape (d,) [m].
+        counts: boxes along each edge, shape (d,).
+    """
+
+    frame: Array
+    size: Array
+    lowest: Array
+    counts: tuple[int, ...]
+
+    def window(self, centre: Array) -> tuple[tuple[int, int], ...]:
+        """Return first and last-but-one index along each edge of the boxes within the largest displacement."""
+        low = np.floor((self.frame @ centre - MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
+        high = np.ceil((self.frame @ centre + MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
+        return tuple((max(a, 0), min(b, n)) for a, b, n in zip(low, high, self.counts, strict=True))
+
+    def corners(self, window: tuple[tuple[int, int], ...], centre: Array) -> Array:
+        """Return the corners of the boxes in a window, (n_0 + 1, ..., 3) [m], in the plane through ``centre``."""
+        ticks = [
+            low + size * np.arange(a, b + 1) for (a, b), low, size in zip(window, self.lowest, self.size, strict=True)
+        ]
+        grid = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1)
+        return np.asarray(grid @ self.frame + (centre - self.frame.T @ (self.frame @ centre)))
+
+
+def _grids(question: Question, axes: Array) -> Iterator[_Cells]:
+    """Yield grids to try: coarse cubes, flat boxes aligned with each obstacle that has a frame, finer cubes."""
+    d = len(axes)
+    coarse, thin, fine = _PROOF_SIZES[d]
+    yield _cells(question, axes, np.full(d, coarse))
+    frames = [axes]
+    for obstacle in question.obstacles:
+        if isinstance(obstacle, PosedObstacle) and d > 1:
+            frame = _aligned(obstacle.pose.rotation.T, axes)
+            if not any(np.abs(np.abs(frame @ other.T) - np.eye(d)).max() < 1e-6 for other in frames[1:]):
+                frames.append(frame)
+    for frame in frames[1:][:_MAX_FRAMES]:
+        for axis in range(d):
+            size = np.full(d, 2.0 * coarse if d == 2 else coarse)
+            size[axis] = thin
+            yield _cells(question, frame, size)
+    yield _cells(question, axes, np.full(d, fine))
+
+
+def _aligned(rotation: Array, axes: Array) -> Array:
+    """Return an orthonormal basis of the span of ``axes`` (d, 3) that is aligned with the rows of a rotation."""
+    d = len(axes)
+    inside = rotation @ axes.T @ axes
+    first = inside[int(np.argmax(np.linalg.norm(inside, axis=1)))]
+    first = first / np.linalg.norm(first)
+    if d == 3:
+        return rotation
+    return np.stack([first, np.cross(np.cross(axes[0], axes[1]), first)])
+
+
+def _cells(question: Question, frame: Array, size: Array) -> _Cells:
+    along = question.nominal.positions @ frame.T
+    lowest = along.min(axis=0) - MAX_DISPLACEMENT - size
+    counts = np.ceil((along.max(axis=0) + MAX_DISPLACEMENT + size - lowest) / size).astype(int)
+    return _Cells(frame, size, lowest, tuple(counts.tolist()))
+
+
+def _impossible(question: Question, cells: _Cells) -> bool:
+    """Prove that there is no path: flood, interval after interval, every box that might be free during some of it.
+
+    A box is blocked when all of its corners are inside one and the same inflated obstacle, for it is convex. Boxes are
+    fixed in space, so the motion of the tip does not matter; what remains of the motion (out of the permitted plane,
+    of spheres beside the tip, of the obstacles) is subtracted.
+    """
+    d = len(cells.frame)
+    moving = any(obstacle.velocity.any() for obstacle in question.obstacles)
+    spans = np.linspace(0.0, question.nominal.times[-1], (4 if moving else 1) * _PROOF_INTERVALS[d] + 1)
+    spans = np.unique(np.concatenate([spans, question.fixed_times]))
+    first = question.at(np.array([0.0]))[0][0]
+    window = cells.window(first)
+    reached = _touching(cells, window, first)
+    everything = tuple((0, n) for n in cells.counts)
+    constant: Bools | None = None  # the same at all times: nothing but the tip moves
+    if not moving and d == 3 and not question.spheres[:, :3].any():
+        still = np.zeros((len(question.obstacles), len(question.spheres)))
+        relative = np.zeros((len(question.spheres), 3))
+        constant = _maybe_free(question, cells, everything, 0.0, first, relative, still)
+    for start, end in pairwise(spans.tolist()):
+        times = np.unique(np.concatenate([[start, 0.5 * (start + end), end], _inside(question, start, end)]))
+        tip, relative = question.at(times)
+        middle = int(np.searchsorted(times, 0.5 * (start + end)))
+        new = cells.window(tip[middle])
+        reached = _shifted(reached, window, new)
+        window = new
+        if constant is not None:
+            free = constant[tuple(slice(a, b) for a, b in window)]
+        else:
+            slack = _leftover_motion(question, cells, times, tip, relative, middle)
+            free = _maybe_free(question, cells, window, times[middle], tip[middle], relative[:, middle], slack)
+        usable = free & _permitted(question, cells, window, times, tip)
+        labels, _ = ndimage.label(usable, structure=np.ones((3,) * d))
+        seen = np.zeros(int(labels.max()) + 1, dtype=bool)
+        seen[labels[reached & usable]] = True
+        seen[0] = False
+        reached = seen[labels]
+        if not reached.any():
+            return True
+        if np.min(np.abs(end - np.asarray(question.fixed_times))) < 1e-12:
+            reached &= _touching(cells, window, tip[-1])
+            if not reached.any():
+                return True
+    return False
+
+
+def _touching(cells: _Cells, window: tuple[tuple[int, int], ...], point: Array) -> Bools:
+    """Return which boxes of a window touch a point."""
+    at = (cells.frame @ point - cells.lowest) / cells.size
+    lines = [
+        (np.arange(a, b) - 1e-9 <= x) & (x <= np.arange(a, b) + 1.0 + 1e-9)
+        for (a, b), x in zip(window, at, strict=True)
+    ]
+    answer = lines[0]
+    for line in lines[1:]:
+        answer = answer[..., None] & line
+    return np.asarray(answer)
+
+
+def _shifted(values: Bools, old: tuple[tuple[int, int], ...], new: tuple[tuple[int, int], ...]) -> Bools:
+    """Return the values of boxes in another window; False outside the old one."""
+    answer = np.zeros([b - a for a, b in new], dtype=bool)
+    low = [max(a, c) for (a, _), (c, _) in zip(old, new, strict=True)]
+    high = [min(b, e) for (_, b), (_, e) in zip(old, new, strict=True)]
+    here = tuple(slice(i - a, j - a) for i, j, (a, _) in zip(low, high, new, strict=True))
+    there = tuple(slice(i - a, j - a) for i, j, (a, _) in zip(low, high, old, strict=True))
+    answer[here] = values[there]
+    return answer
+
+
+def _inside(question: Question, start: float, end: float) -> Array:
+    times = question.nominal.times
+    return np.asarray(times[(times > start) & (times < end)])
+
+
+def _leftover_motion(
+    question: Question, cells: _Cells, times: Array, tip: Array, relative: Array, middle: int
+) -> Array:
+    """Return how far spheres get, relative to obstacles, from where they are at ``middle``, (n_obstacles, m) [m]."""
+    out_of_plane = tip - tip @ cells.frame.T @ cells.frame
+    bow = np.linalg.norm(question.spheres[:, :3], axis=1) * 1e-3 * bool(np.abs(np.diff(relative, axis=1)).max() > 0.0)
+    answer = np.empty((len(question.obstacles), len(question.spheres)))
+    for i, obstacle in enumerate(question.obstacles):
+        points = out_of_plane + relative - times[:, None] * obstacle.velocity
+        answer[i] = np.linalg.norm(points - points[:, middle : middle + 1], axis=-1).max(axis=1) + bow
+    return np.asarray(answer)
+
+
+def _maybe_free(
+    question: Question,
+    cells: _Cells,
+    window: tuple[tuple[int, int], ...],
+    time: float,
+    tip: Array,
+    relative: Array,
+    slack: Array,
+) -> Bools:
+    """Return which boxes are not surely blocked."""
+    d = len(cells.frame)
+    corners = cells.corners(window, tip)
+    blocked = np.zeros([b - a for a, b in window], dtype=bool)
+    for i, obstacle in enumerate(question.obstacles):
+        for j, sphere in enumerate(question.spheres):
+            shift = relative[j] - time * obstacle.velocity
+            inside = obstacle.signed_distance(corners + shift) + slack[i, j] < question.clearance + sphere[3]
+            for axis in range(d):
+                first, last = _halves(axis, d)
+                inside = inside[first] & inside[last]
+            blocked |= inside
+    return ~blocked
+
+
+def _permitted(
+    question: Question, cells: _Cells, window: tuple[tuple[int, int], ...], times: Array, tip: Array
+) -> Bools:
+    """Return which boxes a one-sided forbidden direction does not rule out at some time of an interval."""
+    answer = np.ones([b - a for a, b in window], dtype=bool)
+    corners: Array | None = None
+    for f in question.forbidden:
+        unit = f / np.linalg.norm(f)
+        if np.linalg.norm(cells.frame @ unit) < 1e-9:
+            continue
+        corners = cells.corners(window, tip[0]) if corners is None else corners
+        height = corners @ unit
+        for axis in range(len(window)):
+            first, last = _halves(axis, len(window))
+            height = np.minimum(height[first], height[last])
+        answer &= height <= (tip @ unit).max() + 1e-9
+    return answer
+
+
+# ------------------------------------------------------------------------------------------------ search and fit
+def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Array, Array] | None:
+    """Return times (k,) and displacements (k, 3) of the cheapest chain of free cells, or None.
+
+    Cell centres are multiples of ``h``, so that the nominal position is one of them.
+    """
+    d, half = len(axes), round(reach / h)
+    side, n = 2 * half + 1, len(question.nominal)
+    ticks = np.asarray((np.arange(side) - half) * h, dtype=np.float64)
+    times = np.unique(
+        np.concatenate([question.nominal.times[_layer_samples(question, n)], np.asarray(question.fixed_times)])
+    )
+    grid = np.stack(np.meshgrid(*[ticks] * d, indexing="ij"), axis=-1)
+    flat = grid.reshape(-1, d) @ axes
+    permitted = np.sum(grid**2, axis=-1) <= MAX_DISPLACEMENT**2
+    for f in question.forbidden:
+        permitted &= grid @ (axes @ (f / np.linalg.norm(f))) <= 1e-9
+    away = _AWAY_COST * np.sum(grid**2, axis=-1)
+    middle = (half,) * d
+    tip, relative = question.at(times)
+    longest = np.linalg.norm(np.diff(question.nominal.positions, axis=0), axis=1).max()
+    per_sample = (question.nominal.times[-1] - question.nominal.times[0]) / (n - 1)
+    costs: list[Array] = []
+    sideways: list[list[Bools]] = []
+    straight: list[Bools] = []
+    cost = np.full((side,) * d, np.inf)
+    cost[middle] = 0.0
+    previous: list[tuple[Array, Array]] | None = None
+    for k, time in enumerate(times.tolist()):
+        here, open_sides, open_ahead, free = _layer(
+            question, flat, d, side, h, axes, k, time, tip, relative, previous, times
+        )
+        if k > 0:
+            cost = np.where(open_ahead, cost, np.inf)
+            straight.append(open_ahead)
+        cost = np.where(free & permitted, cost + away, np.inf)
+        if np.min(np.abs(time - np.asarray(question.fixed_times))) < 1e-12:
+            value = cost[middle]
+            cost = np.full((side,) * d, np.inf)
+            cost[middle] = value
+        elif k + 1 < len(times):
+            allowed = MAX_STEP_RATIO * longest * (times[k] - times[k - 1]) / per_sample
+            sweeps = min(_LATERAL_SWEEPS if reach > 0.3 else _LATERAL_SWEEPS // 2, max(int(0.9 * allowed / h), 1))
+            usable = free & permitted
+            for _ in range(sweeps):
+                before = cost
+                cost = _swept(cost, open_sides, usable, h)
+                if np.array_equal(before, cost):
+                    break
+        if not np.isfinite(cost).any():
+            return None
+        costs.append(cost)
+        sideways.append(open_sides)
+        previous = here
+    if not np.isfinite(costs[-1][middle]):
+        return None
+    return times, _backtracked(costs, sideways, away, middle, h) @ axes
+
+
+def _layer_samples(question: Question, n: int) -> NDArray[np.intp]:
+    """Return the samples that are layers: evenly, and all of the first few from each fixed time."""
+    moving = any(obstacle.velocity.any() for obstacle in question.obstacles)
+    samples = set(np.round(np.linspace(0, n - 1, n if moving else min(_SEARCH_LAYERS, n))).astype(int).tolist())
+    for time in question.fixed_times:
+        at = int(np.argmin(np.abs(question.nominal.times - time)))
+        samples |= {j for j in range(at - 5, at + 6) if 0 <= j < n}
+    return np.array(sorted(samples), dtype=np.intp)
+
+
+def _layer(
+    question: Question,
+    flat: Array,
+    d: int,
+    side: int,
+    h: float,
+    axes: Array,
+    k: int,
+    time: float,
+    tip: Array,
+    relative: Array,
+    previous: list[tuple[Array, Array]] | None,
+    times: Array,
+) -> tuple[list[tuple[Array, Array]], list[Bools], Bools, Bools]:
+    """Return distances and gradients of a layer, free moves along each axis, free moves from before, free cells."""
+    shape = (side,) * d
+    free, ahead = np.ones(shape, dtype=bool), np.ones(shape, dtype=bool)
+    sides = [np.ones(shape, dtype=bool) for _ in range(d)]
+    here: list[tuple[Array, Array]] = []
+    far = h * side * np.sqrt(d)
+    pair = 0
+    for obstacle in question.obstacles:
+        for j, sphere in enumerate(question.spheres):
+            centre = tip[k] + relative[j, k] - time * obstacle.velocity
+            need = question.clearance + sphere[3]
+            step = np.zeros(3)
+            if k > 0:
+                step = centre - (tip[k - 1] + relative[j, k - 1] - times[k - 1] * obstacle.velocity)
+            distance: Array
+            if float(obstacle.signed_distance(centre)) > need + far + float(np.linalg.norm(step)):
+                here.append((np.full(len(flat), np.inf), np.zeros((len(flat), 3))))
+                pair += 1
+                continue
+            distance, gradient = obstacle.distance_and_gradient(flat + centre)
+            free &= (distance >= need).reshape(shape)
+            for axis in range(d):
+                along = (gradient @ axes[axis] * h).reshape(shape)
+                value = distance.reshape(shape)
+                first, last = _halves(axis, d)
+                low = _tangent_bound(value[first], along[first], value[last], along[last])
+                sides[axis][first] &= low >= need
+            if previous is not None:
+                before, slope = previous[pair]
+                if np.isfinite(before[0]):
+                    low = _tangent_bound(before, slope @ step, distance, gradient @ step)
+                    ahead &= (low >= need).reshape(shape)
+            here.append((distance, gradient))
+            pair += 1
+    return here, sides, ahead, free
+
+
+def _halves(axis: int, d: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    first, last = [slice(None)] * d, [slice(None)] * d
+    first[axis], last[axis] = slice(None, -1), slice(1, None)
+    return tuple(first), tuple(last)
+
+
+def _tangent_bound(f0: Array, a: Array, f1: Array, b: Array) -> Array:
+    """Return a lower bound on [0, 1] of a convex function with values f0, f1 and slopes a, b at the ends."""
+    inside = (a < 0.0) & (b > 0.0)
+    s = np.clip((f1 - f0 - b) / np.where(inside, a - b, -1.0), 0.0, 1.0)
+    return np.where(inside, np.maximum(f0 + a * s, f1 + b * (s - 1.0)), np.minimum(f0, f1))
+
+
+def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
+    """Return the costs after one more move to a neighbour along each axis, where it is free."""
+    d = cost.ndim
+    result = cost.copy()
+    for axis in range(d):
+        first, last = _halves(axis, d)
+        passable = sides[axis][first]
+        up = np.where(passable, cost[first], np.inf) + _CHANGE_COST * h
+        down = np.where(passable, cost[last], np.inf) + _CHANGE_COST * h
+        result[last] = np.minimum(result[last], np.where(usable[last], up, np.inf))
+        result[first] = np.minimum(result[first], np.where(usable[first], down, np.inf))
+    return result
+
+
+def _backtracked(costs: list[Array], sides: list[list[Bools]], away: Array, middle: tuple[int, ...], h: float) -> Array:
+    """Return the cell coordinates (k, d) [m] of the cheapest chain, one at each layer: where it arrives there."""
+    d = len(middle)
+    chain = np.zeros((len(costs), d))
+    cell = middle
+    for k in range(len(costs) - 1, 0, -1):
+        cost = costs[k]
+        chain[k] = (np.array(cell) - np.array(middle)) * h
+        while True:  # sideways moves within this layer, backwards
+            entered = costs[k - 1][cell] + away[cell]
+            if entered <= cost[cell] + 1e-9:
+                break
+            for neighbour, passable in _neighbours(cell, sides[k], cost.shape):
+                if passable and cost[neighbour] + _CHANGE_COST * h <= cost[cell] + 1e-9:
+                    cell = neighbour
+                    break
+            else:
+                break
+    return chain
+
+
+def _neighbours(
+    cell: tuple[int, ...], sides: list[Bools], shape: tuple[int, ...]
+) -> Iterator[tuple[tuple[int, ...], bool]]:
+    for axis in range(len(cell)):
+        for step in (-1, 1):
+            other = (*cell[:axis], cell[axis] + step, *cell[axis + 1 :])
+            if 0 <= other[axis] < shape[axis]:
+                yield other, bool(sides[axis][min(cell, other)])
+
+
+def _fits(question: Question, axes: Array, chain: tuple[Array, Array]) -> bool:
+    """Tell whether sums of components, or of hat functions in time, follow a chain and keep the clearance."""
+    times = question.nominal.times
+    wanted = np.stack([np.interp(times, chain[0], column) for column in chain[1].T], axis=1)
+    return any(
+        _fit(question, axes, basis, wanted) for basis in (question.basis, _hats(question, 4), _hats(question, 2))
+    )
+
+
+def _hats(question: Question, every: int) -> Array:
+    """Return hat functions in time (n, m): a peak every few samples, and more near fixed times."""
+    times, n = question.nominal.times, len(question.nominal)
+    fixed = [int(np.argmin(np.abs(times - time))) for time in question.fixed_times]
+    peaks = set(range(0, n, every)) | {n - 1}
+    for at in fixed:
+        peaks |= {j for j in range(at - 6, at + 7) if 0 <= j < n}
+    ordered = sorted(peaks)
+    hats = np.stack([np.interp(times, times[ordered], row) for row in np.eye(len(ordered))], axis=1)
+    return np.asarray(hats[:, [i for i, j in enumerate(ordered) if j not in fixed]])
+
+
+def _fit(question: Question, axes: Array, basis: Array, wanted: Array) -> bool:
+    """Fit displacements (n, 3) by least squares under tangents of the distances, and verify the result."""
+    times = question.nominal.times
+    d, m = len(axes), basis.shape[1]
+    tip, relative = question.at(times)
+    steps = np.linalg.norm(np.diff(tip, axis=0), axis=1)
+    smooth = np.diff(basis, 2, axis=0)
+    quadratic = np.kron(basis.T @ basis + 4.0 * (smooth.T @ smooth) + 1e-6 * np.eye(m), np.eye(d))
+    linear = -(basis.T @ (wanted @ axes.T)).reshape(-1)
+    here = wanted
+    extra = np.empty((0, 2))  # points between samples that were too close: sample and fraction
+    for _ in range(_FIT_ROUNDS):
+        rows, lower = _tangent_rows(question, axes, basis, tip, relative, here, extra)
+        for f in question.forbidden:
+            part = axes @ (f / np.linalg.norm(f))
+            if np.abs(part).max() > 1e-9:
+                rows = np.concatenate([rows, np.kron(np.eye(m), -part[None])])
+                lower = np.append(lower, np.zeros(m))
+        size = rows.shape[1]
+        slack_rows = np.hstack([rows, np.ones((len(rows), 1))])
+        weight = np.zeros((size + 1, size + 1))
+        weight[:size, :size], weight[size, size] = quadratic, 1e6
+        x, _, flag, _ = daqp.solve(
+            weight, np.append(linear, 0.0), np.ascontiguousarray(slack_rows), np.full(len(lower), 1e30), lower
+        )
+        if flag != 1:
+            return False
+        here = basis @ (np.asarray(x)[:size].reshape(m, d) @ axes)
+        for f in question.forbidden:
+            unit = f / np.linalg.norm(f)
+            here = here - np.maximum(here @ unit, 0.0)[:, None] * unit
+        if separation(question, times, tip + here) >= 0.0:
+            longest = np.linalg.norm(np.diff(tip + here, axis=0), axis=1).max()
+            inside = np.linalg.norm(here, axis=1).max() <= MAX_DISPLACEMENT
+            return bool(inside and longest <= MAX_STEP_RATIO * steps.max())
+        extra = np.concatenate([extra, _close_points(question, times, tip, relative, here)])
+    return False
+
+
+def _tangent_rows(
+    question: Question, axes: Array, basis: Array, tip: Array, relative: Array, here: Array, extra: Array
+) -> tuple[Array, Array]:
+    """Return rows (r, m d) and lower bounds (r,): the tangents of all near distances along ``tip + here``."""
+    times = question.nominal.times
+    j, s = extra[:, 0].astype(int), extra[:, 1:2]
+
+    def between(values: Array) -> Array:
+        last = np.minimum(j + 1, len(values) - 1)
+        return np.concatenate([values, (1.0 - s) * values[j] + s * values[last]])
+
+    lever, moved, clock = between(basis), between(here), between(times[:, None])[:, 0]
+    base = between(tip)
+    rows, lower = [np.empty((0, basis.shape[1] * len(axes)))], [np.empty(0)]
+    for obstacle in question.obstacles:
+        for sphere, offset in zip(question.spheres, relative, strict=True):
+            points = base + between(offset) + moved - clock[:, None] * obstacle.velocity
+            distance, gradient = obstacle.distance_and_gradient(points)
+            missing = question.clearance + sphere[3] + 1e-5 - distance
+            near = np.flatnonzero((missing > -0.06) & (lever.max(axis=1) > 1e-3))
+            reduced = gradient[near] @ axes.T
+            rows.append((lever[near, :, None] * reduced[:, None, :]).reshape(len(near), basis.shape[1] * len(axes)))
+            lower.append(missing[near] + np.einsum("rd,rd->r", gradient[near], moved[near]))
+    return np.concatenate(rows), np.concatenate(lower)
+
+
+def _close_points(question: Question, times: Array, tip: Array, relative: Array, here: Array) -> Array:
+    """Return sample and fraction of the closest of nine points on each segment that is too close, shape (r, 2)."""
+    found = []
+    fractions = np.linspace(0.1, 0.9, 9)[:, None, None]
+    path = tip + here
+    for obstacle in question.obstacles:
+        for sphere, offset in zip(question.spheres, relative, strict=True):
+            points = path + offset - times[:, None] * obstacle.velocity
+            inner = (1.0 - fractions) * points[:-1] + fractions * points[1:]
+            gap = obstacle.signed_distance(inner) - sphere[3] - question.clearance
+            for segment in np.flatnonzero(gap.min(axis=0) < 2e-6).tolist():
+                found.append((segment, float(fractions[int(np.argmin(gap[:, segment])), 0, 0])))
+    return np.array(found).reshape(-1, 2)
