@@ -46,8 +46,9 @@ _ANGLES = np.arange(12) * (np.pi / 6.0)
 _RING = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # directions tried across the path
 _IDENTITY = np.eye(3)
 _OTHERS = ([1, 2], [0, 2], [0, 1])
-_MAX_CHOICES = 8  # of a side, before all times are searched together
+_MAX_CHOICES = 4  # of a side, before all times are searched together
 _MAX_ROUTES = 3  # through the roadmap
+_HOPELESS = 0.012  # [m] a cheapest route that lacks more clearance than this leads to no detour
 _MAX_ROWS = 12  # violated samples that vote on a direction; the least detour then respects all of them
 _REFINED = 2  # directions whose amplitudes are minimised; the others wait with a rougher answer
 _VIOLATION_COST = 1e3  # [1/m] price of violated clearance against the style cost
@@ -90,9 +91,12 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
     if best.feasible or not allowed.dimension:
         return best
     tool = nominal.tool
+    roadmap = Roadmap(path, tool, clearance, allowed)
+    if roadmap.violation() > _HOPELESS:
+        return best
     learned = LeastDetour(path, tool, clearance, allowed, exact=True)
     divided = LeastDetour(path.divided, tool, clearance, allowed, exact=True)
-    for route in Roadmap(path, tool, clearance, allowed).routes(_MAX_ROUTES):
+    for route in roadmap.routes(_MAX_ROUTES):
         start = tool.clearance_of(path.nominal.positions + route)
         for least in (learned, divided):
             best = best_of((best, least.shrink(start))) or best

@@ -33,6 +33,8 @@ _MAX_SAG = 2e-4  # [m] most that is kept beyond the clearance at samples for the
 _ROUNDING = 2e-6  # [m] quadratic programs keep their rows no better
 _SLACK_SCALE = 1e-4  # [m] missing the tangents by this costs as much as one demonstrated sigma
 _GAIN = 0.9  # stop when a round saves less than a tenth
+_STALLED = 2e-5  # [m] a try that raises the lowest bound by less is no progress either
+_MAX_STALLED = 4  # tries without progress, then the search gives up
 _PROGRESS = 0.7  # a try that leaves more than this fraction of what was missing is no progress
 _SMOOTHNESS = 1e-3  # weight of the squared jerk of the displacement, in units of the largest nominal jerk
 _SMOOTHER = (1e-1, 1e1, 1e3)  # weights tried where the path would be too jerky
@@ -209,7 +211,7 @@ class LeastDetour:
         scale = self._scale(moved, smoothness)
         best: Detour | None = None
         here, held = start, ClosePoints.none()
-        missing = np.inf
+        missing, lowest, stalled = np.inf, -np.inf, 0
         for _ in range(_MAX_TRIES if len(moved) and self.allowed.dimension else 0):
             cost = np.inf
             displacement: Array | None = None
@@ -235,6 +237,10 @@ class LeastDetour:
             if still > 1e-5 and still > _PROGRESS * missing:
                 break
             missing = min(missing, still) if still > 0.0 else missing
+            stalled = 0 if detour.lowest > lowest + _STALLED else stalled + 1
+            lowest = max(lowest, detour.lowest)
+            if stalled > _MAX_STALLED:
+                break
             held = held + detour.close
         return best
 

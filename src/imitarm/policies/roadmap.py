@@ -59,7 +59,7 @@ class Roadmap:
         self.exists = np.ones(self.nodes.shape[:2], dtype=bool)
         self.exists[:, 1:] = free.reshape(n_layers, -1) & ~fixed[:, None]
         self.pairs_of_nodes = _edges(rays, _NEIGHBOURS.get(allowed.dimension, 1))
-        self.edge_costs = self._edge_costs()
+        self.edge_costs, self.violations = self._edges_between_layers()
         self._from_start, self._came_from = self._sweep(forward=True)
         self._to_goal, self._goes_to = self._sweep(forward=False)
 
@@ -136,8 +136,8 @@ class Roadmap:
             answer = np.maximum(answer, lift)
         return answer
 
-    def _edge_costs(self) -> Array:
-        """Return the cost of every edge, shape (n_layers - 1, n_edges)."""
+    def _edges_between_layers(self) -> tuple[Array, Array]:
+        """Return cost and unproven clearance [m] of every edge, shapes (n_layers - 1, n_edges)."""
         start, end = self.pairs_of_nodes
         positions = self.path.nominal.positions[self.layers][:, None, :] + self.nodes
         spread = np.swapaxes(positions, 0, 1)  # (n_nodes, n_layers, 3)
@@ -148,8 +148,8 @@ class Roadmap:
             if d.min() > self.clearance + 2.0 * MAX_DISPLACEMENT:
                 continue
             own = np.einsum("lkd,lkd->lk", n, centres)
-            a = np.einsum("lkd,lmd->lkm", n[:-1], centres[1:])[:, start, end] - own[:-1, start]
-            b = own[1:, end] - np.einsum("lkd,lmd->lkm", centres[:-1], n[1:])[:, start, end]
+            a = (n[:-1] @ np.swapaxes(centres[1:], 1, 2))[:, start, end] - own[:-1, start]
+            b = own[1:, end] - (centres[:-1] @ np.swapaxes(n[1:], 1, 2))[:, start, end]
             low = crossing_of_tangents(d[:-1, start], a, d[1:, end], b, 1.0)[0]
             np.maximum(violation, self.clearance - _JUST_OUTSIDE - low, out=violation)
         change = self.nodes[1:, end] - self.nodes[:-1, start]
@@ -159,7 +159,7 @@ class Roadmap:
         longest = MAX_STEP_RATIO * float(np.sqrt(np.einsum("nd,nd->n", steps, steps).max()))
         too_fast = np.einsum("led,led->le", step, step) > (longest * np.diff(self.layers)[:, None]) ** 2
         missing = ~(self.exists[:-1, start] & self.exists[1:, end])
-        return np.where(too_fast | missing, _BLOCKED, cost)
+        return np.where(too_fast | missing, _BLOCKED, cost), violation
 
     def _sweep(self, *, forward: bool) -> tuple[Array, Index]:
         """Return the cheapest cost of every node from the start (or to the goal), and the node before (or after) it."""
@@ -199,10 +199,22 @@ class Roadmap:
             chosen[layer + 1] = self._goes_to[layer, chosen[layer]]
         return chosen
 
+    def violation(self) -> float:
+        """Return the most that an edge of the cheapest route lacks of the clearance [m]; inf when there is no route."""
+        if not self._from_start[-1, 0] < _BLOCKED:
+            return np.inf
+        edges = self._edges_of(self._through(0, 0))
+        return float(self.violations[np.arange(len(edges)), edges].max())
+
+    def _edges_of(self, chosen: Index) -> Index:
+        """Return the index of the edge that a route takes from each layer to the next."""
+        n = self.nodes.shape[1]
+        keys = self.pairs_of_nodes[0] * n + self.pairs_of_nodes[1]  # sorted
+        return np.asarray(np.searchsorted(keys, chosen[:-1] * n + chosen[1:]), dtype=np.intp)
+
     def _worst_layer(self, chosen: Index) -> int:
         """Return the layer where a route costs most, or is displaced most when all of its edges are free."""
-        key = {pair: i for i, pair in enumerate(zip(*map(np.ndarray.tolist, self.pairs_of_nodes), strict=True))}
-        edges = [key[pair] for pair in zip(chosen[:-1].tolist(), chosen[1:].tolist(), strict=True)]
+        edges = self._edges_of(chosen)
         costs = self.edge_costs[np.arange(len(edges)), edges]
         if costs.max() > 1.0:
             return int(np.clip(np.argmax(costs), 1, len(self.layers) - 2))
