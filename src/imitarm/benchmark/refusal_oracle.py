@@ -17,9 +17,10 @@ the longest step of the nominal path, fixed times do not move, and nothing moves
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
+from typing import Any
 
 import daqp
 import numpy as np
@@ -35,7 +36,11 @@ Bools = NDArray[np.bool_]
 
 MAX_DISPLACEMENT = 0.5  # [m] as the product states it
 MAX_STEP_RATIO = 8.0  # as the product states it
-_SEARCH_GRIDS = {1: ((0.5, 0.002),), 2: ((0.2, 0.01), (0.5, 0.01), (0.5, 0.004)), 3: ((0.2, 0.02), (0.5, 0.025))}
+_SEARCH_GRIDS = {
+    1: ((0.5, 0.002),),
+    2: ((0.2, 0.01), (0.5, 0.01), (0.5, 0.004), (0.3, 0.002)),
+    3: ((0.2, 0.02), (0.5, 0.025), (0.3, 0.0125)),
+}
 _PROOF_SIZES = {1: (0.004, 0.002, 0.0005), 2: (0.008, 0.0007, 0.0025), 3: (0.025, 0.002, 0.0125)}  # coarse, flat, fine
 _PROOF_INTERVALS = {1: 400, 2: 150, 3: 80}
 _MAX_FRAMES = 3
@@ -126,13 +131,19 @@ def separation(question: Question, times: Array, positions: Array) -> float:
 def answer(question: Question) -> Answer:
     """Decide whether a path exists."""
     axes = question.axes()
-    grids = _grids(question, axes) if len(axes) else iter(())
-    coarse = next(grids, None)
-    if coarse is not None and _impossible(question, coarse):
+    if not len(axes):
+        return Answer.POSSIBLE if _solved(question, axes) else Answer.IMPOSSIBLE
+    # What is impossible for a part of the tool is impossible for all of it; the part next to the tip is the quickest.
+    nearest = int(np.argmin(np.linalg.norm(question.spheres[:, :3], axis=1)))
+    part = replace(question, spheres=question.spheres[[nearest]])
+    grids = _grids(part, axes)
+    if _impossible(part, next(grids)):
         return Answer.IMPOSSIBLE
     if _solved(question, axes):
         return Answer.POSSIBLE
-    if coarse is None or any(_impossible(question, cells) for cells in grids):
+    if any(_impossible(part, cells) for cells in grids):
+        return Answer.IMPOSSIBLE
+    if len(question.spheres) > 1 and any(_impossible(question, cells) for cells in _grids(question, axes)):
         return Answer.IMPOSSIBLE
     return Answer.UNDECIDED
 
@@ -193,8 +204,10 @@ def _grids(question: Question, axes: Array) -> Iterator[_Cells]:
             frame = _aligned(obstacle.pose.rotation.T, axes)
             if not any(np.abs(np.abs(frame @ other.T) - np.eye(d)).max() < 1e-6 for other in frames[1:]):
                 frames.append(frame)
+    if len(frames) > 1:
+        yield _cells(question, frames[1], np.full(d, fine))
     for frame in frames[1:][:_MAX_FRAMES]:
-        for axis in range(d):
+        for axis in range(d) if d == 2 or not question.spheres[:, :3].any() else ():
             size = np.full(d, 2.0 * coarse if d == 2 else coarse)
             size[axis] = thin
             yield _cells(question, frame, size)
@@ -375,24 +388,31 @@ def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Arr
     per_sample = (question.nominal.times[-1] - question.nominal.times[0]) / (n - 1)
     costs: list[Array] = []
     sideways: list[list[Bools]] = []
-    straight: list[Bools] = []
+    arrivals: list[Any] = []  # at fixed times: the cell of the layer before from which the chain arrives
+    distance_away = np.linalg.norm(grid, axis=-1)
+    was_fixed = True
     cost = np.full((side,) * d, np.inf)
     cost[middle] = 0.0
     previous: list[tuple[Array, Array]] | None = None
     for k, time in enumerate(times.tolist()):
+        is_fixed = bool(np.min(np.abs(time - np.asarray(question.fixed_times))) < 1e-12)
         here, open_sides, open_ahead, free = _layer(
-            question, flat, d, side, h, axes, k, time, tip, relative, previous, times
+            question, flat, d, side, h, axes, k, time, tip, relative, previous, times, was_fixed, is_fixed
         )
+        allowed = MAX_STEP_RATIO * longest * (times[k] - times[k - 1]) / per_sample if k > 0 else 0.0
         if k > 0:
+            cost = _advanced(cost, middle, distance_away, 0.8 * allowed, was_fixed, is_fixed)
             cost = np.where(open_ahead, cost, np.inf)
-            straight.append(open_ahead)
-        cost = np.where(free & permitted, cost + away, np.inf)
-        if np.min(np.abs(time - np.asarray(question.fixed_times))) < 1e-12:
-            value = cost[middle]
+        if is_fixed:
+            arrivals.append(np.unravel_index(int(np.argmin(cost)), cost.shape))
+            value = cost.min() if k > 0 else 0.0
             cost = np.full((side,) * d, np.inf)
-            cost[middle] = value
-        elif k + 1 < len(times):
-            allowed = MAX_STEP_RATIO * longest * (times[k] - times[k - 1]) / per_sample
+            cost[middle] = value if free[middle] else np.inf
+        else:
+            arrivals.append(None)
+            cost = np.where(free & permitted, cost + away, np.inf)
+        was_fixed = is_fixed
+        if not is_fixed and k + 1 < len(times):
             sweeps = min(_LATERAL_SWEEPS if reach > 0.3 else _LATERAL_SWEEPS // 2, max(int(0.9 * allowed / h), 1))
             usable = free & permitted
             for _ in range(sweeps):
@@ -407,7 +427,18 @@ def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Arr
         previous = here
     if not np.isfinite(costs[-1][middle]):
         return None
-    return times, _backtracked(costs, sideways, away, middle, h) @ axes
+    return times, _backtracked(costs, sideways, arrivals, away, middle, h) @ axes
+
+
+def _advanced(
+    cost: Array, middle: tuple[int, ...], away: Array, longest: float, from_fixed: bool, to_fixed: bool
+) -> Array:
+    """Return the costs at the next layer: cells stay, except straight from and to a point that must not move."""
+    if from_fixed and not to_fixed:
+        return np.where(away <= longest, cost[middle] + _CHANGE_COST * away, np.inf)
+    if to_fixed and not from_fixed:
+        return np.where(away <= longest, cost + _CHANGE_COST * away, np.inf)
+    return cost
 
 
 def _layer_samples(question: Question, n: int) -> NDArray[np.intp]:
@@ -433,6 +464,8 @@ def _layer(
     relative: Array,
     previous: list[tuple[Array, Array]] | None,
     times: Array,
+    from_fixed: bool,
+    to_fixed: bool,
 ) -> tuple[list[tuple[Array, Array]], list[Bools], Bools, Bools]:
     """Return distances and gradients of a layer, free moves along each axis, free moves from before, free cells."""
     shape = (side,) * d
@@ -464,7 +497,25 @@ def _layer(
             if previous is not None:
                 before, slope = previous[pair]
                 if np.isfinite(before[0]):
-                    low = _tangent_bound(before, slope @ step, distance, gradient @ step)
+                    if from_fixed and not to_fixed:
+                        steps, centre_row = step + flat, len(flat) // 2
+                        start = np.einsum("nd,d->n", steps, slope[centre_row])
+                        low = _tangent_bound(
+                            np.full(len(flat), before[centre_row]),
+                            start,
+                            distance,
+                            np.einsum("nd,nd->n", gradient, steps),
+                        )
+                    elif to_fixed and not from_fixed:
+                        steps, centre_row = step - flat, len(flat) // 2
+                        low = _tangent_bound(
+                            before,
+                            np.einsum("nd,nd->n", slope, steps),
+                            np.full(len(flat), distance[centre_row]),
+                            steps @ gradient[centre_row],
+                        )
+                    else:
+                        low = _tangent_bound(before, slope @ step, distance, gradient @ step)
                     ahead &= (low >= need).reshape(shape)
             here.append((distance, gradient))
             pair += 1
@@ -498,18 +549,22 @@ def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
     return result
 
 
-def _backtracked(costs: list[Array], sides: list[list[Bools]], away: Array, middle: tuple[int, ...], h: float) -> Array:
-    """Return the cell coordinates (k, d) [m] of the cheapest chain, one at each layer: where it arrives there."""
-    d = len(middle)
-    chain = np.zeros((len(costs), d))
+def _backtracked(
+    costs: list[Array], sides: list[list[Bools]], arrivals: list[Any], away: Array, middle: tuple[int, ...], h: float
+) -> Array:
+    """Return the cell coordinates (k, d) [m] of the cheapest chain, one at each layer: where it leaves the layer."""
+    chain = np.zeros((len(costs), len(middle)))
     cell = middle
     for k in range(len(costs) - 1, 0, -1):
-        cost = costs[k]
         chain[k] = (np.array(cell) - np.array(middle)) * h
-        while True:  # sideways moves within this layer, backwards
-            entered = costs[k - 1][cell] + away[cell]
-            if entered <= cost[cell] + 1e-9:
-                break
+        if arrivals[k] is not None:
+            cell = tuple(int(i) for i in arrivals[k])
+            continue
+        if arrivals[k - 1] is not None:
+            cell = middle
+            continue
+        cost = costs[k]
+        while costs[k - 1][cell] + away[cell] > cost[cell] + 1e-9:  # sideways moves within this layer, backwards
             for neighbour, passable in _neighbours(cell, sides[k], cost.shape):
                 if passable and cost[neighbour] + _CHANGE_COST * h <= cost[cell] + 1e-9:
                     cell = neighbour

@@ -10,6 +10,7 @@ only a proposal, from which the least detour takes its tangents.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from imitarm.policies.least_detour import MAX_DISPLACEMENT, MAX_STEP_RATIO, Allo
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_LAYERS = 40  # about so many times, and some more next to fixed ones
+_LAYERS = 28  # about so many times, and some more next to fixed ones
 _NEAR_FIXED = (1, 2, 4, 7)  # samples from a fixed one that are layers too
 _RAYS = {1: 2, 2: 16, 3: 42}  # by the number of dimensions in which components may move
 _NEIGHBOURS = {1: 2, 2: 5, 3: 8}  # rays to which edges lead, the same one included
@@ -60,15 +61,13 @@ class Roadmap:
         self.exists[:, 1:] = free.reshape(n_layers, -1) & ~fixed[:, None]
         self.pairs_of_nodes = _edges(rays, _NEIGHBOURS.get(allowed.dimension, 1))
         self.edge_costs, self.violations = self._edges_between_layers()
-        self._from_start, self._came_from = self._sweep(forward=True)
-        self._to_goal, self._goes_to = self._sweep(forward=False)
 
     def routes(self, n: int) -> Iterator[Array]:
         """Yield up to ``n`` routes as displacements of the tip at all samples (n_samples, 3) [m], cheapest first.
 
         After the first, each passes elsewhere at the layer where the ones before came closest to an obstacle.
         """
-        through = self._from_start + self._to_goal
+        through = self._forward[0] + self._backward[0]
         used: list[Array] = []
         at, node = 0, 0
         for _ in range(n):
@@ -194,16 +193,24 @@ class Roadmap:
         chosen = np.zeros(len(self.layers), dtype=np.intp)
         chosen[at] = node
         for layer in range(at, 0, -1):
-            chosen[layer - 1] = self._came_from[layer, chosen[layer]]
+            chosen[layer - 1] = self._forward[1][layer, chosen[layer]]
         for layer in range(at, len(self.layers) - 1):
-            chosen[layer + 1] = self._goes_to[layer, chosen[layer]]
+            chosen[layer + 1] = self._backward[1][layer, chosen[layer]]
         return chosen
+
+    @cached_property
+    def _forward(self) -> tuple[Array, Index]:
+        return self._sweep(forward=True)
+
+    @cached_property
+    def _backward(self) -> tuple[Array, Index]:
+        return self._sweep(forward=False)
 
     def violation(self) -> float:
         """Return the most that an edge of the cheapest route lacks of the clearance [m]; inf when there is no route."""
-        if not self._from_start[-1, 0] < _BLOCKED:
+        if not self._forward[0][-1, 0] < _BLOCKED:
             return np.inf
-        edges = self._edges_of(self._through(0, 0))
+        edges = self._edges_of(self._through(len(self.layers) - 1, 0))
         return float(self.violations[np.arange(len(edges)), edges].max())
 
     def _edges_of(self, chosen: Index) -> Index:
