@@ -16,40 +16,31 @@ the longest step of the nominal path, fixed times do not move, and nothing moves
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from enum import Enum
-from itertools import pairwise
 from typing import Any
 
 import daqp
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from imitarm.kinematics.pose import rotate, slerp
-from imitarm.scene.obstacle import Obstacle, PosedObstacle
-from imitarm.trajectory import Trajectory
+from imitarm.benchmark.refusal_proof import MAX_DISPLACEMENT, Question, grids, halves, is_impossible, separation
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-MAX_DISPLACEMENT = 0.5  # [m] as the product states it
 MAX_STEP_RATIO = 8.0  # as the product states it
 _SEARCH_GRIDS = {
     1: ((0.5, 0.002),),
     2: ((0.2, 0.01), (0.5, 0.01), (0.5, 0.004), (0.3, 0.002)),
     3: ((0.2, 0.02), (0.5, 0.025), (0.3, 0.0125)),
 }
-_PROOF_SIZES = {1: (0.004, 0.002, 0.0005), 2: (0.008, 0.0007, 0.0025), 3: (0.025, 0.002, 0.0125)}  # coarse, flat, fine
-_PROOF_INTERVALS = {1: 400, 2: 150, 3: 80}
-_MAX_FRAMES = 3
 _SEARCH_LAYERS = 67
 _LATERAL_SWEEPS = 16  # cells that a chain may move sideways within a layer
 _CHANGE_COST = 20.0  # [1/m]
 _AWAY_COST = 2.0  # [1/m^2] at each layer
 _FIT_ROUNDS = 12
-_DENSE = 4000
 
 
 class Answer(Enum):
@@ -60,311 +51,44 @@ class Answer(Enum):
     UNDECIDED = "undecided"
 
 
-@dataclass(frozen=True, eq=False)
-class Question:
-    """A scene as the oracle sees it.
-
-    Attributes:
-        nominal: the nominal path, n samples.
-        basis: influence of the skill's components on the samples, shape (n, n_components).
-        obstacles: where they are at time 0; they keep their velocity.
-        spheres: of the tool, rows x y z r, shape (m, 4) [m].
-        clearance: required [m].
-        forbidden: directions in which nothing may move, shape (k, 3).
-        fixed_times: at which the path must not move [s].
-    """
-
-    nominal: Trajectory
-    basis: Array
-    obstacles: tuple[Obstacle, ...]
-    spheres: Array
-    clearance: float
-    forbidden: Array
-    fixed_times: tuple[float, ...]
-
-    def at(self, times: Array) -> tuple[Array, Array]:
-        """Return the tip (m, 3) and the centres of the spheres relative to it (n_spheres, m, 3) at times (m,)."""
-        tip, quaternions = self.nominal.at(times)
-        if quaternions is None:
-            return tip, np.zeros((len(self.spheres), len(times), 3))
-        rotations = slerp(times, self.nominal.times, np.asarray(self.nominal.quaternions))
-        return tip, np.stack([rotate(rotations, np.broadcast_to(s[:3], (len(times), 3))) for s in self.spheres])
-
-    def axes(self) -> Array:
-        """Return an orthonormal basis (d, 3) of the displacements that are not ruled out altogether."""
-        if not len(self.forbidden):
-            return np.eye(3)
-        unit = self.forbidden / np.linalg.norm(self.forbidden, axis=1, keepdims=True)
-        both = unit[(unit @ unit.T).min(axis=1) < -1.0 + 1e-9]
-        if not len(both):
-            return np.eye(3)
-        _, size, rows = np.linalg.svd(both)
-        return np.asarray(rows[int(np.sum(size > 1e-6)) :])
-
-
-def separation(question: Question, times: Array, positions: Array) -> float:
-    """Return the smallest proven distance [m] along a path, less the required clearance.
-
-    A point is at least ``u . p - max_x u . x`` away from a convex obstacle, for any unit vector u; the maximum over the
-    points x of the obstacle is its support function. Nothing else of the product's geometry is trusted: its gradient
-    only proposes u.
-
-    Args:
-        question: obstacles, spheres and clearance.
-        times: of the path [s], shape (n,).
-        positions: of the tip, a polyline, shape (n, 3) [m].
-    """
-    dense = np.unique(np.concatenate([np.linspace(times[0], times[-1], _DENSE), times]))
-    tip = np.stack([np.interp(dense, times, column) for column in positions.T], axis=1)
-    _, relative = question.at(dense)
-    lowest = np.inf
-    for obstacle in question.obstacles:
-        for sphere, offset in zip(question.spheres, relative, strict=True):
-            points = tip + offset - dense[:, None] * obstacle.velocity
-            u = obstacle.gradient(points)
-            u = u / np.linalg.norm(u, axis=1, keepdims=True)
-            gap = np.einsum("nd,nd->n", u, points - obstacle.support(u)) - sphere[3]
-            lowest = min(lowest, float(gap.min()))
-    return lowest - question.clearance
-
-
 def answer(question: Question) -> Answer:
     """Decide whether a path exists."""
     axes = question.axes()
     if not len(axes):
-        return Answer.POSSIBLE if _solved(question, axes) else Answer.IMPOSSIBLE
+        return Answer.POSSIBLE if is_solved(question, axes) else Answer.IMPOSSIBLE
     # What is impossible for a part of the tool is impossible for all of it; the part next to the tip is the quickest.
     nearest = int(np.argmin(np.linalg.norm(question.spheres[:, :3], axis=1)))
     part = replace(question, spheres=question.spheres[[nearest]])
-    grids = _grids(part, axes)
-    if _impossible(part, next(grids)):
+    boxes = grids(part, axes)
+    if is_impossible(part, next(boxes)):
         return Answer.IMPOSSIBLE
-    if _solved(question, axes):
+    if is_solved(question, axes, _SEARCH_GRIDS[len(axes)][:1]):
         return Answer.POSSIBLE
-    if any(_impossible(part, cells) for cells in grids):
+    if any(is_impossible(part, cells) for cells in boxes):
         return Answer.IMPOSSIBLE
-    if len(question.spheres) > 1 and any(_impossible(question, cells) for cells in _grids(question, axes)):
+    if is_solved(question, axes, _SEARCH_GRIDS[len(axes)][1:]):
+        return Answer.POSSIBLE
+    if len(question.spheres) > 1 and any(is_impossible(question, cells) for cells in grids(question, axes)):
         return Answer.IMPOSSIBLE
     return Answer.UNDECIDED
 
 
-def _solved(question: Question, axes: Array) -> bool:
-    """Tell whether a path is found and verified."""
+def is_solved(
+    question: Question, axes: Array | None = None, grids_to_search: Sequence[tuple[float, float]] | None = None
+) -> bool:
+    """Tell whether a path is found and verified, on all grids or on some, given by reach and size of a cell [m]."""
+    axes = question.axes() if axes is None else axes
     if separation(question, question.nominal.times, question.nominal.positions) >= -1e-9:
         return True
     if not len(axes):
         return False
-    for reach, h in _SEARCH_GRIDS[len(axes)]:
+    for reach, h in _SEARCH_GRIDS[len(axes)] if grids_to_search is None else grids_to_search:
         chain = _chain(question, axes, reach, h)
         if chain is not None and _fits(question, axes, chain):
             return True
     return False
 
 
-# ------------------------------------------------------------------------------------------------- proof of absence
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Boxes that fill a region of positions.
-
-    Attributes:
-        frame: rows are the directions of the edges, an orthonormal basis of the permitted plane, line or space, (d, 3).
-        size: of a box along each edge, shape (d,) [m].
-        lowest: coordinates of the lowest corner of all, shape (d,) [m].
-        counts: boxes along each edge, shape (d,).
-    """
-
-    frame: Array
-    size: Array
-    lowest: Array
-    counts: tuple[int, ...]
-
-    def window(self, centre: Array) -> tuple[tuple[int, int], ...]:
-        """Return first and last-but-one index along each edge of the boxes within the largest displacement."""
-        low = np.floor((self.frame @ centre - MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
-        high = np.ceil((self.frame @ centre + MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
-        return tuple((max(a, 0), min(b, n)) for a, b, n in zip(low, high, self.counts, strict=True))
-
-    def corners(self, window: tuple[tuple[int, int], ...], centre: Array) -> Array:
-        """Return the corners of the boxes in a window, (n_0 + 1, ..., 3) [m], in the plane through ``centre``."""
-        ticks = [
-            low + size * np.arange(a, b + 1) for (a, b), low, size in zip(window, self.lowest, self.size, strict=True)
-        ]
-        grid = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1)
-        return np.asarray(grid @ self.frame + (centre - self.frame.T @ (self.frame @ centre)))
-
-
-def _grids(question: Question, axes: Array) -> Iterator[_Cells]:
-    """Yield grids to try: coarse cubes, flat boxes aligned with each obstacle that has a frame, finer cubes."""
-    d = len(axes)
-    coarse, thin, fine = _PROOF_SIZES[d]
-    yield _cells(question, axes, np.full(d, coarse))
-    frames = [axes]
-    for obstacle in question.obstacles:
-        if isinstance(obstacle, PosedObstacle) and d > 1:
-            frame = _aligned(obstacle.pose.rotation.T, axes)
-            if not any(np.abs(np.abs(frame @ other.T) - np.eye(d)).max() < 1e-6 for other in frames[1:]):
-                frames.append(frame)
-    if len(frames) > 1:
-        yield _cells(question, frames[1], np.full(d, fine))
-    for frame in frames[1:][:_MAX_FRAMES]:
-        for axis in range(d) if d == 2 or not question.spheres[:, :3].any() else ():
-            size = np.full(d, 2.0 * coarse if d == 2 else coarse)
-            size[axis] = thin
-            yield _cells(question, frame, size)
-    yield _cells(question, axes, np.full(d, fine))
-
-
-def _aligned(rotation: Array, axes: Array) -> Array:
-    """Return an orthonormal basis of the span of ``axes`` (d, 3) that is aligned with the rows of a rotation."""
-    d = len(axes)
-    inside = rotation @ axes.T @ axes
-    first = inside[int(np.argmax(np.linalg.norm(inside, axis=1)))]
-    first = first / np.linalg.norm(first)
-    if d == 3:
-        return rotation
-    return np.stack([first, np.cross(np.cross(axes[0], axes[1]), first)])
-
-
-def _cells(question: Question, frame: Array, size: Array) -> _Cells:
-    along = question.nominal.positions @ frame.T
-    lowest = along.min(axis=0) - MAX_DISPLACEMENT - size
-    counts = np.ceil((along.max(axis=0) + MAX_DISPLACEMENT + size - lowest) / size).astype(int)
-    return _Cells(frame, size, lowest, tuple(counts.tolist()))
-
-
-def _impossible(question: Question, cells: _Cells) -> bool:
-    """Prove that there is no path: flood, interval after interval, every box that might be free during some of it.
-
-    A box is blocked when all of its corners are inside one and the same inflated obstacle, for it is convex. Boxes are
-    fixed in space, so the motion of the tip does not matter; what remains of the motion (out of the permitted plane,
-    of spheres beside the tip, of the obstacles) is subtracted.
-    """
-    d = len(cells.frame)
-    moving = any(obstacle.velocity.any() for obstacle in question.obstacles)
-    spans = np.linspace(0.0, question.nominal.times[-1], (4 if moving else 1) * _PROOF_INTERVALS[d] + 1)
-    spans = np.unique(np.concatenate([spans, question.fixed_times]))
-    first = question.at(np.array([0.0]))[0][0]
-    window = cells.window(first)
-    reached = _touching(cells, window, first)
-    everything = tuple((0, n) for n in cells.counts)
-    constant: Bools | None = None  # the same at all times: nothing but the tip moves
-    if not moving and d == 3 and not question.spheres[:, :3].any():
-        still = np.zeros((len(question.obstacles), len(question.spheres)))
-        relative = np.zeros((len(question.spheres), 3))
-        constant = _maybe_free(question, cells, everything, 0.0, first, relative, still)
-    for start, end in pairwise(spans.tolist()):
-        times = np.unique(np.concatenate([[start, 0.5 * (start + end), end], _inside(question, start, end)]))
-        tip, relative = question.at(times)
-        middle = int(np.searchsorted(times, 0.5 * (start + end)))
-        new = cells.window(tip[middle])
-        reached = _shifted(reached, window, new)
-        window = new
-        if constant is not None:
-            free = constant[tuple(slice(a, b) for a, b in window)]
-        else:
-            slack = _leftover_motion(question, cells, times, tip, relative, middle)
-            free = _maybe_free(question, cells, window, times[middle], tip[middle], relative[:, middle], slack)
-        usable = free & _permitted(question, cells, window, times, tip)
-        labels, _ = ndimage.label(usable, structure=np.ones((3,) * d))
-        seen = np.zeros(int(labels.max()) + 1, dtype=bool)
-        seen[labels[reached & usable]] = True
-        seen[0] = False
-        reached = seen[labels]
-        if not reached.any():
-            return True
-        if np.min(np.abs(end - np.asarray(question.fixed_times))) < 1e-12:
-            reached &= _touching(cells, window, tip[-1])
-            if not reached.any():
-                return True
-    return False
-
-
-def _touching(cells: _Cells, window: tuple[tuple[int, int], ...], point: Array) -> Bools:
-    """Return which boxes of a window touch a point."""
-    at = (cells.frame @ point - cells.lowest) / cells.size
-    lines = [
-        (np.arange(a, b) - 1e-9 <= x) & (x <= np.arange(a, b) + 1.0 + 1e-9)
-        for (a, b), x in zip(window, at, strict=True)
-    ]
-    answer = lines[0]
-    for line in lines[1:]:
-        answer = answer[..., None] & line
-    return np.asarray(answer)
-
-
-def _shifted(values: Bools, old: tuple[tuple[int, int], ...], new: tuple[tuple[int, int], ...]) -> Bools:
-    """Return the values of boxes in another window; False outside the old one."""
-    answer = np.zeros([b - a for a, b in new], dtype=bool)
-    low = [max(a, c) for (a, _), (c, _) in zip(old, new, strict=True)]
-    high = [min(b, e) for (_, b), (_, e) in zip(old, new, strict=True)]
-    here = tuple(slice(i - a, j - a) for i, j, (a, _) in zip(low, high, new, strict=True))
-    there = tuple(slice(i - a, j - a) for i, j, (a, _) in zip(low, high, old, strict=True))
-    answer[here] = values[there]
-    return answer
-
-
-def _inside(question: Question, start: float, end: float) -> Array:
-    times = question.nominal.times
-    return np.asarray(times[(times > start) & (times < end)])
-
-
-def _leftover_motion(
-    question: Question, cells: _Cells, times: Array, tip: Array, relative: Array, middle: int
-) -> Array:
-    """Return how far spheres get, relative to obstacles, from where they are at ``middle``, (n_obstacles, m) [m]."""
-    out_of_plane = tip - tip @ cells.frame.T @ cells.frame
-    bow = np.linalg.norm(question.spheres[:, :3], axis=1) * 1e-3 * bool(np.abs(np.diff(relative, axis=1)).max() > 0.0)
-    answer = np.empty((len(question.obstacles), len(question.spheres)))
-    for i, obstacle in enumerate(question.obstacles):
-        points = out_of_plane + relative - times[:, None] * obstacle.velocity
-        answer[i] = np.linalg.norm(points - points[:, middle : middle + 1], axis=-1).max(axis=1) + bow
-    return np.asarray(answer)
-
-
-def _maybe_free(
-    question: Question,
-    cells: _Cells,
-    window: tuple[tuple[int, int], ...],
-    time: float,
-    tip: Array,
-    relative: Array,
-    slack: Array,
-) -> Bools:
-    """Return which boxes are not surely blocked."""
-    d = len(cells.frame)
-    corners = cells.corners(window, tip)
-    blocked = np.zeros([b - a for a, b in window], dtype=bool)
-    for i, obstacle in enumerate(question.obstacles):
-        for j, sphere in enumerate(question.spheres):
-            shift = relative[j] - time * obstacle.velocity
-            inside = obstacle.signed_distance(corners + shift) + slack[i, j] < question.clearance + sphere[3]
-            for axis in range(d):
-                first, last = _halves(axis, d)
-                inside = inside[first] & inside[last]
-            blocked |= inside
-    return ~blocked
-
-
-def _permitted(
-    question: Question, cells: _Cells, window: tuple[tuple[int, int], ...], times: Array, tip: Array
-) -> Bools:
-    """Return which boxes a one-sided forbidden direction does not rule out at some time of an interval."""
-    answer = np.ones([b - a for a, b in window], dtype=bool)
-    corners: Array | None = None
-    for f in question.forbidden:
-        unit = f / np.linalg.norm(f)
-        if np.linalg.norm(cells.frame @ unit) < 1e-9:
-            continue
-        corners = cells.corners(window, tip[0]) if corners is None else corners
-        height = corners @ unit
-        for axis in range(len(window)):
-            first, last = _halves(axis, len(window))
-            height = np.minimum(height[first], height[last])
-        answer &= height <= (tip @ unit).max() + 1e-9
-    return answer
-
-
-# ------------------------------------------------------------------------------------------------ search and fit
 def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Array, Array] | None:
     """Return times (k,) and displacements (k, 3) of the cheapest chain of free cells, or None.
 
@@ -491,7 +215,7 @@ def _layer(
             for axis in range(d):
                 along = (gradient @ axes[axis] * h).reshape(shape)
                 value = distance.reshape(shape)
-                first, last = _halves(axis, d)
+                first, last = halves(axis, d)
                 low = _tangent_bound(value[first], along[first], value[last], along[last])
                 sides[axis][first] &= low >= need
             if previous is not None:
@@ -522,12 +246,6 @@ def _layer(
     return here, sides, ahead, free
 
 
-def _halves(axis: int, d: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    first, last = [slice(None)] * d, [slice(None)] * d
-    first[axis], last[axis] = slice(None, -1), slice(1, None)
-    return tuple(first), tuple(last)
-
-
 def _tangent_bound(f0: Array, a: Array, f1: Array, b: Array) -> Array:
     """Return a lower bound on [0, 1] of a convex function with values f0, f1 and slopes a, b at the ends."""
     inside = (a < 0.0) & (b > 0.0)
@@ -540,7 +258,7 @@ def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
     d = cost.ndim
     result = cost.copy()
     for axis in range(d):
-        first, last = _halves(axis, d)
+        first, last = halves(axis, d)
         passable = sides[axis][first]
         up = np.where(passable, cost[first], np.inf) + _CHANGE_COST * h
         down = np.where(passable, cost[last], np.inf) + _CHANGE_COST * h

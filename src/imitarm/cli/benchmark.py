@@ -10,12 +10,13 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from imitarm.benchmark import avoidance, placements, real_motions
+from imitarm.benchmark import avoidance, placements, real_motions, refusals
 from imitarm.benchmark.experiment import METHODS, Result
 from imitarm.benchmark.mapping import MappingBenchmark, tables, write_tables
 from imitarm.benchmark.mapping_tables import TEST, Results
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recordings import KINDS
+from imitarm.benchmark.refusal_oracle import Answer
 from imitarm.benchmark.running import LOCAL, run_all
 from imitarm.benchmark.tables import Place, Table
 from imitarm.cli.outputs import check_outputs, same_place
@@ -35,6 +36,7 @@ examples:
   imitarm benchmark avoidance --seeds 200
   imitarm benchmark placements --skill pour.json --robot panda --tool gripper --seeds 100
   imitarm benchmark people recordings person.mp4
+  imitarm benchmark refusals --scenes 1000
 
 'mapping' saves each result in the folder --out; after Ctrl-C the same command continues where it stopped.
 """
@@ -85,6 +87,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     other.add_argument("--methods", nargs="+", choices=ADAPTERS, default=list(ADAPTERS))
     _add_fill(other)
     other.set_defaults(benchmark=_avoidance)
+    third = parsers.add_parser(
+        "refusals", help="whether accepted paths are clear and refusals right, over random scenes, by an oracle"
+    )
+    third.add_argument("--scenes", type=int, default=1000, metavar="N", help="how many; default: 1000")
+    third.add_argument("--first", type=int, default=0, metavar="N", help="first seed; default: 0")
+    third.add_argument("--skills", type=Path, nargs="+", default=[], metavar="FILE", help="skills to adapt as well")
+    _add_fill(third)
+    third.set_defaults(benchmark=_refusals)
     placed = parsers.add_parser("placements", help="policies on a simulated arm, among seeded obstacles on the path")
     placed.add_argument("--skill", type=Path, metavar="FILE", help="default: the packaged sweep, Sawyer and brush")
     placed.add_argument("--policies", nargs="+", choices=POLICIES, default=["acfra"], metavar="NAME")
@@ -173,6 +183,26 @@ def _avoidance(arguments: argparse.Namespace) -> int:
         )
     _report([table], place, [code_version()])
     return 0
+
+
+def _refusals(arguments: argparse.Namespace) -> int:
+    """Run the random scenes and print their table; return 1 when an accepted path violates its clearance."""
+    if arguments.scenes < 1 or arguments.first < 0:
+        raise InputError(f"--scenes must be at least 1 and --first 0, got {arguments.scenes} and {arguments.first}")
+    place = _place(arguments, "refusals")
+    with progress_bar() as bar:
+        task = bar.add_task("adapting", total=arguments.scenes)
+        table, verdicts = refusals.refusal_table(
+            arguments.scenes,
+            arguments.first,
+            arguments.skills,
+            on_done=lambda finished, _: bar.update(task, completed=finished),
+        )
+    _report([table], place, [code_version()])
+    doubtful = [v for v in verdicts if v.is_violation or (not v.accepted and v.oracle is not Answer.IMPOSSIBLE)]
+    for v in doubtful:
+        say(f"seed {v.seed} ({v.family}): {'violated' if v.is_violation else f'refused, {v.oracle.value}'}")
+    return int(any(v.is_violation for v in verdicts))
 
 
 def _placements(arguments: argparse.Namespace) -> int:
