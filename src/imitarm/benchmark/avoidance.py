@@ -65,8 +65,7 @@ def learn(*, planar: bool) -> tuple[Skill, Array]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DegenerateAxisWarning)  # a planar reach has no spread in z, on purpose
         skill = Skill(n_components=8).fit(s_shaped_demonstrations(planar=planar))
-    path, _ = skill.gmr_.predict(np.linspace(0.0, skill.duration_, 400))
-    return skill, path
+    return skill, skill.gmr_.trajectory(400).positions
 
 
 def evaluate(case: Case, adaptation: Adaptation) -> Outcome:

@@ -291,7 +291,7 @@ def _gap(rng: np.random.Generator, path: Array, duration: float, planar: bool, r
     ahead = path[min(at + 5, len(path) - 1)] - path[at - 5]
     yaw = np.array([0.0, 0.0, np.arctan2(ahead[1], ahead[0])])
     across = quaternion_to_matrix(quaternion_exp(yaw))[:, 1]
-    width = max(2.0 * reach + rng.uniform(-0.04, 0.03), 0.002)
+    width = 2.0 * reach + rng.uniform(-0.04, 0.03)
     centre = path[at] + rng.uniform(-0.06, 0.06) * across
     thick, high = rng.uniform(0.004, 0.06), rng.choice([0.15, 1.6], p=[0.2, 0.8])
     return tuple(

@@ -54,23 +54,22 @@ class Answer(Enum):
 def answer(question: Question) -> Answer:
     """Decide whether a path exists."""
     axes = question.axes()
-    if not len(axes):
+    if not len(axes):  # nothing may move
         return Answer.POSSIBLE if is_solved(question, axes) else Answer.IMPOSSIBLE
     # What is impossible for a part of the tool is impossible for all of it; the part next to the tip is the quickest.
     nearest = int(np.argmin(np.linalg.norm(question.spheres[:, :3], axis=1)))
     part = replace(question, spheres=question.spheres[[nearest]])
-    boxes = grids(part, axes)
+    boxes, searches = grids(part, axes), _SEARCH_GRIDS[len(axes)]
     if is_impossible(part, next(boxes)):
         return Answer.IMPOSSIBLE
-    if is_solved(question, axes, _SEARCH_GRIDS[len(axes)][:1]):
+    if is_solved(question, axes, searches[:1]):
         return Answer.POSSIBLE
     if any(is_impossible(part, cells) for cells in boxes):
         return Answer.IMPOSSIBLE
-    if is_solved(question, axes, _SEARCH_GRIDS[len(axes)][1:]):
+    if is_solved(question, axes, searches[1:]):
         return Answer.POSSIBLE
-    if len(question.spheres) > 1 and any(is_impossible(question, cells) for cells in grids(question, axes)):
-        return Answer.IMPOSSIBLE
-    return Answer.UNDECIDED
+    whole = grids(question, axes) if len(question.spheres) > 1 else ()
+    return Answer.IMPOSSIBLE if any(is_impossible(question, cells) for cells in whole) else Answer.UNDECIDED
 
 
 def is_solved(

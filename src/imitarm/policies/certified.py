@@ -48,6 +48,7 @@ _IDENTITY = np.eye(3)
 _OTHERS = ([1, 2], [0, 2], [0, 1])
 _MAX_CHOICES = 3  # of a side, before all times are searched together
 _MAX_ROUTES = 3  # through the roadmap
+_ALMOST = 0.003  # [m] an attempt that lacks less clearance than this is tried again with narrower components
 _HOPELESS = 0.012  # [m] a cheapest route that lacks more clearance than this leads to no detour
 _MAX_ROWS = 12  # violated samples that vote on a direction; the least detour then respects all of them
 _REFINED = 2  # directions whose amplitudes are minimised; the others wait with a rougher answer
@@ -91,11 +92,15 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
     if best.feasible or not allowed.dimension:
         return best
     tool = nominal.tool
+    divided = LeastDetour(path.divided, tool, clearance, allowed, exact=True)
+    if best.lowest > clearance - _ALMOST:
+        best = best_of((best, divided.shrink(best.clearance))) or best
+        if best.feasible:
+            return best
     roadmap = Roadmap(path, tool, clearance, allowed)
     if roadmap.violation() > _HOPELESS:
         return best
     learned = LeastDetour(path, tool, clearance, allowed, exact=True)
-    divided = LeastDetour(path.divided, tool, clearance, allowed, exact=True)
     for route in roadmap.routes(_MAX_ROUTES):
         start = tool.clearance_of(path.nominal.positions + route)
         for least in (learned, divided):

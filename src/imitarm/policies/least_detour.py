@@ -35,9 +35,10 @@ _SLACK_SCALE = 1e-4  # [m] missing the tangents by this costs as much as one dem
 _GAIN = 0.9  # stop when a round saves less than a tenth
 _STALLED = 2e-5  # [m] a try that raises the lowest bound by less is no progress either
 _MAX_STALLED = 4  # tries without progress, then the search gives up
-_PROGRESS = 0.7  # a try that leaves more than this fraction of what was missing is no progress
+_PROGRESS = 0.9  # a try that leaves more than this fraction of what was missing is no progress
 _SMOOTHNESS = 1e-3  # weight of the squared jerk of the displacement, in units of the largest nominal jerk
 _SMOOTHER = (1e-1, 1e1, 1e3)  # weights tried where the path would be too jerky
+_WITHIN = 0.999  # of the stated limits is planned for
 _SOLVED = 1  # daqp's exit flag of an optimal solution
 
 
@@ -150,6 +151,29 @@ class Detour:
         return float(self.bounds.min(initial=np.inf))
 
 
+@dataclass(frozen=True, eq=False)
+class _Cuts:
+    """Half-spaces ``direction . (lever @ Delta) <= bound``.
+
+    Attributes:
+        lever: influence of the components, shape (m, n_components).
+        direction: unit rows, shape (m, 3).
+        bound: shape (m,) [m].
+    """
+
+    lever: Array
+    direction: Array
+    bound: Array
+
+    @classmethod
+    def none(cls, n_components: int) -> _Cuts:
+        return cls(np.empty((0, n_components)), np.empty((0, 3)), np.empty(0))
+
+    def __add__(self, other: _Cuts) -> _Cuts:
+        pairs = ((self.lever, other.lever), (self.direction, other.direction), (self.bound, other.bound))
+        return _Cuts(*(np.concatenate(pair) for pair in pairs))
+
+
 def _longest_step(positions: Array) -> float:
     step = positions[1:] - positions[:-1]
     return float(np.sqrt(np.einsum("nd,nd->n", step, step).max()))
@@ -182,6 +206,18 @@ class LeastDetour:
         self.exact = exact
         self.movable = path.lever > (1e-3 if exact else NEGLIGIBLE_LEVER)
 
+    def _beyond_limits(self, positions: Array) -> _Cuts:
+        """Return half-spaces that hold for every path within the stated limits, and not for this one."""
+        nominal, basis = self.path.nominal.positions, self.path.basis
+        away, step = positions - nominal, np.diff(positions, axis=0)
+        far, long = np.linalg.norm(away, axis=1), np.linalg.norm(step, axis=1)
+        longest = MAX_STEP_RATIO * self._longest_step
+        j, k = np.flatnonzero(far > MAX_DISPLACEMENT), np.flatnonzero(long > longest)
+        direction = np.concatenate([away[j] / far[j, None], step[k] / long[k, None]])
+        nominal_step = np.einsum("kd,kd->k", np.diff(nominal, axis=0)[k], direction[len(j) :])
+        bound = np.concatenate([np.full(len(j), _WITHIN * MAX_DISPLACEMENT), _WITHIN * longest - nominal_step])
+        return _Cuts(np.concatenate([basis[j], basis[k + 1] - basis[k]]), direction, bound)
+
     def evaluate(self, displacement: Array, clearance: PathClearance) -> Detour:
         """Return what is proven of a displaced path, and whether it is within the stated limits."""
         bounds, close = clearance.certified(self.clearance)
@@ -210,13 +246,13 @@ class LeastDetour:
         moved = np.arange(self.path.n_components) if moved is None else moved
         scale = self._scale(moved, smoothness)
         best: Detour | None = None
-        here, held = start, ClosePoints.none()
+        here, held, cuts = start, ClosePoints.none(), _Cuts.none(self.path.n_components)
         missing, lowest, stalled = np.inf, -np.inf, 0
         for _ in range(_MAX_TRIES if len(moved) and self.allowed.dimension else 0):
             cost = np.inf
             displacement: Array | None = None
             for _ in range(_ROUNDS):
-                step = self._step(moved, scale, here, held)
+                step = self._step(moved, scale, here, held, cuts)
                 if step is None:
                     break
                 displacement, here, previous, cost = *step[:2], cost, step[2]
@@ -242,6 +278,8 @@ class LeastDetour:
             if stalled > _MAX_STALLED:
                 break
             held = held + detour.close
+            if detour.out_of_limits:
+                cuts = cuts + self._beyond_limits(here.positions)
         return best
 
     def smoothed(self, detour: Detour) -> tuple[Detour, float]:
@@ -286,7 +324,7 @@ class LeastDetour:
         return np.asarray(np.linalg.inv(lower).T)
 
     def _step(
-        self, moved: Index, scale: Array, here: PathClearance, held: ClosePoints
+        self, moved: Index, scale: Array, here: PathClearance, held: ClosePoints, cuts: _Cuts
     ) -> tuple[Array, PathClearance, float] | None:
         """Return the displacement of least cost under the tangents, its clearance and cost; None: no solution.
 
@@ -294,7 +332,7 @@ class LeastDetour:
         """
         answer = None
         for influence in (_INFLUENCE, np.inf):
-            solution = self._least(moved, scale, here, held, influence)
+            solution = self._least(moved, scale, here, held, cuts, influence)
             if solution is None:
                 return None
             displacement, cost = solution
@@ -305,7 +343,7 @@ class LeastDetour:
         return answer
 
     def _least(
-        self, moved: Index, scale: Array, here: PathClearance, held: ClosePoints, influence: float
+        self, moved: Index, scale: Array, here: PathClearance, held: ClosePoints, cuts: _Cuts, influence: float
     ) -> tuple[Array, float] | None:
         """Minimise the cost under the tangents along a path; None: no solution.
 
@@ -329,6 +367,9 @@ class LeastDetour:
         if len(self.allowed.one_sided):
             one_sided = np.kron(np.eye(len(moved)), -self.allowed.one_sided)
             rows, lower = np.concatenate([rows, one_sided]), np.append(lower, np.zeros(len(one_sided)))
+        if len(cuts.bound):
+            along = (cuts.lever[:, moved, None] * (cuts.direction @ self.allowed.axes)[:, None, :]).reshape(-1, size)
+            rows, lower = np.concatenate([rows, -along]), np.append(lower, -cuts.bound)
         rows, upper = rows @ scale, np.full(len(lower), UNBOUNDED)
         y = least_norm(rows, lower, upper)
         if y is None:
