@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from imitarm.benchmark.avoidance import learn
-from imitarm.benchmark.families import sparse_clutter
+from imitarm.benchmark.families import narrow_gap, sparse_clutter
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose, quaternion_exp, rotate
-from imitarm.policies import ADAPTERS, HORIZONTAL_ONLY, adapt
+from imitarm.policies import ADAPTERS, HORIZONTAL_ONLY, PathAdapter, adapt
 from imitarm.policies.baselines.potential_components import FORCES, component_distances, push_components
 from imitarm.policies.component_path import ComponentPath, quintic_step
 from imitarm.scene import Box, Scene, Sphere
@@ -209,7 +209,7 @@ def test_pushed_components_keep_forbidden_directions():
 
 
 def near_an_end(seed, path):
-    """An obstacle that leaves the start or the goal just clear, where the path can hardly move."""
+    """An obstacle just ahead of the start or the goal, which it leaves barely clear."""
     rng = np.random.default_rng([21, seed])
     end, inward = (path[0], path[45] - path[0]) if rng.random() < 0.5 else (path[-1], path[-45] - path[-1])
     direction = inward / np.linalg.norm(inward) + 0.1 * rng.normal(size=3)
@@ -218,34 +218,61 @@ def near_an_end(seed, path):
     return Scene(None, [Sphere(end + direction / np.linalg.norm(direction) * (radius + gap), radius)])
 
 
-def test_no_accepted_path_leads_absurdly_far_or_jumps(spatial):
-    """Next to a pinned end a tiny lift would take a huge displacement: that is a refusal, not a way round."""
+def test_next_to_an_end_a_path_is_found_within_the_stated_limits(spatial):
+    """No path leads absurdly far or jumps, although little can move next to a point that must not move."""
     skill, path = spatial
-    verdicts = []
     for seed in range(40):
         adaptation = adapt(skill, near_an_end(seed, path), tool_radius=0.03)
-        verdicts.append(adaptation.feasible)
-        if adaptation.feasible:
-            nominal, done = adaptation.nominal.positions, adaptation.trajectory.positions
-            steps = [np.linalg.norm(np.diff(p, axis=0), axis=1).max() for p in (done, nominal)]
-            assert np.linalg.norm(done - nominal, axis=1).max() <= 0.5
-            assert steps[0] <= 8.0 * steps[1]
-        else:
-            assert "sphere 1" in adaptation.reason and "move" in adaptation.reason
-    assert 0 < sum(verdicts) < 40  # both happen
+        assert adaptation.feasible, (seed, adaptation.reason)
+        nominal, done = adaptation.nominal.positions, adaptation.trajectory.positions
+        steps = [np.linalg.norm(np.diff(p, axis=0), axis=1).max() for p in (done, nominal)]
+        assert np.linalg.norm(done - nominal, axis=1).max() <= 0.5
+        assert steps[0] <= 8.0 * steps[1]
 
 
-def test_what_a_refusal_says_of_its_best_attempt_is_proven(spatial):
+def test_a_path_beyond_the_stated_limits_is_refused(spatial):
+    """A wall whose ends are farther away than the largest displacement."""
     skill, path = spatial
-    refused = 0
-    for seed in range(25):
-        scene = near_an_end(seed, path)
-        adaptation = adapt(skill, scene, tool_radius=0.03)
+    wall = Box(Pose(path[200], [1, 0, 0, 0]), [0.02, 1.2, 1.2], name="wall")
+    adaptation = adapt(skill, Scene(None, [wall]), tool_radius=0.03)
+    assert not adaptation.feasible and 'box "wall"' in adaptation.reason and "move" in adaptation.reason
+    smaller = Box(Pose(path[200], [1, 0, 0, 0]), [0.02, 0.7, 0.7])
+    assert adapt(skill, Scene(None, [smaller]), tool_radius=0.03).feasible
+
+
+def test_what_a_refusal_says_of_its_best_attempt_is_proven():
+    skill, path = learn(planar=True)
+    for seed in range(15):
+        case = narrow_gap(seed, path, solvable=False)
+        adaptation = adapt(skill, case.scene, tool_radius=0.03, forbidden=case.forbidden)
+        assert not adaptation.feasible
         times = np.linspace(0.0, skill.duration_, 4000)
-        dense = scene.clearance(adaptation.trajectory.at(times)[0]).min() - 0.03
+        dense = case.scene.clearance(adaptation.trajectory.at(times)[0]).min() - 0.03
         assert adaptation.certified_clearance <= dense + 1e-9
-        refused += not adaptation.feasible
-    assert refused > 0
+
+
+def test_an_adaptation_is_shown_in_a_line_and_in_a_table(spatial):
+    skill, path = spatial
+    shown = adapt(skill, Scene(None, [Sphere(path[200], 0.03)]), tool_radius=0.03)
+    assert "feasible, certified clearance 20." in repr(shown) and len(repr(shown)) < 160
+    assert "certified clearance" in shown._repr_html_() and "not planned" in shown._repr_html_()
+    refused = adapt(skill, Scene(None, [Sphere(path[0], 0.03, name="<jar>")]), tool_radius=0.03)
+    assert "not feasible" in repr(refused) and "<jar>" not in refused._repr_html_()
+    assert shown.joints is None
+
+
+def test_another_package_can_add_a_method(spatial, monkeypatch):
+    """One object: it moves nothing, so that its path is the nominal one."""
+
+    class Still(PathAdapter):
+        def detour(self, problem):
+            return problem.evaluated(np.zeros((problem.path.n_components, 3)))
+
+    monkeypatch.setitem(ADAPTERS._loaded, "still", Still())
+    skill, path = spatial
+    adaptation = adapt(skill, Scene(None, [Sphere(path[200], 0.03)]), "still", tool_radius=0.0)
+    assert not adaptation.moved.any() and not adaptation.feasible
+    assert "try method 'certified'" in adaptation.reason
 
 
 @pytest.mark.parametrize("n_samples", [10, 37, 200])
