@@ -73,7 +73,7 @@ def test_a_smooth_reference_is_followed_without_lag(arm):
     limiter.start(arm.home)
     t = np.arange(0.0, 6.0, DT)[:, None]
     q = arm.home + 0.2 * (1.0 - np.cos(1.5 * t))
-    v = 0.3 * np.sin(1.5 * t)
+    v = 0.3 * np.sin(1.5 * t) * np.ones(7)
     reached = np.array([limiter.follow(a, b) for a, b in zip(q, v, strict=True)])
     assert np.abs(reached - q)[100:].max() < 0.002
 
@@ -131,7 +131,7 @@ def test_joints_that_follow_do_not_feel_the_lead(arm):
         limiter.start(arm.home)
         joints = [arm.home] * 3
         for a, b in zip(q, v, strict=True):
-            joints.append(limiter.follow(a, b, joints[-3]))
+            joints.append(limiter.follow(a, np.broadcast_to(b, 7), joints[-3]))
         reached[max_lead] = np.array(joints)
     np.testing.assert_array_equal(reached[0.06], reached[np.inf])
 
