@@ -241,7 +241,7 @@ def test_the_clutch_by_options_and_by_answers(inside, monkeypatch, capsys):
     assert "'neither' is not a choice" in capsys.readouterr().err
     assert main(["calibrate", "clutch", "--scale", "1", "--anchor", "object"]) == 2
     assert main(["calibrate", "clutch", "--scale", "70", "--orientation", "hand"]) == 2
-    assert "scale must be between" in capsys.readouterr().err
+    assert "scale must be a finite number" in capsys.readouterr().err
 
 
 def test_each_step_adds_to_one_file(inside, capsys):

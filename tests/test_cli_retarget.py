@@ -215,7 +215,7 @@ def test_an_arm_that_is_never_seen_for_long_is_a_failure_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("words", "reported"),
     [
-        (["--scale", "-1"], "scale must be between"),
+        (["--scale", "-1"], "scale must be a finite number"),
         (["--pace", "2"], "must be a finite number of at least 0.05 and of at most 1"),
         (["--seconds", "0"], "--seconds must be above 0"),
         (["--trim", "50", "60"], "no frame between"),

@@ -114,7 +114,7 @@ def test_nobody_in_the_picture_is_a_failure(capfd):
         (["--calibration", "{}/person.csv"], 2, "person.csv"),
         (["--calibration", "{}/no.json"], 2, "no.json"),
         (["--robot", "tractor"], 2, "tractor"),
-        (["--scale", "0"], 2, "scale must be between"),
+        (["--scale", "0"], 2, "scale must be a finite number"),
     ],
 )
 def test_a_wrong_option_is_one_message(person, tmp_path, capsys, options, status, message):

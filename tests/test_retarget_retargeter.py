@@ -5,7 +5,7 @@ import pytest
 
 from imitarm import ArmModel
 from imitarm.errors import InputError
-from imitarm.retarget import RETARGETERS, Correspondence, ModernRetargeter, Retargeter
+from imitarm.retarget import RETARGETERS, Correspondence, LimbLengths, ModernRetargeter, Retargeter
 from imitarm.retarget.engagement import EngagementState
 from shown_arm import LENGTHS, shown, swing
 
@@ -113,12 +113,43 @@ def test_a_stopped_arm_that_is_moved_by_hand_stays_where_it_is_put_too(name):
         np.testing.assert_allclose(retargeter.step(None, moved), moved, atol=1e-12)
 
 
-def test_measured_positions_that_are_no_numbers_move_nothing():
-    retargeter = Damped(ARM, FIXED)
-    for bad in (np.nan, np.inf):
-        np.testing.assert_array_equal(retargeter.step(None, np.full(7, bad)), ARM.home)
-
-
 def test_a_control_period_out_of_range_is_refused():
-    with pytest.raises(InputError, match="Damped: dt must be between"):
+    with pytest.raises(InputError, match="Damped: dt must be a finite number"):
         Damped(ARM, dt=0.1)
+
+
+WRONG = [np.nan, np.inf, -1.0, "x", [1, 2], np.zeros(3), np.full(7, np.nan), object()]
+
+
+@pytest.mark.parametrize("value", WRONG, ids=repr)
+@pytest.mark.parametrize(
+    "call",
+    [
+        *(lambda v, name=name: Correspondence(**{name: v}) for name in ("side", "scale", "orientation", "lengths")),
+        lambda v: Correspondence(sensor_to_base=v),
+        *(lambda v, name=name: LimbLengths(0.3, 0.3, **{name: v}) for name in ("spread", "n_frames")),
+        *(
+            lambda v, name=name: ModernRetargeter(ARM, **{name: v})
+            for name in ("correspondence", "dt", "scene", "gain", "lead", "rotation_length", "elbow", "max_speed")
+        ),
+        ModernRetargeter,
+        *(
+            lambda v, name=name: RETARGETERS["thesis"](ARM, **{name: v})
+            for name in ("gain", "max_speed", "iterations", "lag", "as_printed", "smoothing", "small_angle")
+        ),
+        *(
+            lambda v, name=name: RETARGETERS["m1"](ARM, **{name: v})
+            for name in ("advice_time", "seed", "constraints", "velocity_scaling", "relative")
+        ),
+        lambda v: RETARGETERS["m3"](ARM, gain=v),
+        lambda v: Damped(ARM).start(v),
+        lambda v: Damped(ARM).step(v, ARM.home),
+        lambda v: Damped(ARM).step(None, v),
+        lambda v: Damped(ARM).run(v),
+    ],
+)
+def test_what_is_not_usable_is_refused(call, value):
+    if isinstance(value, list) and getattr(call, "__defaults__", None) == ("spread",):
+        pytest.skip("two numbers are a spread")
+    with pytest.raises(InputError):
+        call(value)

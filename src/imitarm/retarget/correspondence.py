@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.capture.skeleton import SIDES
-from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose, matrix_to_quaternion, quaternion_multiply
 from imitarm.retarget.limbs import LimbLengths
+from imitarm.validation import choice, finite_number, instance
 
 Array = NDArray[np.float64]
 Orientation = Literal["hand", "upright", "fixed"]
@@ -53,12 +53,13 @@ class Correspondence:
     orientation: Orientation = "hand"
 
     def __post_init__(self) -> None:
-        if self.side not in SIDES:
-            raise UnknownNameError.among("side", self.side, SIDES)
-        if self.orientation not in get_args(Orientation):
-            raise UnknownNameError.among("orientation", self.orientation, get_args(Orientation))
-        if not 0.05 <= self.scale <= 10.0:
-            raise InputError(f"Correspondence: scale must be between 0.05 and 10, got {self.scale!r}")
+        choice(self.side, SIDES, "side")
+        choice(self.orientation, get_args(Orientation), "orientation")
+        instance(self.sensor_to_base, Pose, "Correspondence: sensor_to_base")
+        if self.lengths is not None:
+            instance(self.lengths, LimbLengths, "Correspondence: lengths")
+        scale = finite_number(self.scale, "Correspondence: scale", at_least=0.05, at_most=10.0)
+        object.__setattr__(self, "scale", scale)
 
     def engage(self, wrist: ArrayLike, hand: Array, tool_to_base: Pose) -> Clutch:
         """Return the clutch that begins here.

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
+from imitarm.validation import finite_number, finite_vector, whole_number
 
 Array = NDArray[np.float64]
 
@@ -44,12 +45,17 @@ class LimbLengths:
 
     def __post_init__(self) -> None:
         low, high = _PLAUSIBLE
-        for what, length in (("upper_arm", self.upper_arm), ("forearm", self.forearm)):
+        for what, value in (("upper_arm", self.upper_arm), ("forearm", self.forearm)):
+            length = finite_number(value, f"LimbLengths: {what}", "m")
             if not low <= length <= high:
                 raise InputError(
                     f"LimbLengths: {what} must be between {low} and {high} m, got {length!r}; is the unit metres, and "
                     "is the arm in view?"
                 )
+        spread = finite_vector(self.spread, 2, "LimbLengths: spread", "m")
+        if (spread < 0.0).any():
+            raise InputError(f"LimbLengths: spread must not be negative [m], got {self.spread!r}")
+        whole_number(self.n_frames, "LimbLengths: n_frames", at_least=0)
 
     @property
     def standard_error(self) -> float:

@@ -25,6 +25,7 @@ from imitarm.retarget.jerk_limit import JerkLimiter
 from imitarm.retarget.retargeter import Goal, Retargeter
 from imitarm.scene import Scene
 from imitarm.scene.clearance_limit import ClearanceLimit
+from imitarm.validation import finite_number, finite_numbers
 
 Array = NDArray[np.float64]
 
@@ -111,22 +112,30 @@ class ModernRetargeter(Retargeter):
         max_speed: float = 1.5,
         max_lead: float = 0.06,
     ) -> None:
-        if not (0.0 < gain * dt <= 1.0 and 0.0 <= lead <= 1.0 and elbow >= 0.0 and max_speed > 0.0):
-            raise InputError(
-                f"ModernRetargeter: needs 0 < gain <= 1/dt = {1 / dt:g}, lead from 0 to 1, elbow >= 0, max_speed > 0"
-            )
-        self._gain, self._lead = gain, lead
+        super().__init__(arm, correspondence, dt=dt, scene=scene)
+        self._gain = finite_number(gain, "ModernRetargeter: gain", "1/s", above=0.0, at_most=1.0 / dt)
+        self._lead = finite_number(lead, "ModernRetargeter: lead", at_least=0.0, at_most=1.0)
+        finite_number(elbow, "ModernRetargeter: elbow", "m^2", at_least=0.0)
+        finite_number(max_speed, "ModernRetargeter: max_speed", "m/s", above=0.0)
+        if not (isinstance(max_lead, float) and max_lead == math.inf):
+            finite_number(max_lead, "ModernRetargeter: max_lead", "rad", above=0.0)
+        if own_clearance is not None:
+            finite_number(own_clearance, "ModernRetargeter: own_clearance", "m", at_least=0.0)
         self._obstacles = ClearanceLimit(arm, clearance)
         known = arm.landmarks is not None  # otherwise its elbow angle and its singularities are unknown
         if rotation_length is None:
-            rotation_length = _ROTATION_LENGTHS[(correspondence or Correspondence()).orientation]
+            rotation_length = _ROTATION_LENGTHS[self.correspondence.orientation]
+        lengths = finite_numbers(rotation_length, "ModernRetargeter: rotation_length", "m")
+        if len(lengths) not in {1, 3} or not (lengths > 0.0).all():
+            raise InputError(
+                f"ModernRetargeter: rotation_length must be one or three lengths > 0, got {rotation_length!r}"
+            )
         limits = [JointLimits(arm), *(singularity_limits(arm) if known else ())]
         self._solver = IKSolver(arm, limits, dt=dt)
         self._rotation_length, self._max_speed = rotation_length, max_speed
         self._elbow = elbow if known else 0.0
         self._own = None if own_clearance is None else SelfClearance(arm, own_clearance).periodic(dt)
         self._limiter = JerkLimiter(arm, dt, max_lead=max_lead)
-        super().__init__(arm, correspondence, dt=dt, scene=scene)
 
     def _begin(self) -> None:
         if self._own is not None:

@@ -20,6 +20,7 @@ from imitarm.retarget.correspondence import Clutch, Correspondence
 from imitarm.retarget.engagement import Engagement, EngagementRule, EngagementState, engaged_samples
 from imitarm.scene import Scene
 from imitarm.trajectory import Demonstration, Trajectory
+from imitarm.validation import finite_number, finite_vector, instance
 
 Array = NDArray[np.float64]
 
@@ -101,6 +102,7 @@ class Retargeter(ABC):
         caption: one sentence about the method for reports.
         rule: times after which the robot follows, coasts, holds and stops.
         arm: the robot's arm with its tool.
+        n_joints: number of its joints.
         correspondence: between the person's arm and the robot's.
         dt: control period [s].
         scene: obstacles; only some methods avoid them.
@@ -113,7 +115,7 @@ class Retargeter(ABC):
         scene: obstacles; None: none.
 
     Raises:
-        InputError: when ``dt`` is out of range.
+        InputError: when an argument has the wrong type, or ``dt`` is out of range.
     """
 
     name: ClassVar[str] = ""
@@ -136,12 +138,13 @@ class Retargeter(ABC):
         dt: float = 0.01,
         scene: Scene | None = None,
     ) -> None:
-        if not 0.0005 <= dt <= 0.05:
-            raise InputError(f"{type(self).__name__}: dt must be between 0.0005 and 0.05 s, got {dt!r}")
-        self.arm = arm
-        self.correspondence = Correspondence() if correspondence is None else correspondence
-        self.dt = dt
-        self.scene = Scene() if scene is None else scene
+        me = type(self).__name__
+        self.arm = instance(arm, ArmModel, f"{me}: arm")
+        chosen = Correspondence() if correspondence is None else correspondence
+        self.correspondence = instance(chosen, Correspondence, f"{me}: correspondence")
+        self.dt = finite_number(dt, f"{me}: dt", "s", at_least=0.0005, at_most=0.05)
+        self.scene = instance(Scene() if scene is None else scene, Scene, f"{me}: scene")
+        self.n_joints = arm.n_joints
         self.latest = RetargetStep(0.0, np.array(arm.home), np.zeros(arm.n_joints))
         self._engagement = Engagement(self.correspondence, self.rule)
         self._estimator: ArmEstimator  # made by start
@@ -154,7 +157,7 @@ class Retargeter(ABC):
         Raises:
             InputError: when ``q`` has the wrong shape or is beyond the joint limits.
         """
-        posture = np.array(q, dtype=float)
+        posture = finite_vector(q, self.arm.n_joints, "q", "rad").copy()
         self.arm.check_limits(posture)
         self.latest = RetargetStep(0.0, posture, np.zeros(self.arm.n_joints))
         self._engagement.reset()
@@ -173,10 +176,16 @@ class Retargeter(ABC):
 
         Returns:
             The joint positions to reach by the end of the period, shape (n_joints,) [rad]; also in :attr:`latest`.
+
+        Raises:
+            InputError: when ``q`` is not ``n_joints`` finite numbers, or ``skeleton`` is not a skeleton.
         """
         if not self._started:
             self.start(self.arm.home)
-        measured, engagement, dt = np.asarray(q, dtype=float), self._engagement, self.dt
+        measured = finite_vector(q, self.n_joints, "q", "rad")
+        if skeleton is not None:
+            instance(skeleton, Skeleton, "skeleton")
+        engagement, dt = self._engagement, self.dt
         fresh = self._see(skeleton)
         if fresh is not None:
             self._estimate = fresh
@@ -270,7 +279,7 @@ class Retargeter(ABC):
 
     def _start_where_pushed(self, measured: Array) -> None:
         """Rest where the arm is when somebody has moved it by hand while nobody led it."""
-        if PUSHED < float(np.abs(measured - self.latest.q).max()) < np.inf:
+        if float(np.abs(measured - self.latest.q).max()) > PUSHED:
             q = np.clip(measured, self.arm.lower, self.arm.upper)
             self.latest = RetargetStep(self.latest.time, q, np.zeros(self.arm.n_joints), state=self.latest.state)
             self._rest_at(q)
@@ -366,9 +375,11 @@ def in_order(skeletons: Iterable[Skeleton]) -> list[Skeleton]:
     """Return a recording as a list.
 
     Raises:
-        InputError: when there are fewer than two skeletons, or a time is not later than the one before.
+        InputError: when there are fewer than two skeletons, one is not a skeleton, or times do not increase.
     """
-    frames = list(skeletons)
+    if not isinstance(skeletons, Iterable):
+        raise InputError(f"retarget: needs a sequence of skeletons, got {type(skeletons).__name__}")
+    frames = [instance(frame, Skeleton, "retarget: each frame") for frame in skeletons]
     if len(frames) < 2:
         raise InputError(f"retarget: needs at least 2 skeletons, got {len(frames)}; is the person in the picture?")
     for i, (before, after) in enumerate(pairwise(frames)):

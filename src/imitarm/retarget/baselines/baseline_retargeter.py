@@ -16,6 +16,7 @@ from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.engagement import EngagementState
 from imitarm.retarget.retargeter import Goal, Retargeter
 from imitarm.scene import Scene
+from imitarm.validation import flag
 
 Array = NDArray[np.float64]
 
@@ -55,7 +56,7 @@ class BaselineRetargeter(Retargeter):
         velocity_scaling: bool = False,
     ) -> None:
         super().__init__(arm, correspondence, dt=dt, scene=scene)
-        self.velocity_scaling = velocity_scaling
+        self.velocity_scaling = flag(velocity_scaling, f"{type(self).__name__}: velocity_scaling")
         self.counts: Counter[str] = Counter()
         self._period, self._led = FRAME_PERIOD, False
 

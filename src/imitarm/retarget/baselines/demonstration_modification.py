@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.capture.skeleton import Skeleton
-from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.retarget.baselines.baseline_retargeter import BaselineRetargeter
 from imitarm.retarget.baselines.demonstrated_motion import DemonstratedMotion, engagements
@@ -21,6 +20,7 @@ from imitarm.retarget.correspondence import Clutch, Correspondence
 from imitarm.retarget.engagement import EngagementState
 from imitarm.retarget.retargeter import Goal, Retargeting, RetargetStep, in_order
 from imitarm.scene import Scene
+from imitarm.validation import finite_number, whole_number
 
 Array = NDArray[np.float64]
 
@@ -94,12 +94,11 @@ class DemonstrationModification(BaselineRetargeter):
         advice_time: float = ADVICE_TIME,
         seed: int = 0,
     ) -> None:
-        if not 0.0 <= advice_time < np.inf:
-            raise InputError(f"DemonstrationModification: advice_time must not be negative [s], got {advice_time!r}")
         super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
         self._mapping = JointMapping(arm, relative=relative)
         self.check = FeasibilityCheck(arm, dt, constraints)
-        self._advice_time, self._seed = advice_time, seed
+        self._advice_time = finite_number(advice_time, "DemonstrationModification: advice_time", "s", at_least=0.0)
+        self._seed = whole_number(seed, "DemonstrationModification: seed", at_least=0)
         self._shown_times = np.empty(0)
 
     def _rest_at(self, q: Array) -> None:

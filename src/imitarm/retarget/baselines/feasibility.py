@@ -65,7 +65,9 @@ class FeasibilityCheck:
 
     def __init__(self, arm: ArmModel, dt: float, constraints: Mapping[str, Constraint] | None = None) -> None:
         self.arm, self.dt = arm, dt
-        self.constraints = {} if constraints is None else dict(constraints)
+        if constraints is not None and not isinstance(constraints, Mapping):
+            raise InputError(f"FeasibilityCheck: constraints must be conditions by name, got {constraints!r}")
+        self.constraints = dict(constraints or {})
         taken = sorted({"limits", "speed", "singular", "stretched"} & set(self.constraints))
         if taken:
             raise InputError(

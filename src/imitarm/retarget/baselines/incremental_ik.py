@@ -7,13 +7,13 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
 from imitarm.retarget.baselines.baseline_retargeter import BaselineRetargeter
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.retargeter import Goal
 from imitarm.scene import Scene
+from imitarm.validation import finite_number
 
 Array = NDArray[np.float64]
 
@@ -64,10 +64,8 @@ class IncrementalIK(BaselineRetargeter):
         velocity_scaling: bool = False,
         gain: float = 0.5,
     ) -> None:
-        if not 0.0 < gain <= 1.0:
-            raise InputError(f"IncrementalIK: gain must be above 0 and at most 1, got {gain!r}")
-        self._gain = gain
         super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
+        self._gain = finite_number(gain, "IncrementalIK: gain", above=0.0, at_most=1.0)
 
     def _rest_at(self, q: Array) -> None:
         self._last_target: Pose | None = None

@@ -12,6 +12,7 @@ from imitarm.retarget.arm_estimator import ArmEstimate
 from imitarm.retarget.correspondence import Clutch
 from imitarm.retarget.human_arm import AXES, human_arm_angles, human_arm_pose
 from imitarm.retarget.limbs import LimbLengths
+from imitarm.validation import flag
 
 Array = NDArray[np.float64]
 
@@ -53,7 +54,7 @@ class JointMapping:
     """
 
     def __init__(self, arm: ArmModel, *, relative: bool) -> None:
-        self.arm, self.relative = arm, relative
+        self.arm, self.relative = arm, flag(relative, "JointMapping: relative")
         self.zero, self.sense = _chain_of(arm)
         stretched = arm.tool_pose(self.zero).rotation
         self._tool_to_hand = stretched.T  # chain(theta) = R_tool(q) R_tool(q*)^T

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.capture.skeleton import Skeleton
-from imitarm.errors import InputError, UnknownNameError
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import (
@@ -31,6 +31,7 @@ from imitarm.retarget.limbs import LimbLengths, correct_limbs
 from imitarm.retarget.retargeter import Goal, Retargeter, Retargeting, in_order
 from imitarm.retarget.smoothing import GAP
 from imitarm.scene import Scene
+from imitarm.validation import choice, finite_number, whole_number
 
 Array = NDArray[np.float64]
 
@@ -223,21 +224,20 @@ class ThesisRetargeter(Retargeter):
         max_speed: float = 1.0,
     ) -> None:
         faults = _faults(as_printed)
-        if smoothing is not None and smoothing not in get_args(Curve):
-            raise UnknownNameError.among("smoothing", smoothing, get_args(Curve))
-        if small_angle not in {None, "thesis"}:
-            raise UnknownNameError.among("small_angle", str(small_angle), ("thesis",))
-        if not (0.0 < gain * dt <= 1.0 and max_speed > 0.0 and 1 <= iterations <= 10 and 0.0 <= lag <= 0.3):
-            raise InputError(
-                "ThesisRetargeter: needs 0 < gain <= 1/dt, max_speed > 0, iterations 1 to 10 and lag 0 to 0.3 s; got "
-                f"{gain!r}, {max_speed!r}, {iterations!r}, {lag!r}"
-            )
+        super().__init__(arm, correspondence, dt=dt, scene=scene)
+        if smoothing is not None:
+            choice(smoothing, get_args(Curve), "smoothing")
+        if small_angle is not None:
+            choice(small_angle, ("thesis",), "small_angle")
+        finite_number(gain, "ThesisRetargeter: gain", "1/s", above=0.0, at_most=1.0 / dt)
+        finite_number(max_speed, "ThesisRetargeter: max_speed", "m/s", above=0.0)
+        whole_number(iterations, "ThesisRetargeter: iterations", at_least=1, at_most=10)
+        finite_number(lag, "ThesisRetargeter: lag", "s", at_least=0.0, at_most=0.3)
         self.faults = faults
         self._small_angle = "thesis" if "small_angle" in faults else small_angle
         self._smoothing, self._lag, self._iterations = smoothing, lag, iterations
         self._gain, self._max_speed = gain, _UNLIMITED if "damping" in faults else max_speed
         self._whole: HandCurve | None = None
-        super().__init__(arm, correspondence, dt=dt, scene=scene)
 
     def _begin(self) -> None:
         self._tracker = HumanArmTracker(self._iterations, self.faults)
@@ -313,8 +313,7 @@ class ThesisRetargeter(Retargeter):
 def _faults(as_printed: bool | Collection[str]) -> frozenset[str]:
     if isinstance(as_printed, bool):
         return frozenset(PRINTED if as_printed else ())
+    if not isinstance(as_printed, str | Collection):
+        raise InputError(f"ThesisRetargeter: as_printed must be True, False or names of misprints, got {as_printed!r}")
     names = [as_printed] if isinstance(as_printed, str) else list(as_printed)
-    for name in names:
-        if name not in PRINTED:
-            raise UnknownNameError.among("as_printed", name, PRINTED)
-    return frozenset(names)
+    return frozenset(choice(name, PRINTED, "as_printed") for name in names)
