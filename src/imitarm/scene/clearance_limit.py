@@ -95,6 +95,11 @@ class ClearanceLimit:
             lower += np.einsum("ij,ij->j", velocity, normal)
         matrix = self._cover.speeds(data, sphere, points, normal)
         if lower.max() > 0.0:  # a link that no joint moves away, such as one that turns in place above a table
-            moved = (np.abs(matrix).max(axis=1) > _UNMOVED) | (lower <= 0.0)
-            matrix, lower = matrix[moved], lower[moved]
+            pressed = (lower > 0.0).nonzero()[0]
+            own = matrix.take(pressed, axis=0)
+            stuck = pressed[np.einsum("ij,ij->i", own, own) <= _UNMOVED**2]
+            if len(stuck):
+                kept = np.ones(len(lower), dtype=bool)
+                kept[stuck] = False
+                matrix, lower = matrix[kept], lower[kept]
         return Rows(matrix, lower)

@@ -57,9 +57,10 @@ class _Frames(NamedTuple):
     """The own frames of obstacles, family by family, in the order of ``PackedObstacles._sorted``."""
 
     to_own: Array  # rotation of base vectors into each own frame, shape (n, 3, 3)
-    rows: Array  # the same, stacked for one product with many points: axis first, shape (3 n, 3)
+    rows: Array  # the same, axis first, for one product with many points, shape (3 n, 3)
     center: Array  # of each obstacle, in its own rotation, shape (3, n, 1) [m]
     velocity: Array  # of each obstacle, in its own rotation, shape (3, n, 1) [m/s]
+    upright: bool  # whether no own frame is rotated
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +206,8 @@ class PackedObstacles:
         rows = np.ascontiguousarray(to_own.transpose(1, 0, 2)).reshape(-1, 3)
         center, velocity = (np.einsum("nij,nj->in", to_own, v[order]) for v in (self.positions, self.velocities))
         center[2, self.kinds[order] == KINDS.index("half_space")] -= DEPTH
-        return _Frames(to_own, rows, center[..., None], velocity[..., None])
+        upright = not self.quaternions[:, 1:].any()
+        return _Frames(to_own, rows, center[..., None], velocity[..., None], upright)
 
     @cached_property
     def _kept(self) -> list[tuple[Array, Array]]:
@@ -221,19 +223,12 @@ class PackedObstacles:
 
 
 class Single(NamedTuple):
-    """One obstacle, ready for distances.
-
-    Attributes:
-        formula: of its family.
-        to_own: rotation of base vectors into the own frame, shape (3, 3); None when there is none.
-        center: of the obstacle, in its own rotation, shape (3, 1) [m].
-        parameters: of the formula.
-    """
+    """One obstacle, ready for distances."""
 
     formula: Formula
-    to_own: Array | None
-    center: Array
-    parameters: list[Array | None]
+    to_own: Array | None  # rotation of base vectors into the own frame, shape (3, 3); None when there is none
+    center: Array  # of the obstacle, in its own rotation, shape (3, 1) [m]
+    parameters: list[Array | None]  # of the formula
 
     @classmethod
     def of(cls, solid: Solid) -> Single:
@@ -350,8 +345,11 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
         reach: of each point, shape (m,) [m]; the same array in every call saves time.
     """
     frames, m = packed._frames, len(points)
-    every = np.dot(frames.rows, points.T).reshape(3, -1, m)
-    every -= frames.center
+    if frames.upright:
+        every = np.subtract(points.T[:, None], frames.center, order="C")
+    else:
+        every = np.dot(frames.rows, points.T).reshape(3, -1, m)
+        every -= frames.center
     flat = (np.add.reduce(every * every, axis=0) <= packed._limits(reach)).ravel().nonzero()[0]
     if not len(flat):
         return None
@@ -375,8 +373,9 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
     if len(near) < len(flat):
         place, point, distance = place.take(near), point.take(near), distance.take(near)
         normal = normal.take(near, axis=1)
-    base = np.einsum("jk,kji->ik", normal, frames.to_own.take(place, axis=0))
-    return NearPairs(packed._sorted[0][place], point, distance, base)
+    if not frames.upright:
+        normal = np.einsum("jk,kji->ik", normal, frames.to_own.take(place, axis=0))
+    return NearPairs(packed._sorted[0][place], point, distance, normal)
 
 
 def _evaluate(
