@@ -240,6 +240,8 @@ class GMR:
         order = np.argsort(means[:, 0], kind="stable")
         self.weights_, self.means_, self.covariances_ = weights[order], means[order], covariances[order]
         self.n_components_ = len(order)
+        variances = self.covariances_[:, 0, 0]
+        self._curvature, self._log_peak = -0.5 / variances, np.log(self.weights_) - 0.5 * np.log(variances)
         # m_k is linear and m_k m_k^T quadratic in u_k = t - mu_k^t, so both sums over the components are products of
         # [h, h u, h u^2] with a table. Positions relative to the centre of the motion avoid cancellation.
         self._center = self.weights_ @ self.means_[:, 1:]
@@ -290,8 +292,7 @@ class GMR:
 
     def _responsibilities(self, u: Array) -> Array:
         """Return h (n, K) for u (n, K), the times relative to the components' mean times."""
-        variances = self.covariances_[:, 0, 0]
-        h = u * u * (-0.5 / variances) + (np.log(self.weights_) - 0.5 * np.log(variances))
+        h = u * u * self._curvature + self._log_peak
         np.exp(h - h.max(axis=1, keepdims=True), out=h)
         return np.asarray(h / h.sum(axis=1, keepdims=True))
 
