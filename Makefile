@@ -34,7 +34,7 @@ floors: $(VENV)/.dev  ## no import goes up
 	$(BIN)/lint-imports
 
 unit: $(VENV)/.dev $(MEDIAPIPE)  ## the tests
-	$(BIN)/pytest -n $(JOBS)
+	$(BIN)/pytest -n $(JOBS) --dist loadgroup
 
 quick: $(VENV)/.dev  ## the tests that your changes touch, the nearest first, in under a minute
 	$(BIN)/python tests/quick.py

@@ -6,11 +6,14 @@ import math
 import os
 import stat
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from imitarm.capture.mediapipe import FIELD_OF_VIEW, N_LANDMARKS, PoseLandmarks
+from imitarm.capture.recording import SkeletonRecording
+from imitarm.capture.sources import open_source
 
 VIDEOS = Path(__file__).resolve().parents[1] / ".cache" / "pose2sim"
 SIZE = (1280, 720)
@@ -82,3 +85,10 @@ def alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+@cache
+def video_recording(view):
+    """The recording that MediaPipe makes of one of the videos; the tests that share it are in the group "video"."""
+    with open_source(f"video:{VIDEOS / f'cam0{view}.mp4'}") as source:
+        return SkeletonRecording(list(source), name=source.name)

@@ -20,7 +20,9 @@ from imitarm.capture.skeleton import SIDES
 from imitarm.capture.sources import open_source
 from imitarm.cli import main
 from imitarm.errors import InputError
-from mediapipe_samples import VIDEOS
+from mediapipe_samples import VIDEOS, video_recording
+
+pytestmark = pytest.mark.xdist_group("video")  # one process sees each video once, for all tests
 
 VIEWS = (1, 2, 3, 4)
 FACING = {1: 1.0, 2: 1.0, 3: -1.0, 4: -1.0}  # sign of right minus left shoulder along x
@@ -42,16 +44,9 @@ def available():
 
 
 @cache
-def seen(view: int) -> SkeletonRecording:
-    """What MediaPipe makes of a view."""
-    with open_source(f"video:{VIDEOS / f'cam0{view}.mp4'}") as source:
-        return SkeletonRecording(list(source), name=source.name)
-
-
-@cache
 def kept_apart(view: int) -> SkeletonRecording:
     """The same with left and right kept apart."""
-    return guarded(seen(view))
+    return guarded(video_recording(view))
 
 
 def points(recording, *names):
@@ -65,7 +60,7 @@ def times(recording):
 @pytest.mark.slow
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_real_person_is_seen_in_nearly_every_picture_at_the_videos_times(view):
-    recording = seen(view)
+    recording = video_recording(view)
     assert len(recording) >= 97
     steps = np.diff(times(recording)) * 60.0  # 60 pictures a second
     assert steps.min() > 0.99 and np.allclose(steps, np.round(steps), atol=1e-3)
@@ -77,7 +72,7 @@ def test_a_real_person_is_seen_in_nearly_every_picture_at_the_videos_times(view)
 @pytest.mark.slow
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_real_person_has_a_persons_size_and_stands_in_the_room(view):
-    recording = seen(view)
+    recording = video_recording(view)
     for side in SIDES:
         for name in ("upper arm", "forearm"):
             length, spread = bone(recording, side, name)
@@ -93,7 +88,7 @@ def test_a_real_person_has_a_persons_size_and_stands_in_the_room(view):
 def test_left_and_right_are_the_persons_own(view):
     left, right = np.moveaxis(points(kept_apart(view), "shoulder_left", "shoulder_right"), 1, 0)
     assert np.mean(FACING[view] * (right - left)[:, 0] > 0.0) > 0.9
-    left, right = np.moveaxis(points(seen(view), "shoulder_left", "shoulder_right"), 1, 0)
+    left, right = np.moveaxis(points(video_recording(view), "shoulder_left", "shoulder_right"), 1, 0)
     share = np.mean(FACING[view] * (right - left)[:, 0] > 0.0)
     assert share > 0.95 if view != 2 else 0.5 < share < 0.9  # there MediaPipe takes one for the other for half a second
 
@@ -122,7 +117,7 @@ def test_capture_records_and_checks_a_real_video(tmp_path, capsys):
     assert main(["capture", f"video:{VIDEOS / 'cam01.mp4'}", "--check", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
     assert "60.0 frames a second" in shown and "0 errors" in shown
-    assert len(read_recording(out)) == len(seen(1))
+    assert len(read_recording(out)) == len(video_recording(1))
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ Limits are measured here, from the joint positions alone, in every control perio
 from __future__ import annotations
 
 import os
-from functools import cache
 
 import numpy as np
 import pytest
@@ -15,13 +14,13 @@ from imitarm import ArmModel, SimulatedRobot
 from imitarm.capture.checks import repaired
 from imitarm.capture.mediapipe_environment import find_python
 from imitarm.capture.recording import read_recording, slowed
-from imitarm.capture.sources import followed, open_source
+from imitarm.capture.sources import followed
 from imitarm.errors import InputError
 from imitarm.evaluation.tracking import seen_arm
 from imitarm.retarget import Correspondence, ModernRetargeter
 from imitarm.retarget.engagement import SEEN_FOR
 from imitarm.retarget.fitting import fit_motion
-from mediapipe_samples import VIDEOS
+from mediapipe_samples import VIDEOS, video_recording
 
 DT = 0.01
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
@@ -123,10 +122,11 @@ def test_a_simulated_arm_with_its_drives_follows(real_data, arm, name, pace):
     assert (np.mean(np.abs(torques), axis=0) < 0.6 * arm.max_torque).all()  # not at the rated torque all the time
 
 
-@cache
 def man_in_the_film(view):
     """The man of the pose2sim videos, as MediaPipe sees him from one side, left and right kept apart."""
-    with followed(open_source(f"video:{VIDEOS / f'cam0{view}.mp4'}")) as one:
+    recording = video_recording(view)
+    recording.rewind()
+    with followed(recording) as one:
         return list(one)
 
 
@@ -146,6 +146,7 @@ def film():
 
 
 @pytest.mark.slow
+@pytest.mark.xdist_group("video")
 @each_arm
 @pytest.mark.parametrize("view", [1, 2, 3, 4])
 def test_a_man_in_a_film_breaks_no_limit_either(film, arm, view):

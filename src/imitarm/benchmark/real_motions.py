@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imitarm.benchmark.tables import Table
 from imitarm.capture.checks import repaired
@@ -87,35 +88,54 @@ def tables(motions: Sequence[Motion]) -> list[Table]:
     Args:
         motions: at least one.
     """
-    modern = [
-        (motion.name, arm, f"{speed:g}", *_row(motion, arm, speed, "modern"))
-        for motion in motions
-        for arm in _ARMS
-        for speed in SPEEDS
-    ]
+    arms = {name: ArmModel.load(name, tool="gripper") for name in _ARMS}
+    modern, starts = [], {}
+    for motion in motions:
+        for arm in _ARMS:
+            for speed in SPEEDS:
+                start = starts[motion.name, arm, speed] = _start(motion, arms[arm], speed)
+                modern.append((motion.name, arm, f"{speed:g}", *_row(start, "modern")))
     first, speed = motions[0], SPEEDS[-1]
-    every = [(arm, method, *_row(first, arm, speed, method)) for arm in _ARMS for method in RETARGETERS]
+    every = [(arm, name, *_row(starts[first.name, arm, speed], name)) for arm in _ARMS for name in RETARGETERS]
     return [
         Table("modern on every motion", ("motion", "arm", "playback speed>", *_COLUMNS), tuple(modern)),
         Table(f"All methods on {first.name!r} at playback speed {speed:g}", ("arm", "method", *_COLUMNS), tuple(every)),
     ]
 
 
-def _row(motion: Motion, robot: str, speed: float, method: str) -> list[str]:
-    """Return the cells of one motion by one method on one arm, which starts where all of the motion is within reach."""
-    arm = ArmModel.load(robot, tool="gripper")
+class Start(NamedTuple):
+    """How an arm starts to follow a motion: where all of it is within reach.
+
+    The fields are the arm, the skeletons at the playback speed, the correspondence, the first posture (n_joints,)
+    [rad], and the largest speed of the target [m/s].
+    """
+
+    arm: ArmModel
+    skeletons: list[Skeleton]
+    follow: Correspondence
+    q: NDArray[np.float64]
+    target_speed: float
+
+
+def _start(motion: Motion, arm: ArmModel, speed: float) -> Start:
     skeletons = slowed(motion.skeletons, speed)
     follow = Correspondence(motion.side, orientation="fixed")
     wrist = seen_arm(skeletons, np.arange(SEEN_FOR, skeletons[-1].time - skeletons[0].time, _PERIOD), follow).wrist
     fit = fit_motion(arm, wrist, wrist[0])
     follow = replace(follow, scale=fit.scale)
-    gone = np.linalg.norm(wrist[_STRIDE:] - wrist[:-_STRIDE], axis=1) / (_STRIDE * _PERIOD)
-    run = RETARGETERS[method](arm, follow, dt=_PERIOD).run(skeletons, fit.q)
+    speeds = np.linalg.norm(wrist[_STRIDE:] - wrist[:-_STRIDE], axis=1) / (_STRIDE * _PERIOD)
+    return Start(arm, skeletons, follow, fit.q, fit.scale * float(speeds.max()))
+
+
+def _row(start: Start, method: str) -> list[str]:
+    """Return the cells of one motion by one method on one arm."""
+    arm, follow = start.arm, start.follow
+    run = RETARGETERS[method](arm, follow, dt=_PERIOD).run(start.skeletons, start.q)
     m, execution, links = measure(run, follow), execute_on_robot(run), SelfClearance(arm)
     lag = 1e3 * target_lag(run.times, arm.tool_path(run.joints)[0], run.targets[0])
     return [
-        f"{fit.scale:.2f}",
-        f"{fit.scale * float(gone.max()):.1f}",
+        f"{follow.scale:.2f}",
+        f"{start.target_speed:.1f}",
         f"{100 * m.following_fraction:.0f}",
         f"{1e3 * m.target_rms:.0f}",
         f"{lag:.0f}" if np.isfinite(lag) else "–",

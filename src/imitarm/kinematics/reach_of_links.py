@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from functools import lru_cache
 
 import mujoco
@@ -14,6 +15,10 @@ from imitarm.kinematics.spheres import COLLISION_GROUP
 
 _FEW = 3  # links with more joints between them are assumed to meet: there are too many postures to try
 _POSTURES = 512  # tried for each pair of links
+
+
+_known: dict[bytes, NDArray[np.bool_]] = {}  # by the content of the model: an arm that is loaded again is the same
+_MOST_KNOWN = 64
 
 
 @lru_cache(maxsize=16)
@@ -31,9 +36,20 @@ def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
     Returns:
         shape (n_joints + 1, n_joints + 1); entry [outer, inner] for outer > inner, False elsewhere; read-only.
     """
+    model = arm.spec().compile()
+    content = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    key = hashlib.sha256(content.tobytes() + arm.home.tobytes() + repr(arm.joint_names).encode()).digest()
+    if key not in _known:
+        while len(_known) >= _MOST_KNOWN:
+            _known.pop(next(iter(_known)))
+        _known[key] = _measured(arm, model)
+    return _known[key]
+
+
+def _measured(arm: ArmModel, model: mujoco.MjModel) -> NDArray[np.bool_]:
     n = arm.n_joints
     meet = np.tril(np.ones((n + 1, n + 1), dtype=bool), -2)
-    model = arm.spec().compile()
     data, shapes = mujoco.MjData(model), _shapes(arm, model)
     for outer in range(2, n + 1):
         for inner in range(max(outer - _FEW, 0), outer - 1):
