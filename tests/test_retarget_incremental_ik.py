@@ -64,7 +64,7 @@ def edge_run(**options):
 
 
 def test_at_the_edge_of_reach_it_explodes_and_only_the_caps_hold_it():
-    """The failure that METHODS A.9 measured: nothing damps the inverse, so joints are at their caps again and again."""
+    """Nothing damps the inverse, so joints are at their caps again and again."""
     arm, run = ARMS["sawyer"], edge_run()
     inside = IncrementalIK(arm, Correspondence(lengths=LENGTHS, orientation="fixed")).run(shown(swing(0, 0.5), 6.0))
     assert run.notes["capped_steps"] > 100

@@ -49,7 +49,7 @@ def test_a_steady_motion_is_not_slowed_down_by_any_smoothing():
     line = np.outer(t, [0.5, -0.2, 0.1]) + [1.0, 2.0, 3.0]
     np.testing.assert_allclose(fit_nurbs(t, line, smoothing=100.0).evaluate(t), line, atol=1e-8)
     even = bends(np.arange(20.0), 3)
-    np.testing.assert_allclose(even, np.tile([1.0, -2.0, 1.0], (len(even), 1)))  # METHODS A.6 where knots are even
+    np.testing.assert_allclose(even, np.tile([1.0, -2.0, 1.0], (len(even), 1)))  # where knots are uniform
 
 
 def test_every_span_of_averaged_knots_holds_samples():

@@ -41,7 +41,7 @@ def test_it_does_not_matter_what_the_rotations_are_seen_from():
 
 
 def test_angles_of_roll_pitch_and_yaw_could_not_be_smoothed():
-    """At a pitch of a quarter turn they jump where the rotation does not move (METHODS A.3 and A.6)."""
+    """At a pitch of a quarter turn they jump where the rotation does not move."""
     truth = turning(90.0)
     angles = Rotation.from_quat(truth, scalar_first=True).as_euler("xyz")
     steps = away(truth[1:], truth[:-1]).max()

@@ -91,7 +91,7 @@ def test_pulling_in_clears_a_stretched_arm():
     kappa = pull(motion.points, joints)
     np.testing.assert_allclose(kappa[joints[:, 3] > 0.46], 1.0)
     reach = np.linalg.norm(motion.points[:, 2] - motion.points[:, 0], axis=1) / LENGTHS.reach
-    np.testing.assert_allclose((kappa * reach)[joints[:, 3] < 0.44], 0.975, atol=2e-3)  # METHODS: 0.78 of 0.80
+    np.testing.assert_allclose((kappa * reach)[joints[:, 3] < 0.44], 0.975, atol=2e-3)  # 0.78 of 0.80
     points = pulled_in(motion.points, kappa)
     mapping.resume(joints[0])
     changed = DemonstratedMotion(motion.shown_times, points, motion.hands, motion.shown, motion.closed, joints)

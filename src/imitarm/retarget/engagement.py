@@ -38,7 +38,7 @@ class EngagementState(StrEnum):
 
     @property
     def engaged(self) -> bool:
-        """Whether the person leads the tool, or is expected back within a moment."""
+        """Whether the person leads the tool, or was lost only a short time ago."""
         return self in _ENGAGED
 
 
