@@ -193,7 +193,8 @@ NAMES = sorted(name for name in imitarm.__all__ if name not in UNCALLED and not 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.filterwarnings("ignore")
-def test_an_argument_that_can_not_be_used_is_refused_or_the_answer_is_finite(calls, name):
+def test_an_argument_that_can_not_be_used_is_refused_or_the_answer_is_finite(calls, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # some names are those of files that can be written
     function, arguments = calls[name]
     faults = []
     for argument in arguments:
