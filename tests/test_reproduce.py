@@ -163,6 +163,13 @@ def test_a_motion_nearer_than_the_filter_requires_is_no_success():
     assert rollout.reason.startswith("clearance fell to")
 
 
+def test_an_arm_that_starts_in_contact_is_refused_before_it_moves():
+    robot = robot_with(wall(-0.1))
+    with pytest.raises(InfeasibleError, match=r'starts in contact .*box "wall"'):
+        reproduce(Glide([0, 0, 0]), robot, lambda t: robot.scene)
+    assert robot.time == 0.0
+
+
 def test_a_filter_for_another_period_is_refused():
     with pytest.raises(InputError, match=r"made for dt 0\.02 s"):
         reproduce(Glide([0, 0, 0]), robot_with(), lambda t: Scene(), safety=SafetyFilter(ARM, dt=0.02))

@@ -85,13 +85,14 @@ class PlacementResult:
     reason: str
 
 
-def placement(skill: Skill, arm: ArmModel, seed: int) -> Scene:
-    """Return a scene with one to three obstacles on the learned path, clear of the tool at both ends.
+def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
+    """Return a scene with one to three obstacles on the learned path, clear of the arm at the start.
 
     Args:
         skill: whose path.
         arm: whose tool must be clear at start and goal.
         seed: of the scene; every third has one obstacle.
+        start: joint positions at the start, shape (n_joints,) [rad].
 
     Raises:
         InputError: when the tool leaves no place for an obstacle.
@@ -103,11 +104,16 @@ def placement(skill: Skill, arm: ArmModel, seed: int) -> Scene:
     for _ in range(_TRIES):
         sample = int(rng.integers(round(0.15 * len(path)), round(0.85 * len(path))))
         obstacle = random_obstacle(rng, path.positions[sample] + _SPREAD * rng.normal(size=3), planar=False)
-        if _end_clearance(skill, arm, obstacle) >= CLEARANCE + _FREE_ENDS:
+        if min(_end_clearance(skill, arm, obstacle), _start_clearance(arm, start, obstacle)) >= CLEARANCE + _FREE_ENDS:
             chosen.append(obstacle)
         if len(chosen) == count:
             return Scene(None, tuple(chosen))
     raise InputError(f"placement {seed}: no place for {count} obstacles between start and goal of {skill!r}")
+
+
+def _start_clearance(arm: ArmModel, start: Array, obstacle: Obstacle) -> float:
+    centers, radii = arm.collision_spheres(start)
+    return float((obstacle.signed_distance(centers) - radii).min())
 
 
 def _end_clearance(skill: Skill, arm: ArmModel, obstacle: Obstacle) -> float:
@@ -128,7 +134,7 @@ def run_placement(policy: str, setup: Setup, seed: int) -> PlacementResult:
         UnknownNameError: when the policy or the arm is not known.
     """
     skill, arm, start = _prepared(setup)
-    scene = placement(skill, arm, seed)
+    scene = placement(skill, arm, seed, start)
     robot = SimulatedRobot(arm, scene=scene, q=start)
     spheres = arm.tool_spheres if skill.gmr_.has_orientation_ else [[0.0, 0.0, 0.0, arm.tool_radius]]
     decides = POLICIES[policy].build(skill, tool_spheres=spheres, clearance=CLEARANCE)
@@ -158,7 +164,7 @@ def _outcome(success: bool, reason: str, contact: bool) -> str:
         return "touched"
     if success:
         return "arrived"
-    for start, outcome in (("not finished", "waited"), ("clearance fell", "too near")):
+    for start, outcome in (("not finished", "waited"), ("clearance ", "too near")):
         if reason.startswith(start):
             return outcome
     return "stopped"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.command import Command, Status
-from imitarm.errors import InputError
+from imitarm.errors import InfeasibleError, InputError
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import Pose
 from imitarm.policies.policy import Observation, Policy
@@ -84,7 +84,7 @@ def reproduce(
 
     Raises:
         InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not answer with a Command.
-        InfeasibleError: passed on from ``policy.reset``; the robot has not moved.
+        InfeasibleError: the arm starts in contact with an obstacle, or the policy refuses; the robot has not moved.
     """
     dt, timeout = finite_number(dt, "reproduce: dt", "s"), finite_number(timeout, "reproduce: timeout", "s")
     if not 0.0 < dt <= timeout:
@@ -93,6 +93,8 @@ def reproduce(
     if keeper.dt != dt:
         raise InputError(f"reproduce: the safety filter was made for dt {keeper.dt:g} s, not {dt:g} s")
     log = _Log(robot)
+    if log.clearances[0] <= 0.0:
+        raise InfeasibleError(f"the arm starts in contact ({_nearest(robot)}): move the obstacle, or start elsewhere")
     policy.reset(Observation(0.0, log.state, log.tool_to_base, observe(0.0)))
     finished, last = False, Command(np.zeros(6))
     try:
@@ -124,10 +126,15 @@ def _unfinished(timeout: float, last: Command, robot: Robot) -> str:
     reason = f"not finished within {timeout:g} s"
     if last.status in {Status.WAITING, Status.BRAKING}:
         reason += f": {last.status.value}, {last.reason}"
-        nearest = robot.nearest_pair()
-        if last.status is Status.WAITING and nearest is not None:
-            reason += f"; nearest: {nearest[0]} and {nearest[1]}, {1e3 * robot.clearance():.1f} mm apart"
+        if last.status is Status.WAITING and robot.nearest_pair() is not None:
+            reason += f"; nearest: {_nearest(robot)}"
     return reason
+
+
+def _nearest(robot: Robot) -> str:
+    """Return what is nearest to the arm, and how near."""
+    pair = robot.nearest_pair() or ("the arm", "an obstacle")
+    return f"{pair[0]} and {pair[1]}, {1e3 * robot.clearance():.1f} mm apart"
 
 
 @dataclass
@@ -184,6 +191,8 @@ class _Log:
         nearest = float(np.min(self.clearances, initial=np.inf))
         if not fault and required is not None and nearest < required:
             fault = f"clearance fell to {1e3 * nearest:.1f} mm, {1e3 * required:.1f} mm required"
+            if self.clearances[0] < required:
+                fault += f"; it began at {1e3 * self.clearances[0]:.1f} mm"
         details: dict[str, Any] = {
             "twists": np.array(self.twists),
             "clamped": dict(self.clamped),
