@@ -23,7 +23,7 @@ from imitarm.capture.stream import SkeletonSender, UdpSource
 from imitarm.kinematics.arm import ArmModel
 from imitarm.retarget import Correspondence, LimbLengths, ModernRetargeter
 from imitarm.robots import RobotServer, SimulatedRobot, UdpRobot
-from imitarm.teleoperation.loop import Teleoperation
+from imitarm.teleoperation import Teleoperation
 from imitarm.transmission.latency import LatencyLog
 from imitarm.transmission.sockets import Address
 from timing import Row, duration
@@ -61,12 +61,12 @@ def _retargeting(pipe: Connection, to: Address) -> None:
     with UdpSource(0) as source, UdpRobot(arm, to, timeout=_PATIENCE) as robot:
         pipe.send(source.address)
         robot.enable(_PATIENCE)
-        loop = Teleoperation(source, retargeter, robot, stream=source, operator=lambda trouble, stopped: stopped)
+        loop = Teleoperation(source, retargeter, robot, stream=source, confirm_enable=lambda problem, stopped: stopped)
         until = time.monotonic() + _PATIENCE
-        while len(complete(loop.tally.latency)) < _ENOUGH and time.monotonic() < until:
-            loop.tally.reason = ""
-            loop.run(loop.tally.duration + 1.0)
-        pipe.send((loop.tally.latency.values, loop.tally.doing["following"] / max(loop.tally.steps, 1)))
+        while len(complete(loop.summary.latency)) < _ENOUGH and time.monotonic() < until:
+            loop.summary.reason = ""
+            loop.run(loop.summary.duration + 1.0)
+        pipe.send((loop.summary.latency.values, loop.summary.engagement["following"] / max(loop.summary.steps, 1)))
 
 
 def complete(log: LatencyLog) -> Array:

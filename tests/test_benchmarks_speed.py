@@ -234,9 +234,9 @@ def test_the_peer_is_asked_for_the_same_motion() -> None:
 def test_only_skeletons_whose_whole_latency_is_known_count() -> None:
     log = LatencyLog()
     stages = dict.fromkeys(("expose", "arrive", "wait", "retarget", "send", "robot"), 0.001)
-    log.note(log.begin(), **stages, apply=5.0, total=9.0)
-    log.note(log.begin(), **{name: value for name, value in stages.items() if name != "robot"})
-    log.note(log.begin(), **(stages | {"wait": 0.004}))
+    log.record(log.add(), **stages, apply=5.0, total=9.0)
+    log.record(log.add(), **{name: value for name, value in stages.items() if name != "robot"})
+    log.record(log.add(), **(stages | {"wait": 0.004}))
     np.testing.assert_allclose(transmission_rows.complete(log), [0.006, 0.009])
 
 

@@ -165,12 +165,14 @@ def test_skeletons_are_sent_at_the_pace_at_which_they_happened(tmp_path, capsys)
         came = []
         while (skeleton := received.read(0.0)) is not None:
             came.append(skeleton)
-        assert all(map(same, came, frames[-len(came) :])) and len(came) + received.gate.dropped["stale"] == 12
+        assert (
+            all(map(same, came, frames[-len(came) :])) and len(came) + received.datagram_filter.dropped["stale"] == 12
+        )
     assert "sent 12 skeletons to 127.0.0.1:" in capsys.readouterr().err
     assert main(["capture", str(path), "--send", f"127.0.0.1:{received.address[1]}"]) == 0
     assert "nobody listened to" in capsys.readouterr().err
     assert main(["capture", str(path), "--send", "nowhere"]) == 2
-    assert "'nowhere' is no address" in capsys.readouterr().err
+    assert "'nowhere' is not an address" in capsys.readouterr().err
 
 
 def microseconds(frames):

@@ -8,30 +8,30 @@ import numpy as np
 import pytest
 
 from imitarm.cli import main
-from imitarm.cli.serve import _summary, terminated_as_interrupted
+from imitarm.cli.serve import _show_summary, sigterm_as_interrupt
 from imitarm.files.table import read_table
 from imitarm.kinematics.arm import ArmModel
 from imitarm.robots import RobotServer, SimulatedRobot
-from imitarm.transmission.messages import Status
+from imitarm.transmission.messages import RobotStatus
 
 
 def test_it_serves_for_a_time_and_says_how_it_went(tmp_path, capfd):
     trace = tmp_path / "trace.csv"
     assert main(["serve", "--robot", "sawyer", "--port", "0", "--seconds", "0.3", "--trace", str(trace)]) == 0
     shown = capfd.readouterr()
-    assert "sawyer" in shown.out and "listens at 127.0.0.1:" in shown.out
-    assert "stopped: just started" in shown.err
-    assert "commands admitted" in shown.out and "stopped: just started" in shown.out
+    assert "sawyer" in shown.out and "listens on 127.0.0.1:" in shown.out
+    assert "stopped: the server has just started" in shown.err
+    assert "commands accepted" in shown.out and "stopped: the server has just started" in shown.out
     table = read_table(trace)
     assert table.names[:3] == ("t", "status", "set_right_j0") and len(table.names) == 2 + 3 * 7
-    assert (table.values[:, 1] == Status.STOPPED).all() and (np.diff(table.values[:, 0]) > 0).all()
+    assert (table.values[:, 1] == RobotStatus.STOPPED).all() and (np.diff(table.values[:, 0]) > 0).all()
     assert (table.values[:, 2:9] == table.values[0, 2:9]).all()
 
 
 def test_an_address_that_others_reach_is_warned_of(capfd):
     assert main(["serve", "--robot", "panda", "--port", "0", "--host", "0.0.0.0", "--seconds", "0.05"]) == 0
     shown = capfd.readouterr()
-    assert "whoever can reach this address can move the robot" in shown.err and "panda" in shown.out
+    assert "anyone who can reach this address can move the robot" in shown.err and "panda" in shown.out
 
 
 @pytest.mark.parametrize(
@@ -77,35 +77,35 @@ def test_a_port_that_is_taken_is_said_and_no_more(tmp_path, capsys):
             == 2
         )
     shown = capsys.readouterr()
-    assert "can't listen there" in shown.err and shown.err.startswith("imitarm: error: ") and not shown.out
+    assert "cannot listen there" in shown.err and shown.err.startswith("imitarm: error: ") and not shown.out
     assert trace.read_text() == "an older one"
 
 
 @pytest.mark.parametrize(
     ("status", "reason", "said"),
     [
-        (Status.STOPPED, "just started", "stopped: just started"),
-        (Status.STOPPED, "stopped by an operator", "stopped by an operator"),
-        (Status.FOLLOWING, "", "following"),
+        (RobotStatus.STOPPED, "the server has just started", "stopped: the server has just started"),
+        (RobotStatus.STOPPED, "a client has stopped it", "stopped: a client has stopped it"),
+        (RobotStatus.FOLLOWING, "", "following"),
     ],
 )
 def test_how_it_ended_is_said_once(capsys, status, reason, said):
     with RobotServer(SimulatedRobot(ArmModel.load("sawyer")), 0) as server:
         server.supervisor.status, server.supervisor.reason = status, reason
-        _summary(server)
+        _show_summary(server)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "at the end" in line]
     assert line.split("│")[2].strip() == said
 
 
 def test_the_usual_kill_ends_it_as_ctrl_c_does():
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), terminated_as_interrupted():
+    with pytest.raises(KeyboardInterrupt), sigterm_as_interrupt():
         signal.raise_signal(signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) is before
     outside = []
 
     def elsewhere():
-        with terminated_as_interrupted():
+        with sigterm_as_interrupt():
             outside.append(signal.getsignal(signal.SIGTERM))
 
     thread = threading.Thread(target=elsewhere)

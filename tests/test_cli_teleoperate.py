@@ -62,7 +62,7 @@ def test_a_recording_leads_a_simulated_robot(person, tmp_path, capfd):
     ]
     assert main(["teleoperate", *words]) == 0
     text = capfd.readouterr().out
-    for part in ("the source is over", "following", "of the limits used", "median [ms]", "total", "wrote"):
+    for part in ("the source has ended", "following", "largest use of the limits", "median [ms]", "total", "wrote"):
         assert part in text
     demonstration = Demonstration.load(shown)
     assert demonstration.task == "reach" and demonstration.joints.shape[1] == 7
@@ -77,30 +77,30 @@ def test_a_served_robot_is_led_with_enable(person, served, capfd):
     text = capfd.readouterr().out
     assert status == 0, text
     assert "interruptions" in text and "dropped states" in text and "sent to received by the robot" in text
-    assert served.supervisor.gate.admitted > 20
+    assert served.supervisor.datagram_filter.accepted > 20
 
 
-def test_a_stopped_robot_without_an_operator_ends_it(person, served, capfd, monkeypatch):
+def test_a_stopped_robot_without_a_terminal_ends_it(person, served, capfd, monkeypatch):
     monkeypatch.setattr("imitarm.cli.teleoperate._standard_input", lambda: b"")
     assert main(["teleoperate", str(person), "--to", f"127.0.0.1:{served.address[1]}"]) == 1
-    assert "the robot is stopped: just started; nobody can let it move again" in capfd.readouterr().err
-    assert not served.supervisor.gate.admitted
+    assert "the robot is stopped: the server has just started; it cannot be enabled" in capfd.readouterr().err
+    assert not served.supervisor.datagram_filter.accepted
 
 
 def test_nobody_in_the_picture_is_a_failure(capfd):
     assert main(["teleoperate", "udp:0", "--seconds", "0.2"]) == 1
     shown = capfd.readouterr()
-    assert "nobody took hold" in shown.err and "the time is up" in shown.out
+    assert "never followed a person" in shown.err and "the time is up" in shown.out
 
 
 @pytest.mark.parametrize(
     ("options", "status", "message"),
     [
-        (["--to", "127.0.0.1:0"], 2, "is no address; say HOST:PORT"),
+        (["--to", "127.0.0.1:0"], 2, "is not an address; write HOST:PORT"),
         (["--seconds", "0"], 2, "--seconds must be above 0"),
         (["--rate", "5"], 2, "--rate must be from 50 to 1000 Hz"),
         (["--rate", "49.9"], 2, "--rate must be from 50 to 1000 Hz"),
-        (["--enable"], 2, "--enable is about a served robot"),
+        (["--enable"], 2, "--enable applies to a served robot"),
         (["--record", "{}/no/a.csv"], 2, "there is no folder"),
         (["--record", "{}/there.csv"], 2, "is there already; name another file, or replace it with --force"),
         (["--latency", "{}/there.csv"], 2, "is there already"),
@@ -131,13 +131,13 @@ def test_a_wrong_option_is_one_message(person, tmp_path, capsys, options, status
 def test_the_slowest_rate_is_one_that_every_method_can_do(person, capfd, method):
     words = ["--rate", "50", "--method", method, "--seconds", "0.1"]
     assert main(["teleoperate", str(person), *words]) == 1  # nobody takes hold within 0.1 s
-    assert "nobody took hold" in capfd.readouterr().err
+    assert "never followed a person" in capfd.readouterr().err
 
 
 def test_a_robot_that_does_not_answer_is_said(person, capsys, monkeypatch):
     monkeypatch.setattr(teleoperate, "_connected", lambda arm, address: UdpRobot(arm, ("127.0.0.1", 9), timeout=0.1))
     assert main(["teleoperate", str(person), "--to", "127.0.0.1:9"]) == 1
-    assert "no robot answers; start one with 'imitarm serve'" in capsys.readouterr().err
+    assert "no robot server answers; start one with 'imitarm serve'" in capsys.readouterr().err
 
 
 def test_what_was_calibrated_holds_unless_it_is_said_otherwise(tmp_path, capsys):
@@ -154,5 +154,5 @@ def test_what_was_calibrated_holds_unless_it_is_said_otherwise(tmp_path, capsys)
     found = of("--calibration", str(path), "--scale", "1", "--orientation", "fixed", "--side", "left")
     assert (found.side, found.scale, found.orientation, found.lengths.upper_arm) == ("left", 1.0, "fixed", 0.3)
     assert of("--calibration", str(path), "--side", "right").lengths is None
-    assert "the right one is learnt as it is seen" in capsys.readouterr().err
+    assert "the right arm is measured during the run" in capsys.readouterr().err
     assert (of().side, of().scale, of().orientation) == ("right", 1.0, "upright")

@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel, ArmState
+from imitarm.kinematics.limits import JointLimits
 from imitarm.robots import Robot, limit_velocity
 
 ARM = ArmModel.load("sawyer")
+LIMITS = JointLimits(ARM)
 DT = 0.01
 
 
@@ -51,14 +53,14 @@ def test_an_admissible_velocity_is_sent_as_it_is(seed):
     rng = np.random.default_rng(seed)
     previous = rng.uniform(-0.5, 0.5, 7) * ARM.max_velocity
     asked = previous + rng.uniform(-0.9, 0.9, 7) * ARM.max_acceleration * DT
-    sent, clamped = limit_velocity(ARM, ARM.home, previous, asked, DT)
+    sent, clamped = limit_velocity(LIMITS, ARM.home, previous, asked, DT)
     np.testing.assert_allclose(sent, asked, atol=1e-12)
     assert clamped == ()
 
 
 def test_too_fast_slows_all_joints_by_one_factor():
     asked = np.array([5.0, 0.4, -1.0, 0.2, 0.1, 0.3, -0.2])
-    sent, clamped = limit_velocity(ARM, ARM.home, asked / 5.0 * ARM.max_velocity[0], asked, DT)
+    sent, clamped = limit_velocity(LIMITS, ARM.home, asked / 5.0 * ARM.max_velocity[0], asked, DT)
     np.testing.assert_allclose(sent, asked * ARM.max_velocity[0] / 5.0, atol=1e-12)
     assert clamped == ("velocity",)
 
@@ -66,10 +68,10 @@ def test_too_fast_slows_all_joints_by_one_factor():
 def test_beyond_a_limit_the_way_back_is_free_and_the_way_out_is_not():
     q = ARM.home.copy()
     q[0] = ARM.upper[0] + 0.05
-    out, clamped = limit_velocity(ARM, q, np.zeros(7), np.full(7, 0.05), DT)
+    out, clamped = limit_velocity(LIMITS, q, np.zeros(7), np.full(7, 0.05), DT)
     assert out[0] == 0.0
     assert clamped == ("position",)
-    back, _ = limit_velocity(ARM, q, np.zeros(7), np.full(7, -0.05), DT)
+    back, _ = limit_velocity(LIMITS, q, np.zeros(7), np.full(7, -0.05), DT)
     assert back[0] == pytest.approx(-0.05)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.robots import RobotServer, UdpRobot
-from imitarm.transmission.messages import Mode, Status
+from imitarm.transmission.messages import CommandMode, RobotStatus
 from wire_samples import ARM, Clock, N, Paper, Sender, Served, assert_within_limits, command
 
 
@@ -26,7 +26,7 @@ def test_what_can_not_be_is_refused():
         RobotServer(Paper(), 0, rate=50.0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
-        with pytest.raises(InputError, match="can't listen there"):
+        with pytest.raises(InputError, match="cannot listen there"):
             RobotServer(Paper(), taken.getsockname()[1])
 
 
@@ -55,15 +55,17 @@ def test_it_keeps_its_rate_follows_commands_and_is_braked_at_the_end():
         def lead(server):
             statuses.append(server.supervisor.status)
             if len(statuses) == 1:
-                enable = command(Mode.ENABLE, challenge=server.supervisor.challenge)
+                enable = command(CommandMode.ENABLE, challenge=server.supervisor.challenge)
                 client.sendto(sender.bytes(enable, clock()), server.address)
             elif len(statuses) < 100:
                 q, velocity = robot.set_point + 0.002, np.full(N, 0.3)
-                client.sendto(sender.bytes(command(Mode.MOVE, q, velocity), clock()), server.address)
+                client.sendto(sender.bytes(command(CommandMode.MOVE, q, velocity), clock()), server.address)
 
         server.run(0.6, on_step=lead)
-    assert len(statuses) == server.pace.ticks == 151 and server.pace.overruns == 0  # every 4 ms, from 0 to 0.6 s
-    assert statuses[50] == Status.FOLLOWING and statuses[-1] == Status.SLOWING  # silence since 0.4 s
+    assert (
+        len(statuses) == server.rate_limiter.ticks == 151 and server.rate_limiter.overruns == 0
+    )  # every 4 ms, from 0 to 0.6 s
+    assert statuses[50] == RobotStatus.FOLLOWING and statuses[-1] == RobotStatus.SLOWING  # silence since 0.4 s
     assert np.abs(np.array([velocity for _, velocity, _ in robot.steps])).max() > 0.2
     assert not robot.velocity.any()
     assert_within_limits(robot.steps)

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.robots import SimulatedRobot
-from imitarm.robots.supervisor import NEAR, Supervisor, fingerprint
+from imitarm.robots.supervisor import REACH_TIME, Supervisor, fingerprint
 from imitarm.transmission.datagram import Encoder, decode
-from imitarm.transmission.messages import JointState, Mode, Status
-from test_datagram import signed
+from imitarm.transmission.messages import CommandMode, JointState, RobotStatus
+from test_transmission_datagram import signed
 from wire_samples import ARM, DT, MS, N, Paper, Sender, assert_within_limits, command, joint_state, skeleton_frame
 
 STEP = round(1e9 * DT)
@@ -30,7 +30,7 @@ class Bench:
         self.sender = Sender(self.supervisor, session)
         if enabled:
             self.sender.enable(self.now)
-            assert self.status is Status.FOLLOWING
+            assert self.status is RobotStatus.FOLLOWING
 
     @property
     def status(self):
@@ -59,7 +59,7 @@ class Bench:
 
 def test_it_begins_stopped_and_holds():
     bench = Bench(enabled=False)
-    assert bench.status is Status.STOPPED and bench.supervisor.challenge != 0
+    assert bench.status is RobotStatus.STOPPED and bench.supervisor.challenge != 0
     bench.sender.move(bench.now, ARM.home + 0.05)
     bench.step(100)
     assert np.array_equal(bench.robot.q, ARM.home)
@@ -69,7 +69,11 @@ def test_it_begins_stopped_and_holds():
 def test_it_follows_closely_and_within_the_limits():
     bench = Bench()
     bench.wave(4.0)
-    assert bench.status is Status.FOLLOWING and not bench.supervisor.dropped and not bench.supervisor.gate.dropped
+    assert (
+        bench.status is RobotStatus.FOLLOWING
+        and not bench.supervisor.dropped
+        and not bench.supervisor.datagram_filter.dropped
+    )
     assert_within_limits(bench.robot.steps)
     q, velocity = bench.robot.set_point.copy() + 0.05, np.zeros(N)
     for _ in range(100):
@@ -91,13 +95,13 @@ def test_a_simulated_robot_is_led_like_any_other():
     arm = ArmModel.load("sawyer", tool="gripper")
     bench = Bench(SimulatedRobot(arm))
     bench.wave(1.0, size=0.1)
-    assert not bench.robot.fault and bench.status is Status.FOLLOWING
+    assert not bench.robot.fault and bench.status is RobotStatus.FOLLOWING
     assert np.abs(bench.robot.state().q - arm.home).max() > 0.02
     bench.sender.move(bench.now, bench.robot.set_point, opening=0.0)
     bench.step(40)
     assert bench.robot.opening < bench.robot.widest_opening - 0.01
     bench.sender.move(bench.now, bench.robot.set_point, opening=0.5)
-    assert bench.supervisor.dropped == {"gripper": 1}
+    assert bench.supervisor.dropped == {"gripper opening": 1}
 
 
 # --- the watchdog
@@ -112,7 +116,7 @@ def test_the_watchdog_slows_after_100_ms_and_latches_after_500():
     while bench.now < last + 700 * MS:
         bench.step()
         seen.setdefault(bench.status, (bench.now - last) / MS)
-    assert 100 <= seen[Status.SLOWING] <= 112 and 500 <= seen[Status.STOPPED] <= 512
+    assert 100 <= seen[RobotStatus.SLOWING] <= 112 and 500 <= seen[RobotStatus.STOPPED] <= 512
     assert not bench.robot.velocity.any()
     assert_within_limits(bench.robot.steps)
     assert bench.events[-2:] == ["no valid command for 100 ms: slowing", "stopped: no valid command for 500 ms"]
@@ -126,7 +130,7 @@ def test_a_command_is_carried_on_for_30_ms_and_has_faded_by_100():
     for _ in range(21):
         bench.step()
         fastest.append(np.max(np.abs(bench.robot.velocity) / speed))
-    assert bench.status is Status.FOLLOWING
+    assert bench.status is RobotStatus.FOLLOWING
     assert min(fastest[:4]) > 0.95 and fastest[-1] < 0.35
     assert_within_limits(bench.robot.steps)
 
@@ -152,19 +156,21 @@ def test_commands_that_come_again_in_time_are_followed_without_a_jump():
     bench = Bench()
     bench.wave(0.6)
     bench.step(round(0.3 / DT))
-    assert bench.status is Status.SLOWING
+    assert bench.status is RobotStatus.SLOWING
     bench.wave(0.6, seed=1)
-    assert bench.status is Status.FOLLOWING
+    assert bench.status is RobotStatus.FOLLOWING
     assert_within_limits(bench.robot.steps)
 
 
 def test_a_latched_stop_is_only_left_by_the_challenge_of_that_stop():
     bench = Bench()
-    first = bench.sender.bytes(command(Mode.ENABLE, challenge=123), bench.now)
+    first = bench.sender.bytes(command(CommandMode.ENABLE, challenge=123), bench.now)
     recorded = [first]
-    bench.wave(0.5, each=lambda k: recorded.append(bench.sender.bytes(command(Mode.ENABLE, challenge=1), bench.now)))
+    bench.wave(
+        0.5, each=lambda k: recorded.append(bench.sender.bytes(command(CommandMode.ENABLE, challenge=1), bench.now))
+    )
     bench.step(200)
-    assert bench.status is Status.STOPPED
+    assert bench.status is RobotStatus.STOPPED
     before, challenge = bench.robot.q.copy(), bench.supervisor.challenge
     for _ in range(20):
         bench.sender.move(bench.now, before + 0.05)
@@ -175,25 +181,25 @@ def test_a_latched_stop_is_only_left_by_the_challenge_of_that_stop():
         bench.sender.enable(bench.now, challenge=wrong)
     bench.sender.enable(bench.now, arm=1)
     bench.step(10)
-    assert bench.status is Status.STOPPED and np.array_equal(bench.robot.q, before)
+    assert bench.status is RobotStatus.STOPPED and np.array_equal(bench.robot.q, before)
     good = bench.sender.enable(bench.now)
-    assert bench.status is Status.FOLLOWING and bench.supervisor.challenge == 0
+    assert bench.status is RobotStatus.FOLLOWING and bench.supervisor.challenge == 0
     bench.step(10)
     assert np.array_equal(bench.robot.q, before)  # it begins from where it is
     bench.wave(0.3)
     bench.step(200)
     for _ in range(3):
         bench.supervisor.receive(good, bench.now)  # replayed: the next stop has another challenge
-    assert bench.status is Status.STOPPED
+    assert bench.status is RobotStatus.STOPPED
     assert_within_limits(bench.robot.steps)
 
 
 def test_it_can_not_be_enabled_before_it_is_at_rest():
     bench = Bench()
     bench.wave(0.6)
-    bench.supervisor.receive(bench.sender.bytes(command(Mode.STOP), bench.now), bench.now)
+    bench.supervisor.receive(bench.sender.bytes(command(CommandMode.STOP), bench.now), bench.now)
     bench.sender.enable(bench.now)
-    assert bench.status is Status.STOPPED and bench.supervisor.dropped == {"still braking": 1}
+    assert bench.status is RobotStatus.STOPPED and bench.supervisor.dropped == {"still braking": 1}
     bench.step(200)
     assert_within_limits(bench.robot.steps)
 
@@ -201,21 +207,21 @@ def test_it_can_not_be_enabled_before_it_is_at_rest():
 def test_an_enabled_robot_that_is_not_led_latches_again():
     bench = Bench()
     bench.step(round(0.6 / DT))
-    assert bench.status is Status.STOPPED
+    assert bench.status is RobotStatus.STOPPED
 
 
 def test_anybody_may_stop_it_but_only_the_owner_leads_it():
     bench = Bench()
     other = Sender(bench.supervisor, 6)
     bench.wave(0.3, each=lambda k: other.move(bench.now, bench.robot.set_point + 0.1))
-    assert bench.supervisor.gate.dropped["foreign"] == round(0.3 / DT)
+    assert bench.supervisor.datagram_filter.dropped["foreign"] == round(0.3 / DT)
     alone = Bench()
     alone.wave(0.3)
     assert np.array_equal(bench.robot.q, alone.robot.q)  # as if the other were not there
     other.enable(bench.now, challenge=bench.supervisor.challenge)
     assert bench.supervisor.dropped == {"not stopped": 1}
-    bench.supervisor.receive(other.bytes(command(Mode.STOP), bench.now), bench.now)
-    assert bench.status is Status.STOPPED and bench.supervisor.reason == "stopped by an operator"
+    bench.supervisor.receive(other.bytes(command(CommandMode.STOP), bench.now), bench.now)
+    assert bench.status is RobotStatus.STOPPED and bench.supervisor.reason == "a client has stopped it"
 
 
 def test_a_client_that_was_started_again_takes_over_from_where_the_arm_is():
@@ -224,10 +230,10 @@ def test_a_client_that_was_started_again_takes_over_from_where_the_arm_is():
     again = Sender(bench.supervisor, 77)
     again.move(bench.now, ARM.home)  # too early: the dead one still leads
     bench.step(round(0.55 / DT))
-    assert bench.status is Status.STOPPED
+    assert bench.status is RobotStatus.STOPPED
     rest = bench.robot.q.copy()
     again.enable(bench.now)
-    assert bench.status is Status.FOLLOWING
+    assert bench.status is RobotStatus.FOLLOWING
     again.move(bench.now, rest)
     bench.step(3)
     assert np.array_equal(bench.robot.q, rest)
@@ -237,7 +243,7 @@ def test_a_client_that_was_started_again_takes_over_from_where_the_arm_is():
     bench.sender = Sender(bench.supervisor, 5, first=10_000)  # one that had died comes late
     before = len(bench.robot.steps)
     bench.wave(0.05)
-    assert bench.supervisor.gate.dropped["retired"] > 0 and len(bench.robot.steps) > before
+    assert bench.supervisor.datagram_filter.dropped["retired"] > 0 and len(bench.robot.steps) > before
 
 
 def test_a_protective_stop_is_final():
@@ -251,11 +257,11 @@ def test_a_protective_stop_is_final():
     bench = Bench(Held())
     bench.robot.held = True
     bench.wave(1.0)
-    assert bench.status is Status.FAULT and "protective stop" in bench.supervisor.reason
+    assert bench.status is RobotStatus.FAULT and "protective stop" in bench.supervisor.reason
     bench.sender.enable(bench.now, challenge=0)
     bench.sender.move(bench.now, bench.robot.q)
     bench.step(300)
-    assert bench.status is Status.FAULT
+    assert bench.status is RobotStatus.FAULT
     state = decode(bench.supervisor.answer(lambda: bench.now))[1]
     assert state.reason == bench.supervisor.reason and state.owner == 0
 
@@ -269,10 +275,10 @@ def test_a_protective_stop_is_final():
         ({"q": ARM.upper + 0.01}, "beyond a position limit"),
         ({"q": ARM.lower - 0.01}, "beyond a position limit"),
         ({"velocity": 1.01 * ARM.max_velocity}, "beyond a velocity limit"),
-        ({"q": ARM.home + 1.01 * NEAR * ARM.max_velocity}, "too far away"),
-        ({"arm": 3}, "another arm"),
-        ({"q": ARM.home[:6], "velocity": np.zeros(6)}, "another arm"),
-        ({"opening": 0.9}, "gripper"),
+        ({"q": ARM.home + 1.01 * REACH_TIME * ARM.max_velocity}, "too far from the set-point"),
+        ({"arm": 3}, "wrong arm"),
+        ({"q": ARM.home[:6], "velocity": np.zeros(6)}, "wrong arm"),
+        ({"opening": 0.9}, "gripper opening"),
     ],
 )
 def test_what_is_impossible_does_not_move_the_arm_nor_calm_the_watchdog(fields, reason):
@@ -281,7 +287,7 @@ def test_what_is_impossible_does_not_move_the_arm_nor_calm_the_watchdog(fields, 
         bench.sender.move(bench.now, **fields)
         bench.step()
     assert np.array_equal(bench.robot.q, ARM.home)
-    assert bench.status is Status.STOPPED
+    assert bench.status is RobotStatus.STOPPED
     assert bench.supervisor.dropped[reason] > 100
 
 
@@ -309,7 +315,7 @@ def junk(rng, bench, recorded):
             kind = skeleton_frame(rng) if rng.random() < 0.5 else joint_state(rng)
             return Encoder(session, 2**30).encode(kind, bench.now)
         case _:  # from a stranger, with numbers that could be
-            mode = Mode.MOVE if rng.random() < 0.5 else Mode.ENABLE
+            mode = CommandMode.MOVE if rng.random() < 0.5 else CommandMode.ENABLE
             wrong = int(rng.integers(1, 2**32))
             return Encoder(int(rng.integers(0, 2**32))).encode(
                 command(mode, ARM.home + 0.1, challenge=wrong), bench.now
@@ -325,7 +331,7 @@ def test_hostile_datagrams_move_nothing_that_is_stopped(seed):
         for _ in range(3):
             bench.supervisor.receive(junk(rng, bench, recorded), bench.now)
         bench.step()
-    assert bench.status is Status.STOPPED
+    assert bench.status is RobotStatus.STOPPED
     assert all(np.array_equal(q, ARM.home) and not v.any() for q, v, _ in bench.robot.steps)
 
 
@@ -340,7 +346,7 @@ def test_hostile_datagrams_do_not_change_the_motion_of_an_arm_that_is_led(seed):
     among.sender.move = lambda *given, **fields: recorded.append(move(*given, **fields))
     among.wave(0.5, seed=seed, each=lambda k: among.supervisor.receive(junk(rng, among, recorded), among.now))
     assert all(np.array_equal(a[0], b[0]) for a, b in zip(alone.robot.steps, among.robot.steps, strict=True))
-    assert sum((among.supervisor.dropped + among.supervisor.gate.dropped).values()) > 50
+    assert sum((among.supervisor.dropped + among.supervisor.datagram_filter.dropped).values()) > 50
 
 
 @settings(max_examples=40)
@@ -350,7 +356,7 @@ def test_no_stream_of_commands_breaks_a_limit(seed, wild):
     rng, bench = np.random.default_rng(seed), Bench()
     for _ in range(150):
         if rng.random() < 0.7:
-            q = bench.robot.set_point + rng.uniform(-1, 1, N) * NEAR * ARM.max_velocity
+            q = bench.robot.set_point + rng.uniform(-1, 1, N) * REACH_TIME * ARM.max_velocity
             if rng.random() < wild:
                 q = rng.uniform(ARM.lower, ARM.upper)
             speed = rng.uniform(-1, 1, N) * ARM.max_velocity
@@ -384,7 +390,7 @@ def test_commands_that_were_long_on_their_way_slow_it_down():
     for _ in range(round(0.7 / DT)):
         bench.supervisor.receive(bench.sender.bytes(command(q=bench.robot.q), bench.now - 200 * MS), bench.now)
         bench.step()
-    assert bench.status is Status.STOPPED and bench.supervisor.gate.dropped["stale"] > 100
+    assert bench.status is RobotStatus.STOPPED and bench.supervisor.datagram_filter.dropped["stale"] > 100
 
 
 def test_the_state_says_how_things_are():
@@ -392,7 +398,7 @@ def test_the_state_says_how_things_are():
     bench.wave(0.2)
     header, state = decode(bench.supervisor.answer(lambda: bench.now))
     assert isinstance(state, JointState) and header.time_ns == bench.now
-    assert state.status is Status.FOLLOWING and state.owner == 5 and state.challenge == 0
+    assert state.status is RobotStatus.FOLLOWING and state.owner == 5 and state.challenge == 0
     assert state.arm == fingerprint(ARM) != fingerprint(ArmModel.load("panda"))
     np.testing.assert_array_equal(state.set_point, bench.robot.set_point)
     np.testing.assert_array_equal(state.set_velocity, bench.robot.velocity)

@@ -6,7 +6,7 @@ import pytest
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.robots import ROBOTS, SimulatedRobot, UdpRobot
-from imitarm.transmission.messages import Mode, Status
+from imitarm.transmission.messages import CommandMode, RobotStatus
 from wire_samples import ARM, DT, MS, N, Paper, Served, assert_within_limits, command
 
 PERIOD = 0.012  # of the client
@@ -52,7 +52,7 @@ def test_it_is_registered():
 
 def test_nothing_moves_before_it_is_enabled(served):
     with served.client() as robot:
-        assert not robot.ready and robot.trouble == "just started"
+        assert not robot.ready and robot.problem == "the server has just started"
         wave(served, robot, 0.5)
         assert np.array_equal(served.robot.q, ARM.home) and np.array_equal(robot.set_point, ARM.home)
         assert not robot.velocity.any() and robot.interruptions == 0
@@ -61,7 +61,7 @@ def test_nothing_moves_before_it_is_enabled(served):
 def test_it_leads_within_the_limits_and_is_followed(led):
     served, robot = led
     wave(served, robot, 2.0)
-    assert robot.ready and robot.trouble == "" and robot.interruptions == 0
+    assert robot.ready and robot.problem == "" and robot.interruptions == 0
     assert np.abs(served.robot.set_point - ARM.home).max() > 0.2
     assert_within_limits(served.robot.steps)
     rest(served, robot, 1.0)
@@ -78,7 +78,7 @@ def test_its_own_limits_come_first_and_the_server_s_again(led):
     with pytest.raises(InputError, match="7 finite numbers"):
         robot.move(np.full(N, np.nan), PERIOD)
     for k in range(100):
-        robot._say(Mode.MOVE, robot.reported.set_point + 0.1, ARM.max_velocity * (-1) ** k)
+        robot._command(CommandMode.MOVE, robot.reported.set_point + 0.1, ARM.max_velocity * (-1) ** k)
         served.sleep(PERIOD)
         robot.listen()
     assert_within_limits(served.robot.steps)
@@ -88,14 +88,14 @@ def test_a_pause_of_the_client_is_a_stop_of_the_arm_and_no_jump(led):
     served, robot = led
     wave(served, robot, 0.6)
     served.sleep(0.3)  # the process was busy with something else
-    assert served.status is Status.SLOWING and not robot.ready
+    assert served.status is RobotStatus.SLOWING and not robot.ready
     wave(served, robot, 0.6, seed=1)
-    assert served.status is Status.FOLLOWING and robot.ready and robot.interruptions >= 1
+    assert served.status is RobotStatus.FOLLOWING and robot.ready and robot.interruptions >= 1
     served.sleep(0.7)
-    assert served.status is Status.STOPPED
+    assert served.status is RobotStatus.STOPPED
     before = served.robot.q.copy()
     wave(served, robot, 0.5)
-    assert np.array_equal(served.robot.q, before) and "no valid command" in robot.trouble
+    assert np.array_equal(served.robot.q, before) and "no valid command" in robot.problem
     robot.enable()
     wave(served, robot, 0.3)
     assert not np.array_equal(served.robot.q, before)
@@ -117,7 +117,7 @@ def test_a_client_that_dies_and_is_started_again_begins_from_where_the_arm_is(le
         robot.move(np.ones(N), PERIOD)  # the dead one comes back
         served.sleep(PERIOD)
         robot.move(np.ones(N), PERIOD)
-        assert robot.trouble == "somebody else leads the robot" and not robot.ready
+        assert robot.problem == "another client controls the robot" and not robot.ready
     assert_within_limits(served.robot.steps)
 
 
@@ -125,13 +125,13 @@ def test_a_client_that_is_started_while_another_one_leads_waits(led):
     served, robot = led
     wave(served, robot, 0.2)
     with served.client() as second:
-        assert second.trouble == "somebody else leads the robot"
+        assert second.problem == "another client controls the robot"
         second.request_enable()
         second.move(np.ones(N), PERIOD)
         assert not second.ready
         wave(served, robot, 0.2)
-    assert served.status is Status.FOLLOWING  # closing the second one has stopped nothing
-    assert served.supervisor.gate.session == robot._encoder.session
+    assert served.status is RobotStatus.FOLLOWING  # closing the second one has stopped nothing
+    assert served.supervisor.datagram_filter.session == robot._encoder.session
 
 
 def test_a_server_that_dies_and_is_started_again_is_not_led_by_old_set_points(led):
@@ -143,13 +143,13 @@ def test_a_server_that_dies_and_is_started_again_is_not_led_by_old_set_points(le
     for k in range(20):
         robot.move(np.full(N, 0.2), PERIOD)
         served.sleep(PERIOD)
-        assert k < 9 or (not robot.ready and robot.trouble == "the robot does not answer")
+        assert k < 9 or (not robot.ready and robot.problem == "the robot does not answer")
     again = Served(Paper(ARM.home + 0.3), port=port, clock=served.clock)
     try:
         for _ in range(30):
             robot.move(np.full(N, 0.2), PERIOD)
             again.sleep(PERIOD)
-        assert not robot.ready and robot.trouble == "just started"
+        assert not robot.ready and robot.problem == "the server has just started"
         np.testing.assert_array_equal(robot.set_point, ARM.home + 0.3)
         assert np.array_equal(again.robot.q, ARM.home + 0.3)
         robot._sleep = again.sleep
@@ -166,7 +166,7 @@ def test_closing_stops_the_robot_at_once(served):
         robot.enable()
         wave(served, robot, 0.5)
     served.sleep(DT)
-    assert served.status is Status.STOPPED and served.supervisor.reason == "stopped by an operator"
+    assert served.status is RobotStatus.STOPPED and served.supervisor.reason == "a client has stopped it"
     robot.close()
 
 
@@ -178,7 +178,7 @@ def test_stop_brakes_at_the_pace_of_time(led):
     robot.stop(PERIOD)
     assert moving > 0.3 and not robot.velocity.any()
     assert served.clock() - begun > 20 * MS
-    assert served.status is Status.FOLLOWING
+    assert served.status is RobotStatus.FOLLOWING
     assert_within_limits(served.robot.steps)
 
 
@@ -215,7 +215,7 @@ def test_what_became_of_each_command_is_told(led):
 
 def test_nobody_there_is_said(served):
     served.kill()
-    with pytest.raises(TaskFailedError, match="no robot answers; start one with 'imitarm serve'"):
+    with pytest.raises(TaskFailedError, match="no robot server answers; start one with 'imitarm serve'"):
         served.client(timeout=0.1)
 
 
@@ -237,7 +237,7 @@ def test_another_arm_that_takes_the_place_of_the_robot_is_not_led(led):
         for _ in range(20):
             robot.move(np.ones(N), PERIOD)
             other.sleep(PERIOD)
-        assert not robot.ready and robot.trouble == "the robot that answers is not sawyer"
+        assert not robot.ready and robot.problem == "the robot that answers is not sawyer"
         assert not other.robot.velocity.any()
     finally:
         other.kill()
@@ -245,7 +245,7 @@ def test_another_arm_that_takes_the_place_of_the_robot_is_not_led(led):
 
 def test_a_robot_that_can_not_be_enabled_says_why(led):
     served, robot = led
-    with served.client() as second, pytest.raises(TaskFailedError, match="not enabled: somebody else leads"):
+    with served.client() as second, pytest.raises(TaskFailedError, match="not enabled: another client controls"):
         rest(served, robot, 0.05)
 
         def both(seconds):
@@ -262,21 +262,21 @@ def test_answers_from_elsewhere_are_not_heard(led):
     before = robot.reported
     with Served(Paper(ARM.home + 0.5)).server as other:
         address = robot._socket.getsockname()
-        other._asked[address] = None
+        other._clients[address] = None
         other.step()
         robot.listen()
     assert robot.reported is before
 
 
-def test_the_server_answers_only_who_has_asked_and_bears_a_flood(served):
+def test_the_server_answers_only_who_has_clients_and_bears_a_flood(served):
     with served.client() as robot:
         for _ in range(500):
             robot._socket.send(b"x" * 50)
-        robot._socket.send(robot._encoder.encode(command(Mode.OBSERVE), served.clock()))
-        assert len(served.server._asked) == 0
+        robot._socket.send(robot._encoder.encode(command(CommandMode.OBSERVE), served.clock()))
+        assert len(served.server._clients) == 0
         for _ in range(3):
             served.server.receive()
-            assert len(served.server._asked) == 0
+            assert len(served.server._clients) == 0
         served.sleep(0.1)
         assert robot.listen()
         assert served.supervisor.dropped["magic"] > 100

@@ -12,10 +12,10 @@ from imitarm.retarget import RETARGETERS, Correspondence, ModernRetargeter
 from imitarm.robots import SimulatedRobot
 from imitarm.safety import SafetyFilter
 from imitarm.scene import Box, Scene
-from imitarm.teleoperation.loop import INTERRUPTED, Teleoperation
+from imitarm.teleoperation import Teleoperation
 from imitarm.trajectory import Demonstration
-from imitarm.transmission.messages import Status
-from imitarm.transmission.pace import Pace
+from imitarm.transmission.messages import RobotStatus
+from imitarm.transmission.rate import RateLimiter
 from recording_samples import Listed, skeletons
 from wire_samples import ARM, Clock, Paper, Served, assert_within_limits
 
@@ -33,9 +33,14 @@ def loop(robot, source=None, clock=None, sleep=None, **options):
     def pass_time(seconds):
         clock.ns += round(1e9 * seconds)
 
-    pace = Pace(DT, clock_ns=clock, sleep=pass_time if sleep is None else sleep)
+    rate_limiter = RateLimiter(DT, clock_ns=clock, sleep=pass_time if sleep is None else sleep)
     return Teleoperation(
-        Listed([]) if source is None else source, retargeter(robot.arm), robot, clock_ns=clock, pace=pace, **options
+        Listed([]) if source is None else source,
+        retargeter(robot.arm),
+        robot,
+        clock_ns=clock,
+        rate_limiter=rate_limiter,
+        **options,
     )
 
 
@@ -53,9 +58,9 @@ def test_a_robot_here_is_led_within_its_limits():
     robot = Paper()
     one = loop(robot)
     lead(one, 5.0)
-    assert one.tally.doing["following"] > 300 and one.tally.frames == 150
+    assert one.summary.engagement["following"] > 300 and one.summary.skeletons == 150
     assert np.abs(robot.q - ARM.home).max() > 0.05
-    assert one.tally.speed <= 1.0 and one.tally.acceleration <= 1.0 + 1e-9
+    assert one.summary.speed <= 1.0 and one.summary.acceleration <= 1.0 + 1e-9
     assert_within_limits(robot.steps)
     np.testing.assert_allclose(robot.set_point, one.retargeter.latest.q, atol=2e-3)
 
@@ -78,9 +83,9 @@ def test_a_method_that_looks_after_nothing_is_kept_clear_by_the_filter():
         one = loop(robot, safety=safety)
         one.retargeter = RETARGETERS["m3"](ARM, Correspondence(orientation="fixed"), dt=DT, scene=scene)
         lead(one, 5.0, each=lambda k, r=robot: postures.setdefault(id(r), []).append(r.q.copy()))
-        assert one.tally.doing["following"] > 300
+        assert one.summary.engagement["following"] > 300
         if robot is kept:
-            assert one.tally.filtered > 0
+            assert one.summary.filtered > 0
     assert min(clearance(q, table) for q in postures[id(blind)]) < 0.0
     assert min(clearance(q, table) for q in postures[id(kept)]) > 0.008
 
@@ -107,10 +112,10 @@ def test_the_hand_leads_the_gripper():
 def test_it_ends_with_the_source_or_the_time_and_the_arm_at_rest():
     robot = Paper()
     source = Listed(skeletons(40))
-    tally = loop(robot, source).run()
-    assert tally.reason == "the source is over" and not robot.velocity.any()
-    tally = loop(Paper(), Listed([None] * 5000)).run(0.5)
-    assert tally.reason == "the time is up" and tally.steps + tally.overruns == 50
+    summary = loop(robot, source).run()
+    assert summary.reason == "the source has ended" and not robot.velocity.any()
+    summary = loop(Paper(), Listed([None] * 5000)).run(0.5)
+    assert summary.reason == "the time is up" and summary.steps + summary.overruns == 50
 
 
 def test_ctrl_c_ends_it_with_the_arm_at_rest():
@@ -122,8 +127,8 @@ def test_ctrl_c_ends_it_with_the_arm_at_rest():
                 raise KeyboardInterrupt
             return super().read(timeout)
 
-    tally = loop(robot, Pressed(skeletons(60))).run()
-    assert tally.reason == "stopped by the user" and not robot.velocity.any()
+    summary = loop(robot, Pressed(skeletons(60))).run()
+    assert summary.reason == "stopped by the user" and not robot.velocity.any()
 
 
 def test_a_protective_stop_ends_it():
@@ -131,7 +136,7 @@ def test_a_protective_stop_ends_it():
     one = loop(robot)
     robot.fault = "protective stop: a joint was held"
     one.step(0.0, None)
-    assert one.tally.reason == robot.fault and one.tally.doing == {INTERRUPTED: 1}
+    assert one.summary.reason == robot.fault and one.summary.interrupted == 1 and not one.summary.engagement
 
 
 def test_what_the_robot_did_is_recorded_from_when_it_was_led(tmp_path):
@@ -141,7 +146,7 @@ def test_what_the_robot_did_is_recorded_from_when_it_was_led(tmp_path):
         one = loop(robot, recorder=recorder)
         lead(one, 2.0)
     shown = Demonstration.load(path)
-    assert len(shown) == recorder.n_samples >= one.tally.doing["following"] > 100
+    assert len(shown) == recorder.n_samples >= one.summary.engagement["following"] > 100
     np.testing.assert_array_equal(shown.joints[-1], robot.state().q)
     assert shown.trajectory.times[0] > 0.3
 
@@ -167,14 +172,19 @@ def test_a_state_that_came_once_is_recorded_once(tmp_path, monkeypatch):
 class Wired:
     """Person, stream, loop, client and server, one after the other in the same time."""
 
-    def __init__(self, operator=None):
+    def __init__(self, confirm_enable=None):
         self.served = Served()
         self.clock = self.served.clock
         self.stream = UdpSource(0, clock_ns=self.clock)
         self.sender = SkeletonSender(self.stream.address, clock_ns=self.clock)
         self.robot = self.served.client()
         self.loop = loop(
-            self.robot, followed(self.stream), self.clock, stream=self.stream, operator=operator, sleep=lambda s: None
+            self.robot,
+            followed(self.stream),
+            self.clock,
+            stream=self.stream,
+            confirm_enable=confirm_enable,
+            sleep=lambda s: None,
         )
         self.frames = skeletons(600)
         self.k = 0
@@ -199,30 +209,32 @@ class Wired:
 
 @pytest.fixture
 def wired():
-    wired = Wired(operator=lambda trouble, stopped: stopped)
+    wired = Wired(confirm_enable=lambda problem, stopped: stopped)
     yield wired
     wired.close()
 
 
 def test_a_served_robot_is_led_once_the_operator_lets_it(wired):
-    told = []
-    wired.loop._operator = lambda trouble, stopped: bool(told.append((trouble, stopped)))
+    asked = []
+    wired.loop._confirm_enable = lambda problem, stopped: bool(asked.append((problem, stopped)))
     wired.run(2.0)
-    assert set(told) == {("just started", True)} and np.array_equal(wired.served.robot.q, ARM.home)
-    assert wired.loop.tally.doing == {INTERRUPTED: 200}
-    wired.loop._operator = lambda trouble, stopped: stopped
+    assert set(asked) == {("the server has just started", True)} and np.array_equal(wired.served.robot.q, ARM.home)
+    assert wired.loop.summary.interrupted == 200 and not wired.loop.summary.engagement
+    wired.loop._confirm_enable = lambda problem, stopped: stopped
     wired.run(4.0)
-    assert wired.loop.tally.doing["following"] > 200 and wired.served.status is Status.FOLLOWING
+    assert wired.loop.summary.engagement["following"] > 200 and wired.served.status is RobotStatus.FOLLOWING
     assert np.abs(wired.served.robot.q - ARM.home).max() > 0.05
     assert_within_limits(wired.served.robot.steps)
 
 
 def test_the_latency_of_each_stage_is_noted(wired):
     wired.run(3.0)
-    rows = {stage: n for stage, n, *_ in wired.loop.tally.latency.rows()}
+    rows = {stage: n for stage, n, *_ in wired.loop.summary.latency.statistics()}
     assert set(rows) == {"expose", "arrive", "wait", "retarget", "send", "robot", "apply", "total"}
     assert rows["total"] >= 0.9 * rows["wait"] > 50
-    values = dict(zip(wired.loop.tally.latency.stages, np.nanmax(wired.loop.tally.latency.values, axis=0), strict=True))
+    values = dict(
+        zip(wired.loop.summary.latency.stages, np.nanmax(wired.loop.summary.latency.values, axis=0), strict=True)
+    )
     assert values["robot"] <= 0.004 + 1e-9 and values["total"] <= 0.02
 
 
@@ -232,7 +244,7 @@ def test_a_capture_process_that_dies_stops_the_arm_and_begins_anew(wired):
     wired.capturing = False
     wired.run(1.5)
     assert wired.loop.retargeter.latest.state in ("stopped", "waiting")
-    assert np.abs(wired.served.robot.velocity).max() < 1e-4 and wired.served.status is Status.FOLLOWING
+    assert np.abs(wired.served.robot.velocity).max() < 1e-4 and wired.served.status is RobotStatus.FOLLOWING
     wired.sender.close()
     wired.sender = SkeletonSender(wired.stream.address, clock_ns=wired.clock)
     wired.capturing = True
@@ -249,7 +261,7 @@ def test_a_loop_that_was_held_up_takes_hold_anew_from_where_the_arm_is(wired):
     for pause in (0.2, 0.8):  # the server slows, then latches
         wired.served.sleep(pause)
         wired.run(3.0)
-        assert wired.loop.tally.interruptions >= 1
+        assert wired.loop.summary.interruptions >= 1
         assert wired.loop.retargeter.latest.state == "following"
         np.testing.assert_allclose(wired.robot.set_point, wired.loop.retargeter.latest.q, atol=5e-3)
     assert_within_limits(wired.served.robot.steps)
@@ -262,10 +274,10 @@ def test_a_robot_process_that_dies_and_comes_back_elsewhere_is_not_pulled_to_whe
     wired.run(0.5)
     assert not wired.robot.ready
     wired.served = Served(Paper(ARM.home + 0.2), port=port, clock=wired.clock)
-    wired.loop._operator = lambda trouble, stopped: False
+    wired.loop._confirm_enable = lambda problem, stopped: False
     wired.run(1.0)
     assert np.array_equal(wired.served.robot.q, ARM.home + 0.2)
-    wired.loop._operator = lambda trouble, stopped: stopped
+    wired.loop._confirm_enable = lambda problem, stopped: stopped
     wired.run(3.0)
     assert wired.loop.retargeter.latest.state == "following"
     assert_within_limits(wired.served.robot.steps)
@@ -275,4 +287,4 @@ def test_a_faulty_robot_ends_it(wired):
     wired.run(1.5)
     wired.served.robot.fault = "protective stop: a joint was held"
     wired.run(0.1)
-    assert wired.loop.tally.reason == "protective stop: a joint was held"
+    assert wired.loop.summary.reason == "protective stop: a joint was held"

@@ -16,7 +16,7 @@ from imitarm.capture.recording import SkeletonRecording
 from imitarm.files.part_file import PART
 from imitarm.kinematics.arm import ArmModel
 from imitarm.trajectory import Demonstration
-from imitarm.transmission.messages import Status
+from imitarm.transmission.messages import RobotStatus
 from recording_samples import skeletons
 from wire_samples import assert_within_limits
 
@@ -120,7 +120,7 @@ class Stage:
             _, status, q, velocity = self.steps()
             return (
                 len(q) > begun
-                and status[-1] == Status.FOLLOWING
+                and status[-1] == RobotStatus.FOLLOWING
                 and np.abs(velocity[-1]).max() > 0.1
                 and np.abs(q[-1] - q[begun]).max() > 0.02
             )
@@ -135,7 +135,7 @@ class Stage:
         begun = len(self.steps()[0])
         self.wait("time", lambda: (t := self.steps()[0])[-1] - t[begun - 1] > seconds)
         _, status, q, velocity = (column[begun:] for column in self.steps())
-        assert (status == Status.STOPPED).all() and not velocity.any() and (q == q[0]).all()
+        assert (status == RobotStatus.STOPPED).all() and not velocity.any() and (q == q[0]).all()
 
     def close(self):
         for process in self.running.values():
@@ -161,20 +161,18 @@ def test_each_process_may_be_killed_and_started_again_and_the_arm_never_jumps(st
 
     def held():  # by the retargeter, which lives: at rest, and not because the robot has stopped itself
         _, status, _, velocity = stage.steps()
-        return np.abs(velocity[-1]).max() < 1e-3 and status[-1] == Status.FOLLOWING
+        return np.abs(velocity[-1]).max() < 1e-3 and status[-1] == RobotStatus.FOLLOWING
 
     stage.wait("rest", held)
     stage.start_capture()
     stage.wait_for_motion()
 
     stage.kill("retargeting")
-    stage.wait_for_status(Status.STOPPED)
+    stage.wait_for_status(RobotStatus.STOPPED)
     _, status, _, velocity = stage.steps()
-    assert Status.SLOWING in status and not velocity[-1].any()
+    assert RobotStatus.SLOWING in status and not velocity[-1].any()
     stage.start_retargeting()  # nobody has said that the robot may move
-    stage.wait(
-        "question", lambda: "If the workspace is clear, press Enter to let it move again" in stage.log("retargeting")
-    )
+    stage.wait("question", lambda: "If the workspace is clear, press Enter to enable it" in stage.log("retargeting"))
     stage.assert_still(0.3)
     stage.press_enter()
     stage.wait_for_motion()
@@ -192,7 +190,7 @@ def test_each_process_may_be_killed_and_started_again_and_the_arm_never_jumps(st
     retargeting.send_signal(signal.SIGINT)
     retargeting.communicate(timeout=PATIENCE)
     assert retargeting.returncode == 0, stage.log("retargeting")
-    stage.wait_for_status(Status.STOPPED)
+    stage.wait_for_status(RobotStatus.STOPPED)
     robot = stage.running.pop("robot")
     robot.send_signal(signal.SIGTERM)
     robot.communicate(timeout=PATIENCE)

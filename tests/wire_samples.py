@@ -8,7 +8,7 @@ from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.robots import Robot, RobotServer, UdpRobot
 from imitarm.robots.supervisor import fingerprint
 from imitarm.transmission.datagram import Encoder
-from imitarm.transmission.messages import JointCommand, JointState, Mode, SkeletonFrame, Status
+from imitarm.transmission.messages import CommandMode, JointCommand, JointState, RobotStatus, SkeletonFrame
 
 ARM = ArmModel.load("sawyer")
 N = ARM.n_joints
@@ -70,7 +70,7 @@ def skeleton_frame(rng=None, **fields):
     return SkeletonFrame(**(given | fields))
 
 
-def command(mode=Mode.MOVE, q=ARM.home, velocity=None, **fields):
+def command(mode=CommandMode.MOVE, q=ARM.home, velocity=None, **fields):
     given = {"arm": fingerprint(ARM)} | fields
     return JointCommand(mode, np.asarray(q, dtype=float), np.zeros(N) if velocity is None else velocity, **given)
 
@@ -78,7 +78,7 @@ def command(mode=Mode.MOVE, q=ARM.home, velocity=None, **fields):
 def joint_state(rng=None, **fields):
     rng = np.random.default_rng(0) if rng is None else rng
     given = {
-        "status": Status(int(rng.integers(0, 4))),
+        "status": RobotStatus(int(rng.integers(0, 4))),
         "time": float(rng.uniform(0, 100)),
         **{name: rng.normal(size=N) for name in ("q", "velocity", "torque", "set_point", "set_velocity")},
         "arm": int(rng.integers(0, 2**32)),
@@ -147,11 +147,11 @@ class Sender:
         return self.encoder.encode(message, now)
 
     def enable(self, now, **fields):
-        data = self.bytes(command(Mode.ENABLE, **({"challenge": self.supervisor.challenge} | fields)), now)
+        data = self.bytes(command(CommandMode.ENABLE, **({"challenge": self.supervisor.challenge} | fields)), now)
         self.supervisor.receive(data, now)
         return data
 
     def move(self, now, q=ARM.home, velocity=None, **fields):
-        data = self.bytes(command(Mode.MOVE, q, velocity, **fields), now)
+        data = self.bytes(command(CommandMode.MOVE, q, velocity, **fields), now)
         self.supervisor.receive(data, now)
         return data

@@ -10,7 +10,7 @@ import numpy as np
 
 from imitarm.capture.skeleton import HandState, Skeleton, SkeletonSource, Tracking, number_after_colon
 from imitarm.transmission.datagram import Encoder, now_ns
-from imitarm.transmission.gate import Gate
+from imitarm.transmission.datagram_filter import DatagramFilter
 from imitarm.transmission.messages import SkeletonFrame
 from imitarm.transmission.sockets import LOOPBACK, Address, connected, listening, try_to_send, wait_for, waiting
 
@@ -96,8 +96,9 @@ class UdpSource(SkeletonSource):
     """Skeletons from a :class:`SkeletonSender`, live.
 
     Datagrams that are late, damaged, foreign or hostile are dropped and counted by a
-    :class:`~imitarm.transmission.gate.Gate`. A sender that is killed and started again is accepted after half a second
-    of silence; its times are shifted so that they continue after the gap, and every retargeter engages anew.
+    :class:`~imitarm.transmission.datagram_filter.DatagramFilter`. A sender that is killed and started again is
+    accepted after half a second of silence; its times are shifted so that they continue after the gap, and every
+    retargeter engages anew.
 
     Args:
         port: to listen on; 0: any free one.
@@ -120,7 +121,7 @@ class UdpSource(SkeletonSource):
         self._socket = listening((host, port))
         self.address: Address = self._socket.getsockname()
         self.name = f"udp:{port}" if host == LOOPBACK else f"udp:{host}:{port}"
-        self.gate = Gate()
+        self.datagram_filter = DatagramFilter()
         self.arrival: Arrival | None = None
         self._clock_ns = clock_ns
         self._sessions, self._shift = 1, 0.0
@@ -159,10 +160,10 @@ class UdpSource(SkeletonSource):
         while not self._closed:
             for data, address in waiting(self._socket):
                 now = self._clock_ns()
-                came = self.gate.open(data, now, SkeletonFrame)
+                came = self.datagram_filter.receive(data, now, SkeletonFrame)
                 if came is not None:
                     here = address[0].startswith("127.")  # sender and receiver have one clock
-                    queued = 1e-9 * (now - came[0].time_ns) if here else self.gate.age
+                    queued = 1e-9 * (now - came[0].time_ns) if here else self.datagram_filter.age
                     return self._skeleton(came[1], now, queued)
             left = until - clock.monotonic()
             if left <= 0.0:
@@ -172,8 +173,8 @@ class UdpSource(SkeletonSource):
 
     def _skeleton(self, frame: SkeletonFrame, now: int, queued: float) -> Skeleton:
         """Return the skeleton that was sent, at a time that continues from one session of the sender to the next."""
-        if self.gate.sessions != self._sessions:
-            self._sessions = self.gate.sessions
+        if self.datagram_filter.n_sessions != self._sessions:
+            self._sessions = self.datagram_filter.n_sessions
             silent = 0.0 if self.arrival is None else 1e-9 * (now - self.arrival.received_ns)
             self._shift = self._time + silent - frame.time
         self.arrival = Arrival(1e-9 * frame.waited_ns, queued, now)

@@ -1,4 +1,4 @@
-"""``imitarm serve``: a process for a robot, which others lead over UDP."""
+"""``imitarm serve``: makes a robot available to other processes over UDP."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.robots import RobotServer, SimulatedRobot
 from imitarm.scene import Scene, load_scene
-from imitarm.transmission.gate import REASONS
+from imitarm.transmission.datagram_filter import DROP_REASONS
 from imitarm.transmission.sockets import LOOPBACK
 
 EPILOG = """\
@@ -29,34 +29,43 @@ examples:
   imitarm serve --robot panda --scene table.yaml --seconds 600
   imitarm serve --robot sawyer --trace steps.csv
 
-Lead it with 'imitarm teleoperate SOURCE --to 127.0.0.1:7500'. It begins stopped, until the operator there enables it;
-0.1 s without commands and it brakes, 0.5 s and it stays stopped. Whoever can reach the port can move the robot: it
-listens to this machine only, unless --host says otherwise. Ctrl-C brakes and ends it.
+Control the robot with 'imitarm teleoperate SOURCE --to 127.0.0.1:7500'. It is stopped until the user there enables it.
+After 0.1 s without a command it brakes, and after 0.5 s it stays stopped. Anyone who can reach the port can move the
+robot; without --host only this machine can. Ctrl-C brakes the robot and ends the command.
 """
 
 _PORT = 7500
-_SHOWN_EVERY = 25  # periods between two looks at the status line
+_SHOWN_EVERY = 25  # periods between two updates of the status line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes."""
+    """Add the arguments of the command."""
     add_robot_options(parser)
     parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles (YAML); default: none")
-    parser.add_argument("--control", choices=("position", "torque"), default="position", help="of the simulated drives")
-    wire = parser.add_argument_group("the wire")
-    wire.add_argument("--port", type=int, default=_PORT, metavar="N", help=f"default: {_PORT}; 0: any that is free")
-    wire.add_argument("--host", default=LOOPBACK, metavar="ADDRESS", help=f"to listen at; default: {LOOPBACK}")
-    wire.add_argument("--rate", type=float, default=250.0, metavar="HZ", help="control periods a second; default: 250")
-    parser.add_argument("--seconds", type=float, metavar="S", help="how long; default: till Ctrl-C")
-    parser.add_argument("--trace", type=Path, metavar="FILE", help="write every period's status and set-point (CSV)")
+    parser.add_argument(
+        "--control",
+        choices=("position", "torque"),
+        default="position",
+        help="control of the simulated drives; default: position",
+    )
+    network = parser.add_argument_group("network")
+    network.add_argument(
+        "--port", type=int, default=_PORT, metavar="N", help=f"port to listen on; default: {_PORT}; 0: any free port"
+    )
+    network.add_argument(
+        "--host", default=LOOPBACK, metavar="ADDRESS", help=f"address to listen on; default: {LOOPBACK}"
+    )
+    network.add_argument("--rate", type=float, default=250.0, metavar="HZ", help="control rate; default: 250")
+    parser.add_argument("--seconds", type=float, metavar="S", help="duration; default: until Ctrl-C")
+    parser.add_argument("--trace", type=Path, metavar="FILE", help="write each period's status and set-point (CSV)")
     parser.add_argument("--force", action="store_true", help="replace the file of --trace")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve until the time is up or the user stops it.
+    """Serve the robot until the time is up or the user stops it.
 
     Raises:
-        InputError: when an option or a file is wrong, or the port is taken.
+        InputError: when an option or a file is invalid, or the port is in use.
     """
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
@@ -68,9 +77,9 @@ def run(arguments: argparse.Namespace) -> int:
     arm = load_robot(arguments)
     robot = SimulatedRobot(arm, scene=scene, control=arguments.control)
     with ExitStack() as stack:
-        stack.enter_context(terminated_as_interrupted())
+        stack.enter_context(sigterm_as_interrupt())
         status = working("starting")
-        early: list[str] = []  # what happens before it listens, which on a port that is taken it never does
+        early: list[str] = []  # events before the server listens, which it never does if the port is in use
         tell: Callable[[str], None] = early.append
         server = RobotServer(
             robot,
@@ -84,48 +93,49 @@ def run(arguments: argparse.Namespace) -> int:
         if trace is not None:
             stack.callback(trace.close)
         if arguments.host != LOOPBACK:
-            remark("note: whoever can reach this address can move the robot; keep it on a network of its own")
-        say(f"{arm.name} listens at {server.address[0]}:{server.address[1]}")
+            remark("note: anyone who can reach this address can move the robot; use a separate network")
+        say(f"{arm.name} listens on {server.address[0]}:{server.address[1]}")
         tell = status.console.print
         for event in early:
             tell(event)
         stack.enter_context(status)
         try:
-            server.run(arguments.seconds, on_step=_shown(trace, status.update))
+            server.run(arguments.seconds, on_step=_show_progress(trace, status.update))
         except KeyboardInterrupt:
             remark("stopped")
-    _summary(server)
+    _show_summary(server)
     return 0
 
 
-def _shown(trace: Trace | None, update: Callable[[Text], None]) -> Callable[[RobotServer], None]:
-    """Return what to do after every period: write it down, and now and then show it."""
+def _show_progress(trace: Trace | None, update: Callable[[Text], None]) -> Callable[[RobotServer], None]:
+    """Return the function to call after every period: it writes the trace and, from time to time, the status line."""
 
     def on_step(server: RobotServer) -> None:
         supervisor = server.supervisor
         if trace is not None:
             trace.write(server)
-        if server.pace.ticks % _SHOWN_EVERY == 0:
+        if server.rate_limiter.ticks % _SHOWN_EVERY == 0:
             moving = float(np.abs(supervisor.robot.velocity).max())
-            words = f"{supervisor.status.name.lower()}, {supervisor.gate.admitted} commands"
-            missed = f"{server.pace.overruns} periods missed"
+            words = f"{supervisor.status.name.lower()}, {supervisor.datagram_filter.accepted} commands"
+            missed = f"{server.rate_limiter.overruns} periods missed"
             update(Text(f"{words}, {np.degrees(moving):.0f} deg/s, {missed} {supervisor.reason}"))
 
     return on_step
 
 
-def _summary(server: RobotServer) -> None:
-    """Print what came and what was dropped."""
+def _show_summary(server: RobotServer) -> None:
+    """Print how many commands were accepted and dropped."""
     supervisor = server.supervisor
     status, why = supervisor.status.name.lower(), supervisor.reason
-    dropped = supervisor.gate.dropped + supervisor.dropped
+    dropped = supervisor.datagram_filter.dropped + supervisor.dropped
+    rate = server.rate_limiter
     show_table(
         ["served", supervisor.robot.arm.name],
         [
-            ("control periods", f"{server.pace.ticks - server.pace.overruns}, missed {server.pace.overruns}"),
-            ("commands admitted", str(supervisor.gate.admitted)),
+            ("control periods", f"{rate.ticks - rate.overruns}, missed {rate.overruns}"),
+            ("commands accepted", str(supervisor.datagram_filter.accepted)),
             *(
-                (f"dropped: {reason}", f"{n} {REASONS.get(reason, '')}".strip())
+                (f"dropped: {reason}", f"{n} {DROP_REASONS.get(reason, '')}".strip())
                 for reason, n in sorted(dropped.items())
             ),
             ("at the end", why if why.startswith(status) else ": ".join(filter(None, [status, why]))),
@@ -134,18 +144,18 @@ def _summary(server: RobotServer) -> None:
 
 
 class Trace:
-    """Every control period of a robot in a file, each line handed over at once, so that a kill loses none.
+    """A file with one line for each control period, written at once, so that a killed process loses none.
 
     Columns: time [s], status (0 stopped, 1 following, 2 slowing, 3 fault), then set-point [rad], its velocity [rad/s]
     and measured position [rad] of each joint.
 
     Args:
-        path: where to.
-        arm: whose joints.
-        replace: an existing file may be replaced.
+        path: file to write.
+        arm: arm whose joints are written.
+        replace: replace an existing file.
 
     Raises:
-        InputError: when the file is there already, or can't be written.
+        InputError: when the file exists already, or cannot be written.
     """
 
     def __init__(self, path: Path, arm: ArmModel, *, replace: bool = False) -> None:
@@ -162,7 +172,7 @@ class Trace:
         self._file.flush()
 
     def write(self, server: RobotServer) -> None:
-        """Add the period that is just over."""
+        """Write the period that has just ended."""
         supervisor = server.supervisor
         robot = supervisor.robot
         state = robot.state()
@@ -176,8 +186,8 @@ class Trace:
 
 
 @contextmanager
-def terminated_as_interrupted() -> Iterator[None]:
-    """Let the usual ``kill`` end what is in the ``with`` block as Ctrl-C does: with the robot braked."""
+def sigterm_as_interrupt() -> Iterator[None]:
+    """Let SIGTERM end the ``with`` block as Ctrl-C does, so that the robot is braked."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

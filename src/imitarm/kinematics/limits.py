@@ -23,6 +23,7 @@ ELBOW_MARGIN = 0.15  # [rad] distance that ElbowSingularityLimit keeps from the 
 WRIST_MARGIN = 0.1  # [rad] distance that WristSingularityLimit keeps from the singular wrist
 _WRIST_PRICE = 0.1  # as much as the tool's rotation about that joint
 _RETURN_RATE = 5.0  # [1/s] how fast a wrist inside its margin leaves it
+_MAX_PERIODS = 8  # control periods for which the constants of the box are kept
 _SIGN = np.array([[1.0], [-1.0]])
 
 
@@ -53,6 +54,9 @@ class JointLimits(Limit):
     lower bound is its mirror image. When :math:`v_p` kept this bound one step ago, braking with a keeps it now, so
     the box always holds a velocity.
 
+    The bound assumes that the joint moves by :math:`v\,dt` in one step. A robot changes its speed evenly and moves by
+    :math:`(v_p + v)\,dt/2`; ``imitarm.robots.limit_velocity`` therefore evaluates this box at :math:`q + v_p\,dt/2`.
+
     Args:
         arm: whose limits.
     """
@@ -75,6 +79,8 @@ class JointLimits(Limit):
         """
         known = self._boxes.get(dt)
         if known is None:
+            if len(self._boxes) >= _MAX_PERIODS:  # a measured dt differs in every step
+                self._boxes.clear()
             known = self._boxes.setdefault(dt, _VelocityBox(self.arm, dt))
         return known.at(q, velocity)
 

@@ -1,4 +1,4 @@
-"""Bodies that move: simulated and real, here and at the other end of a wire."""
+"""Robots: simulated in this process, or controlled over UDP."""
 
 from __future__ import annotations
 

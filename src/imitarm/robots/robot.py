@@ -1,116 +1,104 @@
-"""What every body has in common: it tells its state and moves at joint velocities, within its limits."""
+"""Robot: the interface of every robot. It reports its state and moves at joint velocities within its limits."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
-
-if TYPE_CHECKING:
-    from imitarm.kinematics.arm import ArmModel, ArmState
+from imitarm.kinematics.arm import ArmModel, ArmState
+from imitarm.kinematics.limits import JointLimits
 
 Array = NDArray[np.float64]
 
-_TOUCHED = 1e-9  # relative change of a velocity above which a limit is said to have changed it
+_CHANGED = 1e-9  # relative change of a velocity above which a limit counts as having changed it
 
 
 def limit_velocity(
-    arm: ArmModel, q: ArrayLike, previous: ArrayLike, velocity: ArrayLike, dt: float
+    limits: JointLimits, q: ArrayLike, previous: ArrayLike, velocity: ArrayLike, dt: float
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return the velocity nearest to the asked one that the joints can follow and still brake from.
+    """Return the velocity nearest to the requested one that the joints can reach and can still brake from.
 
-    1. *velocity*: all joints are slowed by one factor, so that the direction of the tool stays.
-    2. *acceleration* and *position*, joint by joint, the box of METHODS A.9::
-
-           upper = min(v_max, v_p + a dt, max(v_b(q_max - q - v_p dt / 2), v_p - a dt)),   lower mirrored
-           v_b(D) = -a dt + sqrt(a^2 dt^2 + 2 a max(D, 0))
-
-       ``v_b`` satisfies ``v^2 / 2a + v dt <= D``. The term ``v_p dt / 2`` is there because the speed changes evenly
-       during ``dt``: with it whoever obeys the box can always brake before the limit, so the box is never empty,
-       also beyond a limit.
+    First, all joints are slowed by one factor until none exceeds its maximum velocity, so that the tool keeps its
+    direction. Then each joint is clipped to the box of :class:`~imitarm.kinematics.limits.JointLimits`, evaluated at
+    ``q + previous * dt / 2`` and not at ``q``: that box assumes that the set-point moves by ``velocity * dt``, while
+    a robot changes its speed evenly and moves by ``(previous + velocity) / 2 * dt``.
 
     Args:
-        arm: whose limits.
-        q: commanded joint angles now, shape (n,) [rad].
-        previous: velocity ``v_p`` commanded last, shape (n,) [rad/s].
-        velocity: asked, shape (n,) [rad/s].
-        dt: how long the velocity will be held [s].
+        limits: limits of the arm.
+        q: commanded joint positions now, shape (n_joints,) [rad].
+        previous: joint velocity commanded last, shape (n_joints,) [rad/s].
+        velocity: requested joint velocity, shape (n_joints,) [rad/s].
+        dt: time for which the velocity will be held [s].
 
     Returns:
-        The velocity (n,) [rad/s], and which of ``"velocity"``, ``"acceleration"``, ``"position"`` changed it.
+        The velocity, shape (n_joints,) [rad/s], and which of ``"velocity"``, ``"acceleration"`` and ``"position"``
+        changed it.
     """
-    q, v_p, asked = (np.asarray(x, dtype=float) for x in (q, previous, velocity))
-    a = arm.max_acceleration
-    scaled = asked / max(1.0, float(np.max(np.abs(asked) / arm.max_velocity)))
-    reached = np.clip(scaled, v_p - a * dt, v_p + a * dt)
-    ahead = q + 0.5 * dt * v_p
-    upper = np.maximum(_braking_velocity(arm.upper - ahead, a, dt), v_p - a * dt)
-    lower = np.minimum(-_braking_velocity(ahead - arm.lower, a, dt), v_p + a * dt)
-    braked = np.clip(reached, lower, upper)
-    stages = (("velocity", asked, scaled), ("acceleration", scaled, reached), ("position", reached, braked))
-    tolerance = _TOUCHED * arm.max_velocity
-    return braked, tuple(name for name, before, after in stages if np.any(np.abs(after - before) > tolerance))
-
-
-def _braking_velocity(distance: Array, a: Array, dt: float) -> Array:
-    root = np.sqrt(np.square(a * dt) + 2.0 * a * np.maximum(distance, 0.0))
-    return np.maximum(root - a * dt, 0.0)  # rounding must not ask for a motion at the limit
+    q, previous, requested = (np.asarray(x, dtype=float) for x in (q, previous, velocity))
+    arm = limits.arm
+    scaled = requested / max(1.0, float(np.max(np.abs(requested) / arm.max_velocity)))
+    reached = np.clip(scaled, previous - arm.max_acceleration * dt, previous + arm.max_acceleration * dt)
+    box = limits.box(q + 0.5 * dt * previous, dt, previous)
+    allowed = np.clip(scaled, box.lower, box.upper)
+    stages = (("velocity", requested, scaled), ("acceleration", scaled, reached), ("position", reached, allowed))
+    tolerance = _CHANGED * arm.max_velocity
+    return allowed, tuple(name for name, before, after in stages if np.any(np.abs(after - before) > tolerance))
 
 
 class Robot(ABC):
-    """A body with an arm: simulated or real, driven by joint velocities.
+    """A robot with an arm, simulated or real, that is commanded by joint velocities.
 
-    :meth:`move` checks the velocity against the arm's limits and then sends it. What was sent is integrated to
-    ``set_point``, the joint angles where the drives should be, so the limits hold for the commands and do not
-    depend on the noise of a measurement. Between two calls the drives change speed evenly: the set-point moves by
-    ``(previous + velocity) / 2 * dt``.
+    :meth:`move` limits a velocity and sends it. The sent velocities are integrated to ``set_point``, the joint
+    positions that the drives track. The limits therefore hold for the commands and do not depend on measurement
+    noise. Between two calls the speed changes evenly: the set-point moves by ``(previous + velocity) / 2 * dt``.
 
     Attributes:
         arm: the model of the arm, with its limits.
-        set_point: commanded joint angles, shape (n_joints,) [rad].
-        velocity: commanded joint velocity, shape (n_joints,) [rad/s].
+        set_point: commanded joint positions, shape (n_joints,) [rad].
+        velocity: commanded joint velocities, shape (n_joints,) [rad/s].
         clamped: which limits changed the last command: any of ``"velocity"``, ``"acceleration"``, ``"position"``.
-        fault: why the robot has stopped to protect itself and what is near it, in words; empty when all is well.
+        fault: why the robot has made a protective stop; empty if it has not.
     """
 
-    following_error: ClassVar[float] = 0.1  # [rad] a joint so far from its set-point is held by something
+    following_error: ClassVar[float] = 0.1  # [rad] distance from its set-point at which a joint counts as blocked
 
     def __init__(self, arm: ArmModel, q: ArrayLike) -> None:
         self.arm = arm
         self.clamped: tuple[str, ...] = ()
         self.fault = ""
+        self._limits = JointLimits(arm)
         self._begin(q)
 
     def _begin(self, q: ArrayLike) -> None:
-        """Set point and command of an arm at rest at ``q``."""
+        """Reset set-point and velocity to an arm at rest at ``q``."""
         self.set_point: Array = np.array(q, dtype=float)
         self.velocity: Array = np.zeros(self.arm.n_joints)
         self.clamped = ()
 
     @abstractmethod
     def state(self) -> ArmState:
-        """Return the measured joint angles, velocities and torques, and the robot's time."""
+        """Return the measured joint positions, velocities and torques, and the time of the robot."""
 
     @abstractmethod
     def _send(self, previous: Array, velocity: Array, dt: float) -> None:
-        """Drive from ``set_point`` for ``dt`` while the speed goes evenly from ``previous`` to ``velocity``."""
+        """Drive from ``set_point`` for ``dt`` while the speed changes evenly from ``previous`` to ``velocity``."""
 
     def move(self, velocity: ArrayLike, dt: float) -> ArmState:
-        """Move for ``dt`` seconds so that the joints have ``velocity`` at the end of it.
+        """Move for ``dt`` seconds; the joints reach ``velocity`` at the end.
 
-        A velocity that the limits forbid is replaced by the nearest one they allow, see :func:`limit_velocity`;
-        ``clamped`` says so. A velocity that is no velocity stops the robot before the error is raised.
-        A joint that is more than 0.1 rad from its set-point is held by something: the robot stops where it is and
-        sets ``fault``; from then on it does not move.
+        A velocity beyond the limits is replaced by the nearest one within them (:func:`limit_velocity`), and
+        ``clamped`` names the limits. An invalid velocity (wrong shape, NaN) stops the robot, then raises InputError.
+        A joint that is more than 0.1 rad away from its set-point counts as blocked: the robot makes a protective
+        stop, sets ``fault`` and does not move any more.
 
         Args:
-            velocity: of the joints, shape (n_joints,) [rad/s].
-            dt: [s].
+            velocity: joint velocities, shape (n_joints,) [rad/s].
+            dt: duration of the motion [s].
 
         Returns:
             The measured state after the motion.
@@ -118,8 +106,8 @@ class Robot(ABC):
         Raises:
             InputError: when the shape is wrong, a number is not finite or ``dt`` is not positive.
         """
-        asked = np.asarray(velocity, dtype=float)
-        if asked.shape != (self.arm.n_joints,) or not np.isfinite(asked).all():
+        requested = np.asarray(velocity, dtype=float)
+        if requested.shape != (self.arm.n_joints,) or not np.isfinite(requested).all():
             self.stop()
             raise InputError(
                 f"move: velocity must be {self.arm.n_joints} finite numbers [rad/s], got {velocity!r}; robot stopped"
@@ -128,31 +116,32 @@ class Robot(ABC):
             raise InputError(f"move: dt must be a positive time [s], got {dt!r}")
         if self.fault:
             return self.state()
-        allowed, self.clamped = limit_velocity(self.arm, self.set_point, self.velocity, asked, dt)
+        allowed, self.clamped = limit_velocity(self._limits, self.set_point, self.velocity, requested, dt)
         self._send(self.velocity, allowed, dt)
         self.set_point = self.set_point + 0.5 * dt * (self.velocity + allowed)
         self.velocity = allowed
         state = self.state()
-        behind = np.abs(self.set_point - state.q)
-        if behind.max() > self.following_error:
-            i = int(behind.argmax())
+        error = np.abs(self.set_point - state.q)
+        if error.max() > self.following_error:
+            i = int(error.argmax())
             self._begin(state.q)
-            self.fault = f"protective stop: {self.arm.joint_names[i]} was held {behind[i]:.2f} rad from its set-point"
+            self.fault = f"protective stop: {self.arm.joint_names[i]} is {error[i]:.2f} rad away from its set-point"
         return state
 
     def grasp(self, opening: float) -> None:
-        """Begin to move the gripper's fingers to an opening; they go on by themselves while the arm moves.
+        """Start to move the gripper's fingers to an opening; they continue to move while the arm moves.
 
-        Fingers that meet something press on it with their limited force: ``grasp(0.0)`` takes hold of what is
-        between them.
+        Fingers that touch an object press on it with limited force, so ``grasp(0.0)`` grasps an object between them.
 
         Args:
-            opening: between the fingers [m].
+            opening: distance between the fingers [m].
 
         Raises:
             InputError: when this robot has no gripper, or its fingers do not open so far.
         """
-        raise InputError(f"grasp: {type(self).__name__} with {self.arm!r} has no gripper; mount one with a tool")
+        raise InputError(
+            f"grasp: {type(self).__name__} with {self.arm!r} has no gripper; load an arm with a gripper as its tool"
+        )
 
     @property
     def opening(self) -> float:
@@ -161,23 +150,23 @@ class Robot(ABC):
 
     @property
     def widest_opening(self) -> float:
-        """Opening of the gripper when it is wide open [m]; nan without a gripper."""
+        """Largest opening of the gripper [m]; nan without a gripper."""
         return float("nan")
 
     def clearance(self) -> float:
-        """Return the measured distance from arm and tool to the nearest obstacle [m]; nan for a body that can't."""
+        """Return the distance from arm and tool to the nearest obstacle [m]; nan if the robot does not measure it."""
         return float("nan")
 
     def nearest_pair(self) -> tuple[str, str] | None:
-        """Return the names of the arm's part and the obstacle that are nearest; None when there is none, or unknown."""
+        """Return the names of the nearest part of the arm and obstacle; None if there is none or it is unknown."""
         return None
 
     def report(self) -> Mapping[str, Any]:
-        """Return what else this body has measured since it was started, by name; empty by default."""
+        """Return further measurements since the robot was started, by name; empty by default."""
         return {}
 
     def stop(self, dt: float = 0.01) -> ArmState:
-        """Brake as hard as the accelerations allow, until the command is at rest.
+        """Brake at the maximum acceleration until the commanded velocity is zero.
 
         Args:
             dt: time between two commands [s].

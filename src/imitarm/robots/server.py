@@ -1,4 +1,4 @@
-"""RobotServer: a process of its own for a robot, led over UDP."""
+"""RobotServer: serves a robot to clients over UDP."""
 
 from __future__ import annotations
 
@@ -10,40 +10,41 @@ from imitarm.errors import InputError
 from imitarm.robots.robot import Robot
 from imitarm.robots.supervisor import Supervisor
 from imitarm.transmission.datagram import now_ns
-from imitarm.transmission.pace import Pace
+from imitarm.transmission.rate import RateLimiter
 from imitarm.transmission.sockets import LOOPBACK, Address, listening, try_to_send, wait_for, waiting
 
-_AT_ONCE = 64  # datagrams taken in one period: a flood must not keep the robot waiting
-_ANSWERED = 8  # addresses answered in one period
-_MADE_UP = 0.02  # [s] longest step
+_AT_ONCE = 64  # datagrams read in one period, so that a flood does not delay the robot
+_MAX_ANSWERS = 8  # addresses answered in one period
+_MAX_STEP = 0.02  # [s] longest step after missed periods
 
 
 class RobotServer:
-    """Listens for commands, moves a robot at a fixed rate, and answers whoever has asked, at most once a period.
+    """Receives commands, moves a robot at a fixed rate, and answers each client that has asked, once per period.
 
-    Nothing is sent unasked, and what is received is judged by a :class:`~imitarm.robots.supervisor.Supervisor`.
-    Where the machine was too busy for some periods, the next step is as much longer, up to 20 ms: the robot keeps up
-    with the commands, and the limits hold, since they count by the length of a step. What is missed beyond that is
-    left out.
+    It sends nothing unless asked, and a :class:`~imitarm.robots.supervisor.Supervisor` checks everything it receives.
+    If the machine was too busy and periods were missed, the next step is longer by their time, up to 20 ms in total,
+    so that the robot keeps up with the commands. The limits still hold, because they depend on the length of the
+    step. Time missed beyond that is skipped.
 
     Args:
-        robot: a simulated or a real one.
-        port: to listen at; 0: any that is free.
-        host: address of this machine to listen at; the usual one hears this machine only. There is no password:
-            open it to a network only where everybody may move the robot.
-        rate: periods a second [Hz], at least 100; a simulated robot needs a multiple of its timestep.
-        on_event: is told in words when the robot is enabled, slows, stops.
+        robot: robot to serve.
+        port: port to listen on; 0: any free port.
+        host: address of this machine to listen on; the default hears this machine only. There is no password: listen
+            on a network only if everyone on it may move the robot.
+        rate: control periods per second, 100 to 1000 [Hz]; the period of a simulated robot must be a multiple of its
+            timestep.
+        on_event: called with a text when the robot is enabled, slows or stops.
         clock_ns: returns the time [ns].
         wait: waits until a datagram has arrived, at most some seconds, and returns whether one has; with a simulated
             clock it lets the time pass.
 
     Attributes:
-        address: where it listens.
-        supervisor: which watches over the robot.
-        pace: which counts overruns.
+        address: host and port on which it listens.
+        supervisor: checks the commands and moves the robot.
+        rate_limiter: starts the control periods and counts the missed ones.
 
     Raises:
-        InputError: when the rate is too low, or the port is taken.
+        InputError: when the rate is out of range, or the port is in use.
     """
 
     def __init__(
@@ -60,47 +61,47 @@ class RobotServer:
         if not 100.0 <= rate <= 1000.0:
             raise InputError(f"RobotServer: rate must be between 100 and 1000 Hz, got {rate!r}")
         self._clock_ns, self._wait = clock_ns, wait
-        self.pace = Pace(1.0 / rate, clock_ns=clock_ns)
+        self.rate_limiter = RateLimiter(1.0 / rate, clock_ns=clock_ns)
         self.supervisor = Supervisor(robot, 1.0 / rate, on_event=on_event)
-        self._most = max(int(_MADE_UP * rate), 1)
-        self._asked: dict[Address, None] = {}
+        self._max_periods = max(int(_MAX_STEP * rate), 1)
+        self._clients: dict[Address, None] = {}
         self._socket = listening((host, port))
         self.address: Address = self._socket.getsockname()
 
     def receive(self) -> None:
-        """Take in what has come, without waiting."""
+        """Process the datagrams that have arrived, without waiting."""
         for data, address in waiting(self._socket, _AT_ONCE):
-            if self.supervisor.receive(data, self._clock_ns()) and len(self._asked) < _ANSWERED:
-                self._asked[address] = None
+            if self.supervisor.receive(data, self._clock_ns()) and len(self._clients) < _MAX_ANSWERS:
+                self._clients[address] = None
 
     def step(self, missed: int = 0) -> None:
-        """Take in what has come, move the robot, and answer.
+        """Process datagrams, move the robot for one period, and answer.
 
         Args:
-            missed: periods before this one.
+            missed: number of periods missed before this one.
         """
         self.receive()
-        self.supervisor.step(self._clock_ns(), min(1 + missed, self._most))
-        if self._asked:
+        self.supervisor.step(self._clock_ns(), min(1 + missed, self._max_periods))
+        if self._clients:
             answer = self.supervisor.answer(self._clock_ns)
-            for address in self._asked:
+            for address in self._clients:
                 try_to_send(self._socket, answer, address)
-            self._asked.clear()
+            self._clients.clear()
 
     def run(self, seconds: float | None = None, *, on_step: Callable[[Self], None] | None = None) -> None:
-        """Go on for some seconds, or until something raises; the robot is braked at the end.
+        """Serve for some time or until an exception is raised, then brake the robot.
 
         Args:
-            seconds: None: without end.
-            on_step: is called after every period.
+            seconds: duration [s]; None: unlimited.
+            on_step: called after every period.
         """
         until = None if seconds is None else self._clock_ns() + round(1e9 * seconds)
         try:
             while until is None or self._clock_ns() < until:
-                while (left := self.pace.left) > 0.0:
+                while (left := self.rate_limiter.remaining) > 0.0:
                     if self._wait(self._socket, left):
                         self.receive()
-                self.step(self.pace.tick())
+                self.step(self.rate_limiter.tick())
                 if on_step is not None:
                     on_step(self)
         finally:

@@ -1,4 +1,4 @@
-r"""Supervisor: stands between the wire and a robot; believes nothing, keeps every limit, stops when commands stop."""
+r"""Supervisor: checks every datagram for a robot, keeps its limits, and stops it when commands stop."""
 
 from __future__ import annotations
 
@@ -13,66 +13,68 @@ from numpy.typing import NDArray
 from imitarm.kinematics.arm import ArmModel
 from imitarm.robots.robot import Robot
 from imitarm.transmission.datagram import Encoder, Header, decode, now_ns
-from imitarm.transmission.gate import Gate
-from imitarm.transmission.messages import MAX_JOINTS, DatagramError, JointCommand, JointState, Mode, Status
+from imitarm.transmission.datagram_filter import DatagramFilter
+from imitarm.transmission.messages import MAX_JOINTS, CommandMode, DatagramError, JointCommand, JointState, RobotStatus
 
 Array = NDArray[np.float64]
 
-SLOW_AFTER, LATCH_AFTER = 0.1, 0.5  # [s] without a valid command, METHODS A.9
-NEAR = 0.15  # [s] a set-point must be nearer than a joint gets in this time at full speed
-_AHEAD = 0.03  # [s] a command is carried on at its velocity for so long; then that fades until SLOW_AFTER
-_GAIN = 20.0  # [1/s]
+SLOW_AFTER, LATCH_AFTER = 0.1, 0.5  # [s] without a valid command: brake; latch the stop
+REACH_TIME = 0.15  # [s] a command may be as far from the set-point as a joint moves in this time at full speed
+_EXTRAPOLATE = 0.03  # [s] a command is extrapolated at its velocity; after this the velocity fades until SLOW_AFTER
+_GAIN = 20.0  # [1/s] of the position error
 _TOLERANCE = 1e-6  # [rad], and relative
 
 
 def fingerprint(arm: ArmModel) -> int:
-    """Return a number that tells one arm from another: its joints and all their limits."""
+    """Return a number that identifies an arm: a checksum of its joint names and all their limits."""
     limits = np.concatenate([arm.lower, arm.upper, arm.max_velocity, arm.max_acceleration])
     return zlib.crc32("\0".join(arm.joint_names).encode() + limits.astype("<f8").tobytes())
 
 
 class Supervisor:
-    r"""Lets one remote client lead a robot, as long as that client is there and asks for what is possible.
+    r"""Lets one remote client move a robot while it sends valid commands, and checks every one of them.
 
-    ========== ============================================================= ======================================
-    status     what the robot does                                           what leads out
-    ========== ============================================================= ======================================
-    stopped    has braked and holds; commands are not heeded                 ENABLE with this stop's challenge
-    following  goes towards the set-point of the newest command              0.1 s without a valid command; a stop
-    slowing    has no command for 0.1 s: brakes and holds                    a valid command; 0.5 s without one
-    fault      has stopped to protect itself                                 only a new start of this process
-    ========== ============================================================= ======================================
+    ========== ============================================== ======================================================
+    status     what the robot does                            what ends it
+    ========== ============================================== ======================================================
+    stopped    has braked and holds; ignores commands         ENABLE with the challenge of this stop
+    following  moves to the newest commanded positions        no valid command for 0.1 s: slowing; STOP: stopped
+    slowing    brakes and holds                               a valid command: following; none for 0.5 s: stopped
+    fault      has made a protective stop                     a restart of the process
+    ========== ============================================== ======================================================
 
-    It begins stopped, and every stop draws a new challenge: a recorded ENABLE opens nothing, and a client that was
-    started again must have its operator enable the robot again. Whoever enables it owns it until the next stop.
-    Anybody may stop it.
+    It starts stopped. Every stop draws a new challenge, so a recorded ENABLE has no effect, and after a restart of the
+    client its user must enable the robot again. The client that enables the robot is its owner until the next stop.
+    Any client may stop it.
 
-    A command is valid when the gate admits it (:class:`~imitarm.transmission.gate.Gate`), it is for this arm, within
-    the joints' limits of position and velocity, and not farther from the set-point than the joints get in 0.15 s at
-    full speed.
+    A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this
+    arm, is within the joints' position and velocity limits, and is at most as far from the set-point as the joints
+    move in 0.15 s at full speed.
 
-    The robot goes from its own set-point towards the one received, at
+    The set-point q moves towards the commanded position :math:`q_c`, which has the velocity :math:`\dot q_c`, at
 
-    .. math:: \dot q = f\,\dot q_c + \mathrm{sign}(e) \min(k |e|, \sqrt{a |e|}), \qquad e = q_c + \dot q_c\, s - q
+    .. math:: \dot q = f\,\dot q_c + \mathrm{sign}(e) \min(k |e|, \sqrt{a |e|}), \qquad
+              e = q_c + \dot q_c\, s - q
 
-    where s is the age of the command and f its share that is left: whole for 30 ms, then fading until 100 ms. That
-    goes through :meth:`Robot.move <imitarm.robots.robot.Robot.move>`, which limits it once more. So whatever is
-    received, the set-point moves within the limits of position, velocity and acceleration.
+    with the gain k, the maximum acceleration a, the time s for which the command is extrapolated, and the fraction f
+    of its velocity: 1 for the first 30 ms, then decreasing to 0 at 100 ms. :meth:`Robot.move
+    <imitarm.robots.robot.Robot.move>` limits this velocity again. No sequence of datagrams can therefore move the
+    set-point beyond the limits of position, velocity and acceleration.
 
-    Time comes in as an argument, nothing waits: see :class:`~imitarm.robots.server.RobotServer` for the rest.
+    Time is an argument, and no method waits: :class:`~imitarm.robots.server.RobotServer` adds sockets and real time.
 
     Args:
-        robot: that it moves.
-        dt: between two calls of :meth:`step` [s].
-        on_event: is told in words when the status changes.
+        robot: robot to move.
+        dt: time between two calls of :meth:`step` [s].
+        on_event: called with a text when the status changes.
 
     Attributes:
-        robot: as given.
+        robot: the robot.
         status: see the table.
-        reason: why it is stopped or faulty.
-        challenge: what ENABLE must carry now; 0 when it is not stopped.
-        gate: for the owner's commands.
-        dropped: datagrams that were not heeded, besides those the gate dropped, by reason.
+        reason: why the robot is stopped or faulty.
+        challenge: number that ENABLE must carry now; 0 if the robot is not stopped.
+        datagram_filter: checks the owner's commands.
+        dropped: number of commands without effect by reason, besides those that the filter dropped.
     """
 
     def __init__(self, robot: Robot, dt: float, *, on_event: Callable[[str], None] | None = None) -> None:
@@ -82,23 +84,23 @@ class Supervisor:
         self._arm = fingerprint(robot.arm)
         self._on_event = on_event
         self._encoder = Encoder()
-        self._near = NEAR * robot.arm.max_velocity
-        self.gate = Gate(patience=np.inf)
+        self._reach = REACH_TIME * robot.arm.max_velocity
+        self.datagram_filter = DatagramFilter(session_timeout=np.inf)
         self.dropped: Counter[str] = Counter()
-        self.status, self.reason, self.challenge = Status.STOPPED, "", 0
+        self.status, self.reason, self.challenge = RobotStatus.STOPPED, "", 0
         self._command: JointCommand | None = None
         self._header: Header | None = None
-        self._heard = self._applied = 0
-        self._stop("just started")
+        self._received = self._applied = 0
+        self._stop("the server has just started")
 
-    # --- what comes in
+    # --- received datagrams
 
     def receive(self, data: bytes, now: int) -> bool:
-        """Take in a datagram; return whether its sender is to be answered.
+        """Process a datagram and return whether to answer its sender.
 
         Args:
-            data: as received; anything at all.
-            now: when [ns].
+            data: as received; may be anything.
+            now: time of receiving [ns].
         """
         try:
             header, message = decode(data)
@@ -108,11 +110,11 @@ class Supervisor:
         if not isinstance(message, JointCommand):
             self.dropped["kind"] += 1
             return False
-        if message.mode is Mode.STOP:
-            if self.status in (Status.FOLLOWING, Status.SLOWING):
-                self._stop("stopped by an operator")
-        elif message.mode is not Mode.OBSERVE:
-            fault = self._enable(header, message, now) if message.mode is Mode.ENABLE else self._take(
+        if message.mode is CommandMode.STOP:
+            if self.status in (RobotStatus.FOLLOWING, RobotStatus.SLOWING):
+                self._stop("a client has stopped it")
+        elif message.mode is not CommandMode.OBSERVE:
+            fault = self._enable(header, message, now) if message.mode is CommandMode.ENABLE else self._take(
                 header, message, now
             )  # fmt: skip
             if fault:
@@ -120,96 +122,96 @@ class Supervisor:
         return True
 
     def _enable(self, header: Header, message: JointCommand, now: int) -> str:
-        """Let a client lead from here on, or return why not."""
-        if self.status is not Status.STOPPED:
+        """Make a client the owner, or return why not."""
+        if self.status is not RobotStatus.STOPPED:
             return "not stopped"
         if message.arm != self._arm or len(message.q) != self.robot.arm.n_joints:
-            return "another arm"
+            return "wrong arm"
         if message.challenge != self.challenge:
             return "wrong challenge"
         if self.robot.velocity.any():
             return "still braking"
-        if header.session != self.gate.session:
-            self.gate.begin(header.session)
-        if not self.gate.admit(header, now):
+        if header.session != self.datagram_filter.session:
+            self.datagram_filter.start_session(header.session)
+        if not self.datagram_filter.accept(header, now):
             return ""
-        self._heard, self._command, self._header = now, None, None
-        self._become(Status.FOLLOWING, "", "enabled")
+        self._received, self._command, self._header = now, None, None
+        self._become(RobotStatus.FOLLOWING, "", "enabled")
         return ""
 
     def _take(self, header: Header, message: JointCommand, now: int) -> str:
-        """Take a command for the newest one, or return why not."""
-        if self.status not in (Status.FOLLOWING, Status.SLOWING):
+        """Make a command the newest one, or return why not."""
+        if self.status not in (RobotStatus.FOLLOWING, RobotStatus.SLOWING):
             return "stopped"
-        if not self.gate.admit(header, now):  # which counts it
+        if not self.datagram_filter.accept(header, now):  # the filter counts it
             return ""
         fault = self._impossible(message)
         if fault:
             return fault
         if message.opening is not None and (self._command is None or message.opening != self._command.opening):
             self.robot.grasp(message.opening)
-        if self.status is Status.SLOWING:
-            self._become(Status.FOLLOWING, "", "commands come again")
-        self._command, self._header, self._heard, self._applied = message, header, now, 0
+        if self.status is RobotStatus.SLOWING:
+            self._become(RobotStatus.FOLLOWING, "", "commands arrive again")
+        self._command, self._header, self._received, self._applied = message, header, now, 0
         return ""
 
     def _impossible(self, message: JointCommand) -> str:
-        """Return what is wrong with a command for this arm in its present posture; empty: nothing."""
+        """Return why a command is invalid for this arm at its set-point; empty if it is valid."""
         arm = self.robot.arm
         if message.arm != self._arm or len(message.q) != arm.n_joints:
-            return "another arm"
+            return "wrong arm"
         if (message.q < arm.lower - _TOLERANCE).any() or (message.q > arm.upper + _TOLERANCE).any():
             return "beyond a position limit"
         if (np.abs(message.velocity) > (1.0 + _TOLERANCE) * arm.max_velocity).any():
             return "beyond a velocity limit"
-        if (np.abs(message.q - self.robot.set_point) > self._near).any():
-            return "too far away"
+        if (np.abs(message.q - self.robot.set_point) > self._reach).any():
+            return "too far from the set-point"
         if message.opening is not None and not message.opening <= self.robot.widest_opening:
-            return "gripper"
+            return "gripper opening"
         return ""
 
-    # --- what is done
+    # --- control
 
     def step(self, now: int, periods: int = 1) -> None:
-        """Watch the time, and move the robot.
+        """Move the robot for one control period, and brake or stop it if commands are missing.
 
         Args:
-            now: [ns].
-            periods: to move for, in one step; more than one after some were missed.
+            now: time [ns].
+            periods: length of the step in control periods; more than one after missed ones.
         """
-        silent = 1e-9 * (now - self._heard)
-        if self.status in (Status.FOLLOWING, Status.SLOWING):
-            if silent > LATCH_AFTER:
+        silence = 1e-9 * (now - self._received)
+        if self.status in (RobotStatus.FOLLOWING, RobotStatus.SLOWING):
+            if silence > LATCH_AFTER:
                 self._stop(f"no valid command for {1e3 * LATCH_AFTER:.0f} ms")
-            elif silent > SLOW_AFTER and self.status is Status.FOLLOWING:
-                self._become(Status.SLOWING, "", f"no valid command for {1e3 * SLOW_AFTER:.0f} ms: slowing")
-        self.robot.move(self._wanted(silent), periods * self.dt)
-        if self.robot.fault and self.status is not Status.FAULT:
-            self._become(Status.FAULT, self.robot.fault, self.robot.fault)
+            elif silence > SLOW_AFTER and self.status is RobotStatus.FOLLOWING:
+                self._become(RobotStatus.SLOWING, "", f"no valid command for {1e3 * SLOW_AFTER:.0f} ms: slowing")
+        self.robot.move(self._requested(silence), periods * self.dt)
+        if self.robot.fault and self.status is not RobotStatus.FAULT:
+            self._become(RobotStatus.FAULT, self.robot.fault, self.robot.fault)
 
-    def _wanted(self, silent: float) -> Array:
-        """Return the velocity (n_joints,) [rad/s] to ask the robot for."""
+    def _requested(self, silence: float) -> Array:
+        """Return the joint velocity to request from the robot, shape (n_joints,) [rad/s]."""
         command = self._command
-        if command is None or self.status is not Status.FOLLOWING:
+        if command is None or self.status is not RobotStatus.FOLLOWING:
             return np.zeros(self.robot.arm.n_joints)
-        fading = min(max(silent - _AHEAD, 0.0) / (SLOW_AFTER - _AHEAD), 1.0)
-        carried = min(silent, _AHEAD) + (SLOW_AFTER - _AHEAD) * fading * (1.0 - 0.5 * fading)
-        error = command.q + carried * command.velocity - self.robot.set_point
+        fading = min(max(silence - _EXTRAPOLATE, 0.0) / (SLOW_AFTER - _EXTRAPOLATE), 1.0)
+        extrapolated = min(silence, _EXTRAPOLATE) + (SLOW_AFTER - _EXTRAPOLATE) * fading * (1.0 - 0.5 * fading)
+        error = command.q + extrapolated * command.velocity - self.robot.set_point
         size = np.abs(error)
         catching_up = np.minimum(_GAIN * size, np.sqrt(self.robot.arm.max_acceleration * size))
         return (1.0 - fading) * command.velocity + np.sign(error) * catching_up
 
     def answer(self, now: Callable[[], int] = now_ns) -> bytes:
-        """Return the robot's state as a datagram.
+        """Return the state of the robot as a datagram.
 
         Args:
-            now: tells the time [ns].
+            now: returns the time [ns].
         """
         robot, state, header = self.robot, self.robot.state(), self._header
         if header is not None and self._applied == 0:
             self._applied = now()
         gripper = None if np.isnan(robot.opening) else (robot.opening, robot.widest_opening)
-        led = self.status in (Status.FOLLOWING, Status.SLOWING) and self.gate.session is not None
+        owned = self.status in (RobotStatus.FOLLOWING, RobotStatus.SLOWING) and self.datagram_filter.session is not None
         message = JointState(
             self.status,
             state.time,
@@ -220,20 +222,20 @@ class Supervisor:
             robot.velocity,
             self._arm,
             self.challenge,
-            (self.gate.session or 0) if led else 0,
+            (self.datagram_filter.session or 0) if owned else 0,
             gripper,
-            *((0, 0, 0, 0) if header is None else (header.sequence, header.time_ns, self._heard, self._applied)),
+            *((0, 0, 0, 0) if header is None else (header.sequence, header.time_ns, self._received, self._applied)),
             self.reason,
         )
         return self._encoder.encode(message, now())
 
     def _stop(self, reason: str) -> None:
-        """Latch: from now on brake and hold until somebody enables the robot again."""
+        """Brake and hold until a client enables the robot again."""
         self._command = self._header = None
-        self._become(Status.STOPPED, reason, f"stopped: {reason}")
+        self._become(RobotStatus.STOPPED, reason, f"stopped: {reason}")
         self.challenge = 1 + secrets.randbelow(2**32 - 1)
 
-    def _become(self, status: Status, reason: str, event: str) -> None:
+    def _become(self, status: RobotStatus, reason: str, event: str) -> None:
         self.status, self.reason, self.challenge = status, reason, 0
         if self._on_event is not None:
             self._on_event(event)

@@ -1,4 +1,4 @@
-"""UdpRobot: a robot in another process or on another machine, led over UDP as if it were here."""
+"""UdpRobot: controls a robot in another process or on another machine over UDP."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.robots.robot import Robot
 from imitarm.robots.supervisor import fingerprint
 from imitarm.transmission.datagram import Encoder, Header, now_ns
-from imitarm.transmission.gate import Gate
-from imitarm.transmission.messages import JointCommand, JointState, Mode, Status
+from imitarm.transmission.datagram_filter import DatagramFilter
+from imitarm.transmission.messages import CommandMode, JointCommand, JointState, RobotStatus
 from imitarm.transmission.sockets import Address, connected, resolved, try_to_send, waiting
 
 Array = NDArray[np.float64]
 
-FRESH = 0.1  # [s] a state that is older says nothing about now
-TAKEN = "somebody else leads the robot"
-_ASK_AGAIN = 0.02  # [s]
-_LED = (Status.FOLLOWING, Status.SLOWING)
+FRESH = 0.1  # [s] an older state is not used
+OTHER_CLIENT = "another client controls the robot"
+_RETRY_PERIOD = 0.02  # [s] between two requests without an answer
+_ACTIVE = (RobotStatus.FOLLOWING, RobotStatus.SLOWING)
 
 
 class Echo(NamedTuple):
-    """What became of a command.
+    """The times of a command, as the server reports them.
 
     Attributes:
-        sequence: of the command.
-        sent: from sending to receiving [s]; from another machine, beyond the quickest.
-        applied: from receiving until the drives had what follows from it [s].
-        applied_ns: when that was, on the clock of this process; from another machine, as if the quickest took no time.
+        sequence: sequence number of the command.
+        sent: time from sending to receiving [s]; to another machine, relative to the fastest command.
+        applied: time from receiving until the drives had a set-point computed from it [s].
+        applied_ns: the time of that, on the clock of this process [ns]; with another machine, the travel time of the
+            fastest command counts as 0.
     """
 
     sequence: int
@@ -45,32 +46,32 @@ class Echo(NamedTuple):
 class UdpRobot(Robot):
     """The client of a :class:`~imitarm.robots.server.RobotServer`.
 
-    :meth:`move` limits a velocity as every robot does and sends the set-point that comes of it; the server judges it
-    again. It only leads while the server says that it does, in a state that is at most 0.1 s old: else it sends no
-    command, and its set-point is the server's. So a client that was started again, one whose link was cut and one whose
-    server was started again all begin from where the arm is.
+    :meth:`move` limits a velocity as every robot does and sends the resulting set-point; the server checks it again.
+    The client sends commands only while the server reports that it follows this client, in a state that is at most
+    0.1 s old. Otherwise it sends no command and takes over the server's set-point. A restart of the client or of the
+    server, or an interrupted connection, therefore never makes the arm jump.
 
-    A robot that is stopped moves again only after :meth:`enable`, which is for a person to decide.
+    A stopped robot moves again only after :meth:`enable`, which a person must decide.
 
     Args:
-        arm: the model of the arm at the other end.
+        arm: model of the arm that is served.
         address: host and port of the server.
-        timeout: how long to wait for the first answer [s].
-        clock_ns: the time to stamp with [ns].
-        sleep: waits some seconds.
+        timeout: longest time to wait for the first answer [s].
+        clock_ns: clock for the time stamps [ns].
+        sleep: waits for a time [s].
 
     Attributes:
-        reported: the newest state.
-        interruptions: how often it has lost the lead, or had to catch up with the server.
-        sequence: number of the command that was sent last; None: none.
-        gate: which judges what comes back.
+        reported: the newest state that the server has sent.
+        interruptions: how often the client has lost control of the robot, or had to take over the server's set-point.
+        sequence: sequence number of the last command; None before the first.
+        datagram_filter: checks the received states.
 
     Raises:
-        InputError: when there is no such host, or the robot there is another arm.
-        TaskFailedError: when nobody answers.
+        InputError: when there is no such host, or it serves another arm.
+        TaskFailedError: when no server answers.
     """
 
-    following_error: ClassVar[float] = float("inf")  # the server looks after it, without the way over the wire
+    following_error: ClassVar[float] = float("inf")  # the server checks it, where the network adds no delay
 
     def __init__(
         self,
@@ -83,17 +84,17 @@ class UdpRobot(Robot):
     ) -> None:
         self._clock_ns, self._sleep = clock_ns, sleep
         self._arm = fingerprint(arm)
-        self._here = resolved(address)[0].startswith("127.")  # one clock for both sides
+        self._same_clock = resolved(address)[0].startswith("127.")  # both processes are on this machine
         self._socket = connected(address)
         self._encoder = Encoder()
-        self.gate = Gate(patience=FRESH)
+        self.datagram_filter = DatagramFilter(session_timeout=FRESH)
         self.reported: JointState
         self.interruptions, self.sequence = 0, None
-        self._heard: int | None = None
+        self._received: int | None = None
         self._opening: float | None = None
-        self._led = self._slowed = self._other_arm = False
+        self._in_control = self._slowed = self._other_arm = False
         self._echoes: list[Echo] = []
-        self._echoed, self._quickest = 0, float("inf")
+        self._echoed, self._fastest = 0, float("inf")
         super().__init__(arm, arm.home)
         try:
             self._connect(address, timeout)
@@ -104,43 +105,46 @@ class UdpRobot(Robot):
     sequence: int | None
 
     def _connect(self, address: Address, timeout: float) -> None:
-        """Ask until a state comes, and begin from there."""
-        for _ in range(max(round(timeout / _ASK_AGAIN), 1)):
-            self._say(Mode.OBSERVE)
-            self._sleep(_ASK_AGAIN)
+        """Ask until a state arrives, and take over its set-point."""
+        for _ in range(max(round(timeout / _RETRY_PERIOD), 1)):
+            self._command(CommandMode.OBSERVE)
+            self._sleep(_RETRY_PERIOD)
             if self.listen() or self._other_arm:
                 break
         else:
             raise TaskFailedError(
-                f"{address[0]}:{address[1]}: no robot answers; start one with 'imitarm serve', or check the address"
+                f"{address[0]}:{address[1]}: no robot server answers; start one with 'imitarm serve', "
+                "or check the address"
             )
         if self._other_arm:
-            raise InputError(f"{address[0]}:{address[1]}: the robot there is not {self.arm.name}; name the right arm")
+            raise InputError(
+                f"{address[0]}:{address[1]}: the robot there is not {self.arm.name}; choose the model of the arm there"
+            )
         self._begin(self.reported.set_point)
 
-    # --- what it is
+    # --- state
 
     @property
     def fresh(self) -> bool:
-        """Whether a state has come within the last 0.1 s."""
-        return self._heard is not None and self._clock_ns() - self._heard <= 1e9 * FRESH
+        """Whether a state has arrived within the last 0.1 s."""
+        return self._received is not None and self._clock_ns() - self._received <= 1e9 * FRESH
 
     @property
     def ready(self) -> bool:
-        """Whether commands are heeded: the state is fresh, and it is this client that leads."""
-        return self.fresh and self.reported.owner == self._encoder.session and self.reported.status in _LED
+        """Whether the robot follows this client: the state is fresh, and this client is the owner."""
+        return self.fresh and self.reported.owner == self._encoder.session and self.reported.status in _ACTIVE
 
     @property
-    def trouble(self) -> str:
-        """Why it is not ready, in words; empty when it is."""
+    def problem(self) -> str:
+        """Why the robot does not follow this client; empty if it does."""
         if not self.fresh:
             return f"the robot that answers is not {self.arm.name}" if self._other_arm else "the robot does not answer"
-        if self.reported.status in _LED and not self.ready:
-            return TAKEN
+        if self.reported.status in _ACTIVE and not self.ready:
+            return OTHER_CLIENT
         return self.reported.reason
 
     def state(self) -> ArmState:
-        """Return the newest state that has come."""
+        """Return the newest state that has arrived."""
         reported = self.reported
         return ArmState(reported.q, reported.velocity, reported.torque, reported.time)
 
@@ -151,40 +155,40 @@ class UdpRobot(Robot):
 
     @property
     def widest_opening(self) -> float:
-        """Opening of the gripper when it is wide open [m]; nan without a gripper."""
+        """Largest opening of the gripper [m]; nan without a gripper."""
         return float("nan") if self.reported.opening is None else self.reported.opening[1]
 
     def echoes(self) -> list[Echo]:
-        """Return what has become of commands since the last call."""
+        """Return the times of the commands that the server has reported since the last call."""
         echoes, self._echoes = self._echoes, []
         return echoes
 
-    # --- what it does
+    # --- commands
 
     def move(self, velocity: ArrayLike, dt: float) -> ArmState:
-        """Lead the robot, when it is ready; else ask how it is, and stay where it is.
+        """Send a command if the robot follows this client; otherwise only ask for its state.
 
         Args:
-            velocity: of the joints at the end of ``dt``, shape (n_joints,) [rad/s].
-            dt: [s].
+            velocity: joint velocities at the end of ``dt``, shape (n_joints,) [rad/s].
+            dt: duration of the motion [s].
 
         Returns:
-            The newest state that has come.
+            The newest state that has arrived.
 
         Raises:
             InputError: as :meth:`Robot.move <imitarm.robots.robot.Robot.move>`.
         """
         self.listen()
         if not self.ready:
-            self.interruptions += self._led
-            self._led = False
+            self.interruptions += self._in_control
+            self._in_control = False
             self._begin(self.reported.set_point)
-            self._say(Mode.OBSERVE)
+            self._command(CommandMode.OBSERVE)
             return self.state()
-        slowing = self.reported.status is Status.SLOWING
-        if not self._led or (slowing and not self._slowed):
-            self.interruptions += self._led
-            self._led = True
+        slowing = self.reported.status is RobotStatus.SLOWING
+        if not self._in_control or (slowing and not self._slowed):
+            self.interruptions += self._in_control
+            self._in_control = True
             self._begin(self.reported.set_point)
             self.velocity = self.reported.set_velocity.copy()
         self._slowed = slowing
@@ -192,13 +196,13 @@ class UdpRobot(Robot):
 
     def _send(self, previous: Array, velocity: Array, dt: float) -> None:
         q = np.clip(self.set_point + 0.5 * dt * (previous + velocity), self.arm.lower, self.arm.upper)
-        self.sequence = self._say(Mode.MOVE, q, velocity)
+        self.sequence = self._command(CommandMode.MOVE, q, velocity)
 
     def grasp(self, opening: float) -> None:
-        """Ask for an opening of the gripper with every command from now on.
+        """Send an opening of the gripper with every command from now on.
 
         Args:
-            opening: between the fingers [m].
+            opening: distance between the fingers [m].
 
         Raises:
             InputError: when the robot has no gripper, or its fingers do not open so far.
@@ -209,13 +213,13 @@ class UdpRobot(Robot):
         self._opening = float(opening)
 
     def stop(self, dt: float = 0.01) -> ArmState:
-        """Brake as hard as the accelerations allow, at the pace of time.
+        """Brake at the maximum acceleration, in real time, until the commanded velocity is zero.
 
         Args:
             dt: time between two commands [s].
 
         Returns:
-            The newest state at the end.
+            The newest state that has arrived.
         """
         while self.velocity.any():
             self.move(np.zeros(self.arm.n_joints), dt)
@@ -223,33 +227,36 @@ class UdpRobot(Robot):
         return self.state()
 
     def request_enable(self) -> None:
-        """Send the operator's word that the robot may move again; whether it does is told by ``ready``."""
-        self._say(Mode.ENABLE, challenge=self.reported.challenge)
+        """Ask the server to let the robot move again; ``ready`` tells whether it does."""
+        self._command(CommandMode.ENABLE, challenge=self.reported.challenge)
 
     def enable(self, timeout: float = 1.0) -> None:
-        """Let the robot move again, and wait until it may: for a person to decide, never for a program by itself.
+        """Let the robot move again, and wait until it is ready. A person must decide this, never a program by itself.
+
+        Args:
+            timeout: longest time to wait [s].
 
         Raises:
-            TaskFailedError: when it does not become ready; the message says why.
+            TaskFailedError: when the robot does not become ready; the message says why.
         """
-        for _ in range(max(round(timeout / _ASK_AGAIN), 1)):
+        for _ in range(max(round(timeout / _RETRY_PERIOD), 1)):
             self.listen()
             if self.ready:
                 return
-            if self.fresh and self.reported.status is Status.STOPPED:
+            if self.fresh and self.reported.status is RobotStatus.STOPPED:
                 self.request_enable()
             else:
-                self._say(Mode.OBSERVE)
-            self._sleep(_ASK_AGAIN)
+                self._command(CommandMode.OBSERVE)
+            self._sleep(_RETRY_PERIOD)
         self.listen()
         if not self.ready:
-            raise TaskFailedError(f"the robot was not enabled: {self.trouble or 'it did not answer in time'}")
+            raise TaskFailedError(f"the robot was not enabled: {self.problem or 'it did not answer in time'}")
 
     def close(self) -> None:
-        """Stop the robot if this client leads it, and let go of the socket; a second call does nothing."""
+        """Stop the robot if it follows this client, and close the socket; a second call does nothing."""
         if self._socket.fileno() >= 0:
-            if self._heard is not None and self.reported.owner == self._encoder.session:
-                self._say(Mode.STOP)
+            if self._received is not None and self.reported.owner == self._encoder.session:
+                self._command(CommandMode.STOP)
             self._socket.close()
 
     def __enter__(self) -> Self:
@@ -258,12 +265,14 @@ class UdpRobot(Robot):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # --- the wire
+    # --- network
 
-    def _say(self, mode: Mode, q: Array | None = None, velocity: Array | None = None, challenge: int = 0) -> int:
+    def _command(
+        self, mode: CommandMode, q: Array | None = None, velocity: Array | None = None, challenge: int = 0
+    ) -> int:
         """Send a command, and return its sequence number."""
         rest = np.zeros(self.arm.n_joints)
-        opening = self._opening if mode is Mode.MOVE else None
+        opening = self._opening if mode is CommandMode.MOVE else None
         command = JointCommand(
             mode, rest if q is None else q, rest if velocity is None else velocity, self._arm, challenge, opening
         )
@@ -272,29 +281,29 @@ class UdpRobot(Robot):
         return sequence
 
     def listen(self) -> bool:
-        """Take in the states that have come; return whether there was one."""
+        """Process the states that have arrived and return whether there was one."""
         came = False
         for data, _ in waiting(self._socket):
             now = self._clock_ns()
-            opened = self.gate.open(data, now, JointState)
+            opened = self.datagram_filter.receive(data, now, JointState)
             if opened is None:
                 continue
             header, state = opened
             self._other_arm = state.arm != self._arm or len(state.q) != self.arm.n_joints
             if self._other_arm:
                 continue
-            self.reported, self._heard, came = state, now, True
-            self._note_echo(header, state)
+            self.reported, self._received, came = state, now, True
+            self._record_echo(header, state)
         return came
 
-    def _note_echo(self, header: Header, state: JointState) -> None:
-        """Note what has become of a command, once."""
+    def _record_echo(self, header: Header, state: JointState) -> None:
+        """Record the times of a command, once."""
         if state.owner != self._encoder.session or state.applied_ns == 0 or state.echo_sent_ns == self._echoed:
             return
         self._echoed = state.echo_sent_ns
-        way = 1e-9 * (state.received_ns - state.echo_sent_ns)
-        if not self._here:
-            self._quickest = min(self._quickest, way)
-            way -= self._quickest
+        travel = 1e-9 * (state.received_ns - state.echo_sent_ns)
+        if not self._same_clock:
+            self._fastest = min(self._fastest, travel)
+            travel -= self._fastest
         applied = 1e-9 * (state.applied_ns - state.received_ns)
-        self._echoes.append(Echo(state.echo, way, applied, state.echo_sent_ns + round(1e9 * (way + applied))))
+        self._echoes.append(Echo(state.echo, travel, applied, state.echo_sent_ns + round(1e9 * (travel + applied))))

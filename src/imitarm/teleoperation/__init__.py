@@ -1,5 +1,5 @@
-"""The live loop: a person leads a robot, in this process or over UDP."""
+"""Teleoperation: a person moves a robot in real time, in this process or over UDP."""
 
-from imitarm.teleoperation.loop import Teleoperation
+from imitarm.teleoperation.loop import StepInfo, Summary, Teleoperation
 
-__all__ = ["Teleoperation"]
+__all__ = ["StepInfo", "Summary", "Teleoperation"]

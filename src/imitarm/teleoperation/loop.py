@@ -1,4 +1,4 @@
-"""The live loop: skeletons come in, a retargeter turns them into commands, a robot moves, here or over the wire."""
+"""Teleoperation: the live loop from a person's skeletons to a robot, in this process or over UDP."""
 
 from __future__ import annotations
 
@@ -15,70 +15,70 @@ from imitarm.command import Command
 from imitarm.demonstrations.recorder import DemonstrationRecorder
 from imitarm.kinematics.arm import ArmState
 from imitarm.retarget import Retargeter, RetargetStep
+from imitarm.retarget.engagement import EngagementState
 from imitarm.robots import Robot, UdpRobot
 from imitarm.safety import SafetyFilter
 from imitarm.transmission.datagram import now_ns
 from imitarm.transmission.latency import LatencyLog
-from imitarm.transmission.messages import Status
-from imitarm.transmission.pace import Pace
+from imitarm.transmission.messages import RobotStatus
+from imitarm.transmission.rate import RateLimiter
 
 Array = NDArray[np.float64]
 
-INTERRUPTED = "interrupted"
-"""What the loop does while the robot is not ready to be led; the other states are the retargeter's."""
-
-_FOLLOW = 5.0  # [1/s] how quickly the set-point is brought back to the commands after a limit cut one
-_ENDING = 1.0  # [s] that a source's end is followed by, so that the arm comes to rest as the method has it
-_BACKLOG = 64  # skeletons taken at once at most
-_UNANSWERED = 256  # commands of which it is remembered what they were made from
+_FEEDBACK = 5.0  # [1/s] gain that returns the set-point to the retargeter's joint positions after a limit
+_END_TIME = 1.0  # [s] the loop continues after the end of the source, so that the retargeter brings the arm to rest
+_MAX_BACKLOG = 64  # skeletons read in one step
+_MAX_UNANSWERED = 256  # commands for which the skeleton they were computed from is remembered
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
-    """One control step, as ``on_step`` gets it.
+class StepInfo:
+    """One control step, as ``on_step`` receives it.
 
     Attributes:
-        time: since the beginning [s].
-        skeleton: that came in, the newest one; None: none.
-        command: the retargeter's result.
-        state: of the robot, as measured.
-        doing: the retargeter's state, or :data:`INTERRUPTED`.
-        trouble: why the robot can't be led, in words; empty when it can.
+        time: time since the start [s].
+        skeleton: the newest skeleton that arrived in this step; None: none did.
+        command: result of the retargeter.
+        state: measured state of the robot.
+        engagement: state of the retargeter; None while the robot cannot be controlled.
+        problem: why the robot cannot be controlled; empty if it can.
     """
 
     time: float
     skeleton: Skeleton | None
     command: RetargetStep
     state: ArmState
-    doing: str
-    trouble: str
+    engagement: EngagementState | None
+    problem: str
 
 
 @dataclass
-class Tally:
-    """What came of a teleoperation.
+class Summary:
+    """The result of a teleoperation.
 
     Attributes:
-        duration: [s].
-        steps: control steps that were made.
-        overruns: that were missed, because the machine was busy.
-        frames: skeletons that were used.
-        doing: steps in each of the retargeter's states and in :data:`INTERRUPTED`.
-        clamped: steps in which the robot changed the command, by limit.
-        filtered: steps in which the safety filter changed the command for a clearance.
-        unsafe: steps in which no joint velocity kept every limit and clearance.
-        speed: largest velocity of the set-point over its limit.
-        acceleration: largest acceleration of the set-point over its limit.
-        interruptions: how often the robot could not be led any more.
-        reason: why it has ended.
-        latency: of the stages, frame by frame.
+        duration: duration [s].
+        steps: number of control steps.
+        overruns: number of control steps missed because the machine was busy.
+        skeletons: number of skeletons used.
+        engagement: number of steps in each state of the retargeter.
+        interrupted: number of steps in which the robot could not be controlled.
+        clamped: number of steps in which the robot changed the command, by limit.
+        filtered: number of steps in which the safety filter changed the command to keep a clearance.
+        unsafe: number of steps in which no joint velocity kept every limit and clearance.
+        speed: largest velocity of the set-point, as a fraction of its limit.
+        acceleration: largest acceleration of the set-point, as a fraction of its limit.
+        interruptions: how often control of the robot was lost.
+        reason: why the teleoperation has ended; empty while it runs.
+        latency: duration of each stage for each skeleton.
     """
 
     duration: float = 0.0
     steps: int = 0
     overruns: int = 0
-    frames: int = 0
-    doing: Counter[str] = field(default_factory=Counter)
+    skeletons: int = 0
+    engagement: Counter[EngagementState] = field(default_factory=Counter)
+    interrupted: int = 0
     clamped: Counter[str] = field(default_factory=Counter)
     filtered: int = 0
     unsafe: int = 0
@@ -90,26 +90,26 @@ class Tally:
 
 
 class Teleoperation:
-    """Lets a person lead a robot, at the retargeter's control period.
+    """Lets a person move a robot in real time, at the retargeter's control period.
 
-    Each period the newest skeleton goes to the retargeter, and its answer to
-    :meth:`Robot.move <imitarm.robots.robot.Robot.move>`. Whenever a robot could not be led for a while, because it was
-    stopped, has slowed or does not answer, it is first brought to rest, and the retargeter begins anew from where the
-    arm is: the person takes hold once more, and nothing jumps.
+    In each period the newest skeleton goes to the retargeter, its result through the safety filter, and the filtered
+    joint velocity to :meth:`Robot.move <imitarm.robots.robot.Robot.move>`. If the robot could not be controlled for
+    some time, because it was stopped, slowed down or did not answer, it is first brought to rest. The retargeter then
+    starts again from the arm's position and engages anew, so the arm never jumps.
 
     Args:
         source: skeletons of one person, live or in real time.
-        retargeter: the method.
-        robot: to lead.
-        safety: what every command passes through, whatever the method; None: one that keeps the limits of the arm, its
-            links 10 mm apart, and touches nothing in the retargeter's scene.
-        stream: the stream that ``source`` is fed by, for the latencies; None: it is none.
-        recorder: is given the robot's motion from when the person first took hold.
-        operator: is told at every step why a served robot can't be led, and whether it is stopped; answers whether it
-            may move again.
-        on_step: is called after every step.
-        clock_ns: the time [ns], the same as that of ``stream`` and ``robot``.
-        pace: of the control; None: real time.
+        retargeter: the mapping from human arm to robot arm.
+        robot: robot to control.
+        safety: filter for every command, the same for each retargeter; None: a filter that keeps the limits of the
+            arm, a distance of 10 mm between its links, and no contact with the obstacles of the retargeter's scene.
+        stream: the stream that feeds ``source``, for the latencies; None: there is none.
+        recorder: receives the robot's motion from the first time at which a person moves the robot.
+        confirm_enable: called in each step in which a served robot cannot be controlled, with the reason and whether
+            the robot is stopped; returns whether the robot may move again. None: it may not.
+        on_step: called after every step.
+        clock_ns: returns the time [ns], on the same clock as ``stream`` and ``robot``.
+        rate_limiter: starts the control steps; None: in real time.
     """
 
     def __init__(
@@ -121,192 +121,196 @@ class Teleoperation:
         safety: SafetyFilter | None = None,
         stream: UdpSource | None = None,
         recorder: DemonstrationRecorder | None = None,
-        operator: Callable[[str, bool], bool] | None = None,
-        on_step: Callable[[Moment], None] | None = None,
+        confirm_enable: Callable[[str, bool], bool] | None = None,
+        on_step: Callable[[StepInfo], None] | None = None,
         clock_ns: Callable[[], int] = now_ns,
-        pace: Pace | None = None,
+        rate_limiter: RateLimiter | None = None,
     ) -> None:
         self.source, self.retargeter, self.robot = source, retargeter, robot
-        self.tally = Tally()
+        self.summary = Summary()
         self.safety = SafetyFilter(robot.arm, dt=retargeter.dt) if safety is None else safety
         self._stream, self._recorder = stream, recorder
-        self._operator, self._on_step = operator, on_step
+        self._confirm_enable, self._on_step = confirm_enable, on_step
         self._clock_ns = clock_ns
-        self._pace = Pace(retargeter.dt) if pace is None else pace
-        self._wire = robot if isinstance(robot, UdpRobot) else None
-        self._rest = np.zeros(robot.arm.n_joints)
-        self._engaged, self._closed, self._followed = False, False, False
-        self._recorded = float("nan")  # time of the state that was recorded last, by the robot's clock
+        self._rate_limiter = RateLimiter(retargeter.dt) if rate_limiter is None else rate_limiter
+        self._remote = robot if isinstance(robot, UdpRobot) else None
+        self._zero = np.zeros(robot.arm.n_joints)
+        self._started, self._closed, self._has_followed = False, False, False
+        self._recorded = float("nan")  # time of the last recorded state, on the robot's clock
         self._arrival: Arrival | None = None
-        self._made_from: dict[int, tuple[int, int]] = {}  # sequence of a command: row of the log, time of exposure
+        self._origins: dict[int, tuple[int, int]] = {}  # sequence of a command: row of the log, time of exposure [ns]
 
-    def run(self, seconds: float | None = None) -> Tally:
-        """Go on for some seconds, until the source is over, the robot is faulty, or the user presses Ctrl-C.
+    def run(self, seconds: float | None = None) -> Summary:
+        """Run for some time, until the source ends, the robot has a fault, or the user presses Ctrl-C.
 
-        Whatever happens, the robot is brought to rest.
+        The robot is brought to rest in every case.
 
         Args:
-            seconds: None: until something else ends it.
+            seconds: duration [s]; None: unlimited.
         """
-        dt, tally = self.retargeter.dt, self.tally
+        dt, summary = self.retargeter.dt, self.summary
         ending: float | None = None
         if self._stream is not None:
             self._stream.flush()
         try:
-            while not tally.reason:
+            while not summary.reason:
                 skeleton = self._newest()
-                self._pace.wait()
-                time = (self._pace.ticks - 1) * dt
+                self._rate_limiter.wait()
+                time = (self._rate_limiter.ticks - 1) * dt
                 self.step(time, skeleton)
-                tally.duration, tally.steps, tally.overruns = time + dt, tally.steps + 1, self._pace.overruns
+                summary.duration, summary.steps = time + dt, summary.steps + 1
+                summary.overruns = self._rate_limiter.overruns
                 if self.source.over:
                     ending = time if ending is None else ending
-                    if time - ending >= _ENDING:
-                        tally.reason = "the source is over"
-                if seconds is not None and tally.duration >= seconds - 1e-9:
-                    tally.reason = "the time is up"
+                    if time - ending >= _END_TIME:
+                        summary.reason = "the source has ended"
+                if seconds is not None and summary.duration >= seconds - 1e-9:
+                    summary.reason = "the time is up"
         except KeyboardInterrupt:
-            tally.reason = "stopped by the user"
+            summary.reason = "stopped by the user"
         finally:
             self.robot.stop(dt)
-        return tally
+        return summary
 
     def step(self, time: float, skeleton: Skeleton | None) -> None:
         """Make one control step.
 
         Args:
-            time: since the beginning [s].
-            skeleton: the newest that has come since the last step; None: none has.
+            time: time since the start [s].
+            skeleton: the newest one that has arrived since the last step; None: none has.
         """
-        before, tally = self.robot.velocity, self.tally
-        trouble = self._trouble()
-        if trouble:
-            self._engaged = False
-            self._ask(trouble)
-        elif not self._engaged:
+        before, summary = self.robot.velocity, self.summary
+        problem = self._problem()
+        if problem:
+            self._started = False
+            self._wait_for_robot(problem)
+        elif not self._started:
             self._begin()
         else:
-            self._lead(skeleton)
-        doing = self.retargeter.latest.state if self._engaged else INTERRUPTED
-        tally.doing[doing] += 1
-        tally.frames += skeleton is not None
-        if self._wire is not None:
-            self._match_echoes(self._wire)
-            if self._wire.interruptions != tally.interruptions:  # the set-point is the robot's own again
-                tally.interruptions, self._engaged = self._wire.interruptions, False
-        if self._engaged:
+            self._follow(skeleton)
+        engagement = self.retargeter.latest.state if self._started else None
+        if engagement is None:
+            summary.interrupted += 1
+        else:
+            summary.engagement[engagement] += 1
+        summary.skeletons += skeleton is not None
+        if self._remote is not None:
+            self._match_echoes(self._remote)
+            if self._remote.interruptions != summary.interruptions:  # it has taken over the server's set-point
+                summary.interruptions, self._started = self._remote.interruptions, False
+        if self._started:
             self._measure(before)
         state = self.robot.state()
-        self._record(time, doing, state)
+        self._record(time, engagement, state)
         if self._on_step is not None:
-            self._on_step(Moment(time, skeleton, self.retargeter.latest, state, doing, trouble))
+            self._on_step(StepInfo(time, skeleton, self.retargeter.latest, state, engagement, problem))
 
-    # --- what comes in
+    # --- input
 
     def _newest(self) -> Skeleton | None:
-        """Return the newest skeleton that comes until the next step is due, and when and how it came."""
+        """Return the newest skeleton that arrives before the next step is due, and remember how it arrived."""
         newest = None
-        for _ in range(_BACKLOG):
-            left = self._pace.left
-            skeleton = None if self.source.over else self.source.read(left)
+        for _ in range(_MAX_BACKLOG):
+            remaining = self._rate_limiter.remaining
+            skeleton = None if self.source.over else self.source.read(remaining)
             if skeleton is not None:
                 newest, now = skeleton, self._clock_ns()
-                came = None if self._stream is None else self._stream.arrival
-                self._arrival = Arrival(np.nan, np.nan, now) if came is None else came
-            elif left == 0.0 or self.source.over:
+                arrival = None if self._stream is None else self._stream.arrival
+                self._arrival = Arrival(np.nan, np.nan, now) if arrival is None else arrival
+            elif remaining == 0.0 or self.source.over:
                 break
         return newest
 
-    def _trouble(self) -> str:
-        """Return why the robot can't be led; empty when it can."""
-        if self._wire is None:
+    def _problem(self) -> str:
+        """Return why the robot cannot be controlled; empty if it can."""
+        if self._remote is None:
             if self.robot.fault:
-                self.tally.reason = self.robot.fault
+                self.summary.reason = self.robot.fault
             return self.robot.fault
-        self._wire.listen()
-        if self._wire.fresh and self._wire.reported.status is Status.FAULT:
-            self.tally.reason = self._wire.trouble
-        return self._wire.trouble if not self._wire.ready else ""
+        self._remote.listen()
+        if self._remote.fresh and self._remote.reported.status is RobotStatus.FAULT:
+            self.summary.reason = self._remote.problem
+        return self._remote.problem if not self._remote.ready else ""
 
-    def _ask(self, trouble: str) -> None:
-        """See how the robot is, and let the operator decide whether it may move again."""
-        self.robot.move(self._rest, self.retargeter.dt)
-        wire = self._wire
-        if wire is None or self._operator is None or self.tally.reason:
+    def _wait_for_robot(self, problem: str) -> None:
+        """Hold the robot still, and enable it once that is confirmed."""
+        self.robot.move(self._zero, self.retargeter.dt)
+        remote = self._remote
+        if remote is None or self._confirm_enable is None or self.summary.reason:
             return
-        stopped = wire.fresh and wire.reported.status is Status.STOPPED
-        if self._operator(trouble, stopped) and stopped:
-            wire.request_enable()
+        stopped = remote.fresh and remote.reported.status is RobotStatus.STOPPED
+        if self._confirm_enable(problem, stopped) and stopped:
+            remote.request_enable()
 
-    # --- what goes out
+    # --- output
 
     def _begin(self) -> None:
-        """Bring the robot to rest, and let the retargeter begin from there."""
-        self.robot.move(self._rest, self.retargeter.dt)
+        """Bring the robot to rest, then start the retargeter from its position."""
+        self.robot.move(self._zero, self.retargeter.dt)
         if not self.robot.velocity.any():
             arm = self.robot.arm
             self.retargeter.start(np.clip(self.robot.set_point, arm.lower, arm.upper))
-            self._engaged = True
+            self._started = True
 
-    def _lead(self, skeleton: Skeleton | None) -> None:
-        """Let the retargeter decide, and the robot do it."""
+    def _follow(self, skeleton: Skeleton | None) -> None:
+        """Make one step with the retargeter and send it to the robot."""
         robot, retargeter = self.robot, self.retargeter
         before, taken = retargeter.latest.q, self._clock_ns()
         retargeter.step(skeleton, robot.state().q)
         ready = self._clock_ns()
         self._grasp(retargeter.latest.closed)
-        wanted = retargeter.latest.velocity + _FOLLOW * (before - robot.set_point)
-        command = Command(np.zeros(6), joint_velocity=wanted)
-        kept = self.safety.step(command, robot.set_point, robot.velocity, retargeter.scene)
-        robot.move(kept.velocity, retargeter.dt)
-        self.tally.clamped.update(robot.clamped)
-        self.tally.filtered += kept.changed > 0.0
-        self.tally.unsafe += not kept.safe
+        velocity = retargeter.latest.velocity + _FEEDBACK * (before - robot.set_point)
+        command = Command(np.zeros(6), joint_velocity=velocity)
+        safe = self.safety.step(command, robot.set_point, robot.velocity, retargeter.scene)
+        robot.move(safe.velocity, retargeter.dt)
+        self.summary.clamped.update(robot.clamped)
+        self.summary.filtered += safe.changed > 0.0
+        self.summary.unsafe += not safe.safe
         if skeleton is not None and self._arrival is not None:
-            self._note(self._arrival, taken, ready, self._clock_ns())
+            self._log_latency(self._arrival, taken, ready, self._clock_ns())
 
     def _grasp(self, closed: bool | None) -> None:
-        """Close or open the gripper, if there is one and the hand has changed."""
+        """Close or open the gripper if there is one and the person's hand has changed."""
         if closed is None or closed == self._closed or not self.robot.widest_opening > 0.0:
             return
         self._closed = closed
         self.robot.grasp(0.0 if closed else self.robot.widest_opening)
 
-    # --- what is noted
+    # --- measurements
 
     def _measure(self, before: Array) -> None:
-        """Note how much of the limits the set-point takes."""
-        arm, tally, velocity = self.robot.arm, self.tally, self.robot.velocity
+        """Update the largest velocity and acceleration of the set-point."""
+        arm, summary, velocity = self.robot.arm, self.summary, self.robot.velocity
         change = np.abs(velocity - before) / (arm.max_acceleration * self.retargeter.dt)
-        tally.speed = max(tally.speed, float((np.abs(velocity) / arm.max_velocity).max()))
-        tally.acceleration = max(tally.acceleration, float(change.max()))
+        summary.speed = max(summary.speed, float((np.abs(velocity) / arm.max_velocity).max()))
+        summary.acceleration = max(summary.acceleration, float(change.max()))
 
-    def _note(self, arrival: Arrival, taken: int, ready: int, sent: int) -> None:
-        """Note the latencies of a skeleton as far as they are known now."""
-        log = self.tally.latency
-        row = log.begin()
+    def _log_latency(self, arrival: Arrival, taken: int, ready: int, sent: int) -> None:
+        """Log the latencies of a skeleton that are known when its command has been sent."""
+        log = self.summary.latency
+        row = log.add()
         waits = {"expose": arrival.waited, "arrive": arrival.queued, "wait": 1e-9 * (taken - arrival.received_ns)}
-        log.note(row, retarget=1e-9 * (ready - taken), send=1e-9 * (sent - ready), **waits)
-        way = np.nan_to_num(arrival.waited) + np.nan_to_num(arrival.queued)
-        exposed = arrival.received_ns - round(1e9 * float(way))
-        if self._wire is None:
-            log.note(row, total=1e-9 * (sent - exposed))
-        elif self._wire.sequence is not None:
-            if len(self._made_from) > _UNANSWERED:
-                self._made_from.clear()
-            self._made_from[self._wire.sequence] = row, exposed
+        log.record(row, retarget=1e-9 * (ready - taken), send=1e-9 * (sent - ready), **waits)
+        until_received = np.nan_to_num(arrival.waited) + np.nan_to_num(arrival.queued)
+        exposed = arrival.received_ns - round(1e9 * float(until_received))
+        if self._remote is None:
+            log.record(row, total=1e-9 * (sent - exposed))
+        elif self._remote.sequence is not None:
+            if len(self._origins) > _MAX_UNANSWERED:
+                self._origins.clear()
+            self._origins[self._remote.sequence] = row, exposed
 
-    def _match_echoes(self, wire: UdpRobot) -> None:
-        """Complete the rows of which the robot has told what became of the command."""
-        for echo in wire.echoes():
-            made = self._made_from.pop(echo.sequence, None)
-            if made is not None:
-                row, exposed = made
+    def _match_echoes(self, remote: UdpRobot) -> None:
+        """Complete the latencies of the commands whose times the robot has reported."""
+        for echo in remote.echoes():
+            origin = self._origins.pop(echo.sequence, None)
+            if origin is not None:
+                row, exposed = origin
                 total = 1e-9 * (echo.applied_ns - exposed)
-                self.tally.latency.note(row, robot=echo.sent, apply=echo.applied, total=total)
+                self.summary.latency.record(row, robot=echo.sent, apply=echo.applied, total=total)
 
-    def _record(self, time: float, doing: str, state: ArmState) -> None:
-        self._followed = self._followed or doing == "following"
-        if self._recorder is not None and self._followed and state.time != self._recorded:
-            self._recorded = state.time  # a robot at the end of a wire has not always told something new
+    def _record(self, time: float, engagement: EngagementState | None, state: ArmState) -> None:
+        self._has_followed = self._has_followed or engagement is EngagementState.FOLLOWING
+        if self._recorder is not None and self._has_followed and state.time != self._recorded:
+            self._recorded = state.time  # a served robot may not have sent a new state
             self._recorder.write(time, state.q)

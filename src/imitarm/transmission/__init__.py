@@ -1,1 +1,1 @@
-"""What capture, retargeting and a robot tell each other: messages, datagrams, sockets, rates, latency."""
+"""Communication between capture, retargeting and robot: messages, datagrams, UDP sockets, fixed rates, latency."""

@@ -1,8 +1,8 @@
-"""Datagrams: messages as bytes, and back, every byte judged (METHODS A.9).
+"""Datagrams: messages encoded as bytes, and decoded with every value checked.
 
-A datagram is a header of 28 bytes and a payload whose size its kind fixes; little-endian; docs/transmission.md has the
-table. Whatever is not exactly such a datagram is refused with a reason. Nothing in it is executed or believed to be a
-length, so the worst that a hostile one can do is to be counted.
+A datagram is a header of 28 bytes and a payload whose size depends only on its kind, little-endian;
+docs/transmission.md has the table. Anything else is refused with a reason. No part of a datagram is executed or used
+as a length, so a hostile datagram can do no more than be counted.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 def now_ns() -> int:
-    """Return the time that all datagrams go by [ns]: never set, never standing still, the same for all processes here.
+    """Return the time for time stamps [ns]: monotonic, and the same in all processes of this machine.
 
-    It goes on while the machine sleeps, where the system has such a clock: else all that is sent afterwards would
-    look late.
+    It includes the time during which the machine is suspended, if the system has such a clock. Otherwise every
+    datagram sent after a suspension would look delayed.
     """
     return time.clock_gettime_ns(_CLOCK) if _CLOCK is not None else time.monotonic_ns()
 
 
 @dataclass(frozen=True)
 class Header:
-    """What every datagram begins with.
+    """The fields at the start of every datagram.
 
     Attributes:
-        kind: of the payload.
-        flags: bits, as the kind defines them.
-        session: drawn by the sender when it begins, u32.
+        kind: number of the message type.
+        flags: bits, whose meaning depends on the kind.
+        session: number drawn by the sender when it starts, u32.
         sequence: number within the session, u32, wraps around.
-        time_ns: when it was sent, on the sender's clock, u64 [ns].
+        time_ns: time of sending, on the sender's clock, u64 [ns].
     """
 
     kind: int
@@ -53,11 +53,12 @@ class Header:
 
 
 class Encoder:
-    """Turns messages into datagrams of one session, numbered and stamped.
+    """Encodes messages as the numbered and time-stamped datagrams of one session.
 
     Args:
-        session: None: drawn at random, never 0, so that a sender that was restarted is known to be another one.
-        first: sequence number to begin with.
+        session: session number; None: drawn at random, never 0, so that a restarted sender is recognized as another
+            one.
+        first: first sequence number.
     """
 
     def __init__(self, session: int | None = None, first: int = 0) -> None:
@@ -69,50 +70,53 @@ class Encoder:
 
         Args:
             message: to send.
-            time_ns: now, on the sender's clock [ns].
+            time_ns: time of sending, on the sender's clock [ns].
 
         Raises:
-            DatagramError: when a number can't be sent.
+            DatagramError: when a value cannot be encoded.
         """
         try:
             body, numbers = message._pack()
             flags, sequence = message._flags, self.sequence
             head = _HEAD.pack(MAGIC, VERSION, message.KIND, flags, self.session, sequence, time_ns, 0)[:_SIGNED]
         except (struct.error, ValueError) as error:
-            raise DatagramError("range", f"{type(message).__name__} can't be sent: {error}") from error
+            raise DatagramError("range", f"{type(message).__name__} cannot be encoded: {error}") from error
         payload = b"".join([body, *(vector.astype("<f8").tobytes() for vector in numbers)])
         self.sequence = (self.sequence + 1) & 0xFFFFFFFF
         return b"".join([head, struct.pack("<I", zlib.crc32(payload, zlib.crc32(head))), payload])
 
 
 def size_of(kind: type[Message]) -> int:
-    """Return how many bytes a datagram of a kind has."""
+    """Return the size of a datagram of a message type [bytes]."""
     return _HEAD.size + kind.BODY.size + 8 * kind.NUMBERS
 
 
 def decode(data: bytes) -> tuple[Header, Message]:
-    """Return what a datagram says.
+    """Return header and message of a datagram.
+
+    Args:
+        data: as received; may be anything.
 
     Raises:
-        DatagramError: when it is none; its ``reason`` is ``"length"``, ``"magic"``, ``"version"``, ``"kind"``,
-            ``"checksum"`` or ``"range"``.
+        DatagramError: when the bytes are not a valid datagram. Its ``reason`` is ``"length"``, ``"magic"``,
+            ``"version"``, ``"kind"``, ``"checksum"`` or ``"range"``.
     """
     if len(data) < _HEAD.size:
-        raise DatagramError("length", f"{len(data)} bytes are less than a header")
+        raise DatagramError("length", f"{len(data)} bytes are shorter than a header")
     magic, version, number, flags, session, sequence, time_ns, checksum = _HEAD.unpack_from(data)
     if magic != MAGIC:
-        raise DatagramError("magic", "not one of imitarm's")
+        raise DatagramError("magic", "not sent by imitarm")
     if version != VERSION:
         raise DatagramError(
-            "version", f"of version {version}, this imitarm speaks {VERSION}; use the same on both sides"
+            "version", f"format version {version}, but this imitarm uses {VERSION}; use the same version on both sides"
         )
     kind = KINDS.get(number)
     if kind is None:
-        raise DatagramError("kind", f"of unknown kind {number}")
+        raise DatagramError("kind", f"unknown kind {number}")
     if len(data) != size_of(kind):
         raise DatagramError("length", f"{len(data)} bytes where {size_of(kind)} are expected")
     if zlib.crc32(data[_HEAD.size :], zlib.crc32(data[:_SIGNED])) != checksum:
-        raise DatagramError("checksum", "damaged on its way")
+        raise DatagramError("checksum", "damaged (wrong checksum)")
     body = kind.BODY.unpack_from(data, _HEAD.size)
     numbers = np.frombuffer(data, dtype="<f8", offset=_HEAD.size + kind.BODY.size).astype(float)
     return Header(number, flags, session, sequence, time_ns), kind._unpack(flags, body, numbers)

@@ -1,4 +1,4 @@
-"""LatencyLog: how long each stage takes on the way from a person to a robot, frame by frame."""
+"""LatencyLog: the time that each stage between a person and a robot takes, for each skeleton."""
 
 from __future__ import annotations
 
@@ -23,19 +23,22 @@ STAGES = {
     "apply": "received by the robot to applied",
     "total": "exposure to applied",
 }
-"""The stages a frame goes through, in order, and what each is. Between two machines the quickest way counts as none."""
+"""The stages of a skeleton, in order, and their meaning.
+
+Between two machines a travel time is measured relative to the fastest datagram.
+"""
 
 _CHUNK = 1024
 
 
 class LatencyLog:
-    """One row a frame, one column a stage; what a frame did not go through, or was not measured, is nan.
+    """A table with one row for each skeleton and one column for each stage; nan where it was not measured.
 
     Args:
         stages: names of the columns.
 
     Attributes:
-        stages: as given.
+        stages: names of the columns.
     """
 
     def __init__(self, stages: Sequence[str] = tuple(STAGES)) -> None:
@@ -48,18 +51,22 @@ class LatencyLog:
 
     @property
     def values(self) -> Array:
-        """All that was noted, shape (n_frames, n_stages) [s]."""
+        """All durations, shape (n_frames, n_stages) [s]."""
         return self._values[: self._n]
 
-    def begin(self) -> int:
-        """Begin with a frame, and return its number."""
+    def add(self) -> int:
+        """Add a row for a skeleton and return its index."""
         if self._n == len(self._values):
             self._values = np.vstack([self._values, np.full_like(self._values, np.nan)])
         self._n += 1
         return self._n - 1
 
-    def note(self, frame: int, **seconds: float) -> None:
-        """Note how long stages of a frame have taken, by their names [s].
+    def record(self, frame: int, **seconds: float) -> None:
+        """Record the durations of stages.
+
+        Args:
+            frame: index of the row.
+            **seconds: duration of each stage by its name [s].
 
         Raises:
             UnknownNameError: when there is no such stage.
@@ -69,8 +76,8 @@ class LatencyLog:
                 raise UnknownNameError.among("stage", stage, self.stages)
             self._values[frame, self.stages.index(stage)] = value
 
-    def rows(self) -> list[tuple[str, int, float, float, float, float]]:
-        """Return for each stage that was measured its name, how often, median, 95th, 99th percentile, largest [s]."""
+    def statistics(self) -> list[tuple[str, int, float, float, float, float]]:
+        """Return for each measured stage: name, number of values, median, 95th and 99th percentile, maximum [s]."""
         rows = []
         for stage, column in zip(self.stages, self.values.T, strict=True):
             known = column[np.isfinite(column)]
@@ -80,10 +87,10 @@ class LatencyLog:
         return rows
 
     def save(self, path: str | Path) -> None:
-        """Write all of it as a table: the frame's number, then each stage [s].
+        """Write the log as a table: number of the skeleton, then the duration of each stage [s].
 
         Raises:
-            InputError: when it can't be written.
+            InputError: when the file cannot be written.
         """
         table = np.column_stack([np.arange(self._n), self.values])
         write_table(path, {"format": "imitarm-latency", "units": "s"}, ("frame", *self.stages), table)

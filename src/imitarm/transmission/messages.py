@@ -1,4 +1,4 @@
-"""Messages: what can be sent between a capture process, a retargeting one and a robot, and what each may hold."""
+"""Messages between the capture, retargeting and robot processes, with the range that each value may have."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from imitarm.errors import InputError
 Array = NDArray[np.float64]
 
 N_BODY, MAX_JOINTS = 25, 16
-_GRIPPER = 1  # the only flag
-_FARTHEST = 20.0  # [m]
-_LONGEST = 1e10  # [s]
-_ANGLE, _SPEED, _TORQUE = 1e3, 1e3, 1e6  # [rad], [rad/s], [N m]: beyond them there is no joint
-_WAITED = 60_000_000_000  # [ns]
+_GRIPPER = 1  # flag: the gripper's fields are valid
+_MAX_DISTANCE = 20.0  # [m]
+_MAX_TIME = 1e10  # [s]
+_MAX_ANGLE, _MAX_SPEED, _MAX_TORQUE = 1e3, 1e3, 1e6  # [rad], [rad/s], [N m]: no joint exceeds them
+_MAX_WAIT = 60_000_000_000  # [ns]
 
 
 class DatagramError(InputError):
-    """Bytes that are no datagram; ``reason`` is the word under which they are counted."""
+    """Bytes that are not a valid datagram; ``reason`` is the key under which they are counted."""
 
     def __init__(self, reason: str, what: str) -> None:
         super().__init__(f"datagram: {what}")
         self.reason = reason
 
 
-class Mode(IntEnum):
+class CommandMode(IntEnum):
     """What a joint command asks for."""
 
-    OBSERVE = 0  # nothing but an answer
-    MOVE = 1
-    ENABLE = 2  # let the stopped robot move again; carries the challenge of that stop
-    STOP = 3
+    OBSERVE = 0  # an answer only
+    MOVE = 1  # move to the commanded joint positions
+    ENABLE = 2  # allow the stopped robot to move again; carries the challenge of that stop
+    STOP = 3  # brake and stay stopped
 
 
-class Status(IntEnum):
-    """What a robot does."""
+class RobotStatus(IntEnum):
+    """What a robot server does."""
 
-    STOPPED = 0  # latched: only ENABLE leads out
-    FOLLOWING = 1
-    SLOWING = 2  # commands are missing: it brakes and holds
-    FAULT = 3  # it has stopped to protect itself; it must be started anew
+    STOPPED = 0  # latched: only ENABLE ends it
+    FOLLOWING = 1  # moves to the commanded joint positions
+    SLOWING = 2  # commands are missing: brakes and holds
+    FAULT = 3  # protective stop: the server must be restarted
 
 
 @dataclass(frozen=True, eq=False)
 class SkeletonFrame:
-    """A person at one instant; see ``imitarm.capture.Skeleton``.
+    """The skeleton of a person at one time; see ``imitarm.capture.Skeleton``.
 
     Attributes:
-        time: of the exposure, on the source's clock [s].
-        positions: shape (25, 3) [m], at most 20 m; what is lost is 0.
+        time: time of exposure, on the source's clock [s].
+        positions: positions of the joints, shape (25, 3) [m], at most 20 m; 0 where lost.
         tracking: 0 lost, 1 inferred, 2 tracked, shape (25,).
         hands: states of the left and the right hand, 0 to 4.
-        person: which one, u64.
-        waited_ns: between exposure and sending [ns], at most a minute.
+        person: identifier of the person, u64.
+        waited_ns: time between exposure and sending [ns], at most a minute.
     """
 
     KIND: ClassVar[int] = 1
@@ -85,32 +85,32 @@ class SkeletonFrame:
     def _unpack(cls, flags: int, body: tuple[Any, ...], numbers: Array) -> Self:
         time_, person, waited, left, right, states = body
         tracking = np.frombuffer(states, dtype=np.int8)
-        _within(flags == 0, "unknown flags")
-        _within(abs(time_) <= _LONGEST and waited <= _WAITED, "time")
-        _within(left <= 4 and right <= 4, "state of a hand")
-        _within(bool(tracking.min() >= 0 and tracking.max() <= 2), "tracking state")
-        _within(_magnitude(numbers) <= _FARTHEST, "position")
+        _require(flags == 0, "unknown flags")
+        _require(abs(time_) <= _MAX_TIME and waited <= _MAX_WAIT, "time")
+        _require(left <= 4 and right <= 4, "state of a hand")
+        _require(bool(tracking.min() >= 0 and tracking.max() <= 2), "tracking state")
+        _require(_magnitude(numbers) <= _MAX_DISTANCE, "position")
         return cls(time_, numbers.reshape(N_BODY, 3), tracking, (left, right), person, waited)
 
 
 @dataclass(frozen=True, eq=False)
 class JointCommand:
-    """What a robot should do.
+    """What a client asks a robot to do.
 
     Attributes:
-        mode: what is asked for.
-        q: where the joints should be, shape (n_joints,) [rad]; at most 16 joints.
-        velocity: and how fast they should move there, shape (n_joints,) [rad/s].
-        arm: fingerprint of the arm that is meant.
-        challenge: of the stop that ENABLE ends; else 0.
-        opening: of the gripper [m], at most 1; None: as it is.
+        mode: kind of command.
+        q: commanded joint positions, shape (n_joints,) [rad]; at most 16 joints.
+        velocity: commanded joint velocities at these positions, shape (n_joints,) [rad/s].
+        arm: fingerprint of the arm that the command is for.
+        challenge: with ENABLE, the challenge of the stop that it ends; otherwise 0.
+        opening: commanded opening of the gripper [m], at most 1; None: unchanged.
     """
 
     KIND: ClassVar[int] = 2
     BODY: ClassVar[struct.Struct] = struct.Struct("<BB2xIId")
     NUMBERS: ClassVar[int] = 2 * MAX_JOINTS
 
-    mode: Mode
+    mode: CommandMode
     q: Array
     velocity: Array
     arm: int = 0
@@ -129,43 +129,44 @@ class JointCommand:
     @classmethod
     def _unpack(cls, flags: int, body: tuple[Any, ...], numbers: Array) -> Self:
         n, mode, challenge, arm, opening = body
-        _within(flags <= _GRIPPER, "unknown flags")
-        _within(1 <= n <= MAX_JOINTS and mode <= max(Mode), "number of joints or mode")
-        _within(0.0 <= opening <= 1.0, "opening of the gripper")
+        _require(flags <= _GRIPPER, "unknown flags")
+        _require(1 <= n <= MAX_JOINTS and mode <= max(CommandMode), "number of joints or mode")
+        _require(0.0 <= opening <= 1.0, "opening of the gripper")
         q, velocity = numbers.reshape(2, MAX_JOINTS)[:, :n]
-        _within(_magnitude(q) <= _ANGLE and _magnitude(velocity) <= _SPEED, "joint position or velocity")
+        _require(_magnitude(q) <= _MAX_ANGLE and _magnitude(velocity) <= _MAX_SPEED, "joint position or velocity")
         given = opening if flags & _GRIPPER else None
-        return cls(Mode(mode), q, velocity, arm, challenge, given)
+        return cls(CommandMode(mode), q, velocity, arm, challenge, given)
 
 
 @dataclass(frozen=True, eq=False)
 class JointState:
-    """What a robot does.
+    """The state of a robot.
 
     Attributes:
-        status: what it does.
-        time: the robot's own [s].
-        q: measured, shape (n_joints,) [rad].
-        velocity: measured, shape (n_joints,) [rad/s].
-        torque: of the drives, shape (n_joints,) [N m].
-        set_point: where the drives should be, shape (n_joints,) [rad].
-        set_velocity: how fast the set-point moves, shape (n_joints,) [rad/s].
+        status: what the robot does.
+        time: time of the robot [s].
+        q: measured joint positions, shape (n_joints,) [rad].
+        velocity: measured joint velocities, shape (n_joints,) [rad/s].
+        torque: torques of the drives, shape (n_joints,) [N m].
+        set_point: joint positions that the drives track, shape (n_joints,) [rad].
+        set_velocity: velocity of the set-point, shape (n_joints,) [rad/s].
         arm: fingerprint of the arm.
-        challenge: what ENABLE must carry; 0 when the robot is not stopped.
-        owner: session of the sender whose commands are obeyed; 0: nobody's.
-        opening: of the gripper and the widest it has [m]; None without one.
-        echo: sequence number of the last command that was obeyed.
-        echo_sent_ns: when that was sent, on the sender's clock [ns].
-        received_ns: when it was received, on the robot's clock [ns].
-        applied_ns: when the drives first got what follows from it, on the robot's clock [ns]; 0: none yet.
-        reason: why it is stopped or faulty, in words; at most 91 bytes of UTF-8.
+        challenge: number that ENABLE must carry; 0 if the robot is not stopped.
+        owner: session of the client whose commands are followed; 0: none.
+        opening: opening of the gripper and its maximum [m]; None without a gripper.
+        echo: sequence number of the last command that was followed.
+        echo_sent_ns: time at which it was sent, on the client's clock [ns].
+        received_ns: time at which it was received, on the robot's clock [ns].
+        applied_ns: time at which the drives first received a set-point computed from it, on the robot's clock [ns];
+            0: not yet.
+        reason: why the robot is stopped or faulty; at most 91 bytes of UTF-8.
     """
 
     KIND: ClassVar[int] = 3
     BODY: ClassVar[struct.Struct] = struct.Struct("<BB2xIIIIQQQddd92s")
     NUMBERS: ClassVar[int] = 5 * MAX_JOINTS
 
-    status: Status
+    status: RobotStatus
     time: float
     q: Array
     velocity: Array
@@ -197,19 +198,19 @@ class JointState:
     @classmethod
     def _unpack(cls, flags: int, body: tuple[Any, ...], numbers: Array) -> Self:
         n, status, challenge, arm, owner, echo, sent, received, applied, time_, opening, widest, words = body
-        _within(flags <= _GRIPPER, "unknown flags")
-        _within(1 <= n <= MAX_JOINTS and status <= max(Status), "number of joints or status")
-        _within(abs(time_) <= _LONGEST, "time")
-        _within(abs(opening) <= 1.0 and 0.0 <= widest <= 1.0, "opening of the gripper")
+        _require(flags <= _GRIPPER, "unknown flags")
+        _require(1 <= n <= MAX_JOINTS and status <= max(RobotStatus), "number of joints or status")
+        _require(abs(time_) <= _MAX_TIME, "time")
+        _require(abs(opening) <= 1.0 and 0.0 <= widest <= 1.0, "opening of the gripper")
         vectors = numbers.reshape(5, MAX_JOINTS)[:, :n]
         q, velocity, torque, set_point, set_velocity = vectors
-        _within(max(_magnitude(q), _magnitude(set_point)) <= _ANGLE, "joint position")
-        _within(max(_magnitude(velocity), _magnitude(set_velocity)) <= _SPEED, "joint velocity")
-        _within(_magnitude(torque) <= _TORQUE, "torque")
+        _require(max(_magnitude(q), _magnitude(set_point)) <= _MAX_ANGLE, "joint position")
+        _require(max(_magnitude(velocity), _magnitude(set_velocity)) <= _MAX_SPEED, "joint velocity")
+        _require(_magnitude(torque) <= _MAX_TORQUE, "torque")
         reason = words.rstrip(b"\0").decode("utf-8", "replace")
-        _within(not reason or reason.isprintable(), "reason")  # it will be shown in a terminal
+        _require(not reason or reason.isprintable(), "reason")  # it will be shown in a terminal
         return cls(
-            Status(status), time_, q, velocity, torque, set_point, set_velocity, arm, challenge, owner,
+            RobotStatus(status), time_, q, velocity, torque, set_point, set_velocity, arm, challenge, owner,
             (opening, widest) if flags & _GRIPPER else None, echo, sent, received, applied, reason,
         )  # fmt: skip
 
@@ -218,17 +219,17 @@ Message = SkeletonFrame | JointCommand | JointState
 KINDS: dict[int, type[SkeletonFrame] | type[JointCommand] | type[JointState]] = {
     kind.KIND: kind for kind in (SkeletonFrame, JointCommand, JointState)
 }
-"""By the number in the header."""
+"""Message types by their number in the header."""
 
 
 def _magnitude(values: Array) -> float:
-    """Return the largest magnitude; what is not a number is larger than all."""
+    """Return the largest magnitude; infinite if a value is not a number."""
     largest = float(np.abs(values).max())
     return np.inf if np.isnan(largest) else largest
 
 
-def _within(good: bool, what: str) -> None:
-    if not good:
+def _require(in_range: bool, what: str) -> None:
+    if not in_range:
         raise DatagramError("range", f"{what} is out of range")
 
 

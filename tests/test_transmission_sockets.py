@@ -18,7 +18,7 @@ def test_addresses(text, address):
 
 @pytest.mark.parametrize("text", ["", "robot", "robot:", ":7400", "robot:0", "robot:65536", "robot:-1", "robot:12x"])
 def test_what_is_no_address(text):
-    with pytest.raises(InputError, match="is no address; say HOST:PORT"):
+    with pytest.raises(InputError, match="is not an address; write HOST:PORT"):
         parse_address(text)
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imitarm.transmission.datagram import Encoder, Header
-from imitarm.transmission.gate import REASONS, Gate
+from imitarm.transmission.datagram_filter import DROP_REASONS, DatagramFilter
 from imitarm.transmission.messages import JointCommand, SkeletonFrame
 from wire_samples import MS, command, skeleton_frame
 
@@ -18,57 +18,57 @@ def header(sequence, time, session=1):
 
 
 def test_in_order_everything_comes_in():
-    gate = Gate()
-    assert all(gate.admit(header(k, k * PERIOD), k * PERIOD + 5) for k in range(1000))
-    assert gate.admitted == 1000 and not gate.dropped and gate.age == 0.0
+    datagrams = DatagramFilter()
+    assert all(datagrams.accept(header(k, k * PERIOD), k * PERIOD + 5) for k in range(1000))
+    assert datagrams.accepted == 1000 and not datagrams.dropped and datagrams.age == 0.0
 
 
 @given(first=st.integers(0, 2**32 - 1), shuffled=st.permutations(range(12)), repeats=st.lists(st.integers(0, 11)))
 def test_only_what_is_newer_comes_in_whatever_the_order_also_around_the_end_of_all_numbers(first, shuffled, repeats):
-    gate, newest = Gate(), -1
+    datagrams, newest = DatagramFilter(), -1
     for k in [*shuffled, *repeats]:
-        admitted = gate.admit(header(first + k, 0), 50 * MS)
+        admitted = datagrams.accept(header(first + k, 0), 50 * MS)
         assert admitted == (k > newest)
         newest = max(newest, k)
-    assert gate.admitted + gate.dropped["order"] + gate.dropped["duplicate"] == 12 + len(repeats)
+    assert datagrams.accepted + datagrams.dropped["order"] + datagrams.dropped["duplicate"] == 12 + len(repeats)
 
 
 @given(offset=st.integers(-(10**15), 10**15), seed=st.integers(0, 2**32 - 1))
 def test_clocks_may_differ_by_anything_and_age_is_the_time_in_a_queue(offset, seed):
-    rng, gate = np.random.default_rng(seed), Gate()
+    rng, datagrams = np.random.default_rng(seed), DatagramFilter()
     start = 2 * 10**15
-    gate.admit(header(0, start + offset), start + 2 * MS)  # the quickest: 2 ms on its way
+    datagrams.accept(header(0, start + offset), start + 2 * MS)  # the quickest: 2 ms on its way
     for k in range(1, 50):
         sent, queued = start + k * PERIOD, int(rng.integers(0, 200)) * MS
-        admitted = gate.admit(header(k, sent + offset), sent + 2 * MS + queued)
+        admitted = datagrams.accept(header(k, sent + offset), sent + 2 * MS + queued)
         assert admitted == (queued <= 100 * MS)
         if admitted:
-            assert abs(gate.age - 1e-9 * queued) < 1e-9
+            assert abs(datagrams.age - 1e-9 * queued) < 1e-9
 
 
 def test_the_quickest_is_found_though_the_first_was_slow():
-    gate = Gate()
-    gate.admit(header(0, 0), 80 * MS)  # 78 ms queued, which can't be known yet
-    gate.admit(header(1, 100 * MS), 102 * MS)
-    assert not gate.admit(header(2, 200 * MS), 310 * MS)
-    assert gate.dropped == {"stale": 1}
+    datagrams = DatagramFilter()
+    datagrams.accept(header(0, 0), 80 * MS)  # 78 ms queued, which can't be known yet
+    datagrams.accept(header(1, 100 * MS), 102 * MS)
+    assert not datagrams.accept(header(2, 200 * MS), 310 * MS)
+    assert datagrams.dropped == {"stale": 1}
 
 
 def test_clocks_may_drift_apart_for_hours():
     """50 millionths: 180 ms an hour, more than the age that is allowed."""
-    gate = Gate()
+    datagrams = DatagramFilter()
     for k in range(2 * 3600):
         sent = k * 1000 * MS
-        assert gate.admit(header(k, sent), sent + sent // 20_000), k
-    assert gate.age < 0.01
+        assert datagrams.accept(header(k, sent), sent + sent // 20_000), k
+    assert datagrams.age < 0.01
 
 
 def test_a_time_in_the_future_does_not_make_the_others_look_late():
-    gate = Gate()
-    gate.admit(header(0, 1000 * MS), 1000 * MS)
-    assert not gate.admit(header(1, 2**63), 1010 * MS)
-    assert gate.admit(header(2, 1020 * MS), 1020 * MS)
-    assert gate.dropped == {"clock": 1}
+    datagrams = DatagramFilter()
+    datagrams.accept(header(0, 1000 * MS), 1000 * MS)
+    assert not datagrams.accept(header(1, 2**63), 1010 * MS)
+    assert datagrams.accept(header(2, 1020 * MS), 1020 * MS)
+    assert datagrams.dropped == {"clock": 1}
 
 
 EARLY = st.one_of(st.integers(1, 60), st.integers(1, 1500), st.integers(1, 10**9))  # [ms]
@@ -103,9 +103,9 @@ def test_one_stamp_that_is_early_locks_nobody_out_for_longer_than_about_the_age_
 
 def refused_numbers(arrivals):
     """Which of the datagrams are refused though they are newer than all that came."""
-    gate, refused, newest = Gate(), set(), -1
+    datagrams, refused, newest = DatagramFilter(), set(), -1
     for arrival, k, stamp in sorted(arrivals, key=lambda one: one[0]):
-        if not gate.admit(header(k, stamp), arrival) and k > newest:
+        if not datagrams.accept(header(k, stamp), arrival) and k > newest:
             refused.add(k)
         newest = max(newest, k)
     return refused
@@ -127,11 +127,11 @@ def test_stamps_that_are_early_each_in_its_own_way_are_forgotten_one_by_one(earl
     copies = [one for k in range(50, 50 + len(early)) for one in [arrivals[k]] * 2]
     behind = arrivals[50 : 50 + len(early)] * 2  # each copy after the last of them
     for false in (arrivals[50 : 50 + len(early)], copies, behind):
-        gate, now = Gate(), 0
+        datagrams, now = DatagramFilter(), 0
         for arrival, k, stamp in [*arrivals[:50], *false, *arrivals[50 + len(early) :]]:
             now = max(now, arrival)
-            gate.admit(header(k, stamp), now)
-        assert gate.admitted >= 3600 - len(early) - 4
+            datagrams.accept(header(k, stamp), now)
+        assert datagrams.accepted >= 3600 - len(early) - 4
 
 
 @st.composite
@@ -181,9 +181,9 @@ def test_nor_do_the_first_when_the_next_were_sent_before_them(stamps, period, co
 
 @given(at=st.integers(3, 20), early=EARLY, period=st.integers(100, 1000))
 def test_nor_where_frames_are_few(at, early, period):
-    gate = Gate()
+    datagrams = DatagramFilter()
     sent = [10**12 + k * period * MS for k in range(40)]
-    admitted = [gate.admit(header(k, s + early * MS if k == at else s), s + 5 * MS) for k, s in enumerate(sent)]
+    admitted = [datagrams.accept(header(k, s + early * MS if k == at else s), s + 5 * MS) for k, s in enumerate(sent)]
     assert all(admitted[:at]) and all(admitted[at + 3 :])
 
 
@@ -211,87 +211,87 @@ def test_nor_do_many_stamps_that_are_early(stamps, queues, twice):
 
 
 def only_fresh_ones_come_in(stamps, queues, *, twice=False):
-    gate = Gate()
+    datagrams = DatagramFilter()
     waits = [0] + [wait for length, wait in queues for _ in range(length)]
     for k, wait in enumerate(waits):
         sent = 10**12 + 2 * k * PERIOD
         if k in stamps:
             for _ in range(1 + twice):
-                gate.admit(header(2 * k, sent + stamps[k] * MS), sent + 2 * MS + wait * MS)
-        if gate.admit(header(2 * k + 1, sent), sent + 2 * MS + wait * MS):
+                datagrams.accept(header(2 * k, sent + stamps[k] * MS), sent + 2 * MS + wait * MS)
+        if datagrams.accept(header(2 * k + 1, sent), sent + 2 * MS + wait * MS):
             assert wait <= 100
-            assert gate.age >= 1e-3 * wait - 1e-9  # never younger than it is
+            assert datagrams.age >= 1e-3 * wait - 1e-9  # never younger than it is
 
 
 def test_a_queue_that_empties_by_large_steps_is_not_a_row_of_false_stamps():
     """It fills at once, and for long; that the way had been quick once is remembered."""
-    gate = Gate()
+    datagrams = DatagramFilter()
     waits = [900, 900, 900, *range(800, -1, -100), *[880] * 100]
-    admitted = [gate.admit(header(k, k * 40 * MS), k * 40 * MS + wait * MS) for k, wait in enumerate(waits)]
+    admitted = [datagrams.accept(header(k, k * 40 * MS), k * 40 * MS + wait * MS) for k, wait in enumerate(waits)]
     assert all(admitted[:12]) and not any(admitted[12:])
 
 
 def test_a_way_that_was_quick_twice_is_not_forgotten():
     """All are late after it, without an end: that is a queue, not a clock that was wrong."""
-    gate = Gate()
+    datagrams = DatagramFilter()
     waits = [80, 80, 80, 2, 2] + [250] * 1000
-    admitted = [gate.admit(header(k, k * PERIOD), k * PERIOD + wait * MS) for k, wait in enumerate(waits)]
+    admitted = [datagrams.accept(header(k, k * PERIOD), k * PERIOD + wait * MS) for k, wait in enumerate(waits)]
     assert all(admitted[:5]) and not any(admitted[5:])
 
 
 @given(period=st.integers(4, 3000))
 def test_a_clock_that_was_wrong_at_first_is_corrected_by_two_that_agree(period):
     """The first datagram had waited for ages: the offset that was concluded from it locks nobody out."""
-    gate, begin = Gate(), 20_000
-    gate.admit(header(0, 0), begin * MS)
+    datagrams, begin = DatagramFilter(), 20_000
+    datagrams.accept(header(0, 0), begin * MS)
     times = [(begin + k * period) * MS for k in range(1, 100)]
-    admitted = [gate.admit(header(k, time), time) for k, time in enumerate(times, 1)]
+    admitted = [datagrams.accept(header(k, time), time) for k, time in enumerate(times, 1)]
     assert not admitted[0] and all(admitted[1:])
-    assert gate.age == 0.0 and gate.dropped == {"clock": 1}
+    assert datagrams.age == 0.0 and datagrams.dropped == {"clock": 1}
 
 
 def test_two_senders_are_never_mixed():
-    gate = Gate()
+    datagrams = DatagramFilter()
     admitted = []
     for k in range(400):
         for session in (1, 2):
-            if gate.admit(header(k, k * PERIOD, session), k * PERIOD):
+            if datagrams.accept(header(k, k * PERIOD, session), k * PERIOD):
                 admitted.append(session)
-    assert set(admitted) == {1} and gate.dropped == {"foreign": 400}
+    assert set(admitted) == {1} and datagrams.dropped == {"foreign": 400}
 
 
 def test_a_sender_that_was_started_again_is_let_in_after_half_a_second_of_silence_and_the_old_one_never_again():
-    gate = Gate()
+    datagrams = DatagramFilter()
     for k in range(10):
-        gate.admit(header(k + 5000, k * PERIOD, 1), k * PERIOD)
+        datagrams.accept(header(k + 5000, k * PERIOD, 1), k * PERIOD)
     begin = 9 * PERIOD
-    assert not gate.admit(header(0, 0, 2), begin + 400 * MS)
-    assert gate.admit(header(1, 110 * MS, 2), begin + 510 * MS)  # its clock and its numbers begin anew
-    assert gate.sessions == 2 and gate.session == 2
+    assert not datagrams.accept(header(0, 0, 2), begin + 400 * MS)
+    assert datagrams.accept(header(1, 110 * MS, 2), begin + 510 * MS)  # its clock and its numbers begin anew
+    assert datagrams.n_sessions == 2 and datagrams.session == 2
     for late in (begin + 520 * MS, begin + 5000 * MS):
-        assert not gate.admit(header(6000, late, 1), late)  # a late or a replayed one of the first
-    assert gate.dropped == {"foreign": 1, "retired": 2}
+        assert not datagrams.accept(header(6000, late, 1), late)  # a late or a replayed one of the first
+    assert datagrams.dropped == {"foreign": 1, "retired": 2}
 
 
 def test_without_patience_only_begin_changes_the_session():
-    gate = Gate(patience=np.inf)
-    gate.begin(7)
-    assert not gate.admit(header(0, 0, 8), 10**15)
-    assert gate.admit(header(0, 0, 7), 10**15)
+    datagrams = DatagramFilter(session_timeout=np.inf)
+    datagrams.start_session(7)
+    assert not datagrams.accept(header(0, 0, 8), 10**15)
+    assert datagrams.accept(header(0, 0, 7), 10**15)
 
 
 @given(data=st.binary(max_size=900))
 def test_bytes_that_are_nothing_are_counted_and_change_nothing(data):
-    gate = Gate()
-    assert gate.open(data, 0, SkeletonFrame) is None
-    assert sum(gate.dropped.values()) == 1 and set(gate.dropped) <= set(REASONS)
-    assert gate.session is None
+    datagrams = DatagramFilter()
+    assert datagrams.receive(data, 0, SkeletonFrame) is None
+    assert sum(datagrams.dropped.values()) == 1 and set(datagrams.dropped) <= set(DROP_REASONS)
+    assert datagrams.session is None
 
 
 def test_another_kind_is_not_wanted():
-    gate = Gate()
+    datagrams = DatagramFilter()
     encoder = Encoder(3)
-    assert gate.open(encoder.encode(command(), 0), 0, SkeletonFrame) is None
-    opened = gate.open(encoder.encode(skeleton_frame(), 0), 0, SkeletonFrame)
-    assert opened is not None and gate.dropped == {"kind": 1}
-    assert gate.open(encoder.encode(command(), 0), 0, JointCommand) is not None
+    assert datagrams.receive(encoder.encode(command(), 0), 0, SkeletonFrame) is None
+    opened = datagrams.receive(encoder.encode(skeleton_frame(), 0), 0, SkeletonFrame)
+    assert opened is not None and datagrams.dropped == {"kind": 1}
+    assert datagrams.receive(encoder.encode(command(), 0), 0, JointCommand) is not None

@@ -3,7 +3,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.transmission.pace import Pace
+from imitarm.transmission.rate import RateLimiter
 from wire_samples import MS, Clock
 
 
@@ -20,24 +20,24 @@ class Time(Clock):
 
 def test_it_does_not_drift():
     time = Time(late=300_000)
-    pace = Pace(0.01, clock_ns=time, sleep=time.sleep)
+    limiter = RateLimiter(0.01, clock_ns=time, sleep=time.sleep)
     begin = time.ns
     for _ in range(1001):
-        pace.wait()
+        limiter.wait()
         time.ns += 2 * MS
-    assert pace.ticks == 1001 and pace.overruns == 0
+    assert limiter.ticks == 1001 and limiter.overruns == 0
     assert abs(time.ns - begin - 1000 * 10 * MS) <= 3 * MS
 
 
 @given(work=st.lists(st.integers(0, 80), min_size=1, max_size=40))
 def test_missed_ticks_are_left_out_and_counted_and_the_rhythm_stays(work):
     time = Time()
-    pace = Pace(0.01, clock_ns=time, sleep=time.sleep)
+    limiter = RateLimiter(0.01, clock_ns=time, sleep=time.sleep)
     begin = time.ns
     for made, busy in enumerate(work, start=1):
-        missed = pace.wait()
-        assert pace.ticks == made + pace.overruns
-        late = (time.ns - begin) - (pace.ticks - 1) * 10 * MS
+        missed = limiter.wait()
+        assert limiter.ticks == made + limiter.overruns
+        late = (time.ns - begin) - (limiter.ticks - 1) * 10 * MS
         assert 0 <= late < 10 * MS
         assert missed == 0 or late + missed * 10 * MS >= 10 * MS
         time.ns += busy * MS
@@ -45,6 +45,6 @@ def test_missed_ticks_are_left_out_and_counted_and_the_rhythm_stays(work):
 
 def test_the_first_tick_is_now():
     time = Time()
-    pace = Pace(0.5, clock_ns=time, sleep=time.sleep)
-    assert pace.left == 0.0 and pace.wait() == 0
-    assert abs(pace.left - 0.5) < 1e-9
+    limiter = RateLimiter(0.5, clock_ns=time, sleep=time.sleep)
+    assert limiter.remaining == 0.0 and limiter.wait() == 0
+    assert abs(limiter.remaining - 0.5) < 1e-9

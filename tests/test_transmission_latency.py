@@ -12,14 +12,14 @@ def filled(n=5000):
     log, rng = LatencyLog(), np.random.default_rng(0)
     values = rng.exponential(0.002, n)
     for value in values:
-        log.note(log.begin(), wait=value)
+        log.record(log.add(), wait=value)
     return log, values
 
 
 def test_percentiles_are_those_of_what_was_noted():
     log, values = filled()
-    log.note(7, total=0.5)
-    (stage, n, *figures), (last, one, *alike) = log.rows()
+    log.record(7, total=0.5)
+    (stage, n, *figures), (last, one, *alike) = log.statistics()
     assert (stage, n, last, one) == ("wait", 5000, "total", 1)
     np.testing.assert_allclose(figures, [*np.percentile(values, (50, 95, 99)), values.max()])
     assert alike == [0.5] * 4
@@ -28,13 +28,13 @@ def test_percentiles_are_those_of_what_was_noted():
 
 def test_nothing_noted_is_no_row():
     log = LatencyLog()
-    log.begin()
-    assert log.rows() == [] and np.isnan(log.values).all()
+    log.add()
+    assert log.statistics() == [] and np.isnan(log.values).all()
 
 
 def test_a_stage_that_does_not_exist_is_an_error():
     with pytest.raises(UnknownNameError, match="unknown stage 'lunch'"):
-        LatencyLog().note(0, lunch=1.0)
+        LatencyLog().record(0, lunch=1.0)
 
 
 def test_it_is_saved_frame_by_frame(tmp_path):

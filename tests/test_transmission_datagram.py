@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imitarm.transmission.datagram import Encoder, decode, now_ns, size_of
-from imitarm.transmission.messages import DatagramError, JointCommand, JointState, Mode, SkeletonFrame
+from imitarm.transmission.messages import CommandMode, DatagramError, JointCommand, JointState, SkeletonFrame
 from wire_samples import command, joint_state, skeleton_frame
 
 ANY = [skeleton_frame, lambda rng: command(q=rng.normal(size=7), velocity=rng.normal(size=7)), joint_state]
@@ -136,16 +136,16 @@ def test_a_long_reason_is_cut_between_letters():
 
 def test_what_can_not_be_packed_is_not_sent_and_takes_no_number():
     encoder = Encoder(1, 8)
-    with pytest.raises(DatagramError, match="can't be sent"):
+    with pytest.raises(DatagramError, match="cannot be encoded"):
         encoder.encode(command(q=np.zeros(20), velocity=np.zeros(20)), 0)
-    with pytest.raises(DatagramError, match="can't be sent"):
+    with pytest.raises(DatagramError, match="cannot be encoded"):
         encoder.encode(command(), -1)
     assert encoder.sequence == 8
 
 
 def test_sequence_numbers_wrap_around_and_sessions_differ():
     encoder = Encoder(first=2**32 - 1)
-    headers = [decode(encoder.encode(command(Mode.OBSERVE), 0))[0] for _ in range(3)]
+    headers = [decode(encoder.encode(command(CommandMode.OBSERVE), 0))[0] for _ in range(3)]
     assert [header.sequence for header in headers] == [2**32 - 1, 0, 1]
     assert len({Encoder().session for _ in range(50)}) == 50 and 0 not in {Encoder().session for _ in range(50)}
 

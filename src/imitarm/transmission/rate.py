@@ -1,0 +1,58 @@
+"""RateLimiter: runs a loop at a fixed rate without drift and skips the periods it has missed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+
+class RateLimiter:
+    """Starts control periods at multiples of a fixed time after the first one.
+
+    If a period starts a whole period late or more, the missed periods are skipped and counted, and the following ones
+    start on schedule. They are not made up for in a burst, which would move an arm faster than intended.
+
+    Args:
+        period: length of a period [s].
+        clock_ns: returns the time [ns].
+        sleep: waits for a time [s].
+
+    Attributes:
+        ticks: number of periods so far, including the missed ones.
+        overruns: number of missed periods.
+    """
+
+    def __init__(
+        self,
+        period: float,
+        *,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._period = round(1e9 * period)
+        self._clock_ns, self._sleep = clock_ns, sleep
+        self._start: int | None = None
+        self.ticks = self.overruns = 0
+
+    @property
+    def remaining(self) -> float:
+        """Time until the next period is due [s]; 0 if it is due now."""
+        if self._start is None:
+            return 0.0
+        return max(1e-9 * (self._start + self.ticks * self._period - self._clock_ns()), 0.0)
+
+    def tick(self) -> int:
+        """Start the next period, which must be due, and return how many were missed."""
+        now = self._clock_ns()
+        if self._start is None:
+            self._start = now
+        missed = max((now - self._start) // self._period - self.ticks, 0)
+        self.ticks += missed + 1
+        self.overruns += missed
+        return missed
+
+    def wait(self) -> int:
+        """Sleep until the next period is due, start it, and return how many were missed."""
+        while (remaining := self.remaining) > 0.0:
+            self._sleep(remaining)
+        return self.tick()
