@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import solve_ik
-from imitarm.kinematics.reach_of_links import _shapes, meeting_links
-from imitarm.kinematics.self_clearance import SelfClearance
+from imitarm.kinematics.self_clearance import SelfClearance, _shapes, meeting_links
 from imitarm.kinematics.tasks import PostureTask, TwistTask
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}

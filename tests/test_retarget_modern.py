@@ -10,8 +10,7 @@ from imitarm.capture.person import Person
 from imitarm.capture.skeleton import Skeleton
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.kinematics.pose import rotate
-from imitarm.kinematics.reach_of_links import _shapes, meeting_links
-from imitarm.kinematics.self_clearance import SelfClearance
+from imitarm.kinematics.self_clearance import SelfClearance, _shapes, meeting_links
 from imitarm.kinematics.sew import sew_angle
 from imitarm.retarget import FACING, Correspondence, LimbLengths, ModernRetargeter
 from imitarm.retarget.retargeter import ticks

@@ -5,8 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from imitarm.robots.clearance import ClearanceGauge
-from imitarm.robots.world import add_obstacles
+from imitarm.robots.world import ClearanceGauge, add_obstacles
 from imitarm.scene import Scene
 from scene_shapes import KINDS, coal_shape, random_obstacle
 

@@ -6,7 +6,7 @@ import pytest
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.robots.drives import COMPUTED_FREQUENCY, FINGER_SPEED, Drives, add_drives
+from imitarm.robots.simulated import COMPUTED_FREQUENCY, FINGER_SPEED, Drives, add_drives
 
 
 def drives_of(arm, timestep=0.002):

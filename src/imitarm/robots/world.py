@@ -1,4 +1,4 @@
-"""A MuJoCo world around an arm: light, and the fixtures and obstacles of a scene as solids."""
+"""A MuJoCo world around an arm: what stands in it, and how near the arm is to it by the simulator's own geometry."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ OBSTACLE = "obstacle/"  # bodies and geoms of obstacles are called so, followed 
 
 _COLORS = ((0.20, 0.42, 0.70), (0.78, 0.22, 0.20), (0.93, 0.58, 0.15), (0.45, 0.32, 0.60), (0.30, 0.55, 0.40))
 _FIXTURE_COLORS = {"floor": (0.55, 0.57, 0.60, 1.0), "pedestal": (0.28, 0.30, 0.33, 1.0), "": (0.80, 0.68, 0.52, 1.0)}
+_FAR = 100.0  # [m] farther pairs are not measured
 
 
 def standard_fixtures(*, floor: float = -0.75, pedestal_radius: float = 0.12) -> tuple[Obstacle, ...]:
@@ -154,3 +155,91 @@ def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
         directions = directions @ obstacle.pose.rotation.T  # around its own axis
     points = obstacle.support(directions.reshape(-1, 3))
     return points[np.unique(np.round(points, 7), axis=0, return_index=True)[1]]
+
+
+class ClearanceGauge:
+    """Smallest distance from an arm to obstacles, and what touches what, from the simulator's geoms.
+
+    Bounding spheres come first: the distance between centres less both radii is a lower bound of a pair's distance.
+    Pairs are then measured by ``mj_geomDistance``, nearest bound first, until the next bound exceeds the smallest
+    distance found. So most pairs cost nothing.
+
+    Args:
+        model: the compiled world.
+        arm_geoms: ids of the geoms of arm and tool.
+        obstacle_geoms: ids of the geoms whose distance is measured.
+        fixture_geoms: ids of geoms that count for contact only: what the arm stands on.
+        links: for each arm geom how many of the arm's joints move it. Two geoms with different numbers that touch are
+            a self-contact; None for no self-contacts.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        arm_geoms: Sequence[int],
+        obstacle_geoms: Sequence[int],
+        fixture_geoms: Sequence[int] = (),
+        links: Sequence[int] | None = None,
+    ) -> None:
+        self._model = model
+        self._arm = np.array(arm_geoms, dtype=np.intp)
+        self._obstacles = np.array(obstacle_geoms, dtype=np.intp)
+        bounding = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, np.inf, model.geom_rbound)
+        self._radii = bounding[self._arm][:, None] + bounding[self._obstacles][None]
+        self._other = np.zeros(model.ngeom, dtype=bool)
+        self._other[self._obstacles] = True
+        self._other[np.array(fixture_geoms, dtype=np.intp)] = True
+        self._link = np.full(model.ngeom, -1)  # -1: not a geom of the arm
+        self._link[self._arm] = 0 if links is None else links
+        self._by_design: set[tuple[int, int]] = set()
+        self._from_to = np.zeros(6)
+
+    def ignore_present_self_contacts(self, data: mujoco.MjData) -> None:
+        """Take the pairs of links that touch now for overlaps of the model, as neighbours have in some files."""
+        self._by_design = {(first, second) for _, first, second in self._self_contacts(data)}
+
+    def measure(self, data: mujoco.MjData) -> tuple[float, tuple[int, int] | None]:
+        """Return the smallest signed distance [m], negative in contact, and the ids of the two geoms.
+
+        A self-contact counts with its depth. Without obstacles, or when all are farther than 100 m: inf and None.
+        """
+        smallest, pair = _FAR, None
+        for depth, first, second in self._self_contacts(data):
+            if depth < smallest:
+                smallest, pair = depth, (first, second)
+        if self._radii.size:
+            apart = data.geom_xpos[self._arm][:, None] - data.geom_xpos[self._obstacles][None]
+            bounds = (np.sqrt(np.einsum("ijk,ijk->ij", apart, apart)) - self._radii).ravel()
+            for flat in np.argsort(bounds):
+                if bounds[flat] >= smallest:
+                    break
+                i, j = divmod(int(flat), len(self._obstacles))
+                first, second = int(self._arm[i]), int(self._obstacles[j])
+                distance = mujoco.mj_geomDistance(self._model, data, first, second, smallest, self._from_to)
+                if distance < smallest:
+                    smallest, pair = distance, (first, second)
+        return (smallest, pair) if pair is not None else (np.inf, None)
+
+    def touching(self, data: mujoco.MjData) -> set[tuple[int, int]]:
+        """Return the pairs of geoms in contact now: arm and obstacle, arm and fixture, arm and arm (lower id first)."""
+        if not data.ncon:
+            return set()
+        geoms = data.contact.geom
+        pairs: set[tuple[int, int]] = set()
+        for first, second in (geoms.T, geoms.T[::-1]):
+            hits = (self._link[first] >= 0) & self._other[second]
+            pairs.update(zip(first[hits].tolist(), second[hits].tolist(), strict=True))
+        return pairs | {(first, second) for _, first, second in self._self_contacts(data)}
+
+    def _self_contacts(self, data: mujoco.MjData) -> list[tuple[float, int, int]]:
+        """Return depth (negative) [m] and geoms of each contact between two links of the arm."""
+        if not data.ncon:
+            return []
+        geoms = data.contact.geom
+        first, second = self._link[geoms[:, 0]], self._link[geoms[:, 1]]
+        hits = (first >= 0) & (second >= 0) & (first != second)
+        if not hits.any():
+            return []
+        pairs = np.sort(geoms[hits], axis=1).tolist()
+        found = zip(data.contact.dist[hits].tolist(), pairs, strict=True)
+        return [(depth, a, b) for depth, (a, b) in found if (a, b) not in self._by_design]
