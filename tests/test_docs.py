@@ -17,7 +17,6 @@ import pytest
 
 import imitarm
 from imitarm import cli
-from imitarm.capture import SOURCES
 from imitarm.demonstrations.reading import READERS
 from imitarm.policies import ADAPTERS, POLICIES
 from imitarm.retarget import RETARGETERS
@@ -112,7 +111,7 @@ def test_every_block_of_python_is_python_and_imports_what_exists(page: Path) -> 
                     assert resolved(f"{node.module}.{alias.name}") is not None, f"{page.name}: {ast.unparse(node)}"
 
 
-ENTRY_POINT_GROUPS = {registry.group for registry in (ADAPTERS, POLICIES, READERS, RETARGETERS, SOURCES)}
+ENTRY_POINT_GROUPS = {registry.group for registry in (ADAPTERS, POLICIES, READERS, RETARGETERS, imitarm.SOURCES)}
 
 
 @each_page
