@@ -16,6 +16,13 @@ settings.load_profile("imitarm")
 os.environ.pop("COLUMNS", None)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Refuse names with an address in memory: they differ between processes, and pytest-xdist then runs nothing."""
+    for item in items:
+        if " at 0x" in item.nodeid:
+            raise pytest.UsageError(f"{item.nodeid}: this name is another one in every process; give the values ids")
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real recordings: IMITARM_DATA, else ../shared/data beside the checkout.

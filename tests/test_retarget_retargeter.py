@@ -121,7 +121,7 @@ def test_a_control_period_out_of_range_is_refused():
 WRONG = [np.nan, np.inf, -1.0, "x", [1, 2], np.zeros(3), np.full(7, np.nan), object()]
 
 
-@pytest.mark.parametrize("value", WRONG, ids=repr)
+@pytest.mark.parametrize("value", WRONG, ids=lambda value: repr(value).split(" at 0x")[0])
 @pytest.mark.parametrize(
     "call",
     [
