@@ -11,7 +11,7 @@ export MPLBACKEND = Agg
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo install test lint types floors unit quick mediapipe format bench tables clean
+.PHONY: help demo install test lint types floors unit quick mediapipe format bench tables pictures clean
 
 help:  ## list the tasks
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -53,6 +53,9 @@ tables: $(VENV)/.dev $(MEDIAPIPE)  ## print all tables of docs/ again, which tak
 	$(BIN)/imitarm benchmark mapping --out benchmark-mapping --data $(DATA) --fill docs/mapping_benchmark.md
 	$(BIN)/imitarm benchmark avoidance --seeds 200 --fill docs/avoidance.md
 	$(BIN)/imitarm benchmark people $(DATA) $(VIDEOS)/cam01.mp4 $(VIDEOS)/cam02.mp4 --fill docs/real_data.md
+
+pictures: demo  ## renew the picture of the report in docs/images, which needs Chromium, Chrome or Edge
+	$(BIN)/python scripts/take_picture.py demo/report.html docs/images/report.png --anchor scene-4-boxes-and-cone --seconds 25
 
 clean:  ## remove the environment and everything made
 	rm -rf $(VENV) .venv-mediapipe .cache demo .pytest_cache .mypy_cache .ruff_cache .hypothesis

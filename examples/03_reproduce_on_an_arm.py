@@ -94,7 +94,7 @@ def main() -> None:
         title="two boxes",
         scene=scene,
         success=rollout.success,
-        asked_clearance=CLEARANCE,
+        required_clearance=CLEARANCE,
         rollout=rollout,
         adaptation=adaptation,
         tool_radius=task.tool_radius,

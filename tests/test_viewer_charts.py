@@ -17,7 +17,7 @@ def test_clearance_names_the_smallest_and_the_asked_distance() -> None:
     svg = charts.clearance(rollout.trajectory.times, rollout.clearance, 0.02)
     words = text_of(svg)
     assert f"smallest: {1000 * rollout.min_clearance:.1f} mm" in words
-    assert "asked: 20 mm" in words and "time [s]" in words and "[mm]" in words
+    assert "required: 20 mm" in words and "time [s]" in words and "[mm]" in words
     assert len(svg) < 40_000  # 2000 samples are thinned
 
 

@@ -12,7 +12,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.pose import rotate
 from imitarm.retarget import FACING
 from imitarm.viewer import PersonMark, playback_html
-from imitarm.viewer.person import _BONES, _pieces, _turns_from_z
+from imitarm.viewer.person import _BONES, _pieces, _rotations_from_z
 from test_viewer_scene3d import messages
 from viewer_samples import make_recording
 
@@ -64,8 +64,12 @@ def test_without_feet_or_hips_the_person_is_still_above_the_floor() -> None:
 def test_a_bone_lies_along_the_way_between_its_joints(directions: np.ndarray) -> None:
     lengths = np.linalg.norm(directions, axis=1)
     unit = directions[lengths > 1e-3] / lengths[lengths > 1e-3, None]
-    np.testing.assert_allclose(rotate(_turns_from_z(unit), np.tile([0.0, 0.0, 1.0], (len(unit), 1))), unit, atol=1e-6)
-    np.testing.assert_allclose(rotate(_turns_from_z(np.array([[0.0, 0.0, -1.0]])), [[0.0, 0.0, 1.0]]), [[0, 0, -1.0]])
+    np.testing.assert_allclose(
+        rotate(_rotations_from_z(unit), np.tile([0.0, 0.0, 1.0], (len(unit), 1))), unit, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        rotate(_rotations_from_z(np.array([[0.0, 0.0, -1.0]])), [[0.0, 0.0, 1.0]]), [[0, 0, -1.0]]
+    )
 
 
 def test_the_pieces_reach_from_joint_to_joint() -> None:
@@ -115,7 +119,7 @@ def test_person_and_robot_play_in_one_scene_at_the_same_times() -> None:
     moved = {t for t, m in played if t > 0.0 and m.get("name", "").startswith("/person/")}
     assert 10 < len(moved) <= len(recording) - 1
     assert moved <= set(recording.times.tolist())
-    with pytest.raises(InputError, match="has 2 frames, the recording"):
+    with pytest.raises(InputError, match="has 2 frames, but the recording"):
         playback_html(recording, persons=[mark(frames([0.0, 0.1]), [0.0, 0.1])])
 
 

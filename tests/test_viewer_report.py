@@ -94,7 +94,8 @@ def test_nothing_outside_is_asked_for_and_the_browser_enforces_it(html: str, pag
 def test_the_headline_comes_first_then_the_table_then_the_scenes(page: Page) -> None:
     text = page.text
     places = [
-        text.index(words) for words in ("2 of 2 scenes", "Results", "Scene by scene", "What was learnt", "How it")
+        text.index(words)
+        for words in ("2 of 2 scenes", "Results", "Scene by scene", "What was learned", "How to reproduce")
     ]
     assert places == sorted(places)
 
@@ -103,7 +104,12 @@ def test_every_figure_and_number_is_there(page: Page) -> None:
     assert [a.get("class") for tag, a in page.elements if tag == "svg"].count("figure") == 2 + 2 * 4 + 2 + 0
     for words in ("22.0", "31.2", "4 of 7", "57 %", "1.34", "6 of 6", "imitarm demo --seed 0", "numpy", "Seed"):
         assert words in page.text.replace("\N{NO-BREAK SPACE}", " ")
-    for words in ("the arm stands still for 0.31 s", "align cuts it off", "Brought to one time", "stretched to 4.00 s"):
+    for words in (
+        "the arm stands still for 0.31 s",
+        "Align cuts it off",
+        "Alignment in time",
+        "stretched in time to 4.00 s",
+    ):
         assert words in page.text
 
 
@@ -160,9 +166,9 @@ def test_an_undrawable_report_still_tells() -> None:
         "refused", success=False, rollout=None, adaptation=None, rmse=math.nan, reason="box 1 covers the goal"
     )
     page = Page(report_html(Report("x", [refused])))
-    assert "✗ not done" in page.text and "box 1 covers the goal" in page.text
+    assert "✗ not done" in page.text and "Box 1 covers the goal." in page.text
     assert "–" in page.text
-    assert "no scene was tried" in Page(report_html(Report("x", []))).text
+    assert "no scene was run" in Page(report_html(Report("x", []))).text
 
 
 def test_writing_replaces_the_old_report_and_leaves_nothing_else(tmp_path: Path) -> None:
@@ -198,7 +204,7 @@ def test_a_place_that_cant_be_written_is_told_before_anything_is_drawn(
     with pytest.raises(InputError, match="is a folder"):
         write_report(Report("x", []), tmp_path)
     monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(InputError, match="may not be written to"):
+    with pytest.raises(InputError, match="no permission to write"):
         write_report(Report("x", []), tmp_path / "report.html")
 
 

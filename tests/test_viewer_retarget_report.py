@@ -15,9 +15,15 @@ from imitarm.capture.synthetic import SyntheticSource
 from imitarm.errors import InputError
 from imitarm.retarget import RETARGETERS, Correspondence
 from imitarm.viewer import retarget_charts
-from imitarm.viewer.retarget_content import Measure, MethodResult, PlainTable, RetargetReport
-from imitarm.viewer.retarget_frames import retargeting_frames
-from imitarm.viewer.retarget_report import retarget_report_html, write_retarget_report
+from imitarm.viewer.retarget_report import (
+    Measure,
+    MethodResult,
+    PlainTable,
+    RetargetReport,
+    retarget_report_html,
+    retargeting_frames,
+    write_retarget_report,
+)
 from test_viewer_report import Page
 from test_viewer_scene3d import messages
 
@@ -69,7 +75,9 @@ def test_the_page_is_whole_and_asks_nothing_of_the_network(html: str) -> None:
 
 def test_headline_table_players_and_numbers_come_in_this_order(html: str) -> None:
     text = Page(html).text
-    places = [text.index(words) for words in ("follows", "Figures of merit", "Side by side", "The recording", "How it")]
+    places = [
+        text.index(words) for words in ("follows", "Measures", "Person and robot", "The recording", "How to reproduce")
+    ]
     assert places == sorted(places)
     for words in ("it stopped for 1 s", "one gap", "Torques", "1.23", "imitarm retarget x"):
         assert words in text
@@ -130,7 +138,7 @@ def test_an_arm_that_was_never_seen_gives_no_elbow_chart_and_no_target() -> None
     )
     assert retarget_charts.elbow(blind, np.ones((len(blind.times), 3, 3))) == ""
     page = retarget_report_html(make_report("modern", methods=[make_method("modern", run=blind)]))
-    assert "The upper arms" not in page and "The tool and its target" in page
+    assert "Direction of the upper arm" not in page and "Tool and target" in page
 
 
 def test_hostile_text_stays_text() -> None:

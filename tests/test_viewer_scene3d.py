@@ -100,5 +100,5 @@ def test_a_machine_without_ports_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
         raise OSError("not permitted")
 
     monkeypatch.setattr(socket, "create_server", refuse)
-    with pytest.raises(TaskFailedError, match=r"no port on 127\.0\.0\.1"):
+    with pytest.raises(TaskFailedError, match=r"cannot open a port on 127\.0\.0\.1"):
         playback_html(make_recording(seconds=0.0))

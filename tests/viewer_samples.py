@@ -1,4 +1,4 @@
-"""A made-up arm over a table, and made-up results, for the tests of the viewer."""
+"""A simulated arm over a table, and simulated results, for the tests of the viewer."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def world_xml(*, crumbs: int = 12) -> str:
 
 
 def make_recording(*, seconds: float = 4.0, rate: float = 25.0, crumbs: int = 12) -> Recording:
-    """The made-up arm waving over its table; one crumb is pushed away."""
+    """The simulated arm waving over its table; one crumb is pushed away."""
     model = mujoco.MjModel.from_xml_string(world_xml(crumbs=crumbs))
     data = mujoco.MjData(model)
     recorder = FrameRecorder(model, rate=rate)
@@ -70,7 +70,7 @@ def make_recording(*, seconds: float = 4.0, rate: float = 25.0, crumbs: int = 12
 
 
 @dataclass(frozen=True, eq=False)
-class MadeUpAdaptation:
+class SampleAdaptation:
     """What the viewer asks of an adaptation."""
 
     nominal: Trajectory
@@ -87,7 +87,7 @@ class MadeUpAdaptation:
 
 
 @dataclass(frozen=True)
-class MadeUpCandidate:
+class SampleCandidate:
     """What the viewer asks of a number of components."""
 
     n_components: int
@@ -103,14 +103,14 @@ def make_path(n: int = 200, bump: float = 0.0) -> Trajectory:
     return Trajectory(4.0 * u, np.stack([x, -0.4 + 0.8 * u, np.full(n, 0.06)], axis=1))
 
 
-def make_adaptation(bump: float = 0.12) -> MadeUpAdaptation:
-    """Seven components on the made-up path; those in the middle are moved."""
+def make_adaptation(bump: float = 0.12) -> SampleAdaptation:
+    """Seven components on the simulated path; those in the middle are moved."""
     nominal, adapted = make_path(), make_path(bump=bump)
     at = np.linspace(12, 187, 7).astype(int)
     shift = adapted.positions[at] - nominal.positions[at]
     moved = np.linalg.norm(shift, axis=1) > 0.005
     spread = np.diag([2e-4, 1.4e-3, 1e-6])
-    return MadeUpAdaptation(
+    return SampleAdaptation(
         nominal,
         adapted,
         nominal.positions[at],
@@ -136,7 +136,7 @@ def make_rollout(path: Trajectory, *, clearance: float = 0.0213, n_joints: int =
 
 
 def make_scene() -> Scene:
-    """The two obstacles of the made-up world."""
+    """The two obstacles of the simulated world."""
     upright = (1.0, 0.0, 0.0, 0.0)
     box = Box(Pose((0.55, -0.05, 0.08), upright), (0.1, 0.08, 0.16), name="box")
     return Scene(None, (box, Cylinder(Pose((0.62, 0.2, 0.06), upright), 0.04, 0.12, name="tin")))
@@ -150,7 +150,7 @@ def make_result(name: str = "two obstacles", *, recording: Recording | None = No
         "title": name.capitalize(),
         "scene": make_scene(),
         "success": True,
-        "asked_clearance": 0.02,
+        "required_clearance": 0.02,
         "rollout": make_rollout(adaptation.trajectory),
         "adaptation": adaptation,
         "rmse": 0.0312,
@@ -170,7 +170,7 @@ def make_learning() -> LearningSummary:
         wobble = rng.normal(0.0, 0.008) * np.sin(np.linspace(0.0, 3.0, 200) + rng.uniform(0.0, 3.0))
         positions = adaptation.nominal.positions + wobble[:, None] * [1.0, 0.3, 0.0]
         shown.append(Demonstration(Trajectory(adaptation.nominal.times, positions), source=f"sweep_{i}.csv"))
-    tried = [MadeUpCandidate(k, 900.0 / k - 60.0 * k, 800.0 / k - 70.0 * k, 4.0 + 20.0 / k**2) for k in range(2, 13)]
+    tried = [SampleCandidate(k, 900.0 / k - 60.0 * k, 800.0 / k - 70.0 * k, 4.0 + 20.0 / k**2) for k in range(2, 13)]
     return LearningSummary(
         shown,
         adaptation.means,

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,27 +20,19 @@ from imitarm.benchmark.tables import Table
 from imitarm.evaluation.intervals import Interval, Values, interval, rate_interval
 from imitarm.kinematics.arm import ArmModel
 from imitarm.viewer import palette
-from imitarm.viewer.background import provenance_section
 from imitarm.viewer.canvas import INK, canvas
-from imitarm.viewer.markup import figure
-from imitarm.viewer.page import data_link, draw_page, page_html, shared_players
-from imitarm.viewer.panels import Key, Panel, heading, player_card, tabbed
-from imitarm.viewer.retarget_content import MethodResult, RetargetReport
-from imitarm.viewer.retarget_report import playback
+from imitarm.viewer.page import Figure, Header, Player, Tab, Tile, draw_page, render, shared_players
+from imitarm.viewer.retarget_report import PLAYER_KEYS, MethodResult, RetargetReport, playback
 
 _SHOWN: Final = 9.0  # [s] of the recording that is played
-_KEYS: Final = (
-    Key(palette.DEMONSTRATION, "the person's arm, and where the tool should go"),
-    Key(palette.ADAPTED, "path of the robot's tool"),
-)
 _WORDS: Final = {
-    "Interval": "The 95 % confidence interval of a mean over persons, by resampling persons. Two overlapping intervals "
-    "do not rule out a difference; the paired comparison tests it.",
-    "Lag": "The constant delay with which the tool follows the true hand best.",
-    "From first hold": "The distance to where the hand leads since the first engagement, as if the method had never "
-    "let go.",
-    "SPARC": "Length of the speed's spectrum: the nearer to 0, the smoother.",
-    "Our reading": "The thesis describes its baselines in words only; these are methods that fit the words.",
+    "Interval": "The 95 % confidence interval of a mean over persons, from resampling the persons. Two intervals that "
+    "overlap do not rule out a difference; the paired comparison tests it.",
+    "Lag": "The constant delay at which the path of the tool fits the true path of the hand best.",
+    "From first hold": "The distance between the tool and its true target from the first engagement to the end, "
+    "including the time in which the method does not follow.",
+    "SPARC": "Spectral arc length of the speed: the closer to 0, the smoother the motion.",
+    "Our reading": "The thesis describes its baselines only in words. These methods implement that description.",
 }
 
 
@@ -71,18 +62,20 @@ def mapping_report_html(
     results: Results, tables: Sequence[Table], *, provenance: Mapping[str, Any], folder: Path | None
 ) -> str:
     """Return the whole page; see :func:`write_mapping_report`."""
-    players, panels = _players(results, folder)
+    shared, players = _players(results, folder)
     verdict, good = _verdict(results)
-    summary = "Every method on the same recordings of simulated people, and the same people stacking cubes with it."
-    sections = [
-        _figures(results),
-        "".join(['<section id="tables"><h2>Tables</h2>', *(_table(table) for table in tables), "</section>"]),
-        f'<section id="scenes"><h2>Side by side</h2>{tabbed(panels, "Methods")}</section>' if panels else "",
-        f"<section><p>{data_link({'results': [_data(r) for r in results.all]}, 'imitarm-mapping.json')}</p></section>",
-        provenance_section(provenance, _WORDS),
-    ]
-    return page_html(
-        "Mapping benchmark", heading("Mapping benchmark", verdict, good, summary, _tiles(results)), sections, players
+    summary = "All methods on the same recordings of simulated people, and the same people stacking cubes with each."
+    return render(
+        "mapping.html",
+        Header("Mapping benchmark", verdict, good, summary, _tiles(results)),
+        data={"results": [_data(r) for r in results.all]},
+        data_name="imitarm-mapping.json",
+        provenance=provenance,
+        words=_WORDS,
+        shared=shared,
+        figures=_figures(results),
+        tables=[_table(table) for table in tables],
+        players=players,
     )
 
 
@@ -101,58 +94,44 @@ def _breaks(result: Result) -> bool:
     return bool(result.failure) or number(result, "limit_violations") > 0
 
 
-def _tiles(results: Results) -> list[tuple[str, str]]:
+def _tiles(results: Results) -> list[Tile]:
     tiles = []
     for name in results.methods:
         runs = results.of(name, [LIVE])
         if runs:
             done = sum(bool(r.values.get("success")) for r in runs)
-            tiles.append((f"{done}<small> of {len(runs)}</small>", f"towers stacked with {METHODS[name].title}"))
+            tiles.append(Tile(str(done), f"of {len(runs)}", f"towers stacked with {METHODS[name].title}"))
     return tiles[:5]
 
 
-def _figures(results: Results) -> str:
+def _figures(results: Results) -> list[Figure]:
     tasks = results.tasks()
     stacking = results.tasks(["stacking"]) or tasks
     main = Results(r for r in results.all if r.experiment.method in MAIN)
-    bars = "Bars are means over persons, lines 95 % intervals."
-    cards = [
-        figure(successes(main), "Success", f"Four cubes stacked in closed loop. {bars}"),
-        figure(torques(main, stacking), "Mean torque of each joint (Fig 3.6)", bars),
-        figure(path_lengths(main, tasks), "Path length (Fig 3.7)", bars),
-        figure(times(main), "Time to complete (Fig 3.8)", f"Of the trials that succeeded. {bars}"),
-        figure(accuracy(main, tasks), "Accuracy", bars),
-        figure(limit_violations(main, tasks), "Limit violations", bars),
+    bars = "Bars are means over persons, lines are 95 % intervals."
+    return [
+        Figure(successes(main), "Success", f"Four cubes stacked in closed loop. {bars}"),
+        Figure(torques(main, stacking), "Mean torque of each joint (Fig 3.6)", bars),
+        Figure(path_lengths(main, tasks), "Path length (Fig 3.7)", bars),
+        Figure(times(main), "Time to complete (Fig 3.8)", f"Successful trials only. {bars}"),
+        Figure(accuracy(main, tasks), "Accuracy", bars),
+        Figure(limit_violations(main, tasks), "Limit violations", bars),
     ]
-    return f'<section id="figures"><h2>Figures</h2><div class="columns">{"".join(cards)}</div></section>'
 
 
-def _table(table: Table) -> str:
-    kinds = [_kind(column) for column in table.columns]
-    head = "".join(
-        f'<th scope="col"{kind}>{escape(column.removesuffix(">"))}</th>'
-        for column, kind in zip(table.columns, kinds, strict=True)
-    )
-    rows = "".join(
-        f'<tr><th scope="row">{escape(row[0])}</th>'
-        + "".join(f"<td{kind}>{escape(cell)}</td>" for cell, kind in zip(row[1:], kinds[1:], strict=True))
-        + "</tr>"
-        for row in table.rows
-    )
-    return (
-        f'<h3>{escape(table.title)}</h3><div class="card wide"><table><thead><tr>{head}</tr></thead>'
-        f'<tbody>{rows}</tbody></table></div><p class="caption">{escape(table.note)}</p>'
-    )
+def _table(table: Table) -> dict[str, Any]:
+    """Return a table for the template; text columns wrap, and a heading that is a symbol keeps its case."""
+    columns = [
+        {
+            "title": column.removesuffix(">"),
+            "kind": "words" if not column.endswith(">") else "" if column[:1].isascii() else "symbol",
+        }
+        for column in table.columns
+    ]
+    return {"title": table.title, "note": table.note, "columns": columns, "rows": table.rows}
 
 
-def _kind(column: str) -> str:
-    """Return the class of a column: words wrap, a symbol keeps its case, numbers need none."""
-    if not column.endswith(">"):
-        return ' class="words"'
-    return "" if column[:1].isascii() else ' class="symbol"'
-
-
-def _players(results: Results, folder: Path | None) -> tuple[tuple[str, str] | None, list[Panel]]:
+def _players(results: Results, folder: Path | None) -> tuple[tuple[str, str] | None, list[Tab]]:
     """Return the playback of one recording by each of the main methods: the first one at the edge of reach."""
     replayed = [r.experiment for r in results.all if r.experiment.task != LIVE and not r.failure]
     chosen = next((e for e in replayed if e.task == "edge"), next(iter(replayed), None))
@@ -169,11 +148,11 @@ def _players(results: Results, folder: Path | None) -> tuple[tuple[str, str] | N
         return None, []
     report = RetargetReport("Mapping benchmark", methods, seen, recording.correspondence, "", good=True)
     shared, own = shared_players({method.name: playback(report, method) for method in methods})
-    panels = [
-        Panel(f"method-{m.name}", m.title, player_card(f"Person and robot: {m.title}", own[m.name], _KEYS))
+    tabs = [
+        Tab(f"method-{m.name}", m.title, Player(f"Person and robot: {m.title}", own[m.name], PLAYER_KEYS))
         for m in methods
     ]
-    return shared, panels
+    return shared, tabs
 
 
 def _data(result: Result) -> dict[str, Any]:

@@ -314,7 +314,7 @@ def _check(arguments: argparse.Namespace, folder: Path) -> None:
     check_outputs([("--report", arguments.report)], [("--fill", arguments.fill), *written], new_folders=True)
     if arguments.report is None:
         return
-    missing = [name for name in ("matplotlib", "viser") if importlib.util.find_spec(name) is None]
+    missing = [name for name in ("jinja2", "matplotlib", "viser") if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(f"--report needs {' and '.join(missing)}: pip install 'imitarm[report]'")
     page: Path = arguments.report

@@ -31,7 +31,13 @@ from imitarm.retarget.engagement import SEEN_FOR, EngagementState
 from imitarm.retarget.fitting import fit_motion
 from imitarm.scene import Scene, load_scene
 from imitarm.trajectory import Demonstration, Trajectory
-from imitarm.viewer.retarget_content import Measure, MethodResult, PlainTable, RetargetReport
+from imitarm.viewer.retarget_report import (
+    Measure,
+    MethodResult,
+    PlainTable,
+    RetargetReport,
+    write_retarget_report,
+)
 
 EPILOG = f"""\
 examples:
@@ -387,8 +393,6 @@ def _written_report(
     hint: str,
 ) -> Path:
     """Write the report and return where."""
-    from imitarm.viewer.retarget_report import write_retarget_report  # noqa: PLC0415 (only when it is asked for)
-
     (result, tracking), arm, correspondence = done[0], setting.arm, setting.correspondence
     with working("drawing the report"):
         return write_retarget_report(

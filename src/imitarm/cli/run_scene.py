@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 CONTROL_PERIOD = 0.01  # [s]
 TIMEOUT = 4.0  # a reproduction may take this many times as long as the demonstrations
-_LIBRARIES = ("numpy", "scipy", "mujoco", "daqp", "pyyaml", "rich", "viser", "matplotlib")
+_LIBRARIES = ("numpy", "scipy", "mujoco", "daqp", "pyyaml", "rich", "viser", "matplotlib", "jinja2")
 
 Evaluate = Callable[[SimulatedRobot, Rollout], Rollout]
 
@@ -99,7 +99,7 @@ def run_scene(
         title=title,
         scene=scene,
         success=rollout is not None and rollout.success,
-        asked_clearance=clearance,
+        required_clearance=clearance,
         rollout=rollout,
         adaptation=policy.plan,
         rmse=_distance_to(demonstrations, rollout, phases),
@@ -189,7 +189,7 @@ def show_results(report: Report) -> None:
                 f"{1e3 * scene.min_clearance:.1f}" if np.isfinite(scene.min_clearance) else "-",
                 f"{1e3 * adaptation.certified_clearance:.1f}" if adaptation and around else "-",
                 f"{1e3 * scene.rmse:.1f}" if np.isfinite(scene.rmse) else "-",
-                f"{100 * scene.unmoved_share:.0f} %",
+                f"{100 * scene.unmoved_fraction:.0f} %",
                 f"{1e3 * adaptation.compute_time:.1f}" if adaptation else "-",
             )
         )

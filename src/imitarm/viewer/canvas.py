@@ -1,7 +1,7 @@
-"""Matplotlib drawings as inline SVG text that follows the page's light or dark colours.
+"""Matplotlib drawings as inline SVG that follows the light or dark colours of the page.
 
-Lines of text and axes take the colour of the text around them (``currentColor``), the data keep their own colours of
-:mod:`~imitarm.viewer.palette`. Nothing outside of the page is referred to.
+Text and axes have the colour of the text around the drawing (``currentColor``); the data have the colours of
+:mod:`~imitarm.viewer.palette`. The SVG refers to nothing outside the page.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from imitarm.errors import InputError
 
 Array = NDArray[np.float64]
 
-_LONG: Final = re.compile(r"(\d+\.\d\d)\d+")  # a hundredth of a point is enough
-POINTS: Final = 300  # samples of one line that an eye can tell apart
-INK: Final = "#010203"  # stands for the page's text colour until the drawing is text
+_LONG: Final = re.compile(r"(\d+\.\d\d)\d+")  # 0.01 points are precise enough
+POINTS: Final = 300  # samples of one line; more make no visible difference
+INK: Final = "#010203"  # placeholder for the text colour of the page
 MM: Final = 1000.0  # [mm/m]
 _STYLE: Final[Mapping[str, Any]] = {
     "svg.fonttype": "none",
@@ -53,9 +53,9 @@ _STYLE: Final[Mapping[str, Any]] = {
 
 
 class Canvas:
-    """A figure in the making, and the SVG text when it is done.
+    """A figure while it is drawn, and its SVG text afterwards.
 
-    Margins are given in inches and not searched for: that would draw every figure twice.
+    Margins are given in inches: an automatic layout would draw every figure twice.
     """
 
     def __init__(self, figure: Any, size: tuple[float, float]) -> None:
@@ -70,17 +70,17 @@ class Canvas:
         )
 
     def legend(self, columns: int) -> None:
-        """Explain the lines below everything else."""
+        """Add a legend at the bottom of the figure."""
         self.figure.legend(loc="lower center", ncols=columns, borderaxespad=0.1, handlelength=1.8, columnspacing=1.4)
 
 
 @contextmanager
 def canvas(name: str, description: str, size: tuple[float, float]) -> Iterator[Canvas]:
-    """Give a figure of ``size`` [inch] to draw on, then turn it into SVG.
+    """Give a figure of ``size`` [inch] to draw on, then convert it to SVG.
 
     Args:
-        name: unique in the page: the SVG's ids begin with it.
-        description: what is to be seen, for readers that do not see it.
+        name: unique in the page; all ids in the SVG begin with it.
+        description: of the figure, for screen readers.
         size: width and height [inch].
     """
     try:
@@ -100,7 +100,7 @@ def canvas(name: str, description: str, size: tuple[float, float]) -> Iterator[C
 
 
 def _inline(svg: str, name: str, description: str) -> str:
-    """Turn a whole SVG file into an element that can stand in a page beside others."""
+    """Turn an SVG file into an element that can share a page with others."""
     prefix = re.sub(r"\W+", "-", name)
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", svg)  # two figures may not share an id
@@ -115,12 +115,12 @@ def _inline(svg: str, name: str, description: str) -> str:
 
 
 def thin(n: int, most: int = POINTS) -> NDArray[np.int64]:
-    """Return at most ``most`` indices spread over ``n`` samples, the ends kept."""
+    """Return at most ``most`` indices that are spread evenly over ``n`` samples and include both ends."""
     return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
 
 
 def thin_extremes(values: Array, most: int = POINTS) -> NDArray[np.int64]:
-    """Return indices that keep the least and the greatest of every short stretch: no peak is lost."""
+    """Return indices that include the minimum and the maximum of every short stretch, so that no peak is lost."""
     if len(values) <= most:
         return np.arange(len(values))
     stretches = np.array_split(np.arange(len(values)), most // 2)

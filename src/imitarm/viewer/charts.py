@@ -1,30 +1,38 @@
-"""The report's figures over time, over components and over their number; see :mod:`~imitarm.viewer.plots`."""
+"""Figures of a report over time, over the components and over their number, and small charts of all joints.
+
+Every function returns one ``<svg>`` element. Figures of paths are in :mod:`~imitarm.viewer.maps`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.viewer import palette
 from imitarm.viewer.canvas import INK, MM, canvas, thin_extremes
-from imitarm.viewer.small_multiples import JointCurve, small_multiples
 
 Array = NDArray[np.float64]
 
+_WIDTH: Final = 5.5  # [inch]
+_ROW: Final = 1.15  # [inch]
+_SMALL: Final[dict[str, Any]] = {"fontsize": 7.5}
 
-def clearance(times: ArrayLike, distances: ArrayLike, asked: float, *, name: str = "clearance") -> str:
-    """Draw the measured distance to the nearest obstacle over time, and the one that was asked for.
+
+def clearance(times: ArrayLike, distances: ArrayLike, required: float, *, name: str = "clearance") -> str:
+    """Draw the measured and the required clearance over time.
 
     Args:
         times: shape (n_steps,) [s].
-        distances: smallest distance of arm and tool to an obstacle, shape (n_steps,) [m].
-        asked: the clearance that was asked for [m].
+        distances: smallest distance between the arm, with its tool, and any obstacle, shape (n_steps,) [m].
+        required: clearance to keep [m].
         name: unique in the page.
 
     Returns:
-        An SVG element; empty text when no distance is finite, because there was no obstacle.
+        An SVG element; an empty string when no distance is finite, because there was no obstacle.
     """
     t, d = np.asarray(times, dtype=float), MM * np.asarray(distances, dtype=float)
     finite = np.isfinite(d)
@@ -32,26 +40,30 @@ def clearance(times: ArrayLike, distances: ArrayLike, asked: float, *, name: str
         return ""
     t, d = t[finite], d[finite]
     least = int(np.argmin(d))
-    text = f"Clearance over time: at least {d[least]:.1f} mm, asked {MM * asked:.0f} mm"
+    text = f"Clearance over time: at least {d[least]:.1f} mm, required {MM * required:.0f} mm"
     with canvas(name, text, (5.5, 2.2)) as drawing:
         axes = drawing.axes(0.74, 0.48, 5.4, 2.1)
         kept = thin_extremes(d)
         axes.plot(t[kept], d[kept], color=palette.ADAPTED, lw=1.6)
         axes.fill_between(t[kept], d[kept], 0.0, color=palette.ADAPTED, alpha=0.08, lw=0)
-        axes.axhline(MM * asked, color=palette.LIMIT, lw=1.1, ls="--")
+        axes.axhline(MM * required, color=palette.LIMIT, lw=1.1, ls="--")
         axes.axhline(0.0, color=INK, lw=1.0)
-        axes.plot(t[least], d[least], "o", color=palette.LIMIT if d[least] < MM * asked else palette.ADAPTED, ms=5)
+        axes.plot(t[least], d[least], "o", color=palette.LIMIT if d[least] < MM * required else palette.ADAPTED, ms=5)
         right = t[least] > 0.6 * t[-1]
         place = {
-            "xytext": (-6 if right else 6, -14 if d[least] > 2.0 * MM * asked else 9),
+            "xytext": (-6 if right else 6, -14 if d[least] > 2.0 * MM * required else 9),
             "textcoords": "offset points",
         }
         place["ha"] = "right" if right else "left"
         axes.annotate(f"smallest: {d[least]:.1f} mm", (t[least], d[least]), **place)
-        top = max(4.0 * MM * asked, 2.0 * d[least], 60.0)
+        top = max(4.0 * MM * required, 2.0 * d[least], 60.0)
         axes.set_ylim(min(0.0, 1.15 * d[least]), min(1.08 * d.max(), 2.0 * top) if d.max() > 0.0 else top)
         axes.annotate(
-            f"asked: {MM * asked:.0f} mm", (t[-1], MM * asked), xytext=(0, 3), textcoords="offset points", ha="right"
+            f"required: {MM * required:.0f} mm",
+            (t[-1], MM * required),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="right",
         )
         axes.set_xlim(t[0], t[-1])
         axes.set_xlabel("time [s]")
@@ -67,13 +79,13 @@ def torques(
     joint_names: Sequence[str] = (),
     name: str = "torques",
 ) -> str:
-    """Draw the torque of every joint over time between its rated limits.
+    """Draw the torque of each joint over time, with its rated torque.
 
     Args:
         times: shape (n_steps,) [s].
         values: shape (n_steps, n_joints) [N m].
         limits: rated torque, shape (n_joints,) [N m].
-        joint_names: shown above each chart; numbered when left out.
+        joint_names: shown above each chart; by default joints are numbered.
         name: unique in the page.
 
     Returns:
@@ -90,11 +102,11 @@ def torques(
 
 
 def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacement") -> str:
-    """Draw how far every Gaussian component was moved.
+    """Draw the displacement of each Gaussian component.
 
     Args:
-        lengths: of the displacements, in the order of time, shape (n_components,) [m].
-        moved: which components were displaced, shape (n_components,).
+        lengths: lengths of the displacements, in the order of time, shape (n_components,) [m].
+        moved: which components were moved, shape (n_components,).
         name: unique in the page.
 
     Returns:
@@ -112,7 +124,7 @@ def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacem
             "o",
             color=palette.UNMOVED,
             ms=5,
-            label="unmoved",
+            label="not moved",
             clip_on=False,
         )
         for number, length in zip(numbers[went], far[went], strict=True):
@@ -123,7 +135,7 @@ def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacem
         axes.set_xticks(numbers)
         axes.grid(axis="x", visible=False)
         axes.set_xlabel("Gaussian component, in the order of time")
-        axes.set_ylabel("moved by [mm]")
+        axes.set_ylabel("displacement [mm]")
     return drawing.svg
 
 
@@ -136,14 +148,14 @@ def selection(
     *,
     name: str = "selection",
 ) -> str:
-    """Draw what speaks for each number of components: information criteria and the error on held-out demonstrations.
+    """Draw the information criteria and the error on held-out demonstrations for each number of components.
 
     Args:
-        n_components: the numbers that were tried, shape (n,).
-        bic: Bayesian information criterion, less is better, shape (n,); may be empty.
-        aic: Akaike information criterion, less is better, shape (n,); may be empty.
-        held_out_error: root mean square distance to demonstrations that were left out, shape (n,) [m]; may be empty.
-        chosen: the number that was taken.
+        n_components: numbers of components that were evaluated, shape (n,).
+        bic: Bayesian information criterion, lower is better, shape (n,); may be empty.
+        aic: Akaike information criterion, lower is better, shape (n,); may be empty.
+        held_out_error: root mean square distance to held-out demonstrations, shape (n,) [m]; may be empty.
+        chosen: the number that was chosen.
         name: unique in the page.
 
     Returns:
@@ -165,7 +177,7 @@ def selection(
         left.legend()
         if len(np.asarray(held_out_error)):
             right.plot(k, MM * np.asarray(held_out_error, dtype=float), "o-", color=palette.MOVED, ms=3.5, lw=1.4)
-        right.set_ylabel("error on left-out\ndemonstrations [mm]")
+        right.set_ylabel("error on held-out\ndemonstrations [mm]")
         for axes in (left, right):
             axes.axvline(chosen, color=INK, lw=0.9, ls=":")
             axes.set_xlabel("number of components K")
@@ -174,3 +186,88 @@ def selection(
         side = {"xytext": (-4 if late else 4, -9), "textcoords": "offset points", "ha": "right" if late else "left"}
         right.annotate(f"K = {chosen}", (chosen, 1.0), xycoords=("data", "axes fraction"), **side)
     return drawing.svg
+
+
+@dataclass(frozen=True, eq=False)
+class JointCurve:
+    """The motion of one joint between its limits.
+
+    Attributes:
+        title: above the chart.
+        values: over time, shape (n_steps,).
+        lower: lower limit.
+        upper: upper limit.
+        zero: whether to draw a line at 0.
+    """
+
+    title: str
+    values: Array
+    lower: float
+    upper: float
+    zero: bool = True
+
+
+def small_multiples(name: str, description: str, unit: str, times: Array, curves: Sequence[JointCurve]) -> str:
+    """Draw one small chart for each joint, each between its own limits.
+
+    Args:
+        name: unique in the page.
+        description: for screen readers.
+        unit: label of the vertical axis.
+        times: shape (n_steps,) [s].
+        curves: one for each joint.
+
+    Returns:
+        An SVG element.
+    """
+    columns = min(len(curves), 4)
+    rows = -(-len(curves) // columns)
+    size = (_WIDTH, 0.3 + _ROW * rows)
+    with canvas(name, description, size) as drawing:
+        paper = drawing.axes(0.0, 0.0, *size, xlim=(0.0, size[0]), ylim=(0.0, size[1]))  # its units are inches
+        paper.set_axis_off()
+        for i, curve in enumerate(curves):
+            row, column = divmod(i, columns)
+            left = 0.58 + (size[0] - 0.26) / columns * column
+            bottom = size[1] - _ROW * row - 0.94
+            _Panel(left, bottom, (size[0] - 0.26) / columns - 0.42, 0.68).draw(paper, times, curve)
+        paper.text(size[0] / 2, 0.06, "time [s]", ha="center")
+        paper.text(0.08, size[1] / 2, unit, ha="center", va="center", rotation=90)
+    return drawing.svg
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """A small chart on axes whose units are inches; axes of their own for each joint would take ten times as long."""
+
+    left: float
+    bottom: float
+    width: float
+    height: float
+
+    def draw(self, paper: Any, times: Array, curve: JointCurve) -> None:
+        """Draw the motion of a joint between its limits."""
+        low, high = min(curve.lower, float(curve.values.min())), max(curve.upper, float(curve.values.max()))
+        low, high = low - 0.06 * (high - low), high + 0.06 * (high - low)
+        right = self.left + self.width
+        kept = thin_extremes(curve.values, 160)
+        span = max(float(times[-1] - times[0]), 1e-9)
+        across = self.left + self.width * (times[kept] - times[0]) / span
+
+        def up(values: Any) -> Any:
+            return self.bottom + self.height * (values - low) / (high - low)
+
+        paper.plot(across, up(curve.values[kept]), color=palette.ADAPTED, lw=1.1)
+        marks = [(curve.lower, True), (curve.upper, True)]
+        if curve.zero and curve.lower < 0.0 < curve.upper:
+            marks.append((0.0, False))
+        for value, limit in marks:
+            look = {"color": palette.LIMIT, "lw": 1.0, "ls": "--"} if limit else {"color": INK, "lw": 0.6, "alpha": 0.3}
+            paper.plot([self.left, right], [up(value)] * 2, **look)
+            paper.text(self.left - 0.04, up(value), f"{value:.3g}", ha="right", va="center", **_SMALL)
+        paper.plot(
+            [self.left, self.left, right], [self.bottom + self.height, self.bottom, self.bottom], color=INK, lw=0.6
+        )
+        for x, value in ((self.left, times[0]), (right, times[-1])):
+            paper.text(x, self.bottom - 0.04, f"{value:.3g}", ha="center", va="top", **_SMALL)
+        paper.text(self.left, self.bottom + self.height + 0.05, curve.title.replace("$", r"\$"), fontsize=8.0)

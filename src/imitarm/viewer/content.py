@@ -1,14 +1,14 @@
-"""What a report says: plain, frozen results, and the numbers that follow from them.
+"""The content of a report: frozen results, the numbers that follow from them, and the same numbers as plain data.
 
-These nouns know nothing of pages. :mod:`~imitarm.viewer.report` turns them into one.
+:mod:`~imitarm.viewer.report` draws a page from them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import asdict, dataclass, field
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,16 +22,17 @@ from imitarm.viewer.recording import Recording
 Array = NDArray[np.float64]
 
 
+@runtime_checkable
 class AdaptedPath(Protocol):
-    """What is drawn of an adaptation: :class:`imitarm.policies.Adaptation` has all of it."""
+    """The attributes of an adaptation that are drawn; :class:`imitarm.policies.Adaptation` has all of them."""
 
     @property
     def nominal(self) -> Trajectory:
-        """The learnt path."""
+        """The learned path."""
 
     @property
     def trajectory(self) -> Trajectory:
-        """The path around the obstacles."""
+        """The adapted path, around the obstacles."""
 
     @property
     def means(self) -> Array:
@@ -39,15 +40,15 @@ class AdaptedPath(Protocol):
 
     @property
     def covariances(self) -> Array:
-        """Of the components' positions, shape (n_components, 3, 3) [m^2]."""
+        """Position covariances of the components, shape (n_components, 3, 3) [m^2]."""
 
     @property
     def displacement(self) -> Array:
-        """Of each component, shape (n_components, 3) [m]."""
+        """Displacement of each component's mean, shape (n_components, 3) [m]."""
 
     @property
     def moved(self) -> NDArray[np.bool_]:
-        """Which components were displaced, shape (n_components,)."""
+        """Which components were moved, shape (n_components,)."""
 
     @property
     def tolerance(self) -> Array:
@@ -55,52 +56,52 @@ class AdaptedPath(Protocol):
 
     @property
     def certified_clearance(self) -> float:
-        """Proven clearance of the planned path of the tool [m]."""
+        """Guaranteed lower bound of the tool's clearance on the whole planned path [m]."""
 
     @property
     def feasible(self) -> bool:
-        """Whether the asked clearance was reached."""
+        """Whether the certified clearance reaches the required one."""
 
     @property
     def method(self) -> str:
-        """How it was found."""
+        """Name of the method of adaptation."""
 
     @property
     def compute_time(self) -> float:
-        """How long that took [s]."""
+        """Computing time of the adaptation [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneResult:
-    """One scene: what was planned in it and what the robot did.
+    """One scene: what was planned and what the robot did.
 
     Attributes:
-        name: short and unique in the report, used in links.
-        title: what people read.
+        name: short and unique in the report; used in links.
+        title: as shown to the reader.
         scene: goal and obstacles.
-        success: whether the task was done as it should be.
-        asked_clearance: distance to every obstacle that was asked for [m].
-        rollout: what the robot did and what was measured; None when it was not sent off.
+        success: whether the task succeeded.
+        required_clearance: distance to keep from every obstacle [m].
+        rollout: the measured motion; None when the robot did not start.
         adaptation: the planned path; None when nothing was adapted.
-        rmse: root mean square distance of the measured path to the demonstrations [m]; nan when not known.
-        reason: why it ended as it did, in words.
-        tool_radius: radius of the sphere that held the tool in the plan [m].
-        tool_spheres: instead of one radius, rows of x, y, z, radius in the tool's frame, shape (m, 4) [m].
-        recording: for the 3-D playback.
+        rmse: root mean square distance from the measured path to the demonstrations [m]; NaN when unknown.
+        reason: why the run ended, in words.
+        tool_radius: radius of the sphere that contained the tool in the plan [m].
+        tool_spheres: replaces ``tool_radius``: rows of x, y, z, radius in the tool frame, shape (m, 4) [m].
+        recording: poses of all bodies, for the 3-D playback.
         torque_limits: rated torques, shape (n_joints,) [N m].
-        joint_names: names for the charts of the torques.
-        caption: a sentence about what is to be seen.
-        details: anything more the task measured: one column in the table for each name.
+        joint_names: titles of the torque charts.
+        caption: one sentence that describes the scene.
+        details: further measurements of the task; each name becomes a column of the table.
 
     Raises:
-        InputError: when the name is empty.
+        InputError: when ``name`` is empty.
     """
 
     name: str
     title: str
     scene: Scene
     success: bool
-    asked_clearance: float
+    required_clearance: float
     rollout: Rollout | None = None
     adaptation: AdaptedPath | None = None
     rmse: float = math.nan
@@ -119,40 +120,40 @@ class SceneResult:
 
     @property
     def tool(self) -> Array:
-        """Spheres that held the tool in the plan: rows of x, y, z, radius in the tool's frame, shape (m, 4) [m]."""
+        """Spheres that contained the tool in the plan: rows of x, y, z, radius in the tool frame, shape (m, 4) [m]."""
         if self.tool_spheres is None:
             return np.array([[0.0, 0.0, 0.0, self.tool_radius]])
         return np.asarray(self.tool_spheres, dtype=float).reshape(-1, 4)
 
     @property
     def min_clearance(self) -> float:
-        """Smallest measured clearance [m]: inf without obstacles, nan when the robot was not sent off."""
+        """Smallest measured clearance [m]: inf without obstacles, NaN when the robot did not start."""
         return math.nan if self.rollout is None else self.rollout.min_clearance
 
     @property
     def contact(self) -> bool:
-        """Whether something was touched."""
+        """Whether the arm or its tool touched an obstacle."""
         return self.min_clearance <= 0.0
 
     @property
-    def unmoved_share(self) -> float:
-        """Share of the Gaussian components that stayed where they were learnt; nan without an adaptation."""
+    def unmoved_fraction(self) -> float:
+        """Fraction of the Gaussian components that were not moved; NaN without an adaptation."""
         return math.nan if self.adaptation is None else float(1.0 - np.mean(self.adaptation.moved))
 
     @property
-    def peak_torque_share(self) -> float:
-        """Greatest measured torque as a share of its joint's rated torque; nan when not known."""
+    def peak_torque_ratio(self) -> float:
+        """Highest measured torque divided by the rated torque of its joint; NaN when unknown."""
         if self.rollout is None or self.torque_limits is None:
             return math.nan
         return float(np.max(np.abs(self.rollout.torques) / np.asarray(self.torque_limits, dtype=float)))
 
 
 class Candidate(Protocol):
-    """A number of components that was tried: :class:`imitarm.skills.mixture_fitting.Candidate`."""
+    """One evaluated number of components; :class:`imitarm.skills.mixture_fitting.Candidate` has all of its attributes."""
 
     @property
     def n_components(self) -> int:
-        """The number K."""
+        """Number of components K."""
 
     @property
     def bic(self) -> float:
@@ -164,22 +165,22 @@ class Candidate(Protocol):
 
     @property
     def held_out_rmse_mm(self) -> float:
-        """Error on left-out demonstrations [mm]; nan when there was none to leave out."""
+        """Error on held-out demonstrations [mm]; NaN when none could be held out."""
 
 
 @dataclass(frozen=True, eq=False)
 class LearningSummary:
-    """What was shown and what was learnt from it.
+    """The demonstrations and what was learned from them.
 
     Attributes:
-        demonstrations: as they were learnt from (checked and aligned).
+        demonstrations: checked and aligned, as they were used for learning.
         means: of the Gaussian components' positions, shape (n_components, 3) [m].
         covariances: of the Gaussian components' positions, shape (n_components, 3, 3) [m^2].
-        predicted: the learnt path.
-        candidates: numbers of components that were tried.
-        findings: what lint said about the recordings.
-        alignment: what align changed; None when it was not used.
-        details: anything more to state, by name.
+        predicted: the learned path.
+        candidates: the numbers of components that were evaluated.
+        findings: what ``lint`` reported about the recordings.
+        alignment: what ``align`` changed; None when it was not used.
+        details: further facts, by name.
     """
 
     demonstrations: Sequence[Demonstration]
@@ -193,21 +194,21 @@ class LearningSummary:
 
     @property
     def n_components(self) -> int:
-        """How many Gaussian components were learnt."""
+        """Number of Gaussian components that were learned."""
         return len(self.means)
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Everything that one run has to tell.
+    """Everything that a page shows about one run.
 
     Attributes:
         title: of the page.
         scenes: results, in the order in which they are shown; names must be unique.
-        summary: a sentence or two on what this is about.
-        learning: what was shown and learnt.
-        provenance: what is needed to do it again (command, seed, platform, versions, ...), by name; values that are
-            mappings become tables of their own.
+        summary: one or two sentences that introduce the page.
+        learning: the demonstrations and what was learned from them.
+        provenance: what is needed to repeat the run (command, seed, platform, versions, ...), by name; values that
+            are mappings become tables of their own.
 
     Raises:
         InputError: when two scenes have the same name.
@@ -223,7 +224,7 @@ class Report:
         names = [scene.name for scene in self.scenes]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise InputError(f"Report: the scene name {twice[0]!r} is used twice; give every scene its own")
+            raise InputError(f"Report: the scene name {twice[0]!r} is used twice; give each scene a name of its own")
 
     @property
     def passed(self) -> bool:
@@ -239,15 +240,90 @@ class Report:
     def verdict(self) -> str:
         """The result in one line."""
         if not self.scenes:
-            return "no scene was tried"
+            return "no scene was run"
         obstructed = [scene for scene in self.scenes if scene.scene.obstacles]
         done = sum(scene.success for scene in self.scenes)
         if not obstructed:
-            return f"{done} of {len(self.scenes)} scenes done"
+            return f"{done} of {len(self.scenes)} scenes completed"
         clear = sum(scene.rollout is not None and not scene.contact for scene in obstructed)
         parts = [f"{clear} of {len(obstructed)} scenes with obstacles without contact"]
         if math.isfinite(self.min_clearance):
             parts.append(f"smallest clearance {1000.0 * self.min_clearance:.1f} mm")
         if done < len(self.scenes):
-            parts.append(f"{len(self.scenes) - done} not done")
+            parts.append(f"{len(self.scenes) - done} not completed")
         return "; ".join(parts)
+
+
+def as_data(report: Report) -> dict[str, Any]:
+    """Return the report's numbers as plain values in SI units, ready for JSON; unknown numbers become None."""
+    scenes = []
+    for scene in report.scenes:
+        adaptation = scene.adaptation
+        scenes.append(
+            {
+                "name": scene.name,
+                "title": scene.title,
+                "success": scene.success,
+                "reason": scene.reason,
+                "n_obstacles": len(scene.scene.obstacles),
+                "required_clearance_m": scene.required_clearance,
+                "min_clearance_m": scene.min_clearance,
+                "certified_clearance_m": adaptation.certified_clearance if adaptation else None,
+                "rmse_to_demonstrations_m": scene.rmse,
+                "n_components": len(adaptation.moved) if adaptation else None,
+                "n_moved_components": int(np.sum(adaptation.moved)) if adaptation else None,
+                "unmoved_fraction": scene.unmoved_fraction,
+                "adaptation_method": adaptation.method if adaptation else None,
+                "adaptation_time_s": adaptation.compute_time if adaptation else None,
+                "motion_duration_s": scene.rollout.trajectory.duration if scene.rollout else None,
+                "peak_torque_ratio": scene.peak_torque_ratio,
+                "details": dict(scene.details),
+            }
+        )
+    data: dict[str, Any] = {
+        "title": report.title,
+        "passed": report.passed,
+        "verdict": report.verdict,
+        "scenes": scenes,
+        "provenance": dict(report.provenance),
+    }
+    if report.learning is not None:
+        learning = report.learning
+        data["learning"] = {
+            "n_demonstrations": len(learning.demonstrations),
+            "sources": [demonstration.source for demonstration in learning.demonstrations],
+            "n_components": learning.n_components,
+            "candidates": [
+                {"n_components": c.n_components, "bic": c.bic, "aic": c.aic, "held_out_rmse_mm": c.held_out_rmse_mm}
+                for c in learning.candidates
+            ],
+            "findings": [asdict(finding) for finding in learning.findings],
+            "alignment": _alignment_data(learning.alignment) if learning.alignment is not None else None,
+            "details": dict(learning.details),
+        }
+    return plain(data)
+
+
+def _alignment_data(alignment: Alignment) -> dict[str, Any]:
+    return {
+        "method": alignment.method,
+        "duration_s": alignment.duration,
+        "kept_rows": alignment.kept_rows.tolist(),
+        "durations_s": alignment.durations.tolist(),
+        "largest_shift_s": alignment.largest_shift.tolist(),
+    }
+
+
+def plain(value: Any) -> Any:
+    """Return ``value`` with NumPy values as plain Python values, and NaN and infinity as None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value if value is None else str(value)

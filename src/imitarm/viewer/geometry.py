@@ -1,7 +1,7 @@
-"""Triangles of MuJoCo's geoms: few of them, sharp where the shape is sharp, round where it is round.
+"""Triangle meshes of MuJoCo's geoms, with few triangles, sharp edges and smooth round surfaces.
 
-Renderers average the normals of triangles that share a vertex. Faces that meet at an edge therefore get vertices of
-their own here, and those of a curved side share theirs.
+Renderers average the normals of triangles that share a vertex. Faces that meet at a sharp edge therefore get vertices
+of their own, and the faces of a round surface share theirs.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def box(half_size: ArrayLike) -> Mesh:
     return Mesh(np.array(corners) * np.asarray(half_size, dtype=float), np.array(faces))
 
 
-def _turned(profile: Array) -> Mesh:
-    """Turn a profile of (radius, z) rows [m], from the lowest to the highest, around the z axis."""
+def _revolved(profile: Array) -> Mesh:
+    """Revolve a profile of (radius, z) rows [m], from the lowest to the highest, around the z axis."""
     angles = np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     rings = np.concatenate(
@@ -80,15 +80,15 @@ def cylinder(radius: float, half_length: float) -> Mesh:
     """Return a cylinder along z with flat ends; ``half_length`` is half of its length [m]."""
     ends = [(0.0, -half_length), (radius, -half_length)], [(radius, half_length), (0.0, half_length)]
     side = [(radius, -half_length), (radius, half_length)]
-    return merge([_turned(np.array(part)) for part in (ends[0], side, ends[1])])
+    return merge([_revolved(np.array(part)) for part in (ends[0], side, ends[1])])
 
 
 def capsule(radius: float, half_length: float) -> Mesh:
-    """Return a cylinder along z of half length ``half_length`` with half a sphere on each end [m]."""
+    """Return a cylinder along z of half length ``half_length`` with a hemisphere on each end [m]."""
     angles = np.linspace(0.0, 0.5 * np.pi, _RINGS + 1)
     cap = np.stack([radius * np.cos(angles), half_length + radius * np.sin(angles)], axis=1)
     cap[-1, 0] = 0.0  # the cosine of a right angle is not quite zero
-    return _turned(np.concatenate([cap[::-1] * [1.0, -1.0], cap if half_length > 0.0 else cap[1:]]))
+    return _revolved(np.concatenate([cap[::-1] * [1.0, -1.0], cap if half_length > 0.0 else cap[1:]]))
 
 
 def ellipsoid(semi_axes: ArrayLike) -> Mesh:
@@ -119,7 +119,7 @@ def _thinned(mesh: Mesh) -> Mesh:
 
 
 def _sharpened(mesh: Mesh) -> Mesh:
-    """Give faces that meet at a sharp edge vertices of their own; those that point about the same way share them."""
+    """Give faces that meet at a sharp edge vertices of their own; faces with similar normals share them."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15)
@@ -139,7 +139,7 @@ def _sharpened(mesh: Mesh) -> Mesh:
 
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
-    """Return the triangles of a geom in its own frame; None for floors (large planes) and for height fields.
+    """Return the triangles of a geom in its own frame; None for floors (large planes) and height fields.
 
     Args:
         model: any compiled MuJoCo model.
@@ -160,11 +160,11 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
 
 
 def geom_rgba(model: mujoco.MjModel, geom: int) -> Array:
-    """Return red, green, blue and opacity (4,), 0 to 1, as MuJoCo does: a colour of its own wins over a material's."""
+    """Return red, green, blue and opacity (4,), 0 to 1; as in MuJoCo, a geom's own colour overrides its material's."""
     material, own = int(model.geom_matid[geom]), np.array(model.geom_rgba[geom], dtype=float)
     return own if material < 0 or not np.allclose(own, _NO_COLOUR) else np.array(model.mat_rgba[material], dtype=float)
 
 
 def visible_geoms(model: mujoco.MjModel) -> list[int]:
-    """Return the geoms that are looks: groups 0 to 2 and not transparent (group 3 is for collisions)."""
+    """Return the visible geoms: groups 0 to 2, not fully transparent (group 3 is for collisions)."""
     return [g for g in range(model.ngeom) if model.geom_group[g] <= 2 and geom_rgba(model, g)[3] > 0.0]

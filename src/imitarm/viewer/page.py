@@ -1,8 +1,8 @@
-"""A self-contained HTML page: its frame, its look, its 3-D players, and writing it to a file.
+"""A self-contained HTML page: what its templates are given, its 3-D players, and writing it to a file.
 
-The page's own content security policy forbids every outside request, so that the promise to need no network is kept by
-the browser too. Each 3-D player is an iframe that is made when it is looked at; what all players have in common is
-stored once.
+The templates are in ``templates/``; Jinja escapes every text that they show. The page's content security policy forbids
+every request to the outside, so the browser enforces that the page needs no network. Each 3-D player is an iframe that
+is made when it scrolls into view; the code that all players share is stored once.
 """
 
 from __future__ import annotations
@@ -10,78 +10,182 @@ from __future__ import annotations
 import base64
 import errno
 import json
+import math
 import os
-from collections.abc import Callable, Iterable, Mapping
-from html import escape
-from importlib.resources import files
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from imitarm.errors import InputError, TaskFailedError
-from imitarm.viewer.markup import script_text
 
-_POLICY: Final = (
-    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "
-    "img-src data: blob:; font-src data:; connect-src data: blob:; worker-src data: blob:; "
-    "base-uri 'none'; form-action 'none'"
-)
+MM: Final = 1000.0  # [mm/m], and [ms/s]
 
 
-def page_html(title: str, header: str, sections: Iterable[str], players: tuple[str, str] | None = None) -> str:
+@dataclass(frozen=True)
+class Tile:
+    """A number in the header: ``value`` as text, ``unit``, and a ``label`` that says what it is."""
+
+    value: str
+    unit: str
+    label: str
+
+
+@dataclass(frozen=True)
+class Header:
+    """The first part of a page.
+
+    Attributes:
+        title: of the page.
+        verdict: the result in one line.
+        good: whether the result is a good one: green or red.
+        summary: one or two sentences; may be empty.
+        tiles: the numbers that matter most.
+    """
+
+    title: str
+    verdict: str
+    good: bool
+    summary: str = ""
+    tiles: Sequence[Tile] = ()
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A drawing with its ``title`` and ``caption``; it is left out of the page when ``svg`` is empty."""
+
+    svg: str
+    title: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Key:
+    """One entry of a player's legend: the ``colour`` of a line, or of an ellipsoid (``blob``), and its ``label``."""
+
+    colour: str
+    label: str
+    blob: bool = False
+
+
+@dataclass(frozen=True)
+class Player:
+    """A 3-D player.
+
+    Attributes:
+        title: for screen readers.
+        own: the part of its page that no other player has, see :func:`shared_players`.
+        keys: its legend.
+    """
+
+    title: str
+    own: str
+    keys: Sequence[Key]
+
+
+@dataclass(frozen=True)
+class Tab:
+    """One tab: ``anchor``, unique in the page, ``title``, and ``content`` for the template."""
+
+    anchor: str
+    title: str
+    content: Any
+
+
+def render(
+    template: str,
+    header: Header,
+    *,
+    data: Mapping[str, Any],
+    data_name: str,
+    provenance: Mapping[str, Any],
+    words: Mapping[str, str],
+    shared: tuple[str, str] | None = None,
+    **context: Any,
+) -> str:
     """Return a whole page.
 
     Args:
-        title: of the page.
-        header: its first part, HTML.
-        sections: the others in their order, HTML; empty ones are left out.
-        players: what all 3-D players begin and end with, see :func:`shared_players`; None: there are none.
+        template: file in ``templates/`` that extends ``page.html``.
+        header: the first part of the page.
+        data: the page's numbers in SI units, ready for JSON; the reader can save them.
+        data_name: file name under which they are saved.
+        provenance: what is needed to repeat the run, by name; values that are mappings become cards of their own.
+        words: what the technical words on the page mean.
+        shared: beginning and end of every 3-D player, see :func:`shared_players`; None without players.
+        context: what else the template shows.
+
+    Raises:
+        InputError: when jinja2 is not installed.
     """
-    folder = files("imitarm.viewer")
-    style, script = (folder.joinpath(name).read_text(encoding="utf-8") for name in ("report.css", "report.js"))
-    shared = "" if players is None else script_text(list(players))
-    body = [
-        header,
-        "<main>",
-        *sections,
-        "</main>",
-        "<footer>Made by imitarm. This page is complete: it needs no network and sends nothing.</footer>",
-        f'<script type="application/json" id="player-shared">{shared}</script>' if shared else "",
-        f"<script>{script}</script>",
-    ]
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n"
-        "<script>document.documentElement.classList.add('js')</script>\n"
-        f"<style>{style}</style>\n</head>\n<body>\n" + "\n".join(part for part in body if part) + "\n</body>\n</html>\n"
+    numbers = base64.b64encode(json.dumps(data, indent=2, allow_nan=False).encode()).decode()
+    page: str = (
+        _environment()
+        .get_template(template)
+        .render(
+            header=header,
+            data=numbers,
+            data_name=data_name,
+            provenance=provenance,
+            words=words,
+            shared=shared,
+            **context,
+        )
     )
+    return page
 
 
-def data_link(data: Mapping[str, Any], name: str) -> str:
-    """Return a link under which the page's numbers can be saved.
-
-    Args:
-        data: plain values in SI units, ready for JSON.
-        name: of the file.
-    """
-    link = base64.b64encode(json.dumps(data, indent=2, allow_nan=False).encode()).decode()
-    return (
-        f'<a class="button" download="{escape(name, quote=True)}" href="data:application/json;base64,{link}">'
-        "Download the numbers (JSON, SI units)</a>"
+@cache
+def _environment() -> Any:
+    """Return Jinja's environment with the templates of this package."""
+    try:
+        import jinja2  # noqa: PLC0415 (an extra)
+        from markupsafe import Markup  # noqa: PLC0415 (comes with jinja2)
+    except ImportError as error:
+        raise InputError(
+            "reports need jinja2, which is not installed; install it with: pip install 'imitarm[report]'"
+        ) from error
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("imitarm.viewer"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
+    environment.filters["number"] = number
+    environment.filters["script_text"] = lambda value: Markup(script_text(value))
+    return environment
+
+
+def number(value: float, digits: int = 1, unit: str = "") -> str:
+    """Return a number with its unit; NaN and infinity become a dash."""
+    if not math.isfinite(value):
+        return "–"
+    return f"{value:.{digits}f}{chr(0xA0) + unit if unit else ''}"
+
+
+def script_text(value: Any) -> str:
+    """Return ``value`` as JSON that is safe in a script element: it cannot close the element or open a comment."""
+    return json.dumps(value, ensure_ascii=False).replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+def anchor(kind: str, index: int, name: str) -> str:
+    """Return an anchor: unique by its number, readable by its name."""
+    return f"{kind}-{index + 1}-" + (re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "x")
 
 
 def shared_players(pages: Mapping[str, str]) -> tuple[tuple[str, str] | None, dict[str, str]]:
-    """Split 3-D pages into what they begin and end with, and what each has of its own.
+    """Split 3-D pages into the beginning and end that they share and the middle that each has of its own.
 
-    The players' code is most of each page; stored once, a page with five players is four fifths smaller.
+    Most of each page is the player's code. Stored once, it makes a page with five players five times smaller.
 
     Args:
-        pages: by name.
+        pages: 3-D pages by name.
 
     Returns:
-        beginning and end, None when there are no pages; and for each name what is between.
+        The shared beginning and end, None when there are no pages; and the middle of each page, by name.
     """
     if not pages:
         return None, {}
@@ -106,63 +210,54 @@ def _common_start(texts: list[str]) -> str:
 
 
 def check_writable(path: str | Path) -> Path:
-    """Say at once, before anything is drawn, that a place can't be written to.
+    """Check that a page can be written, before the work of drawing it begins.
 
     Returns:
-        The place, absolute.
+        The absolute path.
 
     Raises:
-        InputError: when it is a folder, or its folder is missing or can't be written.
+        InputError: when the path is a folder, or its folder is missing or cannot be written to.
     """
     target = Path(path).expanduser().absolute()
     if target.is_dir():
         raise InputError(f"report {target}: is a folder; name a file in it, such as {target / 'report.html'}")
     if not target.parent.is_dir():
-        raise InputError(f"report {target}: there is no folder {target.parent}; make it first")
+        raise InputError(f"report {target}: there is no folder {target.parent}; create it first")
     if not os.access(target.parent, os.W_OK):
-        raise InputError(f"report {target}: the folder may not be written to; choose another one")
+        raise InputError(f"report {target}: no permission to write to the folder; choose another one")
     return target
 
 
 def draw_page(draw: Callable[[], str], path: str | Path) -> Path:
-    """Write a report as one HTML file that needs nothing else.
+    """Write a page as one HTML file that needs no other file.
 
-    The place is looked at before anything is drawn. The page is written aside and renamed at the end, so an older
-    report stays whole when something goes wrong.
+    The path is checked before anything is drawn. The page is written to a temporary file that is renamed at the end,
+    so an older page stays whole when writing fails.
 
     Args:
         draw: returns the page.
         path: the file to write; its folder must exist.
 
     Returns:
-        Where it was written, absolute.
+        The absolute path of the file.
 
     Raises:
-        InputError: when the folder is missing or can't be written, or the libraries that draw are not installed.
+        InputError: when the file cannot be written there, or the drawing libraries are not installed.
         TaskFailedError: when the disk is full.
     """
     target = check_writable(path)
-    write_page(draw(), target)
-    return target
-
-
-def write_page(page: str, target: Path) -> None:
-    """Write a page aside and rename it at the end, so that an older one stays whole when something goes wrong.
-
-    Raises:
-        TaskFailedError: when the disk is full.
-        InputError: when it can't be written for another reason.
-    """
-    aside = target.with_name(f".{target.name}.{os.getpid()}.part")
+    page = draw().encode("utf-8", "replace")  # a file name in the page may hold bytes that are not UTF-8
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        aside.write_bytes(page.encode("utf-8", "replace"))  # a file name may hold what is no text
-        aside.replace(target)
+        part.write_bytes(page)
+        part.replace(target)
     except OSError as error:
-        aside.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
         full = error.errno in {errno.ENOSPC, errno.EDQUOT}
         raise (TaskFailedError if full else InputError)(
-            f"report {target}: can't be written ({error.strerror or error}); make room or choose another place"
+            f"report {target}: cannot be written ({error.strerror or error}); free some space or choose another path"
         ) from error
     except BaseException:
-        aside.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
         raise
+    return target

@@ -1,21 +1,21 @@
-"""One colour, one meaning, in the 3-D view, in the figures and in the page.
+"""Colours, each with one meaning in the 3-D view, the figures and the page.
 
-All are taken from the Okabe-Ito palette (or are greys), so that they stay apart for colour-blind readers too.
-Line styles repeat what the colours say: no figure needs colour to be read.
+All are greys or from the Okabe-Ito palette, which colour-blind readers can tell apart. Line styles repeat the meaning,
+so every figure can be read without colour.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-NOMINAL: Final = "#8b919c"  # the learnt path, before anything was in the way
+NOMINAL: Final = "#8b919c"  # the learned path, without obstacles
 ADAPTED: Final = "#0072b2"  # the path around the obstacles
-MEASURED: Final = "#e69f00"  # what the robot did
-DEMONSTRATION: Final = "#cc79a7"  # what was shown
-UNMOVED: Final = "#009e73"  # a Gaussian component that stayed
-MOVED: Final = "#d55e00"  # a Gaussian component that was displaced
+MEASURED: Final = "#e69f00"  # the measured motion of the robot
+DEMONSTRATION: Final = "#cc79a7"  # a demonstration
+UNMOVED: Final = "#009e73"  # a Gaussian component that was not moved
+MOVED: Final = "#d55e00"  # a Gaussian component that was moved
 OBSTACLE: Final = "#7d6b60"
-LIMIT: Final = "#b3261e"  # a line that must not be crossed
+LIMIT: Final = "#b3261e"  # a limit or a required clearance
 
 
 def rgb(colour: str) -> tuple[int, int, int]:

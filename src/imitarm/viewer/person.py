@@ -1,4 +1,4 @@
-"""A person in the 3-D playback: a jointed figure that stands beside the robot and moves with it."""
+"""A person in the 3-D playback: an articulated figure that stands beside the robot and moves with it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose, matrix_to_quaternion
 from imitarm.viewer import palette
 from imitarm.viewer.geometry import Mesh, cylinder, ellipsoid, merge
-from imitarm.viewer.nodes import Mover, lit, node_name
+from imitarm.viewer.stage import Mover, lit, node_name
 
 Array = NDArray[np.float64]
 
-_GONE: Final = 0.25  # [s] a person not seen for longer is not drawn
-_STEP: Final = 2.0**-10  # [m], [-] as nodes.STEP, coarser: a camera sees no millimetres
-_HIPS: Final = 0.9  # [m] above the floor, where no foot is seen
-_SOLE: Final = 0.036  # [m] of a foot about its joint
-_PALE: Final = 0.55  # share of white in what was only inferred
+_GONE: Final = 0.25  # [s] a person who has not been seen for longer is not drawn
+_STEP: Final = 2.0**-10  # [m], [-] poses are rounded to this (1 mm): a camera is less precise
+_HIPS: Final = 0.9  # [m] above the floor, used when no foot is seen
+_SOLE: Final = 0.036  # [m] radius of a foot around its joint
+_PALE: Final = 0.55  # fraction of white in the colour of joints that were only inferred
 _BODY: Final = "#6f7a8a"
 _SKIN: Final = "#c9a58c"
 # from, to, radius of the bone, of the ball where it begins, of the ball where it ends [m]
@@ -43,7 +43,7 @@ _BONES: Final[tuple[tuple[str, str, float, float, float], ...]] = (
 )
 _HEAD: Final = (0.075, 0.09, 0.115)  # [m] semi-axes: across, forward, up
 _TRUNK: Final = (0.165, 0.1)  # [m] semi-axes across and forward
-_TRUNK_LENGTH: Final = 0.58  # its third semi-axis over the length of the spine
+_TRUNK_LENGTH: Final = 0.58  # third semi-axis, relative to the length of the spine
 _ARM: Final = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
 
 
@@ -52,12 +52,12 @@ class PersonMark:
     """A person to draw, frame by frame.
 
     Attributes:
-        name: for the tree of drawn things.
+        name: unique in the 3-D scene.
         positions: of the joints :data:`imitarm.capture.skeleton.JOINTS` in the world frame, shape (n_frames, 25, 3)
-            [m]; nan where lost.
-        tracking: :class:`~imitarm.capture.skeleton.Tracking` of each, shape (n_frames, 25); what was inferred is drawn
-            paler, what is lost not at all.
-        side: the arm that is drawn in the colour of what was shown.
+            [m]; NaN where lost.
+        tracking: :class:`~imitarm.capture.skeleton.Tracking` of each joint, shape (n_frames, 25); inferred joints are
+            drawn paler, lost joints are not drawn.
+        side: the arm that is drawn in the colour of a demonstration.
 
     Raises:
         InputError: when a shape is wrong.
@@ -91,16 +91,16 @@ class PersonMark:
         floor: float = 0.0,
         name: str = "person",
     ) -> PersonMark:
-        """Put a recorded person beside a robot, turned as the correspondence says, so that both move alike.
+        """Place a recorded person beside a robot, rotated so that both move in the same directions.
 
         Args:
-            skeletons: in the order of their times, at least one. In gaps, after a quarter of a second without a
-                skeleton, nobody is drawn; after the last one the person stands still.
-            times: of the frames to draw, since the first skeleton, shape (n_frames,) [s].
-            sensor_to_base: only its rotation counts here.
+            skeletons: at least one, in the order of their times. After 0.25 s without a skeleton the person is not
+                drawn; after the last one the person stands still.
+            times: of the frames to draw, counted from the first skeleton, shape (n_frames,) [s].
+            sensor_to_base: of the correspondence; only its rotation is used.
             side: of the arm that is followed.
-            place: where the hips are, on average, in the base frame: x and y [m].
-            floor: where the feet stand, in the base frame [m].
+            place: median position of the hips in the base frame: x and y [m].
+            floor: height of the floor in the base frame [m].
             name: of the person.
 
         Raises:
@@ -109,25 +109,25 @@ class PersonMark:
         if not skeletons:
             raise InputError(f"PersonMark {name}: there is no skeleton to draw")
         at = np.array([skeleton.time for skeleton in skeletons]) - skeletons[0].time
-        turned = np.array([skeleton.positions for skeleton in skeletons]) @ sensor_to_base.rotation.T
+        rotated = np.array([skeleton.positions for skeleton in skeletons]) @ sensor_to_base.rotation.T
         t = np.minimum(np.asarray(times, dtype=float), at[-1])
         newest = np.searchsorted(at, t + 1e-9, side="right") - 1
         tracking = np.array([skeleton.tracking for skeleton in skeletons])[newest]
         tracking[t - at[newest] > _GONE] = Tracking.LOST
-        return cls(name, (turned + _shift(turned, place, floor))[newest], tracking, side)
+        return cls(name, (rotated + _shift(rotated, place, floor))[newest], tracking, side)
 
     @property
     def points_to_see(self) -> Array:
-        """What belongs in the picture, shape (n, 3) [m]: the joints as they mostly are, and the arm wherever it is."""
+        """Points for the camera, shape (n, 3) [m]: the median position of each joint, and all positions of the arm."""
         shown = np.where((self.tracking > Tracking.LOST)[..., None], self.positions, np.nan)
         seen = ~np.isnan(shown).all(axis=(0, 2))
         arm = shown[:, [JOINT[f"{part}_{self.side}"] for part in _ARM]].reshape(-1, 3)
         return np.concatenate([np.nanmedian(shown[:, seen], axis=0), arm[np.isfinite(arm).all(axis=1)]])
 
 
-def _shift(turned: Array, place: tuple[float, float], floor: float) -> Array:
-    """Return by how much joints (n, 25, 3) are moved so that the person stands at a place on the floor, (3,) [m]."""
-    usual = np.array([_median(turned[:, joint]) for joint in range(len(JOINTS))])
+def _shift(joints: Array, place: tuple[float, float], floor: float) -> Array:
+    """Return the displacement (3,) [m] that puts joints (n, 25, 3) at a place on the floor."""
+    usual = np.array([_median(joints[:, joint]) for joint in range(len(JOINTS))])
     feet = [usual[JOINT[f"{part}_{side}"], 2] for part in ("ankle", "foot") for side in ("left", "right")]
     low = np.nanmin(feet) - _SOLE if np.isfinite(feet).any() else np.nan
     known = np.flatnonzero(np.isfinite(usual).all(axis=1))
@@ -140,20 +140,20 @@ def _shift(turned: Array, place: tuple[float, float], floor: float) -> Array:
 
 
 def _median(points: Array) -> Array:
-    """Return the median of points (n, 3) that are known; nan when none is."""
+    """Return the median of the points (n, 3) that are not NaN; NaN when all are."""
     known = points[np.isfinite(points).all(axis=1)]
     return np.median(known, axis=0) if len(known) else np.full(3, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """A rigid piece of the figure: what it looks like, and where it is in each frame.
+    """A rigid piece of the figure and its pose in each frame.
 
     Attributes:
-        name: of it.
-        mesh: in its own frame.
-        colour: of it.
-        position: shape (n_frames, 3) [m]; nan where not known.
+        name: unique in the figure.
+        mesh: in the frame of the piece.
+        colour: ``"#rrggbb"``.
+        position: shape (n_frames, 3) [m]; NaN where unknown.
         wxyz: shape (n_frames, 4).
         tracking: shape (n_frames,).
     """
@@ -167,10 +167,10 @@ class _Piece:
 
 
 def draw_person(server: Any, person: PersonMark) -> list[Mover]:
-    """Draw a person as in the first frame, and return what moves or comes and goes.
+    """Draw a person as in the first frame, and return everything that moves, appears or disappears.
 
-    Every bone is a rigid piece as long as it mostly is. Batches would be fewer messages, but a browser builds them
-    aside, and may be at another frame than that of the robot when the playback is wound.
+    Every bone is rigid and has its median length. Batches would need fewer messages, but a browser builds them
+    asynchronously, and they could show a different frame than the robot after a jump in time.
     """
     movers = []
     for piece in _pieces(person):
@@ -201,17 +201,17 @@ def _rounded(values: Array) -> Array:
 
 
 def _pieces(person: PersonMark) -> Iterator[_Piece]:
-    """Give the bones, then head and trunk."""
+    """Give the bones, then the head and the trunk."""
     p = {name: person.positions[:, JOINT[name]] for name in JOINTS}
     t = {name: person.tracking[:, JOINT[name]] for name in JOINTS}
     for start, end, *radii in _BONES:
         along = p[end] - p[start]
         length = np.linalg.norm(along, axis=1)
-        turns = _turns_from_z(along / np.maximum(length, 1e-9)[:, None])
+        rotations = _rotations_from_z(along / np.maximum(length, 1e-9)[:, None])
         known = length[np.isfinite(length)]
         mesh = _bone(float(np.median(known)) if len(known) else 0.0, *radii)
         colour = _colour(person.side, start, end)
-        yield _Piece(f"{start} {end}", mesh, colour, p[start], turns, np.minimum(t[start], t[end]))
+        yield _Piece(f"{start} {end}", mesh, colour, p[start], rotations, np.minimum(t[start], t[end]))
     across = p["shoulder_left"] - p["shoulder_right"]
     yield _Piece("head", ellipsoid(_HEAD), _SKIN, p["head"], _upright(p["head"] - p["neck"], across), t["head"])
     spine = p["spine_shoulder"] - p["spine_base"]
@@ -225,7 +225,7 @@ def _pieces(person: PersonMark) -> Iterator[_Piece]:
 
 
 def _bone(length: float, radius: float, begins: float, ends: float) -> Mesh:
-    """Return a bone from the origin along z, with a ball where it begins and, if its radius is not 0, where it ends."""
+    """Return a bone from the origin along z with a ball at its start and, if its radius is not 0, one at its end."""
     half = 0.5 * max(length, 1e-3)
     parts = [cylinder(radius, half).moved([0.0, 0.0, half], np.eye(3)), ellipsoid([begins] * 3)]
     if ends > 0.0:
@@ -234,32 +234,32 @@ def _bone(length: float, radius: float, begins: float, ends: float) -> Mesh:
 
 
 def _upright(up: Array, across: Array) -> Array:
-    """Return rotations (n, 4) with z along ``up`` (n, 3) and x as near to ``across`` (n, 3) as it can be."""
-    turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(up), 1))
+    """Return rotations (n, 4) with z along ``up`` (n, 3) and x as close to ``across`` (n, 3) as possible."""
+    rotations = np.tile([1.0, 0.0, 0.0, 0.0], (len(up), 1))
     y = np.cross(up, across)
-    known = np.linalg.norm(y, axis=1) > 1e-6  # not nan either
+    known = np.linalg.norm(y, axis=1) > 1e-6  # False for NaN, too
     z = up[known] / np.linalg.norm(up[known], axis=1, keepdims=True)
     y = y[known] / np.linalg.norm(y[known], axis=1, keepdims=True)
-    turns[known] = matrix_to_quaternion(np.stack([np.cross(y, z), y, z], axis=2))
-    return turns
+    rotations[known] = matrix_to_quaternion(np.stack([np.cross(y, z), y, z], axis=2))
+    return rotations
 
 
-def _turns_from_z(directions: Array) -> Array:
-    """Return the smallest rotations (..., 4) that take z to unit vectors (..., 3)."""
+def _rotations_from_z(directions: Array) -> Array:
+    """Return the smallest rotations (..., 4) from z to unit vectors (..., 3)."""
     x, y, z = np.moveaxis(directions, -1, 0)
-    turns = np.stack([1.0 + z, -y, x, np.zeros_like(x)], axis=-1)
-    length = np.linalg.norm(turns, axis=-1, keepdims=True)
-    back = ~(length > 1e-4)  # straight down, or not known: any half turn does for what is round
-    return np.where(back, [0.0, 1.0, 0.0, 0.0], turns / np.where(back, 1.0, length))
+    rotations = np.stack([1.0 + z, -y, x, np.zeros_like(x)], axis=-1)
+    length = np.linalg.norm(rotations, axis=-1, keepdims=True)
+    back = ~(length > 1e-8)  # straight down or unknown: bones are round, so any half rotation will do
+    return np.where(back, [0.0, 1.0, 0.0, 0.0], rotations / np.where(back, 1.0, length))
 
 
 def _paler(colour: str, white: float) -> list[float]:
-    """Return red, green and blue, 0 to 1, of a colour with a share of white."""
+    """Return red, green and blue, 0 to 1, of a colour mixed with a fraction of white."""
     return [(1.0 - white) * part / 255.0 + white for part in palette.rgb(colour)]
 
 
 def _colour(side: str, start: str, end: str) -> str:
-    """Return the colour of a bone: the followed arm stands out, hands and neck are skin."""
+    """Return the colour of a bone: that of a demonstration for the followed arm, of skin for hands and neck."""
     followed = {f"{part}_{side}" for part in _ARM}
     if start in followed and end in followed:
         return palette.DEMONSTRATION

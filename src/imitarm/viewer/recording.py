@@ -1,4 +1,4 @@
-"""What a simulation looked like: the poses of all bodies, some times a second."""
+"""Recording of a simulation for the 3-D playback: the poses of all bodies at a fixed rate."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Where every body of a model was, frame by frame.
+    """The poses of all bodies of a model, frame by frame.
 
     Attributes:
-        model: the MuJoCo model whose bodies these are.
-        times: when, strictly increasing, shape (n_frames,) [s].
+        model: the MuJoCo model that contains the bodies.
+        times: of the frames, strictly increasing, shape (n_frames,) [s].
         positions: body positions in the world frame, shape (n_frames, n_bodies, 3) [m].
         quaternions: body rotations wxyz in the world frame, shape (n_frames, n_bodies, 4).
 
@@ -53,14 +53,14 @@ class Recording:
 
 
 class FrameRecorder:
-    """Notes the bodies' poses while a simulation runs, at most ``rate`` times a second."""
+    """Records the poses of all bodies while a simulation runs, at most ``rate`` times per second."""
 
     def __init__(self, model: mujoco.MjModel, *, rate: float = 25.0) -> None:
         """Start without frames.
 
         Args:
             model: the model that will be simulated.
-            rate: frames a second of simulated time [1/s].
+            rate: frames per second of simulated time [1/s].
 
         Raises:
             InputError: when ``rate`` is not positive.
@@ -72,10 +72,10 @@ class FrameRecorder:
         self._frames: list[tuple[float, Array, Array]] = []
 
     def note(self, data: mujoco.MjData, time: float | None = None) -> None:
-        """Keep this instant when a frame is due; call it after every step.
+        """Record the current poses when the next frame is due; call it after every step.
 
         Args:
-            data: the simulation's state, its kinematics up to date.
+            data: the state of the simulation, with its kinematics up to date.
             time: simulated time [s]; None takes ``data.time``.
         """
         now = float(data.time if time is None else time)
@@ -83,12 +83,12 @@ class FrameRecorder:
             self._frames.append((now, np.array(data.xpos), np.array(data.xquat)))
 
     def recording(self) -> Recording:
-        """Return what was noted.
+        """Return the recorded frames.
 
         Raises:
-            InputError: when nothing was noted.
+            InputError: when no frame was recorded.
         """
         if not self._frames:
-            raise InputError("FrameRecorder: nothing was noted; call note(data) after every simulated step")
+            raise InputError("FrameRecorder: no frame was recorded; call note(data) after every simulated step")
         times, positions, quaternions = zip(*self._frames, strict=True)
         return Recording(self.model, np.array(times), np.array(positions), np.array(quaternions))

@@ -1,33 +1,72 @@
-"""One self-contained HTML page that tells what a run did: it opens offline and asks nothing of any network.
+"""The report of a run as one HTML page: every scene with its 3-D playback and figures, and what was learned.
 
-The headline comes first, then the table, then everything else; :mod:`~imitarm.viewer.page` puts it together.
+The page is drawn from ``templates/report.html``; :mod:`~imitarm.viewer.content` holds what it is given.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
-from imitarm.viewer import palette
-from imitarm.viewer.background import WORDS, learning_section, provenance_section
-from imitarm.viewer.content import Report, SceneResult
-from imitarm.viewer.data import as_data
-from imitarm.viewer.page import data_link, draw_page, page_html, shared_players
+from imitarm.viewer import charts, maps, palette
+from imitarm.viewer.content import LearningSummary, Report, SceneResult, as_data
+from imitarm.viewer.page import (
+    MM,
+    Figure,
+    Header,
+    Key,
+    Player,
+    Tab,
+    Tile,
+    anchor,
+    draw_page,
+    number,
+    render,
+    shared_players,
+)
 from imitarm.viewer.scene3d import ComponentMark, PathMark, playback_html
-from imitarm.viewer.scene_sections import scenes_section
-from imitarm.viewer.sections import header, table_section
+
+_KEYS: Final = (
+    Key(palette.NOMINAL, "learned path"),
+    Key(palette.ADAPTED, "adapted path"),
+    Key(palette.MEASURED, "measured path of the tool"),
+    Key(palette.UNMOVED, "component, not moved", blob=True),
+    Key(palette.MOVED, "component, moved", blob=True),
+)
+_WORDS: Final = {
+    "Demonstration": "One recording of a person who shows the motion, here by guiding the tool of the arm by hand.",
+    "Learned path": "The mean of all demonstrations. The robot follows it when no obstacle is in the way.",
+    "Gaussian component": "One of the pieces that the learned motion is made of. It is drawn as an ellipse that "
+    "contains 95 % of what was demonstrated there. Where the ellipse is small, all demonstrations agree, and the task "
+    "needs precision.",
+    "Adaptation (ACFRA)": "Only the components near an obstacle are moved. Everywhere else the robot does exactly what "
+    "was demonstrated.",
+    "Tolerance": "How far a path may be from the learned one and still resemble the demonstrations: two standard "
+    "deviations to each side.",
+    "Clearance": "The smallest distance between any part of the arm or its tool and any obstacle. It is measured in "
+    "the simulator while the arm moves, between the exact shapes; it is not taken from the plan.",
+    "Certified clearance": "A guaranteed lower bound of the distance between the tool and any obstacle on the whole "
+    "planned path.",
+    "RMSE": "Root mean square error: the typical distance between the measured path and the demonstrations. It is "
+    "larger where the path has to go around an obstacle.",
+    "Rated torque": "The torque that the drive of a joint can deliver continuously. A real arm can do a motion that "
+    "stays below it.",
+}
 
 
 def write_report(report: Report, path: str | Path) -> Path:
-    """Write a report by :func:`~imitarm.viewer.page.draw_page` and return where it is.
+    """Write a report to one HTML file with :func:`~imitarm.viewer.page.draw_page` and return its absolute path.
 
     Args:
-        report: what to tell.
+        report: what the page shows.
         path: the file to write; its folder must exist.
 
     Raises:
-        InputError: when it can't be written there, or the libraries that draw are not installed.
+        InputError: when the file cannot be written there, or the drawing libraries are not installed.
         TaskFailedError: when the disk is full.
     """
     return draw_page(lambda: report_html(report), path)
@@ -37,21 +76,98 @@ def report_html(report: Report) -> str:
     """Return the whole page.
 
     Args:
-        report: what to tell.
+        report: what the page shows.
 
     Raises:
-        InputError: when the libraries that draw are not installed.
+        InputError: when the drawing libraries are not installed.
     """
     shared, own = shared_players(
         {scene.name: _playback(scene) for scene in report.scenes if scene.recording is not None}
     )
-    sections = [
-        table_section(report, data_link(as_data(report), "imitarm-report.json")),
-        scenes_section(report, own),
-        learning_section(report.learning) if report.learning is not None else "",
-        provenance_section(report.provenance, WORDS),
+    extra = list(dict.fromkeys(key for scene in report.scenes for key in scene.details))
+    heads = (
+        *("Scene", "Obstacles", "Result", "Smallest measured clearance [mm]", "Required clearance [mm]"),
+        *("RMSE to the demonstrations [mm]", "Components not moved", "Adaptation time [ms]"),
+        *("Highest torque / rated torque", *extra),
+    )
+    scenes = [
+        Tab(
+            anchor("scene", i, scene.name),
+            scene.title,
+            {
+                "result": scene,
+                "cells": [*_cells(scene), *(str(scene.details.get(key, "–")) for key in extra)],
+                "text": _sentences(scene.caption, scene.reason),
+                "player": Player(f"3-D playback: {scene.title}", own[scene.name], _KEYS) if scene.name in own else None,
+                "figures": list(_scene_figures(f"s{i + 1}", scene)),
+                "facts": _scene_facts(scene),
+            },
+        )
+        for i, scene in enumerate(report.scenes)
     ]
-    return page_html(report.title, header(report), sections, shared)
+    return render(
+        "report.html",
+        _header(report),
+        data=as_data(report),
+        data_name="imitarm-report.json",
+        provenance=report.provenance,
+        words=_WORDS,
+        shared=shared,
+        heads=heads,
+        scenes=scenes,
+        first=next((i for i, scene in enumerate(report.scenes) if scene.scene.obstacles), 0),
+        learning=report.learning,
+        learning_figures=list(_learning_figures(report.learning)) if report.learning is not None else [],
+    )
+
+
+def _header(report: Report) -> Header:
+    """Return title, verdict and the four numbers that matter most."""
+    obstructed = [scene for scene in report.scenes if scene.scene.obstacles]
+    clear = sum(scene.rollout is not None and not scene.contact for scene in obstructed)
+    required = min((scene.required_clearance for scene in obstructed), default=math.nan)
+    unmoved = [scene.unmoved_fraction for scene in obstructed if not math.isnan(scene.unmoved_fraction)]
+    planning = [scene.adaptation.compute_time for scene in obstructed if scene.adaptation is not None]
+    tiles = (
+        Tile(str(clear), f"of {len(obstructed)}", "scenes with obstacles without contact"),
+        Tile(
+            number(MM * report.min_clearance),
+            "mm",
+            f"smallest measured clearance (required: {number(MM * required, 0, 'mm')})",
+        ),
+        Tile(
+            number(100 * float(np.mean(unmoved)) if unmoved else math.nan, 0),
+            "%",
+            "of the components of the learned motion stay exactly as demonstrated",
+        ),
+        Tile(
+            number(MM * float(np.median(planning)) if planning else math.nan),
+            "ms",
+            "to plan the path around the obstacles (median)",
+        ),
+    )
+    return Header(report.title, report.verdict, report.passed, report.summary, tiles if obstructed else ())
+
+
+def _cells(scene: SceneResult) -> Iterator[str]:
+    """Give the cells of a scene's row in the table of results, after name, obstacles and outcome."""
+    adaptation = scene.adaptation
+    yield number(MM * scene.min_clearance)
+    yield number(MM * scene.required_clearance, 0) if scene.scene.obstacles else "–"
+    yield number(MM * scene.rmse)
+    if adaptation is None:
+        yield from ("–", "–")
+    else:
+        total = len(adaptation.moved)
+        fraction = number(100 * scene.unmoved_fraction, 0, "%")
+        yield f"{total - int(np.sum(adaptation.moved))} of {total} ({fraction})"
+        yield number(MM * adaptation.compute_time, 2)
+    yield number(100 * scene.peak_torque_ratio, 0, "%")
+
+
+def _sentences(*texts: str) -> str:
+    """Return texts as sentences, one after the other; empty ones are left out."""
+    return " ".join(f"{text[0].upper()}{text[1:].rstrip('.')}." for text in texts if text)
 
 
 def _playback(scene: SceneResult) -> str:
@@ -61,15 +177,117 @@ def _playback(scene: SceneResult) -> str:
     if scene.adaptation is not None:
         a = scene.adaptation
         paths += [
-            PathMark("learnt path", a.nominal.positions, palette.NOMINAL, 0.004),
+            PathMark("learned path", a.nominal.positions, palette.NOMINAL, 0.004),
             PathMark("adapted path", a.trajectory.positions, palette.ADAPTED, 0.006),
         ]
         for k, moved in enumerate(a.moved):
             name, mean = f"component {k + 1}", a.means[k] + a.displacement[k]
             components.append(ComponentMark(name, mean, a.covariances[k], palette.MOVED if moved else palette.UNMOVED))
     if scene.rollout is not None:
-        lifted = scene.rollout.trajectory.positions + np.array(
-            [0.0, 0.0, 0.004]
-        )  # [m] or two equal lines would flicker
-        paths.append(PathMark("measured path", lifted, palette.MEASURED, 0.003))
+        lift = np.array([0.0, 0.0, 0.004])  # [m] where two paths coincide, the picture would flicker
+        paths.append(PathMark("measured path", scene.rollout.trajectory.positions + lift, palette.MEASURED, 0.003))
     return playback_html(scene.recording, paths=paths, components=components)
+
+
+def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:
+    """Give the figures of a scene; ``key`` makes their names unique in the page."""
+    adaptation, rollout = scene.adaptation, scene.rollout
+    if adaptation is not None:
+        svg = maps.adaptation(
+            adaptation.nominal,
+            adaptation.trajectory,
+            scene=scene.scene,
+            clearance=scene.required_clearance,
+            tool_spheres=scene.tool,
+            tolerance=adaptation.tolerance,
+            means=adaptation.means,
+            covariances=adaptation.covariances,
+            displacement=adaptation.displacement,
+            moved=adaptation.moved,
+            measured=rollout.trajectory if rollout is not None else None,
+            name=f"{key}-paths",
+        )
+        if scene.scene.obstacles:
+            yield Figure(
+                svg,
+                "Path around the obstacles",
+                "Path of the tool center point. The dotted line bounds the area that the tool sweeps; it must stay "
+                "outside the dashed lines. Arrows show how far components were moved.",
+            )
+            lengths = np.linalg.norm(adaptation.displacement, axis=1)
+            svg = charts.displacement(lengths, adaptation.moved, name=f"{key}-moved")
+            yield Figure(svg, "Displacement of the components", "One bar for each component, in the order of time.")
+        else:
+            yield Figure(svg, "The learned path", "Path of the tool center point. No obstacle is in the way.")
+    if rollout is not None:
+        times = rollout.trajectory.times - rollout.trajectory.times[0]
+        svg = charts.clearance(times, rollout.clearance, scene.required_clearance, name=f"{key}-clearance")
+        yield Figure(
+            svg, "Clearance over time", "Measured in the simulator between the arm, with its tool, and any obstacle."
+        )
+        if scene.torque_limits is not None:
+            names, limits = scene.joint_names, scene.torque_limits
+            svg = charts.torques(times, rollout.torques, limits, joint_names=names, name=f"{key}-torques")
+            yield Figure(
+                svg, "Joint torques", "Dashed: the rated torque. Above each chart: the highest torque, relative to it."
+            )
+
+
+def _scene_facts(scene: SceneResult) -> dict[str, Any]:
+    """Return all numbers of a scene by name."""
+    values: dict[str, Any] = {
+        "Obstacles": "; ".join(o.name or o.kind for o in scene.scene.obstacles) or "none",
+        "Smallest measured clearance": number(MM * scene.min_clearance, 2, "mm"),
+        "Required clearance": number(MM * scene.required_clearance, 1, "mm"),
+        "RMSE to the demonstrations": number(MM * scene.rmse, 2, "mm"),
+    }
+    if scene.adaptation is not None:
+        a = scene.adaptation
+        largest = float(np.linalg.norm(a.displacement, axis=1).max(initial=0.0))
+        values |= {
+            "Method": a.method,
+            "Certified clearance": number(MM * a.certified_clearance, 2, "mm"),
+            "Tool model in the plan": _tool(scene),
+            "Components moved": f"{int(np.sum(a.moved))} of {len(a.moved)}",
+            "Largest displacement": number(MM * largest, 1, "mm"),
+            "Adaptation time": number(MM * a.compute_time, 3, "ms"),
+        }
+    if scene.rollout is not None:
+        values["Duration of the motion"] = number(scene.rollout.trajectory.duration, 2, "s")
+        values["Path length of the tool"] = number(scene.rollout.trajectory.path_length, 3, "m")
+        values["Highest torque / rated torque"] = number(100 * scene.peak_torque_ratio, 1, "%")
+        values["Outcome"] = scene.rollout.reason or ("finished" if scene.rollout.success else "not finished")
+    return values | dict(scene.details)
+
+
+def _tool(scene: SceneResult) -> str:
+    """Describe the model of the tool that the plan used."""
+    spheres = scene.tool
+    reach = float((np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]).max())
+    if reach == 0.0:
+        return "a point"
+    many = "one sphere" if len(spheres) == 1 else f"{len(spheres)} spheres"
+    return f"{many}, within {number(MM * reach, 0, 'mm')} of the tool center point"
+
+
+def _learning_figures(learning: LearningSummary) -> Iterator[Figure]:
+    """Give the figures of what was demonstrated and of how the number of components was chosen."""
+    yield Figure(
+        maps.demonstrations(learning.demonstrations, learning.means, learning.covariances, learning.predicted),
+        f"{len(learning.demonstrations)} demonstrations, {learning.n_components} components",
+        "Where the demonstrations agree, the ellipses are small: the task needs precision there.",
+    )
+    if learning.candidates:
+        tried = learning.candidates
+        svg = charts.selection(
+            [c.n_components for c in tried],
+            [c.bic for c in tried],
+            [c.aic for c in tried],
+            [c.held_out_rmse_mm / MM for c in tried],
+            learning.n_components,
+        )
+        caption = (
+            "More components always fit the recordings more closely. The number is chosen by the error on "
+            "demonstrations that were held out of learning; BIC and AIC weigh the fit against the number of parameters."
+        )
+        yield Figure(svg, "Number of components", caption)

@@ -1,4 +1,7 @@
-"""The figures of a retargeting over time: states, joints within their limits, the tool and its target, the elbow."""
+"""Figures of a retargeting over time: states, joints with their limits, the tool and its target, the upper arm.
+
+Every public function that draws returns one ``<svg>`` element.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,17 @@ from imitarm.retarget import Retargeting
 from imitarm.retarget.engagement import EngagementState
 from imitarm.viewer import palette
 from imitarm.viewer.canvas import INK, MM, canvas, thin, thin_extremes
-from imitarm.viewer.small_multiples import JointCurve, small_multiples
+from imitarm.viewer.charts import JointCurve, small_multiples
 
 Array = NDArray[np.float64]
 
 STATE_COLOURS: Final = dict(zip(EngagementState, ("#bfc5cf", "#009e73", "#56b4e9", "#e69f00", "#d55e00"), strict=True))
-"""Of the states of a retargeter; their order in a band's legend repeats what the colours say."""
+"""Colours of the states of a retargeter, in the order of the legend."""
 _DEGREES: Final = 180.0 / np.pi
 
 
 def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> str:
-    """Draw what each method was doing, as one coloured band a method.
+    """Draw the state of each method over time, one coloured band for each method.
 
     Args:
         runs: titles and runs.
@@ -32,8 +35,8 @@ def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> 
         An SVG element.
     """
     height = 0.62 + 0.24 * len(runs)
-    shares = "; ".join(f"{title}: following {100 * np.mean(run.states == 'following'):.0f} %" for title, run in runs)
-    with canvas(name, f"What was done over time. {shares}", (5.5, height + 0.05)) as drawing:
+    fractions = "; ".join(f"{title}: following {100 * np.mean(run.states == 'following'):.0f} %" for title, run in runs)
+    with canvas(name, f"State over time. {fractions}", (5.5, height + 0.05)) as drawing:
         axes = drawing.axes(0.95, 0.58, 5.4, height)
         longest = max(float(run.times[-1]) for _, run in runs)
         for row, (_, run) in enumerate(runs):
@@ -67,10 +70,10 @@ def stretches(states: NDArray[Any]) -> list[tuple[int, int]]:
 
 
 def tool(run: Retargeting, path: Array, *, name: str = "tool") -> str:
-    """Draw where the tool was and where it should have been, axis by axis, and how far apart the two were.
+    """Draw the tool and its target over time, one chart for each axis, and the distance between them.
 
     Args:
-        run: of a method.
+        run: the retargeted motion.
         path: of the tool, shape (n, 3) [m].
         name: unique in the page.
 
@@ -82,7 +85,7 @@ def tool(run: Retargeting, path: Array, *, name: str = "tool") -> str:
     known = np.isfinite(apart)
     text = "Tool and target over time"
     if known.any():
-        text += f"; at most {apart[known].max():.0f} mm apart"
+        text += f"; largest distance {apart[known].max():.0f} mm"
     with canvas(name, text, (5.5, 4.0)) as drawing:
         for i, axis in enumerate("xyz"):
             top = 3.9 - 0.82 * i
@@ -99,7 +102,7 @@ def tool(run: Retargeting, path: Array, *, name: str = "tool") -> str:
             axes.fill_between(run.times[kept], apart[kept], 0.0, color=palette.MOVED, alpha=0.25, lw=0)
             axes.plot(run.times[kept], apart[kept], color=palette.MOVED, lw=1.0)
             axes.set_ylim(0.0, 1.1 * max(float(apart[known].max()), 1.0))
-        _finish(axes, run.times, "apart [mm]", last=True)
+        _finish(axes, run.times, "distance [mm]", last=True)
         drawing.legend(2)
     return drawing.svg
 
@@ -115,7 +118,7 @@ def _finish(axes: Any, times: Array, label: str, *, last: bool) -> None:
 
 
 def joints(run: Retargeting, *, name: str = "joints") -> str:
-    """Draw each joint's position between its limits [degrees]; an SVG element."""
+    """Draw the position of each joint with its limits [degrees]."""
     arm = run.arm
     curves = []
     for i, title in enumerate(arm.joint_names):
@@ -130,39 +133,39 @@ def joints(run: Retargeting, *, name: str = "joints") -> str:
 
 
 def velocities(run: Retargeting, *, name: str = "velocities") -> str:
-    """Draw each joint's velocity as a share of its limit, by differences of its positions; an SVG element."""
+    """Draw the velocity of each joint, the difference quotient of its positions, as a percentage of its limit."""
     dt = float(run.times[1] - run.times[0])
-    shares = 100.0 * np.diff(run.joints, axis=0) / dt / run.arm.max_velocity
-    return _shares(run, run.times[1:], shares, "velocity", name)
+    percentages = 100.0 * np.diff(run.joints, axis=0) / dt / run.arm.max_velocity
+    return _percentages(run, run.times[1:], percentages, "velocity", name)
 
 
 def accelerations(run: Retargeting, *, name: str = "accelerations") -> str:
-    """Draw each joint's acceleration as a share of its limit, by differences of its positions; an SVG element."""
+    """Draw the acceleration of each joint, from second differences of its positions, as a percentage of its limit."""
     dt = float(run.times[1] - run.times[0])
-    shares = 100.0 * np.diff(run.joints, 2, axis=0) / dt**2 / run.arm.max_acceleration
-    return _shares(run, run.times[2:], shares, "acceleration", name)
+    percentages = 100.0 * np.diff(run.joints, 2, axis=0) / dt**2 / run.arm.max_acceleration
+    return _percentages(run, run.times[2:], percentages, "acceleration", name)
 
 
-def _shares(run: Retargeting, times: Array, shares: Array, what: str, name: str) -> str:
-    """Draw shares [%] of a limit (n, n_joints) over times (n,) [s]."""
+def _percentages(run: Retargeting, times: Array, percentages: Array, what: str, name: str) -> str:
+    """Draw percentages of a limit (n, n_joints) over times (n,) [s]."""
     curves = [
-        JointCurve(f"{title}: {np.abs(shares[:, i]).max():.0f} %", shares[:, i], -100.0, 100.0)
+        JointCurve(f"{title}: {np.abs(percentages[:, i]).max():.0f} %", percentages[:, i], -100.0, 100.0)
         for i, title in enumerate(run.arm.joint_names)
     ]
-    text = f"{what.capitalize()} of {len(curves)} joints as a share of what is allowed"
+    text = f"{what.capitalize()} of {len(curves)} joints as a percentage of the limit"
     return small_multiples(name, text, f"{what} [% of the limit]", times, curves)
 
 
 def elbow(run: Retargeting, points: Array, *, name: str = "elbow") -> str:
-    """Draw where the upper arms of person and robot point: how far upwards and how far to the left.
+    """Draw the directions of the upper arms of person and robot: how far upwards and how far to the left.
 
     Args:
-        run: of a method.
+        run: the retargeted motion.
         points: the robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
         name: unique in the page.
 
     Returns:
-        An SVG element; empty text when the person's elbow was never known.
+        An SVG element; an empty string when the person's elbow was never known.
     """
     known = np.isfinite(run.elbows).all(axis=1)
     if not known.any():
@@ -193,5 +196,5 @@ def elbow(run: Retargeting, points: Array, *, name: str = "elbow") -> str:
 
 
 def _directions(upper: Array) -> Array:
-    """Return how far unit vectors (n, 3) point upwards and to the left, (n, 2) [degrees], 90 being straight there."""
+    """Return the angles of unit vectors (n, 3) above the horizontal and to the left, (n, 2) [degrees]."""
     return _DEGREES * np.arcsin(np.clip(upper[:, [2, 1]], -1.0, 1.0))

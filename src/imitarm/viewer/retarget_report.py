@@ -1,58 +1,172 @@
-"""A report of retargetings as one self-contained HTML page: a person and a robot side by side, figures, numbers."""
+"""The report of retargeting one recording as one HTML page: person and robot side by side, figures, measures.
+
+The page is drawn from ``templates/retarget.html``.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from html import escape
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
+import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
+from imitarm.capture.skeleton import Skeleton
+from imitarm.errors import InputError
+from imitarm.retarget import Correspondence, Retargeting
+from imitarm.robots.world import add_obstacles, arm_world
+from imitarm.scene import Scene
 from imitarm.viewer import palette, retarget_charts
-from imitarm.viewer.background import provenance_section
-from imitarm.viewer.data import plain
-from imitarm.viewer.markup import figure, number
-from imitarm.viewer.page import data_link, draw_page, page_html, shared_players
-from imitarm.viewer.panels import Key, Panel, heading, player_card, tabbed
+from imitarm.viewer.content import plain
+from imitarm.viewer.page import Figure, Header, Key, Player, Tab, Tile, draw_page, number, render, shared_players
 from imitarm.viewer.person import PersonMark
-from imitarm.viewer.retarget_content import Measure, MethodResult, PlainTable, RetargetReport
-from imitarm.viewer.retarget_frames import FLOOR, retargeting_frames
+from imitarm.viewer.recording import FrameRecorder, Recording
 from imitarm.viewer.scene3d import PathMark, playback_html
 from imitarm.viewer.stage import Camera, body_parts, points_to_see
 
-_PLACE: Final = (0.0, 1.35)  # [m] where the person stands in the base frame: at the robot's left
-_VIEW: Final = (1.0, -0.42, 0.36)  # from where the camera looks: both are seen from the front
-_KEYS: Final = (
-    Key(palette.DEMONSTRATION, "the person's arm, and where the tool should go"),
+PLAYER_KEYS: Final = (
+    Key(palette.DEMONSTRATION, "the person's arm and the target of the tool"),
     Key(palette.ADAPTED, "path of the robot's tool"),
 )
+"""The legend of a 3-D player with a person beside a robot."""
+
+_PERSON_PLACE: Final = (0.0, 1.35)  # [m] of the person in the base frame, to the left of the robot
+_VIEW: Final = (1.0, -0.42, 0.36)  # direction towards the camera: person and robot are seen from the front
+_FLOOR: Final = -0.75  # [m] height of the floor in the base frame: the robot stands on a pedestal
+_FINGER_TIME: Final = 0.25  # [s] for the fingers to open or close
 _WORDS: Final = {
-    "Retargeting": "What a person's arm does, seen by a camera, becomes what a robot's arm does: its tool follows the "
-    "hand, and where the method can, its elbow follows the elbow.",
-    "Target": "Where a method wants the tool to be: where it was when the person took hold, and from then on as far "
-    "away as the hand has gone, times the scale.",
-    "Following, coasting, holding, stopped": "What is done while the arm is seen; for a tenth of a second without a "
-    "sight of it; until three tenths; and after that, until the person has been seen for half a second.",
-    "Frames beyond a limit": "Counted from the joints' positions alone, in every control period: what the drives of a "
-    "real arm would be asked for.",
-    "Singular value": "How well the arm can still move its tool in the worst direction. Near 0 it is stretched or "
-    "folded, and small motions of the tool need fast joints.",
-    "Torque": "What the motion takes by the arm's own inertias, without friction; the part that only holds the weight "
-    "is there when nothing moves.",
+    "Retargeting": "The motion of a person's arm, seen by a camera, becomes a motion of a robot arm: the robot's tool "
+    "follows the hand and, where the method supports it, the robot's elbow follows the person's elbow.",
+    "Target": "The position that the method wants the tool to reach: the tool's position when the person began to "
+    "lead, plus the displacement of the hand since then, times the scale.",
+    "Following, coasting, holding, stopped": "Following: the person's arm is seen. Coasting: it has been lost for up "
+    "to 0.1 s, and the motion continues with decaying velocity. Holding: it has been lost for up to 0.3 s, and the "
+    "target stands still. Stopped: it has been lost for longer; following resumes after the arm has been seen for "
+    "0.5 s.",
+    "Frames beyond a limit": "Control periods in which a joint exceeds a limit, computed from the joint positions "
+    "alone: what the drives of a real arm would have to do.",
+    "Smallest singular value": "How well the arm can move its tool in the worst direction. Near 0 the arm is almost "
+    "stretched or folded, and small motions of the tool need fast joints.",
+    "Torque": "The torque that the motion needs by the inverse dynamics of the arm, without friction. The part due to "
+    "weight holds the arm against gravity.",
 }
 
 
+@dataclass(frozen=True)
+class Measure:
+    """One measure of a retargeting.
+
+    Attributes:
+        label: as shown to the reader.
+        value: in ``unit``; NaN when unknown.
+        unit: as shown to the reader.
+        digits: number of decimals.
+        better: whether ``"less"`` or ``"more"`` is better; ``""``: neither.
+        fault: whether any value above 0 is a fault; it is then marked in red.
+    """
+
+    label: str
+    value: float
+    unit: str = ""
+    digits: int = 1
+    better: Literal["less", "more", ""] = ""
+    fault: bool = False
+
+
+@dataclass(frozen=True)
+class PlainTable:
+    """A table of text: ``title``, one heading for each column, rows with one cell for each column, ``caption``."""
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """The result of one method on a recording.
+
+    Attributes:
+        name: short and unique in the report.
+        title: the title of the tab.
+        run: the retargeted motion.
+        measures: of the run; every method has the same measures in the same order.
+        tables: further tables for the tab of this method.
+        notes: sentences that the reader should know about this run.
+        caption: one sentence that describes the method.
+        clock: time of the person's motion for each sample of the run, counted from the first skeleton, shape (n,)
+            [s]; None: the times of the run.
+    """
+
+    name: str
+    title: str
+    run: Retargeting
+    measures: Sequence[Measure] = ()
+    tables: Sequence[PlainTable] = ()
+    notes: Sequence[str] = ()
+    caption: str = ""
+    clock: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RetargetReport:
+    """One recording of a person and the results of one or more methods.
+
+    Attributes:
+        title: of the page.
+        methods: at least one; the header is about the first one.
+        skeletons: of the person, as the methods received them.
+        correspondence: which motion of the person corresponds to which motion of the robot.
+        verdict: the result in one line.
+        good: whether the result is a good one.
+        tiles: the measures that matter most.
+        scene: obstacles around the robot.
+        summary: one or two sentences that introduce the page.
+        findings: what was wrong with the recording and how it was processed, one sentence each.
+        provenance: what is needed to repeat the run, by name.
+
+    Raises:
+        InputError: when there is no method or no skeleton, a name is used twice, or the methods have different
+            measures.
+    """
+
+    title: str
+    methods: Sequence[MethodResult]
+    skeletons: Sequence[Skeleton]
+    correspondence: Correspondence
+    verdict: str
+    good: bool
+    tiles: Sequence[Measure] = ()
+    scene: Scene = field(default_factory=Scene)
+    summary: str = ""
+    findings: Sequence[str] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        names = [method.name for method in self.methods]
+        if not names or not self.skeletons:
+            raise InputError("RetargetReport: needs at least one method and one skeleton")
+        if len(set(names)) < len(names):
+            raise InputError(f"RetargetReport: method names must be unique, got {names}")
+        labels = [[measure.label for measure in method.measures] for method in self.methods]
+        if any(own != labels[0] for own in labels):
+            raise InputError("RetargetReport: every method needs the same measures in the same order")
+
+
 def write_retarget_report(report: RetargetReport, path: str | Path) -> Path:
-    """Write a report of retargetings by :func:`~imitarm.viewer.page.draw_page` and return where it is.
+    """Write a report to one HTML file with :func:`~imitarm.viewer.page.draw_page` and return its absolute path.
 
     Args:
-        report: what to tell.
+        report: what the page shows.
         path: the file to write; its folder must exist.
 
     Raises:
-        InputError: when it can't be written there, or the libraries that draw are not installed.
+        InputError: when the file cannot be written there, or the drawing libraries are not installed.
         TaskFailedError: when the disk is full.
     """
     return draw_page(lambda: retarget_report_html(report), path)
@@ -62,36 +176,50 @@ def retarget_report_html(report: RetargetReport) -> str:
     """Return the whole page.
 
     Args:
-        report: what to tell.
+        report: what the page shows.
 
     Raises:
-        InputError: when the libraries that draw are not installed.
+        InputError: when the drawing libraries are not installed.
     """
     shared, own = shared_players({method.name: playback(report, method) for method in report.methods})
-    tiles = [
-        (f"{number(tile.value, tile.digits)}<small> {escape(tile.unit)}</small>", tile.label) for tile in report.tiles
-    ]
-    panels = [
-        Panel(f"method-{i + 1}", method.title, _method(method, own[method.name], f"m{i + 1}"))
+    tiles = [Tile(number(tile.value, tile.digits), tile.unit, tile.label) for tile in report.tiles]
+    methods = [
+        Tab(
+            f"method-{i + 1}",
+            method.title,
+            {
+                "result": method,
+                "player": Player(f"Person and robot: {method.title}", own[method.name], PLAYER_KEYS),
+                "figures": list(_figures(method.run, f"m{i + 1}")),
+            },
+        )
         for i, method in enumerate(report.methods)
     ]
-    sections = [
-        _results(report, data_link(_as_data(report), "imitarm-retargeting.json")),
-        f'<section id="scenes"><h2>Side by side</h2>{tabbed(panels, "Methods")}</section>',
-        _recording(report),
-        provenance_section(report.provenance, _WORDS),
-    ]
-    return page_html(
-        report.title, heading(report.title, report.verdict, report.good, report.summary, tiles), sections, shared
+    return render(
+        "retarget.html",
+        Header(report.title, report.verdict, report.good, report.summary, tiles),
+        data=_as_data(report),
+        data_name="imitarm-retargeting.json",
+        provenance=report.provenance,
+        words=_WORDS,
+        shared=shared,
+        methods=methods,
+        rows=[_row(measures) for measures in zip(*(method.measures for method in report.methods), strict=True)],
+        states=Figure(
+            retarget_charts.states([(method.name, method.run) for method in report.methods]),
+            "States over time",
+            "The fraction of the time in each state is in the table.",
+        ),
+        findings=report.findings,
     )
 
 
 def playback(report: RetargetReport, method: MethodResult, *, dark: bool = False) -> str:
-    """Return the 3-D page in which the person and the robot move side by side, with one bar for both.
+    """Return the 3-D page in which the person and the robot move side by side on one clock.
 
     Args:
-        report: whose person and scene.
-        method: whose robot.
+        report: with the person and the scene.
+        method: with the motion of the robot.
         dark: dark controls and background.
     """
     run = method.run
@@ -102,12 +230,12 @@ def playback(report: RetargetReport, method: MethodResult, *, dark: bool = False
         times,
         report.correspondence.sensor_to_base,
         side=report.correspondence.side,
-        place=_PLACE,
-        floor=FLOOR,
+        place=_PERSON_PLACE,
+        floor=_FLOOR,
     )
     paths = [PathMark("path of the tool", run.arm.tool_path(run.joints)[0], palette.ADAPTED, 0.006)]
-    aimed = np.asarray(np.isfinite(run.targets[0]).all(axis=1))
-    followed = [(first, last) for first, last in retarget_charts.stretches(aimed) if aimed[first] and last > first]
+    known = np.asarray(np.isfinite(run.targets[0]).all(axis=1))
+    followed = [(first, last) for first, last in retarget_charts.stretches(known) if known[first] and last > first]
     for i, (first, last) in enumerate(followed):
         positions = run.targets[0][first : last + 1]
         paths.append(PathMark(f"target {i + 1}", positions, palette.DEMONSTRATION, 0.004))
@@ -116,112 +244,84 @@ def playback(report: RetargetReport, method: MethodResult, *, dark: bool = False
     return playback_html(recording, paths=paths, persons=[person], camera=camera, dark=dark)
 
 
-def _results(report: RetargetReport, download: str) -> str:
-    """Return the figures of merit, a column for each method, and what each method was doing over time."""
-    heads = "".join(
-        f'<th scope="col"><a href="#method-{i + 1}">{escape(method.title)}</a></th>'
-        for i, method in enumerate(report.methods)
-    )
-    rows = "".join(
-        f'<tr><th scope="row">{escape(_with_unit(measures[0]))}</th>{"".join(_cells(measures))}</tr>'
-        for measures in zip(*(method.measures for method in report.methods), strict=True)
-    )
-    caption = "The best of each row is in bold type." if len(report.methods) > 1 else ""
-    bands = retarget_charts.states([(method.name, method.run) for method in report.methods])
-    card = figure(bands, "What was done when", "The share of the time that the robot follows is in the table.")
-    return (
-        '<section id="results"><h2>Figures of merit</h2>'
-        f'<div class="card wide"><table><thead><tr><th scope="col">Measured</th>{heads}</tr></thead>'
-        f'<tbody>{rows}</tbody></table></div><p class="caption">{caption}</p>'
-        f'<div class="columns">{card}</div><p>{download}</p></section>'
-    )
+def retargeting_frames(run: Retargeting, scene: Scene | None = None, *, rate: float = 25.0) -> Recording:
+    """Return the poses of all bodies of the robot at its commanded joint positions, for the 3-D playback.
+
+    Args:
+        run: the retargeted motion.
+        scene: obstacles to draw, where they are at the start.
+        rate: frames per second [1/s].
+    """
+    spec = arm_world(run.arm, floor=_FLOOR)
+    add_obstacles(spec, Scene() if scene is None else scene)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    frames = FrameRecorder(model, rate=rate)
+    fingers = [j for j in range(model.njnt) if model.joint(j).name.startswith("tool/")]
+    addresses, ranges = model.jnt_qposadr[fingers], model.jnt_range[fingers]
+    opening, dt = 1.0 - float(run.closed[0]), float(run.times[1] - run.times[0])  # 1: open, 0: closed
+    for time, q, closed in zip(run.times, run.joints, run.closed, strict=True):
+        data.qpos[:] = run.arm.posture(model, q)
+        opening = float(np.clip(opening + (-dt if closed else dt) / _FINGER_TIME, 0.0, 1.0))
+        data.qpos[addresses] = ranges[:, 0] + opening * (ranges[:, 1] - ranges[:, 0])
+        mujoco.mj_kinematics(model, data)
+        frames.note(data, float(time))
+    return frames.recording()
 
 
-def _with_unit(measure: Measure) -> str:
-    return f"{measure.label} [{measure.unit}]" if measure.unit else measure.label
-
-
-def _cells(measures: tuple[Measure, ...]) -> Iterator[str]:
-    """Give the cells of a row: the best value bold, faults on red."""
+def _row(measures: tuple[Measure, ...]) -> dict[str, Any]:
+    """Return a row of the table of measures: the best value and faults are marked."""
+    first = measures[0]
     known = [round(m.value, m.digits) for m in measures if math.isfinite(m.value)]
     best = None
-    if len(measures) > 1 and measures[0].better and len(set(known)) > 1:
-        best = min(known) if measures[0].better == "less" else max(known)
-    for measure in measures:
-        text = number(measure.value, measure.digits)
-        if measure.fault and measure.value > 0.0:
-            text = f'<span class="mark bad">{text}</span>'
-        elif math.isfinite(measure.value) and round(measure.value, measure.digits) == best:
-            text = f"<strong>{text}</strong>"
-        yield f"<td>{text}</td>"
-
-
-def _method(method: MethodResult, player: str, key: str) -> str:
-    """Return what is behind one tab: 3-D playback, figures, tables."""
-    run = method.run
-    path = run.arm.tool_path(run.joints)[0]
-    notes = "".join(f"<li>{escape(note)}</li>" for note in method.notes)
-    cards = [
-        figure(
-            retarget_charts.tool(run, path, name=f"{key}-tool"),
-            "The tool and its target",
-            "The target begins when the person has taken hold. What keeps the two apart is the method's own lag, and "
-            "what the arm can't do.",
-        ),
-        figure(
-            retarget_charts.velocities(run, name=f"{key}-velocities"),
-            "Joint velocities",
-            "From the positions alone. Dashed: the limit. The number is the highest velocity as a share of it.",
-        ),
-        figure(
-            retarget_charts.joints(run, name=f"{key}-joints"), "Joint positions", "Dashed: how far each joint may turn."
-        ),
-        figure(
-            retarget_charts.accelerations(run, name=f"{key}-accelerations"),
-            "Joint accelerations",
-            "From the positions alone. Dashed: the limit. The number is the highest acceleration as a share of it.",
-        ),
+    if len(measures) > 1 and first.better and len(set(known)) > 1:
+        best = min(known) if first.better == "less" else max(known)
+    cells = [
+        {
+            "text": number(m.value, m.digits),
+            "fault": m.fault and m.value > 0.0,
+            "best": math.isfinite(m.value) and round(m.value, m.digits) == best,
+        }
+        for m in measures
     ]
+    return {"label": f"{first.label} [{first.unit}]" if first.unit else first.label, "cells": cells}
+
+
+def _figures(run: Retargeting, key: str) -> Iterator[Figure]:
+    """Give the figures of a run; ``key`` makes their names unique in the page."""
+    path = run.arm.tool_path(run.joints)[0]
+    yield Figure(
+        retarget_charts.tool(run, path, name=f"{key}-tool"),
+        "Tool and target",
+        "The target begins when the person begins to lead. The distance between tool and target is due to the lag of "
+        "the method and to the limits of the arm.",
+    )
+    yield Figure(
+        retarget_charts.velocities(run, name=f"{key}-velocities"),
+        "Joint velocities",
+        "Computed from the joint positions. Dashed: the limit. Above each chart: the highest velocity, relative to it.",
+    )
+    yield Figure(
+        retarget_charts.joints(run, name=f"{key}-joints"), "Joint positions", "Dashed: the limits of each joint."
+    )
+    yield Figure(
+        retarget_charts.accelerations(run, name=f"{key}-accelerations"),
+        "Joint accelerations",
+        "Computed from the joint positions. Dashed: the limit. Above each chart: the highest acceleration, relative "
+        "to it.",
+    )
     if run.arm.landmarks is not None:
         points = np.array([run.arm.sew_points(q) for q in run.joints])
-        svg = retarget_charts.elbow(run, points, name=f"{key}-elbow")
-        caption = (
-            "Robot and person begin in postures of their own; what counts is that they move alike. 90° is straight up, "
-            "or straight to the left."
+        yield Figure(
+            retarget_charts.elbow(run, points, name=f"{key}-elbow"),
+            "Direction of the upper arm",
+            "Robot and person start in different postures; compare how the two directions change. 90° is straight up, "
+            "or straight to the left.",
         )
-        cards.append(figure(svg, "The upper arms", caption))
-    cards += [_table(table) for table in method.tables]
-    return (
-        f"<h3>{escape(method.title)} on {escape(run.arm.name)}</h3>"
-        + (f"<p>{escape(method.caption)}</p>" if method.caption else "")
-        + (f'<ul class="plain">{notes}</ul><br>' if notes else "")
-        + player_card(f"Person and robot side by side: {method.title}", player, _KEYS)
-        + f'<div class="columns">{"".join(cards)}</div>'
-    )
-
-
-def _table(table: PlainTable) -> str:
-    head = "".join(f'<th scope="col">{escape(text)}</th>' for text in table.heads)
-    rows = "".join(
-        f'<tr><th scope="row">{escape(row[0])}</th>{"".join(f"<td>{escape(cell)}</td>" for cell in row[1:])}</tr>'
-        for row in table.rows
-    )
-    return (
-        f'<div class="card"><h3>{escape(table.title)}</h3><div class="scroll"><table class="small">'
-        f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"
-        f'<p class="caption">{escape(table.caption)}</p></div>'
-    )
-
-
-def _recording(report: RetargetReport) -> str:
-    """Return what was found in the recording and done to it."""
-    items = "".join(f"<li>{escape(finding)}</li>" for finding in report.findings)
-    body = f'<ul class="plain">{items}</ul>' if items else '<p class="soft">Nothing was found wrong.</p>'
-    return f'<section id="recording"><h2>The recording</h2><div class="card">{body}</div></section>'
 
 
 def _as_data(report: RetargetReport) -> dict[str, Any]:
-    """Return the report's numbers as plain values, ready for JSON; what is not known is None."""
+    """Return the report's numbers as plain values, ready for JSON; unknown numbers become None."""
     methods = [
         {
             "name": method.name,

@@ -1,8 +1,8 @@
-"""Interactive 3-D playback of a rollout in a browser, as one HTML page that asks nothing of the network.
+"""Interactive 3-D playback in a browser, as one HTML page that needs no network.
 
-:func:`playback_html` draws the model of a :class:`~imitarm.viewer.recording.Recording`, paths and Gaussian components
-around it, and lets the bodies move as they were noted. The drawing is done by viser in the reader's browser; here it
-only needs a server on this machine for as long as the page is being written.
+:func:`playback_html` draws the model of a :class:`~imitarm.viewer.recording.Recording` with paths and Gaussian
+components around it, and moves the bodies as they were recorded. viser draws in the reader's browser; it needs a server
+on this machine only while the page is written.
 """
 
 from __future__ import annotations
@@ -20,18 +20,27 @@ from numpy.typing import NDArray
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.pose import matrix_to_quaternion
 from imitarm.viewer import palette
-from imitarm.viewer.nodes import STEP, Mover, lit, node_name
 from imitarm.viewer.person import PersonMark, draw_person
 from imitarm.viewer.recording import Recording
-from imitarm.viewer.stage import Camera, Part, body_parts, floor_height, points_to_see
+from imitarm.viewer.stage import (
+    STEP,
+    Camera,
+    Mover,
+    Part,
+    body_parts,
+    floor_height,
+    lit,
+    node_name,
+    points_to_see,
+)
 
 Array = NDArray[np.float64]
 
-_REST: Final = 1.5  # [s] how long the last picture stands before the playback starts again
+_REST: Final = 1.5  # [s] the last frame stays before the playback starts again
 _CHI2_95: Final = 7.815  # 95 % of a 3-D Gaussian is within sqrt(7.815) sigma
-# viser warns of slow drawing with a note that hides the arm, and fades the picture in frame by frame: for ever, then
+# On a slow machine viser shows a warning that hides the arm, and its fade-in never ends; both are switched off.
 _STYLE: Final = "<style>.mantine-Notifications-root{display:none!important}canvas{opacity:1!important}</style>"
-_MANY: Final = 24  # so many equal bodies are drawn as one batch: small in the file, late on a slow machine
+_MANY: Final = 24  # from this many equal bodies, draw one batch: a smaller file, but it may lag on a slow machine
 _PATH_POINTS: Final = 160
 _BACKDROP: Final = {False: ((246, 247, 249), (221, 225, 231)), True: ((38, 42, 50), (20, 22, 27))}  # dark: top, bottom
 
@@ -73,7 +82,7 @@ def _add_mesh(server: Any, name: str, part: Part) -> None:
 def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[Part]]) -> list[Mover]:
     """Draw every body at its first pose and return those that move.
 
-    Many equal things (crumbs, parts in a box) become one batch, or they would fill the page with messages.
+    Many equal bodies (crumbs, parts in a box) become one batch; one message for each would make the page large.
     """
     positions = np.round(recording.positions / STEP) * STEP
     quaternions = np.round(recording.quaternions / STEP) * STEP
@@ -109,7 +118,7 @@ def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[Par
 
 
 def _draw_stage(server: Any, lowest: float, camera: Camera, *, dark: bool) -> None:
-    """Set camera, lights, backdrop and a quiet grid on the floor, at height ``lowest`` [m]."""
+    """Set the camera, the background and a grid on the floor, at height ``lowest`` [m]."""
     view = server.initial_camera
     view.position, view.look_at, view.fov = camera.position, camera.look_at, camera.field_of_view
     top, bottom = (np.array(colour, dtype=float) for colour in _BACKDROP[dark])
@@ -148,14 +157,16 @@ def _draw_paths(server: Any, paths: Sequence[PathMark]) -> None:
 def _draw_components(server: Any, components: Sequence[ComponentMark]) -> None:
     for component in components:
         variances, axes = np.linalg.eigh(np.asarray(component.covariance, dtype=float))
-        axes[:, 0] *= np.linalg.det(axes)  # a rotation, not a mirror
+        axes[:, 0] *= np.linalg.det(axes)  # make it a rotation, not a reflection
         semi_axes = np.sqrt(_CHI2_95 * np.maximum(variances, 0.0))
         server.scene.add_icosphere(
             node_name("components", component.name),
             1.0,
             palette.rgb(component.colour),
             opacity=component.opacity,
-            scale=tuple(np.maximum(semi_axes, 1e-3).tolist()),  # a plane task has flat components: keep them visible
+            scale=tuple(
+                np.maximum(semi_axes, 1e-3).tolist()
+            ),  # the components of a planar task are flat: keep them visible
             position=np.asarray(component.mean, dtype=float),
             wxyz=matrix_to_quaternion(axes),
             cast_shadow=False,
@@ -164,17 +175,19 @@ def _draw_components(server: Any, components: Sequence[ComponentMark]) -> None:
 
 
 def _free_port() -> int:
-    """Return a port that is free on this machine, or say that none can be opened (viser would wait for ever)."""
+    """Return a free port of this machine; raise when none can be opened, because viser would wait forever."""
     try:
         with socket.create_server(("127.0.0.1", 0)) as listener:
             return int(listener.getsockname()[1])
     except OSError as error:
-        raise TaskFailedError(f"3-D playback: no port on 127.0.0.1 can be opened ({error}); allow it") from error
+        raise TaskFailedError(
+            f"3-D playback: cannot open a port on 127.0.0.1 ({error}); allow local connections"
+        ) from error
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Let rich print nothing: viser prints the address of its server, and nobody is to go there."""
+    """Silence rich, with which viser prints the address of its server; nobody should open it."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:
@@ -185,7 +198,7 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _server() -> Iterator[Any]:
-    """Run viser where only this machine sees it, and stop it afterwards."""
+    """Run a viser server that only this machine can reach, and stop it afterwards."""
     try:
         import viser  # noqa: PLC0415 (heavy, and an extra)
     except ImportError as error:
@@ -213,23 +226,25 @@ def playback_html(
     """Draw a recording and return one self-contained HTML page that plays it.
 
     Args:
-        recording: what moves, and the model it moves in. Geoms of the groups 0 to 2 are drawn.
+        recording: the moving bodies and their model. Geoms of the groups 0 to 2 are drawn.
         paths: lines to draw.
         components: Gaussian components to draw as translucent ellipsoids.
-        persons: people to draw, with as many frames as the recording has.
-        camera: where the view begins; None shows the whole model.
+        persons: people to draw, with as many frames as the recording.
+        camera: the first view; None shows the whole model.
         dark: dark controls and background.
 
     Returns:
-        The page; it can be saved, opened from disk without a network, or put in an iframe.
+        The page; it can be saved, opened from disk without a network, or shown in an iframe.
 
     Raises:
-        InputError: when viser is not installed, or a person has not as many frames as the recording.
-        TaskFailedError: when no port on this machine could be opened.
+        InputError: when viser is not installed, or a person does not have as many frames as the recording.
+        TaskFailedError: when no port of this machine can be opened.
     """
     for person in persons:
         if len(person) != len(recording):
-            raise InputError(f"3-D playback: {person.name} has {len(person)} frames, the recording {len(recording)}")
+            raise InputError(
+                f"3-D playback: {person.name} has {len(person)} frames, but the recording has {len(recording)}"
+            )
     parts = body_parts(recording.model)
     near = [*(path.positions for path in paths), *(person.points_to_see for person in persons)]
     view = camera or Camera.around(points_to_see(recording, parts, near))

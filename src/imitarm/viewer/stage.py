@@ -1,10 +1,10 @@
-"""What of a model is drawn, where its floor is, and from where to look at it."""
+"""What every 3-D drawing needs: a model's meshes and floor, a camera, colours under viser's lights, moving nodes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from mujoco import MjModel, mjtGeom
@@ -16,12 +16,14 @@ from imitarm.viewer.recording import Recording
 
 Array = NDArray[np.float64]
 
-_VIEW: Final = (1.0, -0.95, 0.62)  # from where the camera looks: in front, from the right, from above
+_VIEW: Final = (1.0, -0.95, 0.62)  # direction towards the camera: in front of the robot, to its right, above
+STEP: Final = 2.0**-13  # [m], [-] poses are rounded to this (0.12 mm): a file of round numbers is a third as large
+_EXPOSURE: Final = 0.7
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the view begins: ``position`` and ``look_at`` [m] in the world frame, vertical ``field_of_view`` [rad]."""
+    """The first view: ``position`` and ``look_at`` [m] in the world frame, vertical ``field_of_view`` [rad]."""
 
     position: tuple[float, float, float]
     look_at: tuple[float, float, float]
@@ -29,11 +31,11 @@ class Camera:
 
     @classmethod
     def around(cls, points: ArrayLike, *, direction: ArrayLike = _VIEW, aspect: float = 16 / 9) -> Camera:
-        """Return the nearest camera, looking from ``direction``, that has all ``points`` (n, 3) [m] in the picture.
+        """Return the nearest camera in ``direction`` from which all ``points`` (n, 3) [m] are visible.
 
         Args:
-            points: what must be seen, in the world frame.
-            direction: from the middle of the points towards the camera.
+            points: that must be visible, in the world frame.
+            direction: from the center of the points towards the camera.
             aspect: width of the picture divided by its height.
         """
         p = np.asarray(points, dtype=float)
@@ -43,7 +45,7 @@ class Camera:
         up = np.cross(back, right)
         middle = 0.5 * (p.min(axis=0) + p.max(axis=0))
         tangent = np.tan(0.5 * cls.field_of_view)
-        for _ in range(12):  # what is near takes more of the picture: turn to the picture's middle, then come nearer
+        for _ in range(12):  # near points take more of the picture: aim at the center of the picture, then move closer
             x, y, z = (p - middle) @ right, (p - middle) @ up, (p - middle) @ back
             distance = 1.04 * float(np.max(z + np.maximum(np.abs(y), np.abs(x) / aspect) / tangent))
             u, v = x / (distance - z), y / (distance - z)
@@ -56,14 +58,14 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The triangles of one colour of one body, in the body's frame."""
+    """The triangles of one colour of one body, in the frame of the body."""
 
     mesh: Mesh
     rgba: tuple[float, float, float, float]
 
 
 def body_parts(model: MjModel) -> dict[int, list[Part]]:
-    """Return what is to be drawn of every body that has looks: one mesh for each colour."""
+    """Return the visible parts of each body: one mesh for each colour."""
     found: dict[int, dict[tuple[float, ...], list[Mesh]]] = {}
     for geom in visible_geoms(model):
         mesh = geom_mesh(model, geom)
@@ -79,7 +81,7 @@ def body_parts(model: MjModel) -> dict[int, list[Part]]:
 
 
 def _vertices(recording: Recording, frame: int, bodies: Iterable[int], parts: Mapping[int, list[Part]]) -> Array:
-    """Return vertices (n, 3) [m] of some bodies in the world frame, not all when there are many."""
+    """Return vertices (n, 3) [m] of bodies in the world frame; a subset when there are many."""
     found = [np.empty((0, 3))]
     for body in bodies:
         vertices = np.concatenate([part.mesh.vertices for part in parts[body]])
@@ -90,7 +92,7 @@ def _vertices(recording: Recording, frame: int, bodies: Iterable[int], parts: Ma
 
 
 def points_to_see(recording: Recording, parts: Mapping[int, list[Part]], paths: Iterable[Array]) -> Array:
-    """Return points (n, 3) [m] that belong in the picture: all that moves, what it hangs on, and what is near it."""
+    """Return points (n, 3) [m] for the camera: moving bodies, what carries them, the paths and what is near them."""
     model, still = recording.model, recording.positions[:1]
     turned = np.any(np.abs(recording.quaternions - recording.quaternions[:1]) > 1e-3, axis=(0, 2))
     moves = np.any(np.abs(recording.positions - still) > 1e-3, axis=(0, 2)) | turned
@@ -111,7 +113,45 @@ def points_to_see(recording: Recording, parts: Mapping[int, list[Part]], paths: 
 
 
 def floor_height(recording: Recording, parts: Mapping[int, list[Part]]) -> float:
-    """Return the height of the floor [m]: the lowest plane, or the lowest of what stands there."""
+    """Return the height of the floor [m]: the lowest plane or vertex, at most 0."""
     model = recording.model
     planes = [model.geom_pos[g, 2] for g in range(model.ngeom) if model.geom_type[g] == mjtGeom.mjGEOM_PLANE]
     return float(min([*planes, *_vertices(recording, 0, parts, parts)[:, 2], 0.0]))
+
+
+class Mover:
+    """A node of viser's scene that changes from frame to frame.
+
+    Args:
+        handle: of the node.
+        poses: attributes of the handle in each frame: ``position``, ``wxyz``, ..., or ``visible`` (n_frames,).
+    """
+
+    def __init__(self, handle: Any, poses: Mapping[str, NDArray[Any]]) -> None:
+        self._handle, self._poses = handle, poses
+        self._changed = {
+            name: np.any(values[1:] != values[:-1], axis=tuple(range(1, values.ndim))).tolist()
+            for name, values in poses.items()
+        }
+
+    def show(self, frame: int) -> None:
+        """Send the attributes of a frame, from the second on, that differ from the frame before."""
+        for name, values in self._poses.items():
+            if self._changed[name][frame - 1]:
+                setattr(self._handle, name, bool(values[frame]) if values.ndim == 1 else values[frame])
+
+
+def node_name(kind: str, *names: object) -> str:
+    """Return the name of a node; slashes in ``names`` are replaced, because viser reads them as levels of its tree."""
+    return f"/{kind}/" + " ".join(str(name).replace("/", "|") for name in names)
+
+
+def lit(rgba: Sequence[float], *, linear: bool = False) -> tuple[float, float, float]:
+    """Return the colour that looks like ``rgba`` under viser's lights, which are brighter than MuJoCo's.
+
+    Batches take colours in ``linear`` light, meshes in sRGB.
+    """
+    srgb = np.asarray(rgba[:3], dtype=float)
+    light = _EXPOSURE * np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    shown = light if linear else np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return float(shown[0]), float(shown[1]), float(shown[2])

@@ -1,5 +1,5 @@
 "use strict";
-// The tabs of the scenes, and their 3-D players: one at a time, made when it is looked at.
+// Tabs and their 3-D players: a player is made when it scrolls into view, and removed with its tab.
 (() => {
   const tabs = [...document.querySelectorAll('[role="tab"]')];
   const panels = tabs.map((tab) => document.getElementById(tab.getAttribute("aria-controls")));

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from imitarm.errors import InputError, TaskFailedError
-from imitarm.viewer.picture import _small_enough, take_picture
+from take_picture import _small_enough, take_picture
 
 FAKE = """
     #!{python}
@@ -60,7 +60,7 @@ def browser(tmp_path: Path) -> Path:
     return command
 
 
-@pytest.mark.skipif(os.name == "nt", reason="the made-up browser is a Unix script")
+@pytest.mark.skipif(os.name == "nt", reason="the simulated browser is a Unix script")
 def test_the_page_is_opened_at_its_anchor_and_the_picture_saved(tmp_path: Path, browser: Path) -> None:
     page = tmp_path / "a report.html"
     page.write_text("<p>hello</p>")
@@ -72,7 +72,7 @@ def test_the_page_is_opened_at_its_anchor_and_the_picture_saved(tmp_path: Path, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a report.html", "browser", "log", "p.png"]
 
 
-@pytest.mark.skipif(os.name == "nt", reason="the made-up browser is a Unix script")
+@pytest.mark.skipif(os.name == "nt", reason="the simulated browser is a Unix script")
 def test_a_browser_that_fails_is_reported_and_the_old_picture_stays(tmp_path: Path, browser: Path) -> None:
     page, target = tmp_path / "broken.html", tmp_path / "p.png"
     page.write_text("<p>hello</p>")

@@ -1,16 +1,20 @@
-"""A picture of a report, for a README or a slide, taken by a Chromium browser that is installed on this machine.
+"""Take a picture of a report page, for the documentation.
 
-The browser is asked over its DevTools protocol, because 3-D drawings need real time, which its own screenshot option
-does not give them.
+    python scripts/take_picture.py demo/report.html docs/images/report.png --anchor scene-4-boxes-and-cone --seconds 25
+
+A Chromium browser must be installed on this machine. It is controlled by its DevTools protocol, because a 3-D playback
+needs real time, and the browser's own screenshot option does not wait.
 """
 
 from __future__ import annotations
 
+import argparse
 import base64
 import io
 import json
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -18,11 +22,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from imitarm.errors import InputError, TaskFailedError
+from imitarm.errors import ImitarmError, InputError, TaskFailedError
 
 _BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge")
-_COLOURS: Final = (256, 128, 64, 32)  # fewer and fewer, until the file is small enough
-_PATIENCE: Final = 120.0  # [s] for a browser to begin, and for it to answer: drawing without a graphics card is slow
+_COLOURS: Final = (256, 128, 64, 32)  # tried in this order until the file is small enough
+_PATIENCE: Final = 120.0  # [s] to start a browser, and to answer: drawing without a graphics card is slow
 _OPTIONS: Final = (
     "--headless=new",
     "--no-sandbox",
@@ -48,30 +52,30 @@ def take_picture(
     max_bytes: int = 250_000,
     browser: str | None = None,
 ) -> Path:
-    """Open a report in a browser without a window and save what it shows as a PNG file.
+    """Open a page in a headless browser and save what it shows as a PNG file.
 
     Args:
         page: the report.
         target: the PNG file to write; its folder must exist.
-        anchor: the part of the page to show: ``"scenes"``, ``"results"``, ``"learning"`` or a scene's anchor, which is
-            behind its link in the table of results.
+        anchor: the part of the page to show: ``"scenes"``, ``"results"``, ``"learning"``, or the anchor of a scene, to
+            which the table of results links.
         size: width and height [pixel].
-        seconds: how long to wait for the 3-D playback before the picture is taken [s].
-        max_bytes: colours are reduced until the file is not larger.
-        browser: the browser's command; None looks for Chromium, Chrome and Edge.
+        seconds: how long the 3-D playback runs before the picture is taken [s].
+        max_bytes: the number of colours is reduced until the file is not larger.
+        browser: the command that starts the browser; None searches for Chromium, Chrome and Edge.
 
     Returns:
-        Where the picture was written, absolute.
+        The absolute path of the picture.
 
     Raises:
         InputError: when the page, the folder or a browser is missing.
-        TaskFailedError: when the browser gave no picture, or it can't be made small enough.
+        TaskFailedError: when the browser gives no picture, or the picture cannot be made small enough.
     """
     source, picture = Path(page).absolute(), Path(target).absolute()
     if not source.is_file():
         raise InputError(f"picture: there is no page {source}; write the report first")
     if not picture.parent.is_dir():
-        raise InputError(f"picture {picture}: there is no folder {picture.parent}; make it first")
+        raise InputError(f"picture {picture}: there is no folder {picture.parent}; create it first")
     command = next((path for name in ([browser] if browser else _BROWSERS) if (path := shutil.which(name))), None)
     if command is None:
         raise InputError(f"picture: no browser found ({browser or ', '.join(_BROWSERS)}); install Chromium or name one")
@@ -88,9 +92,9 @@ def take_picture(
 
 @contextmanager
 def _browser(command: str) -> Iterator[Any]:
-    """Run a browser with one page and give a function that asks the page something; end it afterwards."""
-    from websockets.exceptions import WebSocketException  # noqa: PLC0415 (comes with viser, an extra)
-    from websockets.sync.client import connect  # noqa: PLC0415
+    """Run a browser with one page, give a function that sends requests to the page, and end the browser afterwards."""
+    from websockets.exceptions import WebSocketException
+    from websockets.sync.client import connect
 
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         arguments = [*_OPTIONS, f"--user-data-dir={profile}", "about:blank"]
@@ -106,19 +110,19 @@ def _browser(command: str) -> Iterator[Any]:
 
 
 def _address(process: subprocess.Popen[bytes], profile: Path) -> str:
-    """Return where the browser listens: it writes its port and path into a file of its profile."""
-    told = profile / "DevToolsActivePort"
+    """Return the address at which the browser listens; it writes port and path to a file in its profile."""
+    port_file = profile / "DevToolsActivePort"
     end = time.monotonic() + _PATIENCE
     while time.monotonic() < end and process.poll() is None:
-        lines = told.read_text(encoding="utf-8").split() if told.is_file() else []
+        lines = port_file.read_text(encoding="utf-8").split() if port_file.is_file() else []
         if len(lines) == 2:
             return f"ws://127.0.0.1:{lines[0]}{lines[1]}"
         time.sleep(0.05)
-    raise TimeoutError("it did not begin" if process.poll() is None else f"it ended with status {process.returncode}")
+    raise TimeoutError("it did not start" if process.poll() is None else f"it ended with status {process.returncode}")
 
 
 class _Page:
-    """One page of a browser, attached to over the browser's own connection."""
+    """One page of a browser."""
 
     def __init__(self, socket: Any) -> None:
         self._socket, self._number = socket, 0
@@ -128,7 +132,7 @@ class _Page:
         self._session = {"sessionId": attached["sessionId"]}
 
     def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Send a request and return its answer; what else the browser has to say is left out."""
+        """Send a request and return its answer; other messages of the browser are ignored."""
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters, **self._session}))
         end = time.monotonic() + _PATIENCE
@@ -142,8 +146,8 @@ class _Page:
 
 
 def _small_enough(shot: bytes, max_bytes: int) -> bytes:
-    """Return the picture as PNG, with fewer colours when it is too large."""
-    from PIL import Image  # noqa: PLC0415 (comes with matplotlib, an extra)
+    """Return the picture as PNG, with fewer colours if it is too large."""
+    from PIL import Image
 
     with Image.open(io.BytesIO(shot)) as image:
         full = image.convert("RGB")
@@ -153,3 +157,23 @@ def _small_enough(shot: bytes, max_bytes: int) -> bytes:
         if file.tell() <= max_bytes:
             return file.getvalue()
     raise TaskFailedError(f"picture: {file.tell()} bytes with {_COLOURS[-1]} colours; ask for a smaller size")
+
+
+def main() -> int:
+    """Take the picture that the command line asks for."""
+    parser = argparse.ArgumentParser(description="Take a picture of a report page.")
+    parser.add_argument("page", type=Path)
+    parser.add_argument("target", type=Path, help="PNG file")
+    parser.add_argument("--anchor", default="scenes", help="part of the page; default: scenes")
+    parser.add_argument("--seconds", type=float, default=15.0, help="how long the playback runs first; default: 15")
+    arguments = parser.parse_args()
+    try:
+        print(take_picture(arguments.page, arguments.target, anchor=arguments.anchor, seconds=arguments.seconds))
+    except ImitarmError as error:
+        sys.stderr.write(f"{parser.prog}: error: {error}\n")
+        return error.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,12 +1,13 @@
-"""The report's figures of paths: what was shown, what was learnt, how it was bent around obstacles.
+"""Figures of paths in the base frame: demonstrations, the learned path, how it was adapted around obstacles.
 
-Every function returns one ``<svg>`` element. Figures over time and over components are in
-:mod:`~imitarm.viewer.charts`.
+Every public function that draws returns one ``<svg>`` element. Figures over time are in :mod:`~imitarm.viewer.charts`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -16,16 +17,128 @@ from imitarm.kinematics.pose import rotate
 from imitarm.scene import Scene
 from imitarm.trajectory import Demonstration, Trajectory
 from imitarm.viewer import palette
-from imitarm.viewer.canvas import POINTS, thin
-from imitarm.viewer.views import Grid, View, corners_of, drawn_map
+from imitarm.viewer.canvas import POINTS, Canvas, canvas, thin
 
 Array = NDArray[np.float64]
 
-_CHI_95: Final = 2.448  # 95 % of a plane Gaussian is within 2.448 sigma
+_CHI_95: Final = 2.448  # 95 % of a two-dimensional Gaussian lies within 2.448 sigma
+_WIDTH: Final = 5.5  # [inch]
+_HEIGHTS: Final = (1.6, 4.4)  # [inch]
+
+
+@dataclass(frozen=True)
+class View:
+    """The two axes of the base frame that a figure shows.
+
+    Attributes:
+        across: horizontal axis of the figure: 0, 1, 2 for x, y, z.
+        up: vertical axis of the figure.
+    """
+
+    across: int = 0
+    up: int = 1
+
+    @property
+    def depth(self) -> int:
+        """The axis along which the figure looks."""
+        return 3 - self.across - self.up
+
+    @property
+    def title(self) -> str:
+        """The view in words."""
+        return {2: "seen from above", 1: "seen from the side", 0: "seen from the front"}[self.depth]
+
+    @property
+    def leftwards(self) -> bool:
+        """Whether ``across`` increases to the left; y does when seen from above with x upwards."""
+        return (self.across, self.up) == (1, 0)
+
+    @classmethod
+    def best(cls, positions: ArrayLike) -> View:
+        """Return the view that shows most of ``positions`` (n, 3) [m]; from above when that is nearly as good."""
+        spans = np.ptp(np.asarray(positions, dtype=float), axis=0)
+        if spans[2] <= 1.25 * spans[:2].min():
+            return cls(0, 1) if spans[0] >= spans[1] else cls(1, 0)
+        return cls(0, 2) if spans[0] >= spans[1] else cls(1, 2)
+
+    def of(self, positions: ArrayLike) -> Array:
+        """Return the two coordinates that are shown, shape (..., 2) [m]."""
+        return np.asarray(positions, dtype=float)[..., [self.across, self.up]]
+
+
+@contextmanager
+def drawn_map(
+    name: str, text: str, view: View, corners: Array, *, legend_rows: int, note: str = "", stretched: bool = False
+) -> Iterator[tuple[Any, Canvas]]:
+    """Give axes that show ``corners`` (2, 2) [m]; the figure is as high as they need, and its SVG follows at the end.
+
+    Args:
+        name: unique in the page.
+        text: description of the figure, for screen readers.
+        view: the axes to show.
+        corners: lower and upper corner of the area that must be visible.
+        legend_rows: number of rows of the legend.
+        note: added to the title.
+        stretched: whether a flat map may be stretched vertically, and the title says so, instead of equal scales.
+    """
+    span = np.maximum(corners[1] - corners[0], 1e-3)
+    width = _WIDTH - 0.72
+    height = float(np.clip(width * span[1] / span[0], *_HEIGHTS))
+    scales = np.full(2, max(span[0] / width, span[1] / height))  # [m/inch]
+    stretch = scales[1] / (span[1] / height)
+    if stretched and stretch > 1.2:
+        scales[1] = span[1] / height
+        note += f"; {'xyz'[view.up]} is stretched {stretch:.1f} times"
+    below = 0.48 + 0.2 * legend_rows
+    with canvas(name, text, (_WIDTH, below + height + 0.3)) as drawing:
+        axes = drawing.axes(0.64, below, 0.64 + width, below + height)
+        for i, (limits, inches) in enumerate(((axes.set_xlim, width), (axes.set_ylim, height))):
+            middle, half = corners[:, i].mean(), 0.5 * scales[i] * inches
+            limits(middle - half, middle + half)
+        if view.leftwards:
+            axes.invert_xaxis()
+        axes.locator_params(nbins=8)
+        axes.set_xlabel(f"{'xyz'[view.across]} of the base [m]")
+        axes.set_ylabel(f"{'xyz'[view.up]} of the base [m]")
+        axes.set_title(view.title + note, loc="left")
+        yield axes, drawing
+        drawing.legend(3)
+
+
+def corners_of(points: Array, margin: float) -> Array:
+    """Return the lower and the upper corner (2, 2) of a box around all ``points``, with a margin [m]."""
+    return np.array([points.min(axis=0) - margin, points.max(axis=0) + margin])
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A grid of points on a map: coordinates ``across`` (columns,) and ``up`` (rows,) [m] of the axes of ``view``."""
+
+    view: View
+    across: Array
+    up: Array
+
+    @classmethod
+    def of(cls, axes: Any, view: View) -> Grid:
+        """Cover the axes."""
+        low, high = np.sort(np.array([axes.get_xlim(), axes.get_ylim()]), axis=1).T
+        step = float((high - low).max()) / 160.0
+        return cls(view, *(np.arange(low[i], high[i] + step, step) for i in range(2)))
+
+    def distance(self, scene: Scene, obstacle: int, depths: Array) -> Array:
+        """Return the distance from each point to an obstacle (rows, columns) [m], the smallest over ``depths``.
+
+        For one depth the zero line is the cross-section of the obstacle there, for several its projection.
+        """
+        points = np.empty((len(depths), len(self.up), len(self.across), 3))
+        points[..., self.view.across] = self.across
+        points[..., self.view.up] = self.up[:, None]
+        points[..., self.view.depth] = depths[:, None, None]
+        return np.asarray(scene.obstacles[obstacle].signed_distance(points).min(axis=0))
 
 
 def _ellipses(axes: Any, means: ArrayLike, covariances: ArrayLike, view: View, **style: Any) -> None:
-    """Fill the 95 % ellipses of Gaussians, as they are seen in the view: of the two shown coordinates."""
+    """Fill the 95 % ellipses of the two shown coordinates of Gaussians."""
     pick = [view.across, view.up]
     angles = np.linspace(0.0, 2.0 * np.pi, 49)
     circle = _CHI_95 * np.stack([np.cos(angles), np.sin(angles)])
@@ -43,13 +156,13 @@ def demonstrations(
     *,
     name: str = "demonstrations",
 ) -> str:
-    """Draw what was shown, the Gaussian components that were learnt from it and the path they predict.
+    """Draw demonstrations, the Gaussian components learned from them and the path that they predict.
 
     Args:
         shown: the demonstrations.
         means: of the components' positions, shape (n_components, 3) [m].
         covariances: of the components' positions, shape (n_components, 3, 3) [m^2].
-        predicted: the learnt path.
+        predicted: the learned path.
         name: unique in the page.
 
     Returns:
@@ -57,7 +170,7 @@ def demonstrations(
     """
     view = View.best(np.concatenate([d.trajectory.positions for d in shown]))
     text = (
-        f"{len(shown)} demonstrations, {len(np.asarray(means))} Gaussian components and the learnt path, {view.title}"
+        f"{len(shown)} demonstrations, {len(np.asarray(means))} Gaussian components and the learned path, {view.title}"
     )
     reach = _CHI_95 * np.sqrt(np.einsum("kii->ki", np.asarray(covariances, dtype=float)))
     spread = [d.trajectory.positions for d in shown] + [np.asarray(means) - reach, np.asarray(means) + reach]
@@ -66,19 +179,24 @@ def demonstrations(
         for i, demonstration in enumerate(shown):
             path = view.of(demonstration.trajectory.positions)[thin(len(demonstration))]
             axes.plot(
-                *path.T, color=palette.DEMONSTRATION, lw=0.9, alpha=0.75, label="shown" if i == 0 else None, zorder=2
+                *path.T,
+                color=palette.DEMONSTRATION,
+                lw=0.9,
+                alpha=0.75,
+                label="demonstrations" if i == 0 else None,
+                zorder=2,
             )
         style = {"facecolor": palette.UNMOVED, "edgecolor": palette.UNMOVED, "alpha": 0.28, "zorder": 1}
         _ellipses(axes, means, covariances, view, **style)
-        axes.plot(*view.of(means).T, ".", color=palette.UNMOVED, ms=5, label="Gaussian component, 95 %", zorder=3)
+        axes.plot(*view.of(means).T, ".", color=palette.UNMOVED, ms=5, label="Gaussian components, 95 %", zorder=3)
         if predicted is not None:
             path = view.of(predicted.positions)[thin(len(predicted))]
-            axes.plot(*path.T, color=palette.ADAPTED, lw=1.6, label="learnt path", zorder=4)
+            axes.plot(*path.T, color=palette.ADAPTED, lw=1.6, label="learned path", zorder=4)
     return drawing.svg
 
 
 def _tool_along(path: Trajectory, spheres: ArrayLike | None) -> tuple[Array, Array]:
-    """Return where the tool's spheres are at some instants of a path, (n, m, 3) [m], and their radii (m,) [m]."""
+    """Return the centers of the tool's spheres at some samples of a path, (n, m, 3) [m], and their radii (m,) [m]."""
     rows = np.zeros((1, 4)) if spheres is None else np.asarray(spheres, dtype=float).reshape(-1, 4)
     some = thin(len(path), 80)
     centres = np.broadcast_to(rows[:, :3], (len(some), len(rows), 3))
@@ -88,7 +206,7 @@ def _tool_along(path: Trajectory, spheres: ArrayLike | None) -> tuple[Array, Arr
 
 
 def _draw_swept(axes: Any, grid: Grid, centres: Array, radii: Array) -> None:
-    """Fill the area that spheres with ``centres`` (n, m, 2) sweep over, as one area with one outline."""
+    """Fill the area that spheres with ``centres`` (n, m, 2) sweep, and draw its outline."""
     distance = np.full((len(grid.up), len(grid.across)), np.inf)
     for instant in centres:
         for (across, up), radius in zip(instant, radii, strict=True):
@@ -100,7 +218,7 @@ def _draw_swept(axes: Any, grid: Grid, centres: Array, radii: Array) -> None:
 
 
 def _draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance: float, path: Array) -> None:
-    """Fill the obstacles and dash the line that the tool must stay outside of."""
+    """Fill the obstacles and draw the dashed line outside which the tool must stay."""
     depths = np.linspace(depth.min(), depth.max(), 9) if np.ptp(depth) > 2e-3 else np.array([depth.mean()])
     for i, obstacle in enumerate(scene.obstacles):
         distance = grid.distance(scene, i, depths)
@@ -112,11 +230,11 @@ def _draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance
         if distance.min() < clearance:
             look = {"levels": [clearance], "colors": [palette.LIMIT], "linewidths": 0.9, "linestyles": "dashed"}
             axes.contour(grid.across, grid.up, distance, zorder=2, **look)
-    axes.plot([], [], "--", color=palette.LIMIT, lw=0.9, label="asked distance")
+    axes.plot([], [], "--", color=palette.LIMIT, lw=0.9, label="required clearance")
 
 
 def _name(axes: Any, grid: Grid, distance: Array, name: str, path: Array) -> None:
-    """Write an obstacle's name beside it, on the side where the path (n, 2) [m] is not."""
+    """Write an obstacle's name beside it, on the side away from the path (n, 2) [m]."""
     rows, columns = np.nonzero(distance < 0.0)
     across = float(grid.across[columns].mean())
     beside = path[np.argmin(np.abs(path[:, 0] - across)), 1]
@@ -127,7 +245,7 @@ def _name(axes: Any, grid: Grid, distance: Array, name: str, path: Array) -> Non
 
 
 def _band(path: Array, covariances: Array, view: View) -> Array:
-    """Return the outline (2 n, 2) of two standard deviations on both sides of a path, seen in the view."""
+    """Return the outline (2 n, 2) of a band of two standard deviations on both sides of a path."""
     pick = [view.across, view.up]
     points = view.of(path)
     tangents = np.gradient(points, axis=0)
@@ -153,20 +271,20 @@ def adaptation(
     measured: Trajectory | None = None,
     name: str = "adaptation",
 ) -> str:
-    """Draw how a learnt path was bent around obstacles, and which components were moved for it.
+    """Draw how a learned path was adapted around obstacles, and which components were moved.
 
     Args:
-        nominal: the learnt path.
+        nominal: the learned path.
         adapted: the path around the obstacles.
         scene: the obstacles, in the base frame.
-        clearance: asked distance of the tool to every obstacle [m].
-        tool_spheres: that hold the tool, rows of x, y, z, radius in the tool's frame, shape (m, 4) [m].
-        tolerance: spread of the demonstrations along the path, shape (n_steps, 3, 3) [m^2].
+        clearance: distance that the tool must keep from every obstacle [m].
+        tool_spheres: spheres that contain the tool, rows of x, y, z, radius in the tool frame, shape (m, 4) [m].
+        tolerance: covariance of the demonstrations along the path, shape (n_steps, 3, 3) [m^2].
         means: of the components before they were moved, shape (n_components, 3) [m].
         covariances: of the components, shape (n_components, 3, 3) [m^2].
         displacement: of the components, shape (n_components, 3) [m].
         moved: which components were displaced, shape (n_components,).
-        measured: the path that the robot's tool took.
+        measured: the measured path of the robot's tool.
         name: unique in the page.
 
     Returns:
@@ -176,12 +294,14 @@ def adaptation(
     view = View.best(everything)
     tool, radii = _tool_along(adapted, tool_spheres)
     obstacles = scene.obstacles if scene is not None else ()
-    text = f"The learnt and the adapted path around {len(obstacles)} obstacles, {view.title}"
+    text = f"The learned and the adapted path around {len(obstacles)} obstacles, {view.title}"
     shown = view.of(tool)
     swept = np.concatenate([shown - radii[:, None], shown + radii[:, None]]).reshape(-1, 2)
     corners = corners_of(np.concatenate([view.of(everything), swept]), 0.04)
     for obstacle in obstacles:
-        bounds = np.clip(view.of(obstacle.bounds()), corners[0] - 0.15, corners[1] + 0.15)  # [m] far is of no interest
+        bounds = np.clip(
+            view.of(obstacle.bounds()), corners[0] - 0.15, corners[1] + 0.15
+        )  # [m] obstacles far away do not matter
         corners = corners_of(np.concatenate([corners, corners_of(bounds, clearance + 0.01)]), 0.0)
     with drawn_map(name, text, view, corners, legend_rows=3, note="; ● start, ■ end") as (axes, drawing):
         grid = Grid.of(axes, view)
@@ -197,9 +317,9 @@ def adaptation(
             ]
             axes.fill(*band.T, color=palette.ADAPTED, alpha=0.16, lw=0, label="tolerance, 2σ", zorder=3)
         for path, label, look in (
-            (nominal, "learnt path", {"color": palette.NOMINAL, "ls": (0, (5, 2)), "lw": 1.5}),
+            (nominal, "learned path", {"color": palette.NOMINAL, "ls": (0, (5, 2)), "lw": 1.5}),
             (adapted, "adapted path", {"color": palette.ADAPTED, "lw": 2.2}),
-            (measured, "measured on the robot", {"color": palette.MEASURED, "lw": 1.0}),
+            (measured, "measured path", {"color": palette.MEASURED, "lw": 1.0}),
         ):
             if path is not None:
                 axes.plot(*view.of(path.positions)[thin(len(path))].T, label=label, zorder=4, **look)
@@ -216,12 +336,12 @@ def _draw_components(
     displacement: ArrayLike | None,
     moved: ArrayLike | None,
 ) -> None:
-    """Draw unmoved components filled, moved ones where they went, with an arrow from where they were."""
+    """Draw the components; moved ones at their new place, with an arrow from the old one."""
     centres, spreads = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
     shift = np.zeros_like(centres) if displacement is None else np.asarray(displacement, dtype=float)
     went = np.linalg.norm(shift, axis=1) > 0.0 if moved is None else np.asarray(moved, dtype=bool)
     for chosen, colour, label in (
-        (~went, palette.UNMOVED, "component, unmoved"),
+        (~went, palette.UNMOVED, "component, not moved"),
         (went, palette.MOVED, "component, moved"),
     ):
         if chosen.any():
