@@ -38,9 +38,9 @@ def test_seen_from_above_x_up_means_y_to_the_left() -> None:
 
 
 def test_the_footprint_is_the_cut_at_the_paths_height() -> None:
-    ball = Scene(None, (Sphere((0.0, 0.0, 0.05), 0.05),))
+    ball = Sphere((0.0, 0.0, 0.05), 0.05)
     grid = Grid(View(0, 1), np.linspace(-0.1, 0.1, 161), np.linspace(-0.08, 0.08, 129))
-    distance = grid.distance(ball, 0, np.array([0.08]))
+    distance = grid.distance_to(ball, np.array([0.08]))
     inside = distance < 0.0
     radius = np.hypot(grid.across[None, :], grid.up[:, None])
     assert radius[inside].max() == pytest.approx(0.04, abs=0.002)

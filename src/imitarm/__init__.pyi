@@ -30,6 +30,7 @@ from .scene import (
 )
 from .skills import DMP, GMR, GaussianMixture, Skill
 from .trajectory import Demonstration, Rollout, Trajectory
+from .viewer.plot import plot
 
 __version__: str
 __all__ = [
@@ -90,6 +91,7 @@ __all__ = [
     "find_posture",
     "lint",
     "load_scene",
+    "plot",
     "read",
     "reproduce",
     "save_scene",

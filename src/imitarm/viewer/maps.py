@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.kinematics.pose import rotate
-from imitarm.scene import Scene
+from imitarm.scene import Obstacle, Scene
 from imitarm.trajectory import Demonstration, Trajectory
 from imitarm.viewer import palette
 from imitarm.viewer.canvas import POINTS, Canvas, canvas, thin
@@ -125,7 +125,7 @@ class Grid:
         step = float((high - low).max()) / 160.0
         return cls(view, *(np.arange(low[i], high[i] + step, step) for i in range(2)))
 
-    def distance(self, scene: Scene, obstacle: int, depths: Array) -> Array:
+    def distance_to(self, obstacle: Obstacle, depths: Array) -> Array:
         """Return the distance from each point to an obstacle (rows, columns) [m], the smallest over ``depths``.
 
         For one depth the zero line is the cross-section of the obstacle there, for several its projection.
@@ -134,10 +134,10 @@ class Grid:
         points[..., self.view.across] = self.across
         points[..., self.view.up] = self.up[:, None]
         points[..., self.view.depth] = depths[:, None, None]
-        return np.asarray(scene.obstacles[obstacle].signed_distance(points).min(axis=0))
+        return np.asarray(obstacle.signed_distance(points).min(axis=0))
 
 
-def _ellipses(axes: Any, means: ArrayLike, covariances: ArrayLike, view: View, **style: Any) -> None:
+def draw_ellipses(axes: Any, means: ArrayLike, covariances: ArrayLike, view: View, **style: Any) -> None:
     """Fill the 95 % ellipses of the two shown coordinates of Gaussians."""
     pick = [view.across, view.up]
     angles = np.linspace(0.0, 2.0 * np.pi, 49)
@@ -187,7 +187,7 @@ def demonstrations(
                 zorder=2,
             )
         style = {"facecolor": palette.UNMOVED, "edgecolor": palette.UNMOVED, "alpha": 0.28, "zorder": 1}
-        _ellipses(axes, means, covariances, view, **style)
+        draw_ellipses(axes, means, covariances, view, **style)
         axes.plot(*view.of(means).T, ".", color=palette.UNMOVED, ms=5, label="Gaussian components, 95 %", zorder=3)
         if predicted is not None:
             path = view.of(predicted.positions)[thin(len(predicted))]
@@ -220,8 +220,8 @@ def _draw_swept(axes: Any, grid: Grid, centres: Array, radii: Array) -> None:
 def _draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance: float, path: Array) -> None:
     """Fill the obstacles and draw the dashed line outside which the tool must stay."""
     depths = np.linspace(depth.min(), depth.max(), 9) if np.ptp(depth) > 2e-3 else np.array([depth.mean()])
-    for i, obstacle in enumerate(scene.obstacles):
-        distance = grid.distance(scene, i, depths)
+    for obstacle in scene.obstacles:
+        distance = grid.distance_to(obstacle, depths)
         if distance.min() < 0.0:
             look = {"levels": [-1e3, 0.0], "colors": [palette.OBSTACLE], "alpha": 0.85, "zorder": 2}
             axes.contourf(grid.across, grid.up, distance, **look)
@@ -310,7 +310,7 @@ def adaptation(
         if scene is not None and obstacles:
             _draw_obstacles(axes, scene, grid, tool[..., view.depth], clearance, view.of(nominal.positions))
         if means is not None and covariances is not None:
-            _draw_components(axes, view, means, covariances, displacement, moved)
+            draw_components(axes, view, means, covariances, displacement, moved)
         if tolerance is not None:
             band = _band(adapted.positions, np.asarray(tolerance, dtype=float), view)[
                 thin(2 * len(adapted), 2 * POINTS)
@@ -328,7 +328,7 @@ def adaptation(
     return drawing.svg
 
 
-def _draw_components(
+def draw_components(
     axes: Any,
     view: View,
     means: ArrayLike,
@@ -346,7 +346,7 @@ def _draw_components(
     ):
         if chosen.any():
             look = {"facecolor": colour, "edgecolor": colour, "zorder": 1}
-            _ellipses(axes, (centres + shift)[chosen], spreads[chosen], view, alpha=0.25, **look)
+            draw_ellipses(axes, (centres + shift)[chosen], spreads[chosen], view, alpha=0.25, **look)
             axes.plot([], [], "o", color=colour, alpha=0.5, ms=8, label=label)
     for start, end in zip(view.of(centres[went]), view.of((centres + shift)[went]), strict=True):
         arrow = {"arrowstyle": "-|>", "color": palette.MOVED, "lw": 1.1, "shrinkA": 0, "shrinkB": 0}

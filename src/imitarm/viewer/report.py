@@ -211,14 +211,14 @@ def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:
             yield Figure(
                 svg,
                 "Path around the obstacles",
-                "Path of the tool center point. The dotted line bounds the area that the tool sweeps; it must stay "
+                "Path of the tool centre point. The dotted line bounds the area that the tool sweeps; it must stay "
                 "outside the dashed lines. Arrows show how far components were moved.",
             )
             lengths = np.linalg.norm(adaptation.displacement, axis=1)
             svg = charts.displacement(lengths, adaptation.moved, name=f"{key}-moved")
             yield Figure(svg, "Displacement of the components", "One bar for each component, in the order of time.")
         else:
-            yield Figure(svg, "The learned path", "Path of the tool center point. No obstacle is in the way.")
+            yield Figure(svg, "The learned path", "Path of the tool centre point. No obstacle is in the way.")
     if rollout is not None:
         times = rollout.trajectory.times - rollout.trajectory.times[0]
         svg = charts.clearance(times, rollout.clearance, scene.required_clearance, name=f"{key}-clearance")
@@ -267,7 +267,7 @@ def _tool(scene: SceneResult) -> str:
     if reach == 0.0:
         return "a point"
     many = "one sphere" if len(spheres) == 1 else f"{len(spheres)} spheres"
-    return f"{many}, within {number(MM * reach, 0, 'mm')} of the tool center point"
+    return f"{many}, within {number(MM * reach, 0, 'mm')} of the tool centre point"
 
 
 def _learning_figures(learning: LearningSummary) -> Iterator[Figure]:
