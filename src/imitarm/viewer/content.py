@@ -149,7 +149,7 @@ class SceneResult:
 
 
 class Candidate(Protocol):
-    """One evaluated number of components; :class:`imitarm.skills.mixture_fitting.Candidate` has all of its attributes."""
+    """An evaluated number of components, as :class:`imitarm.skills.mixture_fitting.Candidate`."""
 
     @property
     def n_components(self) -> int:
