@@ -168,7 +168,7 @@ def calls(tmp_path_factory) -> dict[str, Call]:
 UNCALLED = {
     **dict.fromkeys(("HORIZONTAL_ONLY", "NOT_DOWN", "POLICIES", "RETARGETERS", "SOURCES"), "a constant"),
     **dict.fromkeys(("Obstacle", "Policy", "Retargeter", "Robot", "SkeletonSource", "Status"), "abstract, or an enum"),
-    **dict.fromkeys(("Adaptation", "Experiment", "Finding", "Result", "Rollout"), "a result"),
+    **dict.fromkeys(("Adaptation", "Finding", "Rollout"), "a result"),
     **dict.fromkeys(("Correspondence", "Skeleton", "plot"), "has tests of its own"),
 }
 

@@ -1,4 +1,3 @@
-from .benchmark.experiment import Experiment, Result
 from .capture import SOURCES, Skeleton, SkeletonSource
 from .command import Command, Status
 from .control_loop import reproduce
@@ -55,7 +54,6 @@ __all__ = [
     "Demonstration",
     "ElbowTask",
     "Ellipsoid",
-    "Experiment",
     "Finding",
     "GaussianMixture",
     "HalfSpace",
@@ -70,7 +68,6 @@ __all__ = [
     "Policy",
     "Pose",
     "PostureTask",
-    "Result",
     "Retargeter",
     "Robot",
     "Rollout",
