@@ -20,7 +20,7 @@ from imitarm.trajectory import Demonstration, Trajectory
 Array = NDArray[np.float64]
 
 TOOL_RADIUS = 0.03  # [m]
-CLEARANCE = 0.02  # [m] asked of every method
+CLEARANCE = 0.02  # [m] required of every method
 _DURATION = 4.0  # [s]
 _FREE_ENDS = 0.08  # [m] no obstacle is nearer to start or goal than this
 _APART = 0.16  # [m] between the centres of sparse obstacles
@@ -35,7 +35,7 @@ class Case:
     Attributes:
         scene: what is in the way.
         forbidden: directions in which nothing may move, shape (m, 3).
-        solvable: whether a path with the asked clearance exists.
+        solvable: whether a path with the required clearance exists.
     """
 
     scene: Scene
@@ -128,7 +128,7 @@ def narrow_gap(seed: int, path: Array, *, solvable: bool) -> Case:
     Args:
         seed: number of the scene.
         path: nominal path, shape (n, 3) [m].
-        solvable: whether the gap lets the tool through with the asked clearance.
+        solvable: whether the gap lets the tool through with the required clearance.
     """
     rng = np.random.default_rng([14, solvable, seed])
     need = 2.0 * (TOOL_RADIUS + CLEARANCE)

@@ -288,6 +288,8 @@ def _spheres(skill: Skill, radius: float | None, spheres: ArrayLike | None, arm:
 
 
 def _unit_rows(directions: ArrayLike) -> Array:
+    if isinstance(directions, tuple) and not directions:
+        return np.empty((0, 3))
     rows = finite_array(directions, (None,) if np.size(directions) == 0 else (None, 3), "forbidden (rows x y z)")
     rows = rows.reshape(-1, 3)
     length = np.linalg.norm(rows, axis=1, keepdims=True)

@@ -160,6 +160,9 @@ class ToolAmongObstacles:
     def clearance_of(self, positions: Array) -> PathClearance:
         """Return the distances and normals of every pair along a path of the tip (n, 3)."""
         n, k = len(positions), self.n_spheres
+        if k == 1 and len(self.obstacles) == 1 and self.offsets[0] is None:
+            d, normals = self.obstacles[0].distance_and_gradient(positions)
+            return PathClearance(self, positions, (d - self.radii[0])[None], normals[None])
         distance, normal = np.empty((self.n_pairs, n)), np.empty((self.n_pairs, n, 3))
         for o, obstacle in enumerate(self.obstacles):
             rows, offset = slice(o * k, (o + 1) * k), self.offsets[o]

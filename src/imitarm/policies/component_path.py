@@ -103,11 +103,13 @@ class ComponentPath:
         """
         n_samples = whole_number(n_samples, "n_samples", at_least=10, at_most=100_000)
         duration = skill.duration_
-        pins = finite_array(pinned, (None,), "pinned", "s")
-        outside = pins[(pins < 0.0) | (pins > duration)]
-        if len(outside):
-            raise InputError(f"pinned: {outside[0]:g} s is outside the motion (0 to {duration:g} s)")
-        learned = _learned(skill.gmr_, n_samples, (0.0, *pins.tolist(), duration))
+        pins: list[float] = []
+        if not isinstance(pinned, tuple) or pinned:
+            pins = finite_array(pinned, (None,), "pinned", "s").tolist()
+        for pin in pins:
+            if not 0.0 <= pin <= duration:
+                raise InputError(f"pinned: {pin:g} s is outside the motion (0 to {duration:g} s)")
+        learned = _learned(skill.gmr_, n_samples, (0.0, *pins, duration))
         if start is None and goal is None:
             return learned
         times = learned.nominal.times
@@ -119,6 +121,11 @@ class ComponentPath:
     def n_components(self) -> int:
         """Number of components."""
         return len(self.means)
+
+    @cached_property
+    def factors(self) -> Array:
+        """Lower Cholesky factors of the yields, (n_components, 3, 3) [m]."""
+        return np.asarray(np.linalg.cholesky(self.yields), dtype=np.float64)
 
     @cached_property
     def lever(self) -> Array:

@@ -75,9 +75,11 @@ class AllowedDirections:
     @classmethod
     def without(cls, forbidden: Array) -> AllowedDirections:
         """Leave out forbidden directions, given as unit rows (m, 3)."""
-        opposite = (forbidden @ forbidden.T).min(axis=1, initial=0.0) < -1.0 + 1e-12 if len(forbidden) else []
+        if not len(forbidden):
+            return cls(forbidden, np.eye(3), np.empty((0, 3)))
+        opposite = (forbidden @ forbidden.T).min(axis=1) < -1.0 + 1e-12
         axes = _complement(forbidden[opposite])
-        rest = forbidden[np.logical_not(opposite)] @ axes if len(forbidden) else np.empty((0, axes.shape[1]))
+        rest = forbidden[~opposite] @ axes
         length = np.linalg.norm(rest, axis=1)
         return cls(forbidden, axes, rest[length > 1e-9] / length[length > 1e-9, None])
 
@@ -97,7 +99,7 @@ class AllowedDirections:
 
     def unit_directions(self, candidates: Array) -> Array:
         """Return the allowed parts of directions (m, 3) as unit rows, without those of which little is left."""
-        allowed = self.enforced(candidates @ self.axes)
+        allowed = self.enforced(candidates @ self.axes) if len(self.forbidden) else candidates
         length = np.sqrt(np.einsum("md,md->m", allowed, allowed))
         allowed = allowed[length > 0.25] / length[length > 0.25, None]
         return np.unique(np.round(allowed, 9) + 0.0, axis=0) if len(self.forbidden) else allowed
@@ -309,9 +311,12 @@ class LeastDetour:
         path is divided or has to be smoother, the squared jerk of the displacement.
         """
         axes, m, d = self.allowed.axes, len(moved), self.allowed.dimension
-        blocks = axes.T @ self.path.precisions[moved] @ axes
         weight = (_SMOOTHNESS if self.exact else 0.0) if smoothness is None else smoothness
         index, h = np.arange(m), np.zeros((m, d, m, d))
+        if weight == 0.0 and d == 3:
+            h[index, :, index, :] = self.path.factors[moved]
+            return h.reshape(m * d, m * d)
+        blocks = axes.T @ self.path.precisions[moved] @ axes
         if weight == 0.0:
             h[index, :, index, :] = np.swapaxes(np.linalg.inv(np.linalg.cholesky(blocks)), 1, 2)
             return h.reshape(m * d, m * d)
