@@ -33,10 +33,10 @@ Bools = NDArray[np.bool_]
 MAX_STEP_RATIO = 8.0  # as the product states it
 _SEARCH_GRIDS = {
     1: ((0.5, 0.002),),
-    2: ((0.2, 0.01), (0.5, 0.01), (0.5, 0.004), (0.3, 0.002)),
-    3: ((0.2, 0.02), (0.5, 0.025), (0.3, 0.0125)),
+    2: ((0.2, 0.01), (0.5, 0.01), (0.5, 0.004), (0.3, 0.002), (0.12, 0.001)),
+    3: ((0.2, 0.02), (0.5, 0.025), (0.3, 0.0125), (0.12, 0.006)),
 }
-_SEARCH_LAYERS = 67
+_SEARCH_LAYERS, _SEARCH_LAYERS_MOVING = 80, 200
 _LATERAL_SWEEPS = 16  # cells that a chain may move sideways within a layer
 _CHANGE_COST = 20.0  # [1/m]
 _AWAY_COST = 2.0  # [1/m^2] at each layer
@@ -96,9 +96,7 @@ def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Arr
     d, half = len(axes), round(reach / h)
     side, n = 2 * half + 1, len(question.nominal)
     ticks = np.asarray((np.arange(side) - half) * h, dtype=np.float64)
-    times = np.unique(
-        np.concatenate([question.nominal.times[_layer_samples(question, n)], np.asarray(question.fixed_times)])
-    )
+    times = _layer_times(question)
     grid = np.stack(np.meshgrid(*[ticks] * d, indexing="ij"), axis=-1)
     flat = grid.reshape(-1, d) @ axes
     permitted = np.sum(grid**2, axis=-1) <= MAX_DISPLACEMENT**2
@@ -164,14 +162,14 @@ def _advanced(
     return cost
 
 
-def _layer_samples(question: Question, n: int) -> NDArray[np.intp]:
-    """Return the samples that are layers: evenly, and all of the first few from each fixed time."""
+def _layer_times(question: Question) -> Array:
+    """Return the times of the layers: evenly, and the first few samples from each fixed time."""
     moving = any(obstacle.velocity.any() for obstacle in question.obstacles)
-    samples = set(np.round(np.linspace(0, n - 1, n if moving else min(_SEARCH_LAYERS, n))).astype(int).tolist())
-    for time in question.fixed_times:
-        at = int(np.argmin(np.abs(question.nominal.times - time)))
-        samples |= {j for j in range(at - 5, at + 6) if 0 <= j < n}
-    return np.array(sorted(samples), dtype=np.intp)
+    samples = question.nominal.times
+    even = np.linspace(samples[0], samples[-1], _SEARCH_LAYERS_MOVING if moving else _SEARCH_LAYERS)
+    near = [samples[max(at - 5, 0) : at + 6] for at in np.searchsorted(samples, question.fixed_times).tolist()]
+    apart = np.abs(even[:, None] - np.concatenate(near)).min(axis=1) > 1e-3 * (even[1] - even[0])
+    return np.unique(np.concatenate([even[apart], *near, question.fixed_times]))
 
 
 def _layer(
@@ -306,7 +304,7 @@ def _fits(question: Question, axes: Array, chain: tuple[Array, Array]) -> bool:
     times = question.nominal.times
     wanted = np.stack([np.interp(times, chain[0], column) for column in chain[1].T], axis=1)
     return any(
-        _fit(question, axes, basis, wanted) for basis in (question.basis, _hats(question, 4), _hats(question, 2))
+        _fit(question, axes, basis, wanted) for basis in (question.basis, _hats(question, 4), _hats(question, 1))
     )
 
 
@@ -388,9 +386,9 @@ def _tangent_rows(
 
 
 def _close_points(question: Question, times: Array, tip: Array, relative: Array, here: Array) -> Array:
-    """Return sample and fraction of the closest of nine points on each segment that is too close, shape (r, 2)."""
+    """Return sample and fraction of the closest of 49 points on each segment that is too close, shape (r, 2)."""
     found = []
-    fractions = np.linspace(0.1, 0.9, 9)[:, None, None]
+    fractions = np.linspace(0.02, 0.98, 49)[:, None, None]
     path = tip + here
     for obstacle in question.obstacles:
         for sphere, offset in zip(question.spheres, relative, strict=True):

@@ -46,7 +46,7 @@ _ANGLES = np.arange(12) * (np.pi / 6.0)
 _RING = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # directions tried across the path
 _IDENTITY = np.eye(3)
 _OTHERS = ([1, 2], [0, 2], [0, 1])
-_MAX_CHOICES = 3  # of a side, before all times are searched together
+_MAX_CHOICES = 4  # of a side, before all times are searched together
 _MAX_ROUTES = 3  # through the roadmap
 _ALMOST = 0.003  # [m] an attempt that lacks less clearance than this is tried again with narrower components
 _HOPELESS = 0.012  # [m] a cheapest route that lacks more clearance than this leads to no detour

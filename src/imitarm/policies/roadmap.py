@@ -22,7 +22,7 @@ from imitarm.policies.least_detour import MAX_DISPLACEMENT, MAX_STEP_RATIO, Allo
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_LAYERS = 28  # about so many times, and some more next to fixed ones
+_LAYERS = 20  # about so many times, and some more next to fixed ones
 _NEAR_FIXED = (1, 2, 4, 7)  # samples from a fixed one that are layers too
 _RAYS = {1: 2, 2: 16, 3: 42}  # by the number of dimensions in which components may move
 _NEIGHBOURS = {1: 2, 2: 5, 3: 8}  # rays to which edges lead, the same one included
