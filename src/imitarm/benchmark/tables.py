@@ -75,7 +75,8 @@ class Place:
             raise InputError(f"{self.document}: can't be read as a document ({error})") from error
         head, found, rest = text.partition(f"{self.begin}\n")
         _, ended, tail = rest.partition(f"{END}\n")
-        if not found or not ended or self.begin in rest or f"{END}\n" in head + tail:
+        others = (head + tail).count("<!-- imitarm benchmark ")  # each has an end of its own
+        if not found or not ended or self.begin in rest or (head + tail).count(f"{END}\n") != others:
             raise InputError(
                 f"{self.document}: the tables go between a line {self.begin!r} and a line {END!r} after it; write "
                 "both, once each"
