@@ -66,7 +66,7 @@ def main() -> None:
     rollout = reproduce(
         policy, robot, scene.at, timeout=40.0, safety=SafetyFilter(arm, clearance=CLEARANCE), on_step=watch
     )
-    rollout = task.judge(robot, rollout)  # the task's own verdict: is the dirt in the pan?
+    rollout = task.evaluate(robot, rollout)  # the task's own verdict: is the dirt in the pan?
 
     adaptation = policy.adaptation
     print(f"{'done' if rollout.success else 'FAILED'}: {rollout.reason}")

@@ -7,7 +7,7 @@ import numpy as np
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.tasks import TwistTask
-from imitarm.tasks.stack import CLOSED, LOOKING_DOWN, OPEN, SIDE, History
+from imitarm.tasks.stack import CLOSED, LOOKING_DOWN, OPEN, SIDE, CubeHistory
 
 DT = 0.01
 
@@ -16,7 +16,7 @@ class Script:
     """Drives the robot of a StackTask from place to place, and watches."""
 
     def __init__(self, task, robot):
-        self.task, self.robot, self.history, self.steps = task, robot, History(), 0
+        self.task, self.robot, self.history, self.steps = task, robot, CubeHistory(), 0
 
     def hold(self, seconds):
         for _ in range(round(seconds / DT)):
@@ -59,7 +59,7 @@ class Script:
             self.pick(i)
             self.put(i)
         self.hold(0.3)
-        return self.task.judge(self.robot, self.history)
+        return self.task.evaluate(self.robot, self.history)
 
     def _move(self, velocity):
         self.robot.move(velocity, DT)

@@ -8,7 +8,7 @@ from imitarm.benchmark.experiment import LIVE, Experiment, camera_maker, run_sta
 from imitarm.benchmark.mapping_tables import Results, success_table
 from imitarm.kinematics.arm import ArmModel
 from imitarm.tasks.stack import FAILURES
-from imitarm.tasks.stack_trial import stack_once
+from imitarm.tasks.stack_run import run_stack
 
 
 @pytest.mark.slow
@@ -30,7 +30,7 @@ def test_ten_people_stack_with_a_method_before_a_noisy_camera():
 
 
 def test_a_trial_is_the_same_every_time(monkeypatch):
-    monkeypatch.setattr(experiment, "stack_once", lambda *a, **k: stack_once(*a, **k, timeout=5.0))
+    monkeypatch.setattr(experiment, "run_stack", lambda *a, **k: run_stack(*a, **k, timeout=5.0))
     first, second = (run_stacking("modern", 0, 0, 0.005) for _ in range(2))
     assert first == second
     assert first.time == 5.0 and first.path_length > 0.05 and not first.success

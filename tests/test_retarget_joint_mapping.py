@@ -10,7 +10,7 @@ from imitarm.retarget.baselines.joint_mapping import Approach, JointMapping, con
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import human_arm_pose
 from imitarm.retarget.limbs import LimbLengths
-from imitarm.tasks.operator import Operator
+from imitarm.tasks.stacking_operator import SimulatedOperator
 from shown_arm import EASY, LENGTHS, skeleton
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
@@ -115,7 +115,7 @@ def test_absolute_a_person_who_stacks_cubes_would_put_the_sawyers_elbow_into_the
     """Why the default is relative: a person's elbow hangs, and the table is 0.32 m below the Sawyer's shoulder."""
     arm = ARMS["sawyer"]
     for seed in range(10):
-        operator = Operator(seed)
+        operator = SimulatedOperator(seed)
         lengths = LimbLengths(operator.person.upper_arm, operator.person.forearm)
         correspondence = Correspondence(lengths=lengths, orientation="fixed")
         estimate = ArmEstimator(correspondence, smoothing=False).update(operator.act(0.0))

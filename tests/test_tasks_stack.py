@@ -8,7 +8,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.tasks import TwistTask
 from imitarm.tasks import TASKS, StackTask
-from imitarm.tasks.stack import CLOSED, N_CUBES, OPEN, SIDE, History
+from imitarm.tasks.stack import CLOSED, N_CUBES, OPEN, SIDE, CubeHistory
 from stacking_script import DT, Script
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -127,7 +127,7 @@ def test_success_is_a_tower_that_stands_by_itself(robot):
     task = StackTask(0)
     build(robot, 4, away=0.003)
     rest(robot)
-    verdict = task.judge(robot, History())
+    verdict = task.evaluate(robot, CubeHistory())
     assert (verdict.success, verdict.failure, verdict.stacked) == (True, "", 4)
 
 
@@ -137,29 +137,29 @@ def test_a_cube_in_the_gripper_does_not_stand_by_itself(arm):
     script.pick(1)
     assert script.history.held == 1
     assert task.touched(script.robot) == (False, True, False, False)
-    assert task.judge(script.robot, script.history).failure == "timeout"  # it is lifted and held: only time is up
+    assert task.evaluate(script.robot, script.history).failure == "timeout"  # it is lifted and held: only time is up
     script.grasp(OPEN)
     script.hold(0.5)
-    verdict = task.judge(script.robot, script.history)
+    verdict = task.evaluate(script.robot, script.history)
     assert verdict.failure == "dropped"
     assert "cube 2" in verdict.reason
 
 
 def test_verdict_tower_fell(robot):
-    task, history = StackTask(0), History()
+    task, history = StackTask(0), CubeHistory()
     build(robot, 3)
     task.watch(robot, history)
     assert history.tallest == 3
     lay(robot, 2, [0.55, 0.0, 0.5 * SIDE])
-    assert task.judge(robot, history).failure == "tower fell"
+    assert task.evaluate(robot, history).failure == "tower fell"
 
 
 def test_verdict_misplaced(robot):
-    task, history = StackTask(0), History()
+    task, history = StackTask(0), CubeHistory()
     lay(robot, 1, [0.62, 0.1, 0.1])
     task.watch(robot, history)
     lay(robot, 1, [0.62, 0.05, 0.5 * SIDE])
-    verdict = task.judge(robot, history)
+    verdict = task.evaluate(robot, history)
     assert verdict.failure == "misplaced"
     assert "cube 2" in verdict.reason
 
@@ -170,13 +170,13 @@ def test_verdict_misplaced(robot):
 )
 def test_verdict_knocked_over(robot, position, quaternion):
     lay(robot, 2, position, quaternion)
-    verdict = StackTask(0).judge(robot, History())
+    verdict = StackTask(0).evaluate(robot, CubeHistory())
     assert verdict.failure == "knocked over"
     assert "cube 3" in verdict.reason
 
 
 def test_verdict_not_grasped(robot):
-    verdict = StackTask(0).judge(robot, History())
+    verdict = StackTask(0).evaluate(robot, CubeHistory())
     assert verdict.failure == "not grasped"
     assert "cube 2" in verdict.reason
     assert verdict.stacked == 1
@@ -184,7 +184,7 @@ def test_verdict_not_grasped(robot):
 
 def test_verdict_protective_stop(robot):
     robot.fault = "protective stop: held"
-    assert StackTask(0).judge(robot, History()).failure == "protective stop"
+    assert StackTask(0).evaluate(robot, CubeHistory()).failure == "protective stop"
 
 
 def test_a_closed_gripper_presses_with_limited_force(robot):

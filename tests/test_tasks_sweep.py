@@ -61,10 +61,10 @@ def test_following_the_nominal_path_sweeps_the_dirt_into_the_pan():
     robot = task.robot(arm=ARM)
     assert not task.swept(robot).any()
     path = nominal()
-    rollout = task.judge(robot, reproduce(Follow(path), robot, lambda t: Scene()))
+    rollout = task.evaluate(robot, reproduce(Follow(path), robot, lambda t: Scene()))
     assert rollout.success
     assert rollout.reason == "dirt in the pan"
-    assert rollout.details["swept_share"] == 1.0
+    assert rollout.details["swept_fraction"] == 1.0
     assert rollout.min_clearance == np.inf
     wanted, _ = path.at(rollout.trajectory.times)
     assert np.linalg.norm(rollout.trajectory.positions - wanted, axis=1).max() < 2e-3
@@ -77,7 +77,7 @@ def test_without_avoidance_every_scene_is_a_collision(name):
     scene = task.scene(name)
     robot = task.robot(scene, arm=ARM)
     blind = SafetyFilter(ARM, clearance=None)
-    rollout = task.judge(robot, reproduce(Follow(nominal()), robot, lambda t: scene, safety=blind))
+    rollout = task.evaluate(robot, reproduce(Follow(nominal()), robot, lambda t: scene, safety=blind))
     assert not rollout.success
     assert "touched" in rollout.reason
     assert "crumbs are not in the pan" in rollout.reason
@@ -94,7 +94,7 @@ def test_the_adapted_skill_sweeps_around_what_stands_in_the_way(skill, name, con
     policy = ACFRA(
         skill, tool_radius=task.tool_radius, clearance=task.clearance, forbidden=HORIZONTAL_ONLY, pinned=pinned
     )
-    rollout = task.judge(robot, reproduce(policy, robot, lambda t: scene))
+    rollout = task.evaluate(robot, reproduce(policy, robot, lambda t: scene))
     assert rollout.success, rollout.reason
     assert not robot.contacts
     assert rollout.min_clearance > task.clearance - 0.5e-3
@@ -145,10 +145,10 @@ def test_crumbs_lie_about_the_dirt_apart_and_as_the_seed_says():
 
 
 def test_the_verdict_names_lost_crumbs_and_touches():
-    task = SweepTask(n_crumbs=4, required_share=0.75)
+    task = SweepTask(n_crumbs=4, required_fraction=0.75)
     robot = task.robot(arm=ARM)
     rollout = reproduce(Follow(nominal(0.5)), robot, lambda t: Scene(), timeout=0.1)
-    slow = task.judge(robot, rollout)
+    slow = task.evaluate(robot, rollout)
     assert "not finished" in slow.reason
     assert "4 of 4 crumbs are not in the pan" in slow.reason
     pan = SweepTask.goal.position
@@ -156,10 +156,10 @@ def test_the_verdict_names_lost_crumbs_and_touches():
         robot.data.joint(f"crumb/{i}").qpos[:3] = pan + np.array([0.02 * i, 0.0, 0.002])
     robot.move(np.zeros(7), 0.01)
     finished = replace(rollout, success=True)
-    assert task.judge(robot, finished).success
-    assert task.judge(robot, finished).details["swept_share"] == 0.75
-    assert not replace(task, required_share=1.0).judge(robot, finished).success
-    overlapped = task.judge(robot, replace(finished, clearance=np.full(len(finished.trajectory), -0.001)))
+    assert task.evaluate(robot, finished).success
+    assert task.evaluate(robot, finished).details["swept_fraction"] == 0.75
+    assert not replace(task, required_fraction=1.0).evaluate(robot, finished).success
+    overlapped = task.evaluate(robot, replace(finished, clearance=np.full(len(finished.trajectory), -0.001)))
     assert "clearance -1.0 mm" in overlapped.reason
 
 
@@ -176,7 +176,7 @@ def test_dirt_time_is_when_the_path_meets_the_dirt():
     assert np.linalg.norm(position[0] - SweepTask.dirt.position) < 2e-3
 
 
-@pytest.mark.parametrize("options", [{"n_crumbs": 0}, {"required_share": 0.0}, {"required_share": 1.1}])
+@pytest.mark.parametrize("options", [{"n_crumbs": 0}, {"required_fraction": 0.0}, {"required_fraction": 1.1}])
 def test_a_task_without_dirt_is_refused(options):
-    with pytest.raises(InputError, match="at least one crumb"):
+    with pytest.raises(InputError, match="n_crumbs must be at least 1"):
         SweepTask(**options)

@@ -24,7 +24,7 @@ from imitarm.evaluation.mapping_metrics import measure
 from imitarm.evaluation.motion import violations
 from imitarm.kinematics.arm import ArmModel
 from imitarm.retarget import RETARGETERS, Correspondence, Retargeter
-from imitarm.tasks.stack_trial import DT, stack_once
+from imitarm.tasks.stack_run import DT, run_stack
 
 REPLAYS = (*KINDS, CAPTURED)
 """Tasks in which a method follows a recording."""
@@ -238,7 +238,7 @@ def run_stacking(
         arm: the Sawyer with the gripper, when it is loaded already.
     """
     arm = ArmModel.load("sawyer", tool="gripper") if arm is None else arm
-    done = stack_once(person, repeat, method(method_name), arm=arm, camera=camera_maker(sigma))
+    done = run_stack(person, repeat, method(method_name), arm=arm, camera=camera_maker(sigma))
     return StackingOutcome(
         success=done.success,
         failure=done.failure,

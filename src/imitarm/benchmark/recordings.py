@@ -23,9 +23,8 @@ from imitarm.kinematics.posture import find_posture
 from imitarm.retarget.correspondence import FACING, Correspondence, Orientation
 from imitarm.retarget.fitting import fit_motion
 from imitarm.retarget.limbs import LimbLengths
-from imitarm.tasks.ideal import IdealFollower, ideal_camera
 from imitarm.tasks.stack import StackTask
-from imitarm.tasks.stack_trial import calibrate, stack_once
+from imitarm.tasks.stack_run import IdealFollower, calibrate_limbs, ideal_camera, run_stack
 
 Array = NDArray[np.float64]
 
@@ -189,7 +188,7 @@ def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
         fit = fit_motion(arm, wrist, wrist[0])
         start, scale = fit.q, fit.scale
     else:
-        lengths = calibrate(person, plan.camera(2 * plan.number + 1))
+        lengths = calibrate_limbs(person, plan.camera(2 * plan.number + 1))
         start, scale = _start(plan, arm, points[0]), _scale(plan, person)
     correspondence = Correspondence(lengths=lengths, scale=scale, orientation=task)
     return MappingRecording(plan, tuple(skeletons), correspondence, start, true_times, points)
@@ -245,7 +244,7 @@ def _drawing(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
 def _stacking(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
     """Return a person who stacks with a gripper that moves exactly with the hand: no method shapes the motion."""
     for k in range(_TRIES):
-        done = stack_once(plan.person, plan.repeat + REPEATS * k, IdealFollower, camera=ideal_camera)
+        done = run_stack(plan.person, plan.repeat + REPEATS * k, IdealFollower, camera=ideal_camera)
         if done.success:
             return _between(done.truth), done.truth[-1].time, "fixed"
     raise TaskFailedError(f"person {plan.person} stacked no tower in {_TRIES} trials with the ideal gripper")

@@ -135,7 +135,7 @@ def _sweep(
         clearance=task.clearance,
         tool_radius=task.tool_radius,
         demonstrations=demonstrations,
-        evaluate=task.judge,
+        evaluate=task.evaluate,
         caption=_CAPTIONS.get(name, ""),
         progress=lambda share: progress.update(whole, completed=before + share),
     )

@@ -117,8 +117,8 @@ def run_scene(
 def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
     """Return what else the table shows."""
     details: dict[str, object] = {}
-    if rollout is not None and "swept_share" in rollout.details:
-        details["dirt in the pan"] = f"{100 * rollout.details['swept_share']:.0f} %"
+    if rollout is not None and "swept_fraction" in rollout.details:
+        details["dirt in the pan"] = f"{100 * rollout.details['swept_fraction']:.0f} %"
     if policy.plan is not None:
         details["demonstrated sigmas moved"] = f"{policy.plan.deviation:.1f}"
     return details

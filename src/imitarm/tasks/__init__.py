@@ -1,4 +1,4 @@
-"""Whole scenes with a success test."""
+"""Tasks: complete scenes with a success test."""
 
 from __future__ import annotations
 

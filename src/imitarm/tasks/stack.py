@@ -20,8 +20,13 @@ Array = NDArray[np.float64]
 
 N_CUBES = 4
 SIDE = 0.032  # [m] of a cube
-OPEN, CLOSED = 0.08, 0.0  # [m] what the gripper is asked for; a cube stops the fingers on their way
-LOOKING_DOWN = (0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0)  # wxyz: the tool looks down, its fingers close along the base's x
+OPEN, CLOSED = 0.08, 0.0  # [m] commanded openings of the gripper; a cube stops the closing fingers earlier
+LOOKING_DOWN = (
+    0.0,
+    np.sqrt(0.5),
+    np.sqrt(0.5),
+    0.0,
+)  # wxyz: the tool points down, its fingers close along the base's x axis
 FAILURES = (
     "protective stop",
     "tower fell",
@@ -31,19 +36,19 @@ FAILURES = (
     "not grasped",
     "timeout",
 )
-"""How stacking can go wrong, in the order in which :meth:`StackTask.judge` looks for it."""
+"""The kinds of failure, in the order in which :meth:`StackTask.evaluate` checks them."""
 
 _PLACES = np.array([[0.62, 0.0], [0.62, 0.10], [0.62, -0.10], [0.62, -0.20]])  # [m] of cubes 1 to 4
-_SPREAD, _TURN = 0.004, 0.06  # [m], [rad] largest variation of a cube's place and of its turn about the vertical
+_MAX_OFFSET, _MAX_ROTATION = 0.004, 0.06  # [m], [rad] largest random change of a cube's place and rotation
 _TABLE = ((0.66, 0.0), (0.72, 1.36, 0.04))  # [m] center and size; the top is at height 0
 _MASS = 0.025  # [kg] a wooden cube
 _FRICTION = [0.6, 0.005, 0.0001]
 _STIFF = [0.004, 1.0]  # solref of contacts: two timesteps, critically damped
-_LEVEL = 0.003  # [m] by which a cube's height may differ from where it belongs
-_UPRIGHT = np.cos(np.radians(5.0))  # of the face that looks up
-_STILL = 0.02  # [m/s]
-_LIFTED = 0.015  # [m] above where it lay at first
-_MOVED = 0.03  # [m] a cube that was never lifted and is farther from its place was pushed about
+_LEVEL = 0.003  # [m] largest error of a cube's height in the tower
+_UPRIGHT = np.cos(np.radians(5.0))  # vertical component of the normal of the upper face
+_STILL = 0.02  # [m/s] slower cubes are at rest
+_LIFTED = 0.015  # [m] height above its first one at which a cube counts as lifted
+_MOVED = 0.03  # [m] a cube that was never lifted and is farther than this from its place was pushed
 _WOOD = (0.80, 0.68, 0.52, 1.0)
 _COLORS = ((0.75, 0.18, 0.16, 1.0), (0.16, 0.38, 0.68, 1.0), (0.93, 0.70, 0.18, 1.0), (0.22, 0.52, 0.32, 1.0))
 _PIPS = {
@@ -55,14 +60,14 @@ _PIPS = {
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """How stacking ended.
+class StackEvaluation:
+    """The evaluation of a stacking run.
 
     Attributes:
-        success: all four stand in order, by themselves.
+        success: whether all four cubes stand in order, without support.
         failure: one of :data:`FAILURES`; empty on success.
-        stacked: how many cubes stand in the tower, counted from cube 1.
-        reason: in words.
+        stacked: number of cubes in the tower, counted from cube 1.
+        reason: explanation.
     """
 
     success: bool
@@ -72,13 +77,14 @@ class Verdict:
 
 
 @dataclass
-class History:
-    """What has happened to the cubes so far, for the verdict; filled by :meth:`StackTask.watch`.
+class CubeHistory:
+    """What has happened to the cubes so far; :meth:`StackTask.watch` updates it.
 
     Attributes:
-        highest: how high each cube's middle has been, shape (4,) [m].
-        tallest: how many cubes have stood in the tower at a time, the gripper away from them.
-        lost: cubes that left the gripper in the air.
+        highest: largest height of each cube's center, shape (4,) [m].
+        tallest: largest number of cubes in the tower while the gripper touched none.
+        lost: indices of the cubes that left the gripper in the air.
+        held: index of the cube in the gripper; None if there is none.
     """
 
     highest: Array = field(default_factory=lambda: np.zeros(N_CUBES))
@@ -91,22 +97,21 @@ class History:
 class StackTask:
     """A Sawyer with a parallel gripper at a table with four 32 mm cubes, numbered 1 to 4 by colour and pips.
 
-    Cube 1 stays where it stands; 2, 3 and 4 are put on it, each on the one before. Success is a tower in the
-    order of the numbers, each cube within the tolerance on the one below, standing by itself.
+    Cube 1 stays in its place; cubes 2, 3 and 4 are stacked on it in this order. The task succeeds if the tower stands
+    in the order of the numbers, without support, and each cube is within the tolerance above the one below.
 
-    Contacts are MuJoCo's with elliptic friction cones and ``impratio`` 10, so a cube that is held does not creep
-    out of the fingers; ``condim`` 4 gives the pads a torsional friction.
+    Contacts use MuJoCo's elliptic friction cones with ``impratio`` 10, so that a held cube does not slip out of the
+    fingers; ``condim`` 4 gives the pads torsional friction.
 
     Attributes:
-        seed: of the small variation of the cubes' places and turns.
-        tolerance: how far a cube's middle may be from that of the one below, across [m]; half a side would still
-            stand.
+        seed: seed of the small random changes of the cubes' places and rotations.
+        tolerance: largest horizontal distance between the centers of a cube and the one below [m], below half a side.
     """
 
     seed: int = 0
     tolerance: float = 0.014
 
-    start: ClassVar[Pose] = Pose(np.array([0.62, -0.05, 0.19]), np.array(LOOKING_DOWN))  # of the tool
+    start: ClassVar[Pose] = Pose(np.array([0.62, -0.05, 0.19]), np.array(LOOKING_DOWN))  # pose of the tool
 
     def __post_init__(self) -> None:
         if not 0.0 < self.tolerance < 0.5 * SIDE:
@@ -118,9 +123,11 @@ class StackTask:
         return ArmModel.load("sawyer", tool="gripper")
 
     def places(self) -> tuple[Array, Array]:
-        """Return where the cubes lie at first, (4, 2) [m], and how they are turned about the vertical, (4,) [rad]."""
+        """Return the first places of the cubes, (4, 2) [m], and their rotations about the vertical, (4,) [rad]."""
         rng = np.random.default_rng([3035, self.seed])
-        return _PLACES + rng.uniform(-_SPREAD, _SPREAD, (N_CUBES, 2)), rng.uniform(-_TURN, _TURN, N_CUBES)
+        return _PLACES + rng.uniform(-_MAX_OFFSET, _MAX_OFFSET, (N_CUBES, 2)), rng.uniform(
+            -_MAX_ROTATION, _MAX_ROTATION, N_CUBES
+        )
 
     def world(self, arm: ArmModel) -> mujoco.MjSpec:
         """Return the world: arm, table, cubes."""
@@ -128,16 +135,17 @@ class StackTask:
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = 10.0
         _add_table(spec)
-        for i, (place, turn) in enumerate(zip(*self.places(), strict=True)):
-            _add_cube(spec, i + 1, place, turn)
+        for i, (place, rotation) in enumerate(zip(*self.places(), strict=True)):
+            _add_cube(spec, i + 1, place, rotation)
         return spec
 
     def robot(self, arm: ArmModel | None = None, *, control: Control = "torque") -> SimulatedRobot:
         """Return the simulated robot with its open gripper above the table.
 
         Args:
-            arm: the arm, when it is loaded already.
-            control: of the drives; computed torque, the softer of the two, by default: contacts are to be expected.
+            arm: the arm, if it is loaded already.
+            control: control of the drives; computed torque, the more compliant one, by default, because contacts are
+                expected.
         """
         arm = self.arm() if arm is None else arm
         robot = SimulatedRobot(arm, world=self.world(arm), control=control, q=self.start_posture(arm))
@@ -150,11 +158,11 @@ class StackTask:
 
     @staticmethod
     def cubes(robot: SimulatedRobot) -> Array:
-        """Return where the cubes' middles are, shape (4, 3) [m]."""
+        """Return the centers of the cubes, shape (4, 3) [m]."""
         return np.array([robot.data.body(f"cube/{i + 1}").xpos for i in range(N_CUBES)])
 
     def stacked(self, robot: SimulatedRobot) -> int:
-        """Return how many cubes stand in the tower: 1 when only cube 1 stands on the table, 0 when it does not."""
+        """Return the number of cubes in the tower: 1 if only cube 1 stands on the table, 0 if it does not."""
         cubes = self.cubes(robot)
         level = self._level(robot)
         for i in range(N_CUBES):
@@ -171,15 +179,15 @@ class StackTask:
 
     @staticmethod
     def touched(robot: SimulatedRobot) -> tuple[bool, ...]:
-        """Tell of each cube whether arm or gripper touches it now."""
+        """Return for each cube whether the arm or gripper touches it."""
         body, names = robot.model.geom_bodyid, [f"cube/{i + 1}" for i in range(N_CUBES)]
         cubes = [robot.model.body(name).id for name in names]
         solid = {*cubes, robot.model.body("table").id, 0}
         pairs = [(int(body[a]), int(body[b])) for a, b in robot.data.contact.geom]
         return tuple(any(cube in pair and not set(pair) <= solid for pair in pairs) for cube in cubes)
 
-    def watch(self, robot: SimulatedRobot, history: History) -> None:
-        """Note what happens to the cubes; call it every few hundredths of a second."""
+    def watch(self, robot: SimulatedRobot, history: CubeHistory) -> None:
+        """Update the history of the cubes; call it every few hundredths of a second."""
         cubes, touched = self.cubes(robot), self.touched(robot)
         history.highest = np.maximum(history.highest, cubes[:, 2])
         if not any(touched):
@@ -191,49 +199,48 @@ class StackTask:
         if before is not None and history.held != before and not touched[before] and _free_below(cubes, before):
             history.lost.add(before)
 
-    def judge(self, robot: SimulatedRobot, history: History) -> Verdict:  # noqa: PLR0911 (one for each way to fail)
-        """Return the verdict on how things are now.
+    def evaluate(self, robot: SimulatedRobot, history: CubeHistory) -> StackEvaluation:  # noqa: PLR0911 (one for each kind of failure)
+        """Return success, or the first failure that applies.
 
-        The failures, in this order: the robot stopped to protect itself; a tower that has stood does so no more; a
-        cube left the gripper in the air and is not in the tower; a cube that was lifted stands elsewhere than it
-        should; a cube that never was lifted lies on another side or was pushed about; the next cube was never lifted;
-        none of these, but not ready in time.
+        The failures, in this order: the robot has made a protective stop; the tower was higher before; a cube left the
+        gripper in the air and is not in the tower; a cube was put down outside the tower; a cube that was never lifted
+        has turned over or was pushed; the next cube was never lifted; none of these, but the time is up.
         """
         n = self.stacked(robot)
         if self.standing(robot):
-            return Verdict(True, "", n, "four cubes stand in order")
+            return StackEvaluation(True, "", n, "four cubes stand in order")
         if robot.fault:
-            return Verdict(False, "protective stop", n, robot.fault)
+            return StackEvaluation(False, "protective stop", n, robot.fault)
         if n < history.tallest:
-            return Verdict(False, "tower fell", n, f"{history.tallest} cubes stood, now {n}")
+            return StackEvaluation(False, "tower fell", n, f"{history.tallest} cubes stood, now {n}")
         waiting = range(n, N_CUBES)
         lost = sorted(history.lost.intersection(waiting))
         if lost:
-            return Verdict(False, "dropped", n, f"cube {lost[0] + 1} fell out of the gripper")
+            return StackEvaluation(False, "dropped", n, f"cube {lost[0] + 1} fell out of the gripper")
         touched, lifted = self.touched(robot), history.highest > 0.5 * SIDE + _LIFTED
         cubes, level = self.cubes(robot), self._level(robot)
         for i in waiting:
             if lifted[i] and not touched[i]:
-                return Verdict(False, "misplaced", n, f"cube {i + 1} was put down elsewhere than on cube {i}")
+                return StackEvaluation(False, "misplaced", n, f"cube {i + 1} was not put down on cube {i}")
         for i in waiting:
             away = float(np.hypot(*(cubes[i, :2] - self.places()[0][i])))
             if not lifted[i] and (not level[i] or away > _MOVED or cubes[i, 2] < 0.0):
-                return Verdict(
+                return StackEvaluation(
                     False, "knocked over", n, f"cube {i + 1} was pushed by {1e3 * away:.0f} mm or turned over"
                 )
         if n < N_CUBES and not lifted[max(n, 1)]:
-            return Verdict(False, "not grasped", n, f"cube {max(n, 1) + 1} was never lifted")
-        return Verdict(False, "timeout", n, f"{n} of {N_CUBES} cubes in the tower when time was up")
+            return StackEvaluation(False, "not grasped", n, f"cube {max(n, 1) + 1} was never lifted")
+        return StackEvaluation(False, "timeout", n, f"{n} of {N_CUBES} cubes in the tower when the time was up")
 
     @staticmethod
     def _level(robot: SimulatedRobot) -> NDArray[np.bool_]:
-        """Tell of each cube whether one of its own faces looks up, and it is the one that did at first."""
+        """Return for each cube whether the face that was up at first is up and level."""
         up = np.array([robot.data.body(f"cube/{i + 1}").xmat[8] for i in range(N_CUBES)])
         return np.asarray(up > _UPRIGHT)
 
 
 def _free_below(cubes: Array, i: int) -> bool:
-    """Return whether there is air under a cube: it rests neither on the table nor on another one."""
+    """Return whether a cube is in the air, resting neither on the table nor on another cube."""
     bottom = cubes[i, 2] - 0.5 * SIDE
     near = np.hypot(*(cubes[:, :2] - cubes[i, :2]).T) < SIDE
     below = near & (cubes[:, 2] < cubes[i, 2] - 0.5 * SIDE)
@@ -251,9 +258,11 @@ def _add_table(spec: mujoco.MjSpec) -> None:
         table.add_geom(name=f"table/leg{i}", type=box, size=[0.025, 0.025, 0.355], pos=place, rgba=(0.3, 0.27, 0.25, 1))
 
 
-def _add_cube(spec: mujoco.MjSpec, number: int, place: Array, turn: float) -> None:
+def _add_cube(spec: mujoco.MjSpec, number: int, place: Array, rotation: float) -> None:
     name, half = f"cube/{number}", 0.5 * SIDE
-    body = spec.worldbody.add_body(name=name, pos=[*place, half], quat=[np.cos(0.5 * turn), 0, 0, np.sin(0.5 * turn)])
+    body = spec.worldbody.add_body(
+        name=name, pos=[*place, half], quat=[np.cos(0.5 * rotation), 0, 0, np.sin(0.5 * rotation)]
+    )
     body.add_freejoint(name=name)
     body.add_geom(
         name=name,

@@ -1,4 +1,4 @@
-"""Sweep dirt on a table into a dustpan, around what stands in the way (thesis Figs 4.5 to 4.8)."""
+"""SweepTask: sweep dirt on a table into a dustpan, around obstacles (thesis Figs 4.5 to 4.8)."""
 
 from __future__ import annotations
 
@@ -27,13 +27,18 @@ SCENES = ("free", "two_boxes", "tall_and_low", "boxes_and_cone", "cone_first")
 
 TABLE_CENTER, TABLE_SIZE = (0.66, 0.0), (0.72, 1.36, 0.04)  # [m] its top is at height 0
 HOVER = 0.003  # [m] the bristles' tips above the table
-SWEEPING = (0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0)  # wxyz: the tool looks down, its open side along the base's y
+SWEEPING = (
+    0.0,
+    np.sqrt(0.5),
+    np.sqrt(0.5),
+    0.0,
+)  # wxyz: the tool points down, its open side along the base's y axis
 
 _PAN_INSIDE = (0.25, 0.15)  # [m] across and along the sweep
 _PAN_WALL = (0.004, 0.025)  # [m] thickness and height
-_PAN_BEFORE_GOAL = 0.085  # [m] from the pan's mouth to where the tool ends
+_PAN_BEFORE_GOAL = 0.085  # [m] from the edge of the pan to the goal of the tool
 _CRUMB = 0.004  # [m] half of a crumb's size
-_SPREAD = 0.016  # [m] crumbs lie within this distance from the dirt's middle
+_SPREAD = 0.016  # [m] crumbs lie within this distance from T
 
 _WOOD, _LEG, _PAN, _DIRT = (
     (0.80, 0.68, 0.52, 1.0),
@@ -45,33 +50,33 @@ _WOOD, _LEG, _PAN, _DIRT = (
 
 @dataclass(frozen=True)
 class SweepTask:
-    """A Sawyer with a curved brush, dirt on a table, a dustpan let into it.
+    """A Sawyer with a curved brush, dirt on a table, and a dustpan that is let into the table.
 
-    The brush starts at S, goes to the dirt at T and pushes it to G inside the dustpan. It hovers above the table
-    with its open side ahead, so its two arms keep the crumbs while it gives way to the left or right.
-    Success is dirt in the pan and no contact of the arm or the brush with an obstacle.
+    The brush starts at S, moves to the dirt at T and pushes it to G in the dustpan. It moves just above the table with
+    its open side ahead, so that its two ends hold the crumbs while it deviates to the left or right. The task succeeds
+    if the dirt is in the pan and neither the arm nor the brush has touched an obstacle.
 
     Attributes:
-        seed: of the crumbs' positions.
-        n_crumbs: how many crumbs lie about T.
-        required_share: share of the crumbs that must end in the pan.
+        seed: seed of the positions of the crumbs.
+        n_crumbs: number of crumbs around T.
+        required_fraction: fraction of the crumbs that must end in the pan.
     """
 
     seed: int = 0
     n_crumbs: int = 6
-    required_share: float = 1.0
+    required_fraction: float = 1.0
 
     start: ClassVar[Pose] = Pose(np.array([0.58, -0.48, HOVER]), np.array(SWEEPING))  # S
     dirt: ClassVar[Pose] = Pose(np.array([0.61, -0.08, HOVER]), np.array(SWEEPING))  # T
     goal: ClassVar[Pose] = Pose(np.array([0.65, 0.40, HOVER]), np.array(SWEEPING))  # G
-    tool_radius: ClassVar[float] = 0.058  # [m] the brush's own 55 mm, and 3 mm for its tilt and for lag
-    clearance: ClassVar[float] = 0.02  # [m] that a reproduction should keep
+    tool_radius: ClassVar[float] = 0.058  # [m] 55 mm of the brush, and 3 mm for its tilt and the lag of the arm
+    clearance: ClassVar[float] = 0.02  # [m] required clearance of a reproduction
 
     def __post_init__(self) -> None:
-        if self.n_crumbs < 1 or not 0.0 < self.required_share <= 1.0:
+        if self.n_crumbs < 1 or not 0.0 < self.required_fraction <= 1.0:
             raise InputError(
-                "SweepTask: needs at least one crumb and a required_share in (0, 1], "
-                f"got {self.n_crumbs} and {self.required_share}"
+                "SweepTask: n_crumbs must be at least 1 and required_fraction in (0, 1], "
+                f"got {self.n_crumbs} and {self.required_fraction}"
             )
 
     @staticmethod
@@ -96,12 +101,12 @@ class SweepTask:
         return {name: cls.scene(name) for name in SCENES}
 
     def dirt_time(self, trajectory: Trajectory) -> float:
-        """Return when ``trajectory`` is nearest to the dirt [s]: an instant at which a path should not give way."""
+        """Return when ``trajectory`` is nearest to the dirt [s]: a time at which a path should not be displaced."""
         away = np.linalg.norm(trajectory.positions - self.dirt.position, axis=1)
         return float(trajectory.times[np.argmin(away)])
 
     def crumb_positions(self) -> Array:
-        """Return where the crumbs lie at first, shape (n_crumbs, 2) [m]: apart from each other, within 16 mm of T."""
+        """Return the first positions of the crumbs, shape (n_crumbs, 2) [m]: without contact, within 16 mm of T."""
         rng = np.random.default_rng(self.seed)
         places: list[Array] = []
         apart = min(2.9 * _CRUMB, 1.2 * _SPREAD / np.sqrt(self.n_crumbs))
@@ -116,9 +121,9 @@ class SweepTask:
         spec = arm_world(arm)
         _add_table(spec)
         _add_dustpan(spec, self.goal.position)
-        turns = np.random.default_rng([self.seed, 1]).uniform(0.0, np.pi, self.n_crumbs)
-        for i, (place, turn) in enumerate(zip(self.crumb_positions(), turns, strict=True)):
-            _add_crumb(spec, f"crumb/{i}", place, turn)
+        rotations = np.random.default_rng([self.seed, 1]).uniform(0.0, np.pi, self.n_crumbs)
+        for i, (place, rotation) in enumerate(zip(self.crumb_positions(), rotations, strict=True)):
+            _add_crumb(spec, f"crumb/{i}", place, rotation)
         return spec
 
     def robot(
@@ -128,8 +133,8 @@ class SweepTask:
 
         Args:
             scene: obstacles on the table; None for none.
-            arm: the arm, when it is loaded already.
-            control: of the drives.
+            arm: the arm, if it is loaded already.
+            control: control of the drives.
         """
         arm = self.arm() if arm is None else arm
         return SimulatedRobot(arm, scene=scene, world=self.world(arm), control=control, q=self.start_posture(arm))
@@ -139,25 +144,25 @@ class SweepTask:
         return find_posture(arm, self.start)
 
     def swept(self, robot: SimulatedRobot) -> NDArray[np.bool_]:
-        """Tell which crumbs lie in the pan now, shape (n_crumbs,)."""
+        """Return which crumbs are in the pan now, shape (n_crumbs,)."""
         crumbs = np.array([robot.data.body(f"crumb/{i}").xpos for i in range(self.n_crumbs)])
         across, along = _PAN_INSIDE
         x, y, z = (crumbs - [self.goal.position[0], self.goal.position[1] - _PAN_BEFORE_GOAL, 0.0]).T
         return np.asarray((np.abs(x) < 0.5 * across) & (y > 0.0) & (y < along) & (z > 0.0) & (z < 2.0 * _PAN_WALL[1]))
 
-    def judge(self, robot: SimulatedRobot, rollout: Rollout) -> Rollout:
-        """Return ``rollout`` with the task's verdict: success is dirt in the pan, no contact, finished in time.
+    def evaluate(self, robot: SimulatedRobot, rollout: Rollout) -> Rollout:
+        """Return ``rollout`` with success or the reasons for failure: dirt outside the pan, contact, or not finished.
 
-        ``details`` gets ``"swept_share"`` (of the crumbs) and ``"swept"`` (for each crumb).
+        ``details`` receives ``"swept_fraction"`` (fraction of the crumbs in the pan) and ``"swept"`` (for each crumb).
         """
         swept = self.swept(robot)
-        share = float(swept.mean())
+        fraction = float(swept.mean())
         faults = [] if rollout.success else [rollout.reason]
-        if share < self.required_share:
+        if fraction < self.required_fraction:
             faults.append(f"{int((~swept).sum())} of {self.n_crumbs} crumbs are not in the pan")
         if robot.contact_steps == 0 and rollout.min_clearance <= 0.0:
-            faults.append(f"an obstacle was reached: clearance {1e3 * rollout.min_clearance:.1f} mm")
-        details = {**rollout.details, "swept_share": share, "swept": swept}
+            faults.append(f"an obstacle was touched: clearance {1e3 * rollout.min_clearance:.1f} mm")
+        details = {**rollout.details, "swept_fraction": fraction, "swept": swept}
         return replace(rollout, success=not faults, reason="; ".join(faults) or "dirt in the pan", details=details)
 
 
@@ -175,7 +180,7 @@ def _add_dustpan(spec: mujoco.MjSpec, goal: Array) -> None:
     box = mujoco.mjtGeom.mjGEOM_BOX
     (across, along), (thick, high) = _PAN_INSIDE, _PAN_WALL
     pan = spec.worldbody.add_body(name="dustpan", pos=[goal[0], goal[1] - _PAN_BEFORE_GOAL + 0.5 * along, 0.0])
-    pan.add_geom(  # its floor is flush with the table, so it is only seen
+    pan.add_geom(  # its floor is level with the table, so it is only visual
         name="dustpan/floor", type=box, size=[0.5 * across, 0.5 * along, 0.0005], rgba=_PAN, contype=0, conaffinity=0
     )
     side = [0.5 * thick, 0.5 * along + thick, 0.5 * high]
@@ -194,9 +199,9 @@ def _add_dustpan(spec: mujoco.MjSpec, goal: Array) -> None:
     )
 
 
-def _add_crumb(spec: mujoco.MjSpec, name: str, place: Array, turn: float) -> None:
+def _add_crumb(spec: mujoco.MjSpec, name: str, place: Array, rotation: float) -> None:
     body = spec.worldbody.add_body(
-        name=name, pos=[*place, _CRUMB], quat=[np.cos(0.5 * turn), 0.0, 0.0, np.sin(0.5 * turn)]
+        name=name, pos=[*place, _CRUMB], quat=[np.cos(0.5 * rotation), 0.0, 0.0, np.sin(0.5 * rotation)]
     )
     body.add_freejoint(name=name)
     size = [_CRUMB, _CRUMB, _CRUMB]

@@ -1,6 +1,6 @@
-"""A made-up teacher, seeded, who guides the compliant simulated arm by hand through the sweep.
+"""Teacher: a simulated person who guides the compliant simulated arm through the sweep by hand.
 
-``python -m imitarm.tasks.teacher --out DIR`` writes the packaged demonstrations anew.
+``python -m imitarm.tasks.teacher --out DIR`` writes the packaged demonstrations again.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from imitarm.trajectory import Demonstration, Trajectory
 
 Array = NDArray[np.float64]
 
-SEEDS = tuple(range(8))  # of the packaged demonstrations
+SEEDS = tuple(range(8))  # seeds of the packaged demonstrations
 RECORDED_EVERY = 0.03  # [s]
-_HAND_EVERY = 0.006  # [s] how often the hand changes its pull
-_DIGITS = 5  # decimals that are recorded: 0.01 mm and 0.01 mrad, finer than any encoder sees
+_HAND_EVERY = 0.006  # [s] between two updates of the hand's force
+_DIGITS = 5  # recorded decimals: 0.01 mm and 0.01 mrad, finer than the resolution of an encoder
 
-# How firmly the hand holds the tool: along x, y, z, then about them. It minds the height most.
+# Spring and damper of the hand that holds the tool: along x, y, z, then about them. The height is stiffest.
 _STIFFNESS = np.array([1200.0, 1200.0, 4000.0, 150.0, 150.0, 150.0])  # [N/m], [N m/rad]
 _DAMPING = np.array([90.0, 90.0, 150.0, 5.0, 5.0, 5.0])  # [N s/m], [N m s/rad]
 _TREMOR_BAND = (4.0, 9.0)  # [Hz] physiological tremor of a hand
@@ -35,16 +35,16 @@ _TREMOR_BAND = (4.0, 9.0)  # [Hz] physiological tremor of a hand
 
 @dataclass(frozen=True, eq=False)
 class Teacher:
-    """One person's way to sweep: where the hand goes, how fast, how steadily.
+    """How one person sweeps: the path of the hand, its speed and its tremor.
 
-    The hand follows the minimum-jerk path through S, two points the person favours, T and G: the quintic spline
-    that starts and ends at rest (Flash and Hogan 1985). It is habits that make people differ: the time taken and its
-    share before the dirt, how far the path bows to a side on the way, how exactly the dirt and the pan are met, how
-    high the brush is carried, how the wrist turns, a tremor, a rest before and after.
+    The hand follows the minimum-jerk path through S, T, G and two points between them: the quintic spline that starts
+    and ends at rest (Flash and Hogan 1985). People differ in the duration and its fraction before T, the sideways
+    displacement of the path, the accuracy at T and G, the height of the brush, the rotation of the wrist, the tremor,
+    and the rest before and after.
 
     Attributes:
-        seed: of all habits.
-        duration: of the motion [s].
+        seed: seed of all these differences.
+        duration: duration of the motion [s].
         rest: time at rest before and after the motion, shape (2,) [s].
     """
 
@@ -57,18 +57,18 @@ class Teacher:
 
     @classmethod
     def from_seed(cls, seed: int) -> Teacher:
-        """Make up the person number ``seed``."""
+        """Draw the person number ``seed``."""
         rng = np.random.default_rng([20240, seed])
         start, dirt, goal = (pose.position for pose in (SweepTask.start, SweepTask.dirt, SweepTask.goal))
         duration = rng.uniform(9.0, 12.0)
-        share = rng.uniform(0.44, 0.50)
-        bow = rng.normal(0.0, [0.012, 0.009])  # [m] sideways, halfway to the dirt and halfway to the pan
-        halfway = [0.5 * (start + dirt) + [bow[0], 0.0, 0.0], 0.5 * (dirt + goal) + [bow[1], 0.0, 0.0]]
+        fraction = rng.uniform(0.44, 0.50)
+        aside = rng.normal(0.0, [0.012, 0.009])  # [m] halfway to the dirt and halfway to the pan
+        halfway = [0.5 * (start + dirt) + [aside[0], 0.0, 0.0], 0.5 * (dirt + goal) + [aside[1], 0.0, 0.0]]
         points = np.array([start, halfway[0], dirt, halfway[1], goal])
         points += rng.normal(0.0, 1.0, (5, 3)) * np.array([0.002, 0.004, 0.0])
         points[:, 2] += rng.normal(0.0, 0.0006, 5)
-        moments = duration * np.array([0.0, 0.53 * share, share, share + 0.47 * (1.0 - share), 1.0])
-        turns = rng.normal(0.0, 0.015, (5, 3))  # [rad]
+        times = duration * np.array([0.0, 0.53 * fraction, fraction, fraction + 0.47 * (1.0 - fraction), 1.0])
+        rotations = rng.normal(0.0, 0.015, (5, 3))  # [rad]
         n = 6
         waves = np.stack(
             [
@@ -81,13 +81,13 @@ class Teacher:
             seed,
             duration,
             rng.uniform(0.3, 0.7, 2),
-            _minimum_jerk(moments, points),
-            _minimum_jerk(moments, turns),
+            _minimum_jerk(times, points),
+            _minimum_jerk(times, rotations),
             waves,
         )
 
     def hand(self, time: float) -> tuple[Pose, Array]:
-        """Return where the hand wants the tool, and the twist (6,) it moves with, at ``time`` [s]."""
+        """Return the hand's target pose of the tool and its twist, shape (6,), at ``time`` [s]."""
         t = float(np.clip(time - self.rest[0], 0.0, self.duration))
         amplitude, frequency, phase = self._tremor
         position = self._path(t) + (amplitude * np.sin(frequency * time + phase)).sum(axis=0)
@@ -95,17 +95,17 @@ class Teacher:
         return Pose(position, quaternion), np.concatenate([self._path(t, 1), self._wrist(t, 1)])
 
     def demonstrate(self, arm: ArmModel | None = None) -> tuple[Demonstration, SimulatedRobot]:
-        """Guide the arm through the sweep, and return what was recorded and the robot with its crumbs.
+        """Guide the arm through the sweep; return the demonstration and the robot with its crumbs.
 
-        The hand pulls with a spring and a damper, ``f = K (x_hand - x) + D (v_hand - v)``, likewise in rotation; the
-        arm carries its own weight and follows. Recorded are the joint angles every 30 ms, and the poses
-        of the tool that belong to them.
+        The hand acts as a spring and a damper, ``f = K (x_hand - x) + D (v_hand - v)``, likewise in rotation; the arm
+        compensates its own weight and follows. The demonstration holds the joint positions every 30 ms, and the
+        corresponding poses of the tool.
 
         Args:
-            arm: the Sawyer with the brush, when it is loaded already.
+            arm: the Sawyer with the brush, if it is loaded already.
 
         Raises:
-            TaskFailedError: when the dirt did not end in the pan.
+            TaskFailedError: when the dirt is not in the pan at the end.
         """
         task = SweepTask(seed=self.seed)
         robot = task.robot(arm=arm)
@@ -114,7 +114,7 @@ class Teacher:
         for k in range(n):
             joints[k] = robot.state().q
             for i in range(round(RECORDED_EVERY / _HAND_EVERY)):
-                robot.guide(self._pull(robot, k * RECORDED_EVERY + i * _HAND_EVERY), _HAND_EVERY)
+                robot.guide(self._wrench(robot, k * RECORDED_EVERY + i * _HAND_EVERY), _HAND_EVERY)
         if not task.swept(robot).all():
             raise TaskFailedError(
                 f"teacher {self.seed} lost {int((~task.swept(robot)).sum())} crumbs; choose another seed"
@@ -127,25 +127,25 @@ class Teacher:
             trajectory, np.round(joints, _DIGITS), task="sweep", source=source, joint_names=names
         ), robot
 
-    def _pull(self, robot: SimulatedRobot, time: float) -> Array:
-        """Return the wrench (6,) of the hand on the tool."""
-        target, wanted = self.hand(time)
+    def _wrench(self, robot: SimulatedRobot, time: float) -> Array:
+        """Return the wrench of the hand on the tool, shape (6,) [N, N m]."""
+        target, twist = self.hand(time)
         state = robot.state()
         error = robot.tool_to_base.error_to(target)
-        rate = wanted - robot.arm.tool_jacobian(state.q) @ state.velocity
+        rate = twist - robot.arm.tool_jacobian(state.q) @ state.velocity
         return np.asarray(_STIFFNESS * error + _DAMPING * rate)
 
 
 def _minimum_jerk(times: Array, points: Array) -> BSpline:
-    """Return the smoothest quintic through ``points`` (n, d) at ``times`` (n,), at rest at both ends."""
+    """Return the minimum-jerk quintic spline through ``points`` (n, d) at ``times`` (n,), at rest at both ends."""
     still = [(1, np.zeros(points.shape[1])), (2, np.zeros(points.shape[1]))]
     return make_interp_spline(times, points, k=5, bc_type=(still, still))
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Write one demonstration for each of the packaged seeds into a folder."""
+    """Write one demonstration for each packaged seed into a folder."""
     parser = argparse.ArgumentParser(prog="python -m imitarm.tasks.teacher", description=main.__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="folder for the files; made when it is missing")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the files; created if missing")
     folder = parser.parse_args(arguments).out
     folder.mkdir(parents=True, exist_ok=True)
     arm = SweepTask.arm()

@@ -7,8 +7,8 @@ import pytest
 
 from imitarm.capture.skeleton import JOINT, HandState
 from imitarm.retarget.correspondence import FACING
-from imitarm.tasks.operator import Habits, Operator, Sight
 from imitarm.tasks.stack import SIDE, StackTask
+from imitarm.tasks.stacking_operator import Habits, OperatorView, Phase, SimulatedOperator
 
 CUBES = np.column_stack([StackTask(0).places()[0], np.full(4, 0.5 * SIDE)])
 START = StackTask.start.position
@@ -26,7 +26,7 @@ class Toy:
 
     def step(self, k):
         time = k / RATE
-        self.operator.see(Sight(time, self.tool.copy(), self.opening, self.cubes.copy()))
+        self.operator.see(OperatorView(time, self.tool.copy(), self.opening, self.cubes.copy()))
         truth = self.operator.act(time)
         self.truths.append(truth)
         hand = FACING.rotation @ truth.joint("wrist_right")
@@ -69,7 +69,7 @@ def wrists(truths):
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_people_stack_with_a_gripper_that_obeys(seed):
-    toy = Toy(Operator(seed))
+    toy = Toy(SimulatedOperator(seed))
     seconds = toy.run(90.0)
     assert toy.operator.finished
     assert seconds < 80.0
@@ -80,7 +80,7 @@ def test_people_stack_with_a_gripper_that_obeys(seed):
 
 def test_the_same_seeds_give_the_same_person_and_others_give_others():
     def motion(seed, repeat):
-        toy = Toy(Operator(seed, repeat))
+        toy = Toy(SimulatedOperator(seed, repeat))
         toy.run(6.0)
         return wrists(toy.truths)
 
@@ -93,7 +93,7 @@ def test_the_same_seeds_give_the_same_person_and_others_give_others():
 def test_an_answer_depends_only_on_what_was_seen_a_reaction_time_ago():
     """Two worlds that part at 4 s: until a reaction time later nobody can tell them apart by the hand."""
     parted = 4.0
-    calm, windy = Toy(Operator(5)), Toy(Operator(5))
+    calm, windy = Toy(SimulatedOperator(5)), Toy(SimulatedOperator(5))
     windy.wind = lambda time: np.array([0.0, 0.004, 0.0]) if time >= parted else np.zeros(3)
     calm.run(7.0)
     windy.run(7.0)
@@ -106,23 +106,23 @@ def test_an_answer_depends_only_on_what_was_seen_a_reaction_time_ago():
 
 
 def test_the_hand_is_still_at_first_so_that_a_robot_can_take_hold():
-    operator = Operator(6)
+    operator = SimulatedOperator(6)
     toy = Toy(operator)
     toy.run(operator.habits.begin)
     assert np.linalg.norm(wrists(toy.truths) - wrists(toy.truths)[0], axis=1).max() < 0.005  # tremor alone
-    assert operator.phase == "begin"
+    assert operator.plan.phase is Phase.CHOOSE
 
 
 def test_nobody_moves_a_robot_that_shows_it_does_not_follow():
-    operator = Operator(7)
+    operator = SimulatedOperator(7)
     for k in range(600):
-        operator.see(Sight(k / RATE, START, 0.08, CUBES, lamp=False))
+        operator.see(OperatorView(k / RATE, START, 0.08, CUBES, following=False))
         operator.act(k / RATE)
-    np.testing.assert_array_equal(operator.hand(6.0), np.zeros(3))
+    np.testing.assert_array_equal(operator.hand_displacement(6.0), np.zeros(3))
 
 
 def test_the_hand_moves_smoothly_and_within_reach():
-    toy = Toy(Operator(2))
+    toy = Toy(SimulatedOperator(2))
     toy.run(40.0)
     way = np.array([t.joint("wrist_right") - t.joint("shoulder_right") for t in toy.truths])
     assert np.linalg.norm(way, axis=1).max() < 0.97 * toy.operator.person.reach  # no one needs to take hold anew
@@ -131,12 +131,12 @@ def test_the_hand_moves_smoothly_and_within_reach():
 
 
 def test_a_missed_cube_is_fetched_again():
-    operator = Operator(1)
+    operator = SimulatedOperator(1)
     toy = Toy(operator)
     missed = []
 
     def wind(time):  # the first cube slips out of the closing fingers
-        if operator.phase == "close" and not missed:
+        if operator.plan.phase is Phase.CLOSE and not missed:
             missed.append(time)
             toy.cubes[1] += [0.0, 0.03, 0.0]
         return np.zeros(3)
@@ -149,7 +149,7 @@ def test_a_missed_cube_is_fetched_again():
 
 
 def test_who_cannot_reach_a_cube_gives_up():
-    operator = Operator(1)
+    operator = SimulatedOperator(1)
     toy = Toy(operator)
     toy.cubes[1] = [0.6, 0.1, -0.7]
     assert toy.run(10.0) < 5.0
@@ -158,7 +158,7 @@ def test_who_cannot_reach_a_cube_gives_up():
 
 def test_the_gripper_is_looked_at_and_not_the_hand():
     """A gripper that goes only half of the way is brought to the cube nevertheless."""
-    operator = Operator(4)
+    operator = SimulatedOperator(4)
     toy = Toy(operator)
     push = -0.03 / RATE
     toy.wind = lambda time: np.array([0.0, push, 0.0]) if 1.0 < time < 6.0 else np.zeros(3)
@@ -168,8 +168,8 @@ def test_the_gripper_is_looked_at_and_not_the_hand():
 
 
 def test_an_operator_is_not_told_which_method_is_driven():
-    assert set(inspect.signature(Operator.__init__).parameters) == {"self", "seed", "repeat", "scale"}
-    assert set(Sight.__dataclass_fields__) == {"time", "tool", "opening", "cubes", "lamp"}
+    assert set(inspect.signature(SimulatedOperator.__init__).parameters) == {"self", "seed", "repeat", "scale"}
+    assert set(OperatorView.__dataclass_fields__) == {"time", "tool", "opening", "cubes", "following"}
 
 
 def test_habits_are_those_of_people():
@@ -180,7 +180,7 @@ def test_habits_are_those_of_people():
 
 
 def test_fist_and_open_hand_are_shown():
-    toy = Toy(Operator(0))
+    toy = Toy(SimulatedOperator(0))
     toy.run(20.0)
     states = {truth.hand_states[1] for truth in toy.truths}
     assert states == {HandState.OPEN, HandState.CLOSED}

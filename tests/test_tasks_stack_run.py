@@ -9,10 +9,9 @@ from imitarm.capture.camera_model import SkeletonCamera
 from imitarm.capture.person import Person
 from imitarm.errors import InputError
 from imitarm.retarget.modern import ModernRetargeter
-from imitarm.tasks.ideal import IdealFollower, ideal_camera
-from imitarm.tasks.operator import Operator
 from imitarm.tasks.stack import StackTask
-from imitarm.tasks.stack_trial import DT, calibrate, stack_correspondence, stack_once
+from imitarm.tasks.stack_run import DT, IdealFollower, calibrate_limbs, ideal_camera, run_stack, stack_correspondence
+from imitarm.tasks.stacking_operator import SimulatedOperator
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +21,12 @@ def arm():
 
 @pytest.fixture(scope="module")
 def short(arm):
-    return stack_once(1, 0, ModernRetargeter, arm=arm, timeout=4.0)
+    return run_stack(1, 0, ModernRetargeter, arm=arm, timeout=4.0)
 
 
 @pytest.mark.slow
 def test_a_person_stacks_with_an_ideal_follower(arm):
-    result = stack_once(0, 0, IdealFollower, arm=arm, camera=ideal_camera, latency=0.0)
+    result = run_stack(0, 0, IdealFollower, arm=arm, camera=ideal_camera, latency=0.0)
     assert result.success, result.reason
     assert result.method == "ideal"
     assert result.stacked == 4
@@ -37,10 +36,10 @@ def test_a_person_stacks_with_an_ideal_follower(arm):
 
 
 def test_a_trial_is_repeated_exactly_by_its_seeds(arm, short):
-    again = stack_once(1, 0, ModernRetargeter, arm=arm, timeout=4.0)
+    again = run_stack(1, 0, ModernRetargeter, arm=arm, timeout=4.0)
     np.testing.assert_array_equal(again.joints, short.joints)
     np.testing.assert_array_equal(again.torques, short.torques)
-    other = stack_once(1, 1, ModernRetargeter, arm=arm, timeout=4.0)
+    other = run_stack(1, 1, ModernRetargeter, arm=arm, timeout=4.0)
     assert np.abs(other.tool[: len(short.tool)] - short.tool[: len(other.tool)]).max() > 1e-3
 
 
@@ -78,10 +77,10 @@ def test_the_camera_sees_the_truth_with_its_noise(short):
 
 def test_an_arm_is_measured_before_a_trial():
     person = Person.from_seed(2)
-    exact = calibrate(person, SkeletonCamera.ideal())
+    exact = calibrate_limbs(person, SkeletonCamera.ideal())
     assert exact.upper_arm == pytest.approx(person.upper_arm, abs=1e-6)
     assert exact.forearm == pytest.approx(person.forearm, abs=1e-6)
-    measured = calibrate(person, SkeletonCamera.from_seed(3))
+    measured = calibrate_limbs(person, SkeletonCamera.from_seed(3))
     assert measured.upper_arm == pytest.approx(person.upper_arm, abs=0.03)
     assert stack_correspondence(person, measured).lengths is measured
     assert stack_correspondence(person).lengths.upper_arm == person.upper_arm
@@ -89,8 +88,8 @@ def test_an_arm_is_measured_before_a_trial():
 
 def test_the_ideal_follower_is_where_the_hand_is(arm):
     """The tool's way is the hand's, up to the follower's lag."""
-    result = stack_once(1, 0, IdealFollower, arm=arm, camera=ideal_camera, latency=0.0, timeout=5.0)
-    person = Operator(1).person
+    result = run_stack(1, 0, IdealFollower, arm=arm, camera=ideal_camera, latency=0.0, timeout=5.0)
+    person = SimulatedOperator(1).person
     rotation = stack_correspondence(person).sensor_to_base.rotation
     hand = np.array([rotation @ truth.joint("wrist_right") for truth in result.truth])
     times = np.array([truth.time for truth in result.truth])
@@ -102,5 +101,5 @@ def test_the_ideal_follower_is_where_the_hand_is(arm):
 
 @pytest.mark.parametrize("options", [{"timeout": 0.0}, {"timeout": np.inf}, {"latency": -0.1}])
 def test_unusable_options_are_named(arm, options):
-    with pytest.raises(InputError, match="timeout to 3600 s and latency to"):
-        stack_once(0, 0, IdealFollower, arm=arm, **options)
+    with pytest.raises(InputError, match="timeout must be above 0 and at most 3600 s, latency from"):
+        run_stack(0, 0, IdealFollower, arm=arm, **options)
