@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imitarm import ArmModel, InputError
-from imitarm.retarget.jerk_limit import JerkLimiter
+from imitarm.retarget.modern import JerkLimiter
 
 DT = 0.01
 

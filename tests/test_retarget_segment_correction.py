@@ -7,9 +7,9 @@ from imitarm import ArmModel
 from imitarm.kinematics.sew import sew_angle
 from imitarm.retarget.arm_estimator import ArmEstimator
 from imitarm.retarget.baselines.demonstrated_motion import DemonstratedMotion
+from imitarm.retarget.baselines.demonstration_modification import elbow_rotated, pull, pulled_in, repaired, slowed
 from imitarm.retarget.baselines.feasibility import FeasibilityCheck, blend, segments
 from imitarm.retarget.baselines.joint_mapping import JointMapping
-from imitarm.retarget.baselines.segment_correction import elbow_rotated, pull, pulled_in, repaired, slowed
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import human_arm_pose
 from shown_arm import EASY, LENGTHS, shown, swing

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_log, quaternion_multiply
+from imitarm.retarget.calibration import fit_sensor_to_base
 from imitarm.retarget.correspondence import FACING
-from imitarm.retarget.sensor import fit_sensor_to_base
 
 BASE = np.array(
     [[0.5, -0.3, 0.2], [0.7, 0.0, 0.4], [0.5, 0.3, 0.2], [0.4, 0.1, 0.6], [0.6, -0.2, 0.5], [0.8, 0.2, 0.1]]

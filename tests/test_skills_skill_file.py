@@ -154,7 +154,7 @@ def test_no_such_file_and_no_such_folder(skill: Skill, tmp_path: Path) -> None:
         Skill.load(tmp_path / "missing.json")
     with pytest.raises(InputError, match="can't read"):
         Skill.load(tmp_path)
-    with pytest.raises(InputError, match="can't write"):
+    with pytest.raises(InputError, match="can't be written"):
         skill.save(tmp_path / "missing" / "s.json")
 
 

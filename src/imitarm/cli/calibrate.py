@@ -18,10 +18,17 @@ from imitarm.cli.robot_options import add_robot_options, load_robot
 from imitarm.cli.screen import remark, say, show_table
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.files.table import read_table
-from imitarm.retarget.calibration import ANCHORS, Anchor, Calibration, suggested_scale
+from imitarm.retarget.calibration import (
+    ANCHORS,
+    LEAST_PAIRS,
+    Anchor,
+    Calibration,
+    SensorFit,
+    fit_sensor_to_base,
+    suggested_scale,
+)
 from imitarm.retarget.correspondence import Orientation
 from imitarm.retarget.limbs import ACCEPTED, LimbLengths, measure_limbs
-from imitarm.retarget.sensor import LEAST_PAIRS, SensorFit, fit_sensor_to_base
 
 Word = TypeVar("Word", bound=str)
 

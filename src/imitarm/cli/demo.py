@@ -14,6 +14,7 @@ from imitarm.cli.run_scene import learning_summary, provenance, run_scene, show_
 from imitarm.cli.screen import progress_bar, say
 from imitarm.demonstrations import compute_alignment, lint
 from imitarm.errors import InputError
+from imitarm.files.document import write_text
 from imitarm.policies import ACFRA, ADAPTERS, HORIZONTAL_ONLY
 from imitarm.skills import Skill
 from imitarm.tasks.sweep import DEMONSTRATIONS, SCENES, SweepTask
@@ -144,11 +145,7 @@ def _sweep(
 
 
 def _write_json(data: object, path: Path) -> None:
-    """Write aside and rename; nothing is left behind when that fails."""
-    aside = path.with_suffix(".json.part")
     try:
-        aside.write_text(json.dumps(data, indent=2, allow_nan=False), encoding="utf-8")
-        aside.replace(path)
-    except OSError as error:
-        aside.unlink(missing_ok=True)
-        raise InputError(f"{path}: can't be written ({error.strerror}); choose another folder with --out") from error
+        write_text(path, json.dumps(data, indent=2, allow_nan=False))
+    except InputError as error:
+        raise InputError(f"{error}; choose another folder with --out") from error

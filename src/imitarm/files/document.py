@@ -7,8 +7,6 @@ import tempfile
 from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
-
 from imitarm.errors import FileFormatError, InputError
 
 Document = TypeVar("Document")
@@ -40,7 +38,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
         if aside is not None:
             aside.unlink(missing_ok=True)
-        raise InputError(f"can't write {target}: {getattr(error, 'strerror', None) or error}") from error
+        raise InputError(f"{target}: can't be written: {getattr(error, 'strerror', None) or error}") from error
 
 
 def _umask() -> int:
@@ -61,6 +59,8 @@ def as_document(content: Any, kind: type[Document], path: str | os.PathLike[str]
     Raises:
         FileFormatError: when a field is missing or of another type; the message names the field.
     """
+    import msgspec  # noqa: PLC0415  slow to import, and only documents with a schema need it
+
     try:
         return msgspec.convert(content, kind)
     except msgspec.ValidationError as error:

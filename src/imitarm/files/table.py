@@ -7,7 +7,6 @@ pairs or the column names.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import FileFormatError, InputError
+from imitarm.files.document import write_text
 
 Array = NDArray[np.float64]
 
@@ -228,11 +228,4 @@ def write_table(
     """
     head = [f"# {key}: {' '.join(str(value).split())}" for key, value in remarks.items()]
     body = [",".join(map(repr, row)) for row in np.asarray(values, dtype=float).tolist()]
-    target = Path(path)
-    aside = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        aside.write_text("\n".join([*head, ",".join(names), *body, ""]), encoding="utf-8", newline="\n")
-        aside.replace(target)
-    except OSError as error:
-        aside.unlink(missing_ok=True)
-        raise InputError(f"{path}: can't be written: {error.strerror or error}") from error
+    write_text(path, "\n".join([*head, ",".join(names), *body, ""]))

@@ -20,6 +20,7 @@ import yaml
 
 import imitarm.scene  # for its registry, which is complete only once all shapes are imported
 from imitarm.errors import FileFormatError, InputError
+from imitarm.files.document import write_text
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
 from imitarm.scene.obstacle import Obstacle
 from imitarm.scene.scene import Scene
@@ -89,13 +90,7 @@ def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     if scene.fixtures:
         content["fixtures"] = [_obstacle_entry(fixture) for fixture in scene.fixtures]
     text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        aside.write_text(text, encoding="utf-8")
-        aside.replace(path)
-    except OSError as error:
-        aside.unlink(missing_ok=True)
-        raise InputError(f"scene file {path} can't be written: {error.strerror}") from error
+    write_text(path, text)
 
 
 # plain decimal numbers; 0500, 1:30, 0x1F and 1_000 (in YAML 1.1: 320, 90, 31 and 1000) stay text, and are refused
