@@ -50,7 +50,7 @@ def test_a_correspondence_holds_all_that_was_measured():
         ({"format": "other"}, "not a calibration"),
         ({"version": 2}, "has version 2, this imitarm reads version 1; update imitarm"),
         ({"version": True}, "has version True"),
-        ({"side": "both"}, "unknown side 'both' \\(str\\); known: left, right"),
+        ({"side": "both"}, "unknown side 'both'; known: left, right"),
         ({"side": 3}, "'side' should be text"),
         ({"scale": "1"}, "'scale' should hold numbers"),
         ({"scale": 99.0}, "scale must be a finite number"),
