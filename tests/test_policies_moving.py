@@ -9,8 +9,10 @@ import pytest
 
 from imitarm.benchmark.avoidance import learn
 from imitarm.benchmark.families import random_obstacle, sparse_clutter
+from imitarm.errors import InputError
+from imitarm.kinematics.pose import Pose
 from imitarm.policies import HORIZONTAL_ONLY, adapt
-from imitarm.scene import Scene, Sphere
+from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, HalfSpace, Scene, Sphere
 
 RADIUS, CLEARANCE = 0.03, 0.02
 
@@ -101,3 +103,39 @@ def test_an_obstacle_that_leaves_in_time_bends_nothing(learned):
     adaptation = adapt(skill, Scene(None, [gone]), tool_radius=RADIUS)
     assert adaptation.feasible and not adaptation.moved.any()
     assert adapt(skill, Scene(None, [replace(gone, velocity=0)]), tool_radius=RADIUS).nominal is not None
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder", "capsule", "hull"])
+def test_an_obstacle_that_rotates_is_avoided_however_it_stands(kind):
+    skill, path = learn(planar=False)
+    rng = np.random.default_rng(5)
+    centre = path[200] + [0.0, 0.0, 0.01]
+    pose, spin = Pose(centre, [1, 0, 0, 0]), [0.4, 0.0, 1.5]
+    obstacle = {
+        "box": Box(pose, [0.16, 0.02, 0.02], angular_velocity=spin),
+        "cylinder": Cylinder(pose, 0.01, 0.16, angular_velocity=spin),
+        "capsule": Capsule(centre - [0.08, 0, 0], centre + [0.08, 0, 0], 0.01, angular_velocity=spin),
+        "hull": ConvexHull(centre + rng.normal(size=(9, 3)) * [0.05, 0.01, 0.01], angular_velocity=spin),
+    }[kind]
+    adaptation = adapt(skill, Scene(None, [obstacle]), tool_radius=0.01, clearance=0.005)
+    assert adaptation.feasible and adaptation.moved.any()
+    assert "may rotate in any way" in adaptation.validity
+    times = np.linspace(0.0, skill.duration_, 800)
+    points, _ = adaptation.trajectory.at(times)
+    measured = min(float(obstacle.after(t).signed_distance(p)) for t, p in zip(times, points, strict=True)) - 0.01
+    assert measured >= 0.005 - 1e-9
+    assert adaptation.certified_clearance <= measured + 1e-9
+
+
+def test_a_floor_is_an_obstacle_like_others():
+    skill, path = learn(planar=False)
+    low = float(path[:, 2].min())
+    spheres = [Sphere(path[150], 0.04), Sphere(path[250], 0.04)]
+    above = adapt(skill, Scene(None, [HalfSpace([0, 0, low - 0.03]), *spheres]), tool_radius=0.02, clearance=0.005)
+    assert above.feasible and above.trajectory.positions[:, 2].min() >= low - 0.03 + 0.025 - 1e-9
+    bump = HalfSpace([0.0, path[100, 1] - 0.004, 0.0], [0.0, -1.0, 0.0])  # a wall that the path would touch
+    beside = adapt(skill, Scene(None, [bump]), tool_radius=0.0, clearance=0.001)
+    assert beside.feasible and beside.moved.any()
+    assert (bump.signed_distance(beside.trajectory.positions) >= 0.001).all()
+    with pytest.raises(InputError, match="rotates"):
+        adapt(skill, Scene(None, [HalfSpace([0, 0, -1.0], angular_velocity=[1, 0, 0])]), tool_radius=0.0)

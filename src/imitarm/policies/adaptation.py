@@ -314,6 +314,9 @@ def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
 def _validity(scene: Scene, duration: float) -> str:
     moving = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.velocity.any()]
     covers = "the tool on the planned path; not the links of the arm, not tracking errors"
+    rotating = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.angular_velocity.any()]
+    if rotating:
+        covers += f"; {' and '.join(rotating)} may rotate in any way about the centre"
     if not moving:
         return f"while the obstacles stand still, for {covers}"
     return (

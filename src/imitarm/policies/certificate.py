@@ -17,13 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.errors import InputError
 from imitarm.kinematics.pose import rotate
 from imitarm.scene.obstacle import Obstacle
+from imitarm.scene.shapes import HalfSpace, Sphere
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+_NEWTON_STEPS = 12
 _MAX_PROBES = 12  # points measured on a segment whose bound is too low; the bracket is then far below a micrometre
 
 
@@ -63,7 +66,7 @@ class ToolAmongObstacles:
     plus a known offset at each sample.
 
     Attributes:
-        obstacles: convex obstacles.
+        obstacles: convex obstacles; spheres in place of those that rotate.
         radii: of the spheres, shape (n_spheres,) [m].
         offsets: for each obstacle, from the tip to the centres of the spheres at each sample, less the motion of the
             obstacle until then, in the base frame, shape (n_spheres, n, 3) [m]; None when all of them are zero.
@@ -85,7 +88,11 @@ class ToolAmongObstacles:
         Args:
             nominal: times and rotations of the tool, n samples.
             spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
-            obstacles: where they are at time 0; one with a velocity moves from there.
+            obstacles: where they are at time 0; one with a velocity moves from there. One that rotates is replaced by
+                a sphere about its centre that contains it.
+
+        Raises:
+            InputError: when a half-space rotates.
         """
         q, n = nominal.quaternions, len(nominal)
         bows = np.zeros((len(spheres), n - 1))
@@ -96,7 +103,8 @@ class ToolAmongObstacles:
             # Exact for a rotation at constant rate: the sagitta of the arc about the tip.
             bows = np.linalg.norm(spheres[:, :3], axis=1)[:, None] * (1.0 - np.cos(half_angle))
         offsets: list[Array | None] = []
-        for obstacle in obstacles:
+        solids = tuple(obstacle if not obstacle.angular_velocity.any() else _around(obstacle) for obstacle in obstacles)
+        for obstacle in solids:
             if not obstacle.velocity.any():
                 offsets.append(centres)
                 continue
@@ -104,7 +112,7 @@ class ToolAmongObstacles:
             moved = np.zeros((len(spheres), n, 3)) if centres is None else centres
             offsets.append(moved - travelled)
         reach = float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]))
-        return cls(tuple(obstacles), np.ascontiguousarray(spheres[:, 3]), tuple(offsets), bows, reach)
+        return cls(solids, np.ascontiguousarray(spheres[:, 3]), tuple(offsets), bows, reach)
 
     @property
     def n_spheres(self) -> int:
@@ -136,6 +144,42 @@ class ToolAmongObstacles:
         obstacle, sphere = divmod(pair, self.n_spheres)
         distance, normal = self.obstacles[obstacle].distance_and_gradient(centres)
         return distance - self.radii[sphere], normal
+
+    def exits(self, pair: int, points: Array, directions: Array, target: float, tolerance: float) -> Array:
+        """Return how far points have to go along directions until they are clear of the obstacle for good.
+
+        Newton's method from outside: the signed distance along a ray is convex, so the lift decreases to the largest
+        root without passing it.
+
+        Args:
+            pair: index of the pair.
+            points: centres of its sphere, shape (p, 3) [m].
+            directions: unit rows, shape (m, 3).
+            target: distance to reach [m].
+            tolerance: the most by which the distance may be larger than that [m].
+
+        Returns:
+            Lifts, shape (m, p) [m]; inf where the obstacle has no end.
+        """
+        obstacle, sphere = divmod(pair, self.n_spheres)
+        solid = self.obstacles[obstacle]
+        if isinstance(solid, HalfSpace):
+            missing = np.maximum(target + self.radii[sphere] - solid.signed_distance(points), 0.0)
+            slope = directions @ solid.normal
+            lift = missing / np.where(slope > 1e-9, slope, np.nan)[:, None]
+            return np.where(missing == 0.0, 0.0, np.where(np.isnan(lift), np.inf, lift))
+        # Beyond the obstacle's farthest plane along a direction every point is clear: begin there.
+        farthest = np.einsum("md,md->m", solid.support(directions), directions) + target + self.radii[sphere]
+        lift = np.maximum(farthest[:, None] - directions @ points.T, 0.0)
+        for _ in range(_NEWTON_STEPS):
+            d, n = self.distance_and_normal(pair, points + lift[..., None] * directions[:, None, :])
+            gap = d - target
+            slope = (n @ directions[:, :, None])[..., 0]
+            falling = slope <= 1e-9  # past the point of closest approach: the ray never enters
+            lift = np.where(falling, 0.0, np.maximum(lift - gap / np.where(falling, 1.0, slope), 0.0))
+            if np.all((gap < tolerance) | (lift <= 0.0)):
+                break
+        return lift
 
     def distances(self, positions: Array, samples: Index | slice = slice(None)) -> Array:
         """Return the distance of every pair.
@@ -276,6 +320,17 @@ class PathClearance:
             d, normal[of] = self.tool.distance_and_normal(i, start + s * step)
             distance[of] = d - self.tool.bows[i % self.tool.n_spheres, j]
         return distance, normal
+
+
+def _around(obstacle: Obstacle) -> Sphere:
+    """Return a sphere about an obstacle's centre that contains it however it rotates."""
+    if isinstance(obstacle, HalfSpace):
+        raise InputError(
+            f"adapt: half-space {obstacle.name!r} rotates; a path among rotating half-spaces can't be certified"
+        )
+    centre = obstacle.solid().position
+    corners = np.abs(obstacle.bounds() - centre).max(axis=0)
+    return Sphere(centre, float(np.linalg.norm(corners)), velocity=obstacle.velocity, name=obstacle.name)
 
 
 def crossing_of_tangents(f0: Array, a: Array, f1: Array, b: Array, length: Array | float) -> tuple[Array, Array]:

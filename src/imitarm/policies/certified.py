@@ -57,7 +57,6 @@ _STYLE_COST = 1e-3
 _REPAIRABLE = 0.003  # [m] a violation that the least detour can remove itself
 _SAME = 1e-5  # [m] choices that differ by less are one and the same up to rounding
 _ROUNDING = 1e-6  # [m] a sample that lacks less is not too near: quadratic programs keep their rows no better
-_NEWTON_STEPS = 12
 _LIFT_TOLERANCE = 1e-3  # [m] lifts are this much too long at most
 _THINNED = 3  # sides are rated on every third sample
 
@@ -243,34 +242,12 @@ class _SideSearch:
         return self.allowed.unit_directions(candidates)
 
     def _exits(self, pair: int, positions: Array, rows: Index, directions: Array) -> Array:
-        """Return how far each sample has to go along each direction to be clear of the obstacle for good.
+        """Return how far samples (p,) have to go along directions (m, 3) to be clear for good, shape (m, p) [m].
 
-        Newton's method from outside: the signed distance along a ray is convex, so it comes down to the largest root
-        without passing it. A lift above ``MAX_LIFT`` becomes inf.
-
-        Args:
-            pair: sphere and obstacle.
-            positions: of the tip, shape (n, 3).
-            rows: which samples, shape (p,).
-            directions: unit, shape (m, 3).
-
-        Returns:
-            Lifts, shape (m, p) [m].
+        A lift above ``MAX_LIFT`` becomes inf.
         """
         points = self.tool.centres(pair, positions[rows], rows)
-        obstacle, sphere = divmod(pair, self.tool.n_spheres)
-        # Beyond the obstacle's farthest plane along a direction every point is clear: begin there.
-        support = self.tool.obstacles[obstacle].support(directions)
-        farthest = np.einsum("md,md->m", support, directions) + self.target + self.tool.radii[sphere]
-        lift = np.maximum(farthest[:, None] - directions @ points.T, 0.0)
-        for _ in range(_NEWTON_STEPS):
-            d, n = self.tool.distance_and_normal(pair, points + lift[..., None] * directions[:, None, :])
-            gap = d - self.target
-            slope = (n @ directions[:, :, None])[..., 0]
-            falling = slope <= 1e-9  # past the point of closest approach: the ray never enters
-            lift = np.where(falling, 0.0, np.maximum(lift - gap / np.where(falling, 1.0, slope), 0.0))
-            if np.all((gap < _LIFT_TOLERANCE) | (lift <= 0.0)):
-                break
+        lift = self.tool.exits(pair, points, directions, self.target, _LIFT_TOLERANCE)
         return np.where(lift > MAX_LIFT, np.inf, lift)
 
     def _affected(self, rows: Index, worst: int, here: PathClearance) -> Index:

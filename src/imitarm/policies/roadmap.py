@@ -33,7 +33,6 @@ _RADII = (0.005, 0.015, 0.03, 0.05, 0.08, 0.12, 0.16, 0.22, 0.28, 0.36, 0.45)  #
 _APART = (0.0, 0.02, 0.06, 0.12)  # [m] least distance of a node from the one before on its ray
 _VIOLATION_COST = 1e5  # [1/m] price of clearance that the tangents of an edge do not prove
 _CHANGE_SCALE = 0.02  # [m] a displacement that changes by this much between layers costs as much as one sigma
-_NEWTON_STEPS = 8
 _DIFFERENT = 0.04  # [m] two routes differ when they are this far apart where the first one failed
 _BLOCKED = 1e9
 
@@ -96,7 +95,7 @@ class Roadmap:
         shape = (len(centre), len(rays))
         candidates = [np.full(shape, radius) for radius in _RADII]
         for obstacle in range(len(self.tool.obstacles)):
-            exits = self._exits(obstacle, centre, rays) + _JUST_OUTSIDE
+            exits = np.minimum(self._exits(obstacle, centre, rays), 2.0 * MAX_DISPLACEMENT) + _JUST_OUTSIDE
             candidates += [exits + more for more in _FARTHER]
         radius = np.sort(np.stack(candidates, axis=-1), axis=-1)
         points = centre[:, None, None, :] + radius[..., None] * rays[None, :, None, :]
@@ -115,24 +114,14 @@ class Roadmap:
     def _exits(self, obstacle: int, centre: Array, rays: Array) -> Array:
         """Return where rays (m, 3) leave the inflated obstacle for good, for all spheres, shape (n_layers, m) [m]."""
         solid, k = self.tool.obstacles[obstacle], self.tool.n_spheres
-        support = np.einsum("md,md->m", solid.support(rays), rays)
         answer = np.zeros((len(centre), len(rays)))
         for sphere in range(k):
-            pair = obstacle * k + sphere
-            points = self.tool.centres(pair, centre, self.layers)
-            lift = np.maximum(support + self.tool.radii[sphere] + self.clearance - points @ rays.T, 0.0)
-            near = np.flatnonzero(
-                solid.signed_distance(points) < self.clearance + self.tool.radii[sphere] + MAX_DISPLACEMENT
-            )
-            lift[np.setdiff1d(np.arange(len(points)), near)] = 0.0
-            for _ in range(_NEWTON_STEPS if len(near) else 0):
-                d, n = self.tool.distance_and_normal(pair, points[near, None] + lift[near, :, None] * rays)
-                gap, slope = d - self.clearance, np.einsum("lmd,md->lm", n, rays)
-                falling = slope <= 1e-9
-                lift[near] = np.where(falling, 0.0, np.maximum(lift[near] - gap / np.where(falling, 1.0, slope), 0.0))
-                if np.all((gap < 1e-4) | (lift[near] <= 0.0)):
-                    break
-            answer = np.maximum(answer, lift)
+            points = self.tool.centres(obstacle * k + sphere, centre, self.layers)
+            reach = self.clearance + self.tool.radii[sphere] + MAX_DISPLACEMENT
+            near = np.flatnonzero(solid.signed_distance(points) < reach)
+            if len(near):
+                lift = self.tool.exits(obstacle * k + sphere, points[near], rays, self.clearance, 1e-4)
+                answer[near] = np.maximum(answer[near], lift.T)
         return answer
 
     def _edges_between_layers(self) -> tuple[Array, Array]:
