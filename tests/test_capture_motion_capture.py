@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imitarm.capture.motion_capture import MotionCapture, is_motion_capture
+from imitarm.capture.formats import MotionCapture, is_motion_capture
 from imitarm.capture.recording import read_recording
 from imitarm.capture.skeleton import JOINT, JOINTS, Tracking
 from imitarm.capture.sources import open_source

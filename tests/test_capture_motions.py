@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from imitarm.capture.motion_capture import MotionCapture
+from imitarm.capture.formats import MotionCapture
 from imitarm.capture.motions import minimum_jerk, reaching
 from imitarm.capture.person import Person
 from imitarm.errors import FileFormatError, InputError, UnknownNameError

@@ -10,8 +10,8 @@ from imitarm.capture.person import Person
 from imitarm.capture.synthetic import SyntheticSource
 from imitarm.errors import InputError
 from imitarm.retarget import Correspondence, LimbLengths
+from imitarm.retarget.baselines.demonstrated_motion import above
 from imitarm.retarget.baselines.demonstration_modification import DemonstrationModification
-from imitarm.retarget.baselines.feasibility import above
 from shown_arm import EASY, LENGTHS, shown, swing
 
 SAWYER = ArmModel.load("sawyer", tool="gripper")

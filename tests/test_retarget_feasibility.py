@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from imitarm import ArmModel
 from imitarm.errors import InputError
-from imitarm.retarget.baselines.feasibility import FeasibilityCheck, above, blend, segments, upright
+from imitarm.retarget.baselines.demonstrated_motion import FeasibilityCheck, above, blend, segments, upright
 
 SAWYER = ArmModel.load("sawyer", tool="gripper")
 F = FeasibilityCheck(SAWYER, 0.01)

@@ -4,7 +4,7 @@ import pytest
 
 from imitarm import ArmModel, InputError, Scene, Sphere
 from imitarm.capture.camera_model import SkeletonCamera
-from imitarm.capture.motion_capture import MotionCapture
+from imitarm.capture.formats import MotionCapture
 from imitarm.capture.motions import reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import Skeleton

@@ -6,9 +6,8 @@ from hypothesis import strategies as st
 from imitarm import ArmModel
 from imitarm.kinematics.sew import sew_angle
 from imitarm.retarget.arm_estimator import ArmEstimator
-from imitarm.retarget.baselines.demonstrated_motion import DemonstratedMotion
+from imitarm.retarget.baselines.demonstrated_motion import DemonstratedMotion, FeasibilityCheck, blend, segments
 from imitarm.retarget.baselines.demonstration_modification import elbow_rotated, pull, pulled_in, repaired, slowed
-from imitarm.retarget.baselines.feasibility import FeasibilityCheck, blend, segments
 from imitarm.retarget.baselines.joint_mapping import JointMapping
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.human_arm import human_arm_pose

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.capture.camera_model import SkeletonCamera
-from imitarm.capture.motion_capture import MotionCapture
+from imitarm.capture.formats import MotionCapture
 from imitarm.capture.motions import DRAWINGS, REST, Truth, drawing, reaching
 from imitarm.capture.person import Person
 from imitarm.capture.skeleton import HandState, Skeleton

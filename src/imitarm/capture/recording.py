@@ -14,14 +14,15 @@ import numpy as np
 from imitarm.capture.formats import (
     TICK,
     UNFINISHED,
+    is_motion_capture,
     is_native,
     native_header,
     native_line,
     read_kinect_table,
+    read_motion_capture,
     read_native,
 )
 from imitarm.capture.issue import RecordingIssue
-from imitarm.capture.motion_capture import is_motion_capture, read_motion_capture
 from imitarm.capture.skeleton import Skeleton, SkeletonSource, Tracking
 from imitarm.errors import InputError
 from imitarm.files.part_file import PART, PartFile

@@ -1,21 +1,31 @@
-"""DemonstratedMotion: the person's arm during one engagement, and the robot's joints for it, evenly sampled."""
+"""DemonstratedMotion: a person's arm and the robot's joints during one engagement, and where the arm can't follow."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from imitarm.capture.skeleton import Skeleton
-from imitarm.kinematics.pose import Pose, slerp
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.pose import Pose, quaternion_to_matrix, slerp
 from imitarm.retarget.arm_estimator import ArmEstimate, ArmEstimator
 from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.engagement import Engagement, EngagementRule
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SINGULAR = 0.03  # smallest singular value of the tool's Jacobian, in m and rad, of a feasible posture
+STRETCHED = 0.79 / 0.80  # largest distance of the wrist from the shoulder, as a fraction of the reach
+ELBOW = 3  # index of the elbow joint; at zero the arm is straight
+DILATION = 0.2  # [s] by which an infeasible segment is extended on both sides
+_WITHIN = 1e-6  # [rad] tolerance of a position limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,3 +125,137 @@ def engagements(
             collected.append(estimate)
     if len(collected) > 1:
         yield tuple(collected)
+
+
+class Constraint(Protocol):
+    """A condition on the tool, as annotated by a teacher."""
+
+    def __call__(self, positions: Array, rotations: Array, /) -> Mask:
+        """Return where it holds, shape (n,), for positions (n, 3) [m] and rotations (n, 3, 3) in the base frame."""
+        ...
+
+
+def above(height: float) -> Constraint:
+    """Return the constraint that the tool is higher than ``height`` [m], for example above a table."""
+
+    def holds(positions: Array, _: Array) -> Mask:
+        return np.asarray(positions[:, 2] > height)
+
+    return holds
+
+
+def upright(angle: float) -> Constraint:
+    """Return the constraint that the tool points straight down to within ``angle`` [rad]."""
+
+    def holds(_: Array, rotations: Array) -> Mask:
+        return np.asarray(-rotations[:, 2, 2] > np.cos(angle))
+
+    return holds
+
+
+class FeasibilityCheck:
+    """Finds the infeasible samples of a joint motion (baseline M1).
+
+    A sample is infeasible where a joint exceeds a limit of position or velocity, where the arm is singular
+    (:math:`s_{min} < 0.03`) or stretched (:func:`stretch` above 79/80), or where a constraint does not hold.
+
+    Args:
+        arm: the robot's arm with its tool.
+        dt: sampling period [s].
+        constraints: additional ones, by name.
+
+    Raises:
+        InputError: when a constraint has the name of a built-in condition.
+    """
+
+    def __init__(self, arm: ArmModel, dt: float, constraints: Mapping[str, Constraint] | None = None) -> None:
+        self.arm, self.dt = arm, dt
+        if constraints is not None and not isinstance(constraints, Mapping):
+            raise InputError(f"FeasibilityCheck: constraints must be conditions by name, got {constraints!r}")
+        self.constraints = dict(constraints or {})
+        taken = sorted({"limits", "speed", "singular", "stretched"} & set(self.constraints))
+        if taken:
+            raise InputError(
+                f"FeasibilityCheck: a constraint can't be named {taken[0]!r}, because that one is built in; rename it"
+            )
+
+    def reasons(self, joints: Array) -> dict[str, Mask]:
+        """Return for each condition where it is violated, shape (n,), for joints (n, n_joints) [rad]."""
+        return {"speed": self.too_fast(joints), **self.postures(joints)}
+
+    def anywhere(self, joints: Array) -> Mask:
+        """Return where any condition is violated, shape (n,), for joints (n, n_joints) [rad]."""
+        return np.asarray(np.any(list(self.reasons(joints).values()), axis=0))
+
+    def too_fast(self, joints: Array) -> Mask:
+        """Return the samples on both sides of a step that is too fast for a joint, shape (n,)."""
+        found = np.zeros(len(joints), dtype=bool)
+        over = (self.speeds(joints) > 1.0 + 1e-9).any(axis=1)
+        found[1:] |= over
+        found[:-1] |= over
+        return found
+
+    def speeds(self, joints: Array) -> Array:
+        """Return speeds relative to the velocity limits, shape (n - 1, n_joints)."""
+        return np.asarray(np.abs(np.diff(joints, axis=0)) / (self.dt * self.arm.max_velocity))
+
+    def postures(self, joints: Array) -> dict[str, Mask]:
+        """Return, for each condition on single postures, where it is violated, shape (n,)."""
+        jacobians = np.array([self.arm.tool_jacobian(q) for q in joints]).reshape(-1, 6, self.arm.n_joints)
+        found: dict[str, Mask] = {
+            "limits": self.outside(joints),
+            "singular": np.linalg.svd(jacobians, compute_uv=False)[:, -1] < SINGULAR,
+            "stretched": stretch(joints) > STRETCHED,
+        }
+        if self.constraints:
+            positions, quaternions = self.arm.tool_path(joints)
+            rotations = np.array([quaternion_to_matrix(q) for q in quaternions]).reshape(-1, 3, 3)
+            found |= {name: ~holds(positions, rotations) for name, holds in self.constraints.items()}
+        return found
+
+    def clear(self, joints: Array) -> bool:
+        """Return whether the motion is feasible everywhere; cheap conditions are checked first."""
+        return not (self.too_fast(joints).any() or self.outside(joints).any() or self._in_postures(joints))
+
+    def allows(self, q: Array) -> bool:
+        """Return whether a posture (n_joints,) [rad] is feasible."""
+        return not (self.outside(q[None])[0] or self._in_postures(q[None]))
+
+    def _in_postures(self, joints: Array) -> bool:
+        return any(found.any() for found in self.postures(joints).values())
+
+    def outside(self, joints: Array) -> Mask:
+        """Return where a joint is outside its range, shape (n,)."""
+        beyond = (joints < self.arm.lower - _WITHIN) | (joints > self.arm.upper + _WITHIN)
+        return np.asarray(beyond.any(axis=1))
+
+
+def stretch(joints: Array) -> Array:
+    r"""Return how far the arm is stretched: distance shoulder to wrist over reach, (n,), for joints (n, n_joints).
+
+    This is measured on the person's chain, to which the joints belong: upper arm and forearm along the joint axes and
+    equally long (Sawyer's are 0.412 and 0.411 m), so it is :math:`|\cos(q_3/2)|`. The robot's own distance from
+    shoulder to wrist is largest with a bent elbow, because of the offsets between its links.
+    """
+    return np.asarray(np.abs(np.cos(0.5 * joints[:, ELBOW])))
+
+
+def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
+    """Return the runs of True, extended by 0.2 s on both sides and merged where they touch, as (first, past the last).
+
+    Args:
+        found: shape (n,).
+        dt: sampling period [s].
+    """
+    wide = round(DILATION / dt)
+    dilated = np.convolve(found, np.ones(2 * wide + 1))[wide : wide + len(found)] > 0.5
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], dilated, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def blend(found: Mask, first: int, past: int, dt: float) -> Array:
+    """Return the weight of a change in a segment: 1 where needed, decaying to 0 within 0.2 s, shape (past - first,)."""
+    at = np.arange(first, past)
+    needed = at[found[first:past]]
+    away = np.abs(at[:, None] - needed).min(axis=1) * dt
+    return np.asarray(0.5 * (1.0 + np.cos(np.pi * np.minimum(away / DILATION, 1.0))))

@@ -18,8 +18,15 @@ from scipy.interpolate import CubicSpline
 from imitarm.capture.skeleton import Skeleton
 from imitarm.kinematics.arm import ArmModel
 from imitarm.retarget.baselines.baseline_retargeter import BaselineRetargeter
-from imitarm.retarget.baselines.demonstrated_motion import DemonstratedMotion, engagements
-from imitarm.retarget.baselines.feasibility import ELBOW, Constraint, FeasibilityCheck, blend, segments
+from imitarm.retarget.baselines.demonstrated_motion import (
+    ELBOW,
+    Constraint,
+    DemonstratedMotion,
+    FeasibilityCheck,
+    blend,
+    engagements,
+    segments,
+)
 from imitarm.retarget.baselines.joint_mapping import Approach, JointMapping
 from imitarm.retarget.correspondence import Clutch, Correspondence
 from imitarm.retarget.engagement import EngagementState
@@ -72,7 +79,7 @@ class DemonstrationModification(BaselineRetargeter):
 
     1. the person's joint angles, in closed form, become the robot's
        (:class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`);
-    2. :class:`~imitarm.retarget.baselines.feasibility.FeasibilityCheck` finds the infeasible segments;
+    2. :class:`~imitarm.retarget.baselines.demonstrated_motion.FeasibilityCheck` finds the infeasible segments;
     3. each of them, extended by 0.2 s on both sides, is changed by the first correction that makes it feasible: slower,
        wrist closer, elbow rotated; otherwise its key frames are repaired
        (:class:`SegmentCorrector`);
