@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.robots import SimulatedRobot
-from imitarm.robots.supervisor import REACH_TIME, Supervisor, fingerprint
+from imitarm.robots.server import REACH_TIME, Supervisor, fingerprint
 from imitarm.transmission.datagram import Encoder, decode
 from imitarm.transmission.messages import CommandMode, JointState, RobotStatus
 from test_transmission_datagram import signed

@@ -6,7 +6,7 @@ import numpy as np
 
 from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.robots import Robot, RobotServer, UdpRobot
-from imitarm.robots.supervisor import fingerprint
+from imitarm.robots.server import fingerprint
 from imitarm.transmission.datagram import Encoder
 from imitarm.transmission.messages import CommandMode, JointCommand, JointState, RobotStatus, SkeletonFrame
 

@@ -1,27 +1,265 @@
-"""RobotServer: serves a robot to clients over UDP."""
+"""RobotServer: serves a robot to clients over UDP; its Supervisor checks every datagram and stops the robot in time."""
 
 from __future__ import annotations
 
+import secrets
+import zlib
+from collections import Counter
 from collections.abc import Callable
 from socket import socket
 from typing import Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
 from imitarm.robots.robot import Robot
-from imitarm.robots.supervisor import Supervisor
-from imitarm.transmission.datagram import now_ns
+from imitarm.transmission.datagram import Encoder, Header, decode, now_ns
+from imitarm.transmission.datagram_filter import DatagramFilter
+from imitarm.transmission.messages import (
+    MAX_JOINTS,
+    CommandMode,
+    DatagramError,
+    JointCommand,
+    JointState,
+    RobotStatus,
+)
 from imitarm.transmission.rate import RateLimiter
 from imitarm.transmission.sockets import LOOPBACK, Address, listening, try_to_send, wait_for, waiting
 
+Array = NDArray[np.float64]
+
+SLOW_AFTER, LATCH_AFTER = 0.1, 0.5  # [s] without a valid command: brake; latch the stop
+REACH_TIME = 0.15  # [s] a command may be as far from the set-point as a joint moves in this time at full speed
+_EXTRAPOLATE = 0.03  # [s] a command is extrapolated at its velocity; after this the velocity fades until SLOW_AFTER
+_GAIN = 20.0  # [1/s] of the position error
+_TOLERANCE = 1e-6  # [rad], and relative
 _AT_ONCE = 64  # datagrams read in one period, so that a flood does not delay the robot
 _MAX_ANSWERS = 8  # addresses answered in one period
 _MAX_STEP = 0.02  # [s] longest step after missed periods
 
 
+def fingerprint(arm: ArmModel) -> int:
+    """Return a number that identifies an arm: a checksum of its joint names and all their limits."""
+    limits = np.concatenate([arm.lower, arm.upper, arm.max_velocity, arm.max_acceleration])
+    return zlib.crc32("\0".join(arm.joint_names).encode() + limits.astype("<f8").tobytes())
+
+
+class Supervisor:
+    r"""Lets one remote client move a robot while it sends valid commands, and checks every one of them.
+
+    ========== ============================================== ======================================================
+    status     what the robot does                            what ends it
+    ========== ============================================== ======================================================
+    stopped    has braked and holds; ignores commands         ENABLE with the challenge of this stop
+    following  moves to the newest commanded positions        no valid command for 0.1 s: slowing; STOP: stopped
+    slowing    brakes and holds                               a valid command: following; none for 0.5 s: stopped
+    fault      has made a protective stop                     a restart of the process
+    ========== ============================================== ======================================================
+
+    It starts stopped. Every stop draws a new challenge, so a recorded ENABLE has no effect, and after a restart of the
+    client its user must enable the robot again. The client that enables the robot is its owner until the next stop.
+    Any client may stop it.
+
+    A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this
+    arm, is within the joints' position and velocity limits, and is at most as far from the set-point as the joints
+    move in 0.15 s at full speed.
+
+    The set-point q moves towards the commanded position :math:`q_c`, which has the velocity :math:`\dot q_c`, at
+
+    .. math:: \dot q = f\,\dot q_c + \mathrm{sign}(e) \min(k |e|, \sqrt{a |e|}), \qquad
+              e = q_c + \dot q_c\, s - q
+
+    with the gain k, the maximum acceleration a, the time s for which the command is extrapolated, and the fraction f
+    of its velocity: 1 for the first 30 ms, then decreasing to 0 at 100 ms. :meth:`Robot.move
+    <imitarm.robots.robot.Robot.move>` limits this velocity again. No sequence of datagrams can therefore move the
+    set-point beyond the limits of position, velocity and acceleration.
+
+    Time is an argument, and no method waits: :class:`~imitarm.robots.server.RobotServer` adds sockets and real time.
+
+    Args:
+        robot: robot to move.
+        dt: time between two calls of :meth:`step` [s].
+        on_event: called with a text when the status changes.
+
+    Attributes:
+        robot: the robot.
+        status: see the table.
+        reason: why the robot is stopped or faulty.
+        challenge: number that ENABLE must carry now; 0 if the robot is not stopped.
+        datagram_filter: checks the owner's commands.
+        dropped: number of commands without effect by reason, besides those that the filter dropped.
+    """
+
+    def __init__(self, robot: Robot, dt: float, *, on_event: Callable[[str], None] | None = None) -> None:
+        if robot.arm.n_joints > MAX_JOINTS:
+            raise DatagramError("range", f"{robot.arm.n_joints} joints are more than {MAX_JOINTS}")
+        self.robot, self.dt = robot, dt
+        self._arm = fingerprint(robot.arm)
+        self._on_event = on_event
+        self._encoder = Encoder()
+        self._reach = REACH_TIME * robot.arm.max_velocity
+        self.datagram_filter = DatagramFilter(session_timeout=np.inf)
+        self.dropped: Counter[str] = Counter()
+        self.status, self.reason, self.challenge = RobotStatus.STOPPED, "", 0
+        self._command: JointCommand | None = None
+        self._header: Header | None = None
+        self._received = self._applied = 0
+        self._stop("the server has just started")
+
+    # --- received datagrams
+
+    def receive(self, data: bytes, now: int) -> bool:
+        """Process a datagram and return whether to answer its sender.
+
+        Args:
+            data: as received; may be anything.
+            now: time of receiving [ns].
+        """
+        try:
+            header, message = decode(data)
+        except DatagramError as error:
+            self.dropped[error.reason] += 1
+            return False
+        if not isinstance(message, JointCommand):
+            self.dropped["kind"] += 1
+            return False
+        if message.mode is CommandMode.STOP:
+            if self.status in (RobotStatus.FOLLOWING, RobotStatus.SLOWING):
+                self._stop("a client has stopped it")
+        elif message.mode is not CommandMode.OBSERVE:
+            fault = self._enable(header, message, now) if message.mode is CommandMode.ENABLE else self._take(
+                header, message, now
+            )  # fmt: skip
+            if fault:
+                self.dropped[fault] += 1
+        return True
+
+    def _enable(self, header: Header, message: JointCommand, now: int) -> str:
+        """Make a client the owner, or return why not."""
+        if self.status is not RobotStatus.STOPPED:
+            return "not stopped"
+        if message.arm != self._arm or len(message.q) != self.robot.arm.n_joints:
+            return "wrong arm"
+        if message.challenge != self.challenge:
+            return "wrong challenge"
+        if self.robot.velocity.any():
+            return "still braking"
+        if header.session != self.datagram_filter.session:
+            self.datagram_filter.start_session(header.session)
+        if not self.datagram_filter.accept(header, now):
+            return ""
+        self._received, self._command, self._header = now, None, None
+        self._become(RobotStatus.FOLLOWING, "", "enabled")
+        return ""
+
+    def _take(self, header: Header, message: JointCommand, now: int) -> str:
+        """Make a command the newest one, or return why not."""
+        if self.status not in (RobotStatus.FOLLOWING, RobotStatus.SLOWING):
+            return "stopped"
+        if not self.datagram_filter.accept(header, now):  # the filter counts it
+            return ""
+        fault = self._impossible(message)
+        if fault:
+            return fault
+        if message.opening is not None and (self._command is None or message.opening != self._command.opening):
+            self.robot.grasp(message.opening)
+        if self.status is RobotStatus.SLOWING:
+            self._become(RobotStatus.FOLLOWING, "", "commands arrive again")
+        self._command, self._header, self._received, self._applied = message, header, now, 0
+        return ""
+
+    def _impossible(self, message: JointCommand) -> str:
+        """Return why a command is invalid for this arm at its set-point; empty if it is valid."""
+        arm = self.robot.arm
+        if message.arm != self._arm or len(message.q) != arm.n_joints:
+            return "wrong arm"
+        if (message.q < arm.lower - _TOLERANCE).any() or (message.q > arm.upper + _TOLERANCE).any():
+            return "beyond a position limit"
+        if (np.abs(message.velocity) > (1.0 + _TOLERANCE) * arm.max_velocity).any():
+            return "beyond a velocity limit"
+        if (np.abs(message.q - self.robot.set_point) > self._reach).any():
+            return "too far from the set-point"
+        if message.opening is not None and not message.opening <= self.robot.widest_opening:
+            return "gripper opening"
+        return ""
+
+    # --- control
+
+    def step(self, now: int, periods: int = 1) -> None:
+        """Move the robot for one control period, and brake or stop it if commands are missing.
+
+        Args:
+            now: time [ns].
+            periods: length of the step in control periods; more than one after missed ones.
+        """
+        silence = 1e-9 * (now - self._received)
+        if self.status in (RobotStatus.FOLLOWING, RobotStatus.SLOWING):
+            if silence > LATCH_AFTER:
+                self._stop(f"no valid command for {1e3 * LATCH_AFTER:.0f} ms")
+            elif silence > SLOW_AFTER and self.status is RobotStatus.FOLLOWING:
+                self._become(RobotStatus.SLOWING, "", f"no valid command for {1e3 * SLOW_AFTER:.0f} ms: slowing")
+        self.robot.move(self._requested(silence), periods * self.dt)
+        if self.robot.fault and self.status is not RobotStatus.FAULT:
+            self._become(RobotStatus.FAULT, self.robot.fault, self.robot.fault)
+
+    def _requested(self, silence: float) -> Array:
+        """Return the joint velocity to request from the robot, shape (n_joints,) [rad/s]."""
+        command = self._command
+        if command is None or self.status is not RobotStatus.FOLLOWING:
+            return np.zeros(self.robot.arm.n_joints)
+        fading = min(max(silence - _EXTRAPOLATE, 0.0) / (SLOW_AFTER - _EXTRAPOLATE), 1.0)
+        extrapolated = min(silence, _EXTRAPOLATE) + (SLOW_AFTER - _EXTRAPOLATE) * fading * (1.0 - 0.5 * fading)
+        error = command.q + extrapolated * command.velocity - self.robot.set_point
+        size = np.abs(error)
+        catching_up = np.minimum(_GAIN * size, np.sqrt(self.robot.arm.max_acceleration * size))
+        return (1.0 - fading) * command.velocity + np.sign(error) * catching_up
+
+    def answer(self, now: Callable[[], int] = now_ns) -> bytes:
+        """Return the state of the robot as a datagram.
+
+        Args:
+            now: returns the time [ns].
+        """
+        robot, state, header = self.robot, self.robot.state(), self._header
+        if header is not None and self._applied == 0:
+            self._applied = now()
+        gripper = None if np.isnan(robot.opening) else (robot.opening, robot.widest_opening)
+        owned = self.status in (RobotStatus.FOLLOWING, RobotStatus.SLOWING) and self.datagram_filter.session is not None
+        message = JointState(
+            self.status,
+            state.time,
+            state.q,
+            state.velocity,
+            state.torque,
+            robot.set_point,
+            robot.velocity,
+            self._arm,
+            self.challenge,
+            (self.datagram_filter.session or 0) if owned else 0,
+            gripper,
+            *((0, 0, 0, 0) if header is None else (header.sequence, header.time_ns, self._received, self._applied)),
+            self.reason,
+        )
+        return self._encoder.encode(message, now())
+
+    def _stop(self, reason: str) -> None:
+        """Brake and hold until a client enables the robot again."""
+        self._command = self._header = None
+        self._become(RobotStatus.STOPPED, reason, f"stopped: {reason}")
+        self.challenge = 1 + secrets.randbelow(2**32 - 1)
+
+    def _become(self, status: RobotStatus, reason: str, event: str) -> None:
+        self.status, self.reason, self.challenge = status, reason, 0
+        if self._on_event is not None:
+            self._on_event(event)
+
+
 class RobotServer:
     """Receives commands, moves a robot at a fixed rate, and answers each client that has asked, once per period.
 
-    It sends nothing unless asked, and a :class:`~imitarm.robots.supervisor.Supervisor` checks everything it receives.
+    It sends nothing unless asked, and a :class:`~imitarm.robots.server.Supervisor` checks everything it receives.
     If the machine was too busy and periods were missed, the next step is longer by their time, up to 20 ms in total,
     so that the robot keeps up with the commands. The limits still hold, because they depend on the length of the
     step. Time missed beyond that is skipped.

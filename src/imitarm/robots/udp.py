@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.robots.robot import Robot
-from imitarm.robots.supervisor import fingerprint
+from imitarm.robots.server import fingerprint
 from imitarm.transmission.datagram import Encoder, Header, now_ns
 from imitarm.transmission.datagram_filter import DatagramFilter
 from imitarm.transmission.messages import CommandMode, JointCommand, JointState, RobotStatus
