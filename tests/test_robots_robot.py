@@ -75,6 +75,24 @@ def test_beyond_a_limit_the_way_back_is_free_and_the_way_out_is_not():
     assert back[0] == pytest.approx(-0.05)
 
 
+def test_the_limits_are_the_velocity_box_of_the_inverse_kinematics_half_a_step_ahead():
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        q, previous = rng.uniform(ARM.lower, ARM.upper), rng.uniform(-1.0, 1.0, 7) * ARM.max_velocity
+        asked = rng.uniform(-1.0, 1.0, 7) * ARM.max_velocity
+        box = LIMITS.box(q + 0.5 * DT * previous, DT, previous)
+        np.testing.assert_array_equal(
+            limit_velocity(LIMITS, q, previous, asked, DT)[0], np.clip(asked, box.lower, box.upper)
+        )
+
+
+def test_a_period_that_is_measured_anew_in_every_step_takes_no_memory():
+    limits, rng = JointLimits(ARM), np.random.default_rng(2)
+    for dt in rng.uniform(0.009, 0.011, 100):
+        limit_velocity(limits, ARM.home, np.zeros(7), np.full(7, 0.01), float(dt))
+    assert len(limits._boxes) <= 8
+
+
 @pytest.mark.parametrize("bad", [np.full(7, np.nan), np.zeros(6), [np.inf] * 7])
 def test_no_velocity_stops_the_robot_and_says_so(bad):
     robot = Paper()

@@ -19,8 +19,8 @@ COMMANDS = {
     "capture": "take a person's motion from a camera or a file, record it and check it",
     "calibrate": "measure a person's arm, find where the sensor is, choose how the robot follows",
     "retarget": "turn a person's motion into a robot's, ready to learn from",
-    "teleoperate": "let a person lead a robot, live",
-    "serve": "be a simulated robot that others lead over UDP",
+    "teleoperate": "let a person move a robot in real time",
+    "serve": "make a simulated robot available to other processes over UDP",
     "lint": "check demonstrations and say what is wrong with them",
     "learn": "learn a skill from demonstrations",
     "reproduce": "let a simulated arm do what a skill has learnt, around obstacles",
@@ -98,7 +98,7 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter)
         if name == asked:
             module = importlib.import_module(f"imitarm.cli.{name}")
-            command.description, command.epilog = summary.capitalize() + ".", module.EPILOG
+            command.description, command.epilog = summary[:1].upper() + summary[1:] + ".", module.EPILOG
             module.add_arguments(command)
             command.set_defaults(run=module.run)
     return parser

@@ -10,7 +10,7 @@ class RateLimiter:
     """Starts control periods at multiples of a fixed time after the first one.
 
     If a period starts a whole period late or more, the missed periods are skipped and counted, and the following ones
-    start on schedule. They are not made up for in a burst, which would move an arm faster than intended.
+    start on schedule. They are not run later in a burst, which would move an arm faster than intended.
 
     Args:
         period: length of a period [s].
