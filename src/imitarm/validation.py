@@ -67,6 +67,18 @@ def finite_array(value: Any, shape: tuple[int | EllipsisType | None, ...], what:
     return array
 
 
+def finite_points(points: Any) -> Array:
+    """Return finite points as an array of shape (..., 3).
+
+    Raises:
+        InputError: when they are not numbers, the last axis has not length 3, or a number is not finite.
+    """
+    ready = type(points) is np.ndarray and points.dtype == np.float64 and points.shape[-1:] == (3,)
+    if ready and math.isfinite(np.add.reduce(points, axis=None)):  # a sum is finite only if every number is
+        return np.asarray(points)
+    return finite_array(points, (..., 3), "points", "m")
+
+
 def real_array(value: Any, shape: tuple[int | EllipsisType | None, ...], what: str, unit: str = "") -> Array:
     """Return ``value`` as an array of numbers of the given shape, float64; NaN and infinities are allowed.
 

@@ -1,7 +1,7 @@
-"""Signed distances from points to obstacles: obstacles as packed arrays, and one entry point.
+"""Signed distances from points to all obstacles of a scene, as packed arrays.
 
-Everything that asks how far something is from an obstacle ends here: ``Obstacle.signed_distance``, ``Scene.clearance``,
-:class:`~imitarm.scene.clearance_limit.ClearanceLimit`. The formulas are in :mod:`~imitarm.scene.formulas`.
+``Scene.clearance`` and :class:`~imitarm.scene.clearance_limit.ClearanceLimit` use them. A single obstacle has its own
+``Obstacle.signed_distance``. The formulas of both are in :mod:`~imitarm.scene.formulas`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply, quaternion_to_matrix
 from imitarm.scene.formulas import DEPTH, FAMILIES, ROUNDS, SLABS, Formula, Parameters, Polytope
-from imitarm.validation import finite_array
+from imitarm.validation import finite_array, finite_points
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -222,40 +222,6 @@ class PackedObstacles:
         return self._kept[0][1]
 
 
-class Single(NamedTuple):
-    """One obstacle, ready for distances."""
-
-    formula: Formula
-    to_own: Array | None  # rotation of base vectors into the own frame, shape (3, 3); None when there is none
-    center: Array  # of the obstacle, in its own rotation, shape (3, 1) [m]
-    parameters: list[Array | None]  # of the formula
-
-    @classmethod
-    def of(cls, solid: Solid) -> Single:
-        """Prepare ``solid``."""
-        to_own = quaternion_to_matrix(solid.quaternion).T if solid.quaternion[1:].any() else None
-        center = np.array((solid.position if to_own is None else to_own @ solid.position)[:, None])
-        if solid.polytope is not None:
-            return cls(solid.polytope.formula, to_own, center, [])
-        if solid.kind == "half_space":
-            center[2] -= DEPTH
-        family = next(family for family in FAMILIES if solid.kind in family.kinds)
-        parameters = family.prepare([solid.kind], np.array([solid.size], dtype=float))
-        return cls(family.formula, to_own, center, _every(parameters, 0))
-
-
-def checked_points(points: ArrayLike) -> Array:
-    """Return finite points as an array of shape (..., 3).
-
-    Raises:
-        InputError: when they are not numbers, the last axis has not length 3, or a number is not finite.
-    """
-    ready = type(points) is np.ndarray and points.dtype == np.float64 and points.shape[-1:] == (3,)
-    if ready and math.isfinite(np.add.reduce(points, axis=None)):  # a sum is finite only if every number is
-        return np.asarray(points)
-    return finite_array(points, (..., 3), "points", "m")
-
-
 def distances(packed: PackedObstacles, points: ArrayLike, times: ArrayLike | None = None) -> Array:
     """Return the signed distance of every point to every obstacle, at one time or at several.
 
@@ -287,35 +253,6 @@ def distances_and_gradients(
     distance, gradient = _evaluate(packed, points, times, True)
     assert gradient is not None
     return distance, gradient
-
-
-def single_distance(single: Single, points: ArrayLike, gradient: bool) -> tuple[Array, Array | None]:
-    """Return the distances of one obstacle, and their gradients if ``gradient``; for many calls with few points.
-
-    Args:
-        single: the obstacle.
-        points: in the base frame, shape (..., 3) [m].
-        gradient: whether to return the gradients too.
-
-    Returns:
-        Distances (...) [m] and unit vectors (..., 3), or None.
-
-    Raises:
-        InputError: when the last axis of ``points`` has not length 3 or a number is not finite.
-    """
-    p = checked_points(points)
-    formula, to_own, center, parameters = single
-    columns = (p if p.ndim == 2 else p.reshape(-1, 3)).T
-    if to_own is None:
-        q = np.subtract(columns, center, order="C")
-    else:
-        q = np.dot(to_own, columns)
-        q -= center
-    distance, normal = formula(q, gradient, *parameters)
-    if normal is not None:
-        normal = normal.T if to_own is None else np.dot(normal.T, to_own)
-        normal = normal if p.ndim == 2 else normal.reshape(p.shape)
-    return (distance if p.ndim == 2 else distance.reshape(p.shape[:-1])), normal
 
 
 class NearPairs(NamedTuple):
@@ -381,7 +318,7 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
 def _evaluate(
     packed: PackedObstacles, points: ArrayLike, times: ArrayLike | None, gradient: bool
 ) -> tuple[Array, Array | None]:
-    p = checked_points(points)
+    p = finite_points(points)
     if times is None:
         shape = p.shape[:-1]
         distance, normals = _at_once(packed, p.reshape(-1, 3), None, gradient)
@@ -417,7 +354,7 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
         q.reshape(3, n, len(times), m // len(times))[...] -= (frames.center + frames.velocity * times)[..., None]
     distance, gradients = np.empty((n, m)), np.empty((n, m, 3)) if gradient else None
     for formula, places, parameters in packed._sorted[1]:
-        part, normal = formula(q[:, places], gradient, *_every(parameters, slice(None)))
+        part, normal = formula(q[:, places], gradient, *_every(parameters))
         distance[packed._sorted[0][places]] = part
         if gradients is not None and normal is not None:
             for i, place in enumerate(range(places.start, places.stop)):
@@ -425,9 +362,9 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
     return distance, gradients
 
 
-def _every(parameters: Parameters, members: int | slice) -> list[Array | None]:
-    """Return the parameters of chosen members with a last axis for the points."""
-    return [None if p is None else p[..., members, None] for p in parameters]
+def _every(parameters: Parameters) -> list[Array | None]:
+    """Return the parameters of all members with a last axis for the points."""
+    return [None if p is None else p[..., None] for p in parameters]
 
 
 def _take(parameters: Parameters, members: Indices) -> list[Array | None]:

@@ -1,6 +1,7 @@
 """Obstacles: convex solids with an exact signed distance, its gradient, and a motion.
 
-The distance formulas are in :mod:`~imitarm.scene.distances`; here are the shapes, their checks and their motion.
+Here is what all shapes have in common: their checks, their motion, and the distances of one obstacle. The shapes are in
+:mod:`~imitarm.scene.shapes`, the distance formulas in :mod:`~imitarm.scene.formulas`.
 """
 
 from __future__ import annotations
@@ -10,21 +11,22 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
-from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_exp, quaternion_multiply
-from imitarm.scene.distances import (
-    PackedObstacles,
-    Single,
-    Solid,
-    checked_points,
-    single_distance,
+from imitarm.kinematics.pose import (
+    Pose,
+    quaternion_conjugate,
+    quaternion_exp,
+    quaternion_multiply,
+    quaternion_to_matrix,
 )
-from imitarm.validation import finite_array, finite_number, finite_vector, whole_number
+from imitarm.scene.distances import PackedObstacles, Solid
+from imitarm.scene.formulas import DEPTH, FAMILIES, Formula
+from imitarm.validation import finite_array, finite_number, finite_points, finite_vector, whole_number
 
 Array = NDArray[np.float64]
 
@@ -60,6 +62,45 @@ def checked_lengths(value: object, what: str) -> Array:
     if values.max() > MAX_SIZE:
         raise InputError(f"{what} {values.tolist()} is beyond {MAX_SIZE:g} m; give it in metres")
     return values
+
+
+class _Single(NamedTuple):
+    """One obstacle, ready for distances."""
+
+    formula: Formula
+    to_own: Array | None  # rotation of base vectors into the own frame, shape (3, 3); None when there is none
+    center: Array  # of the obstacle, in its own rotation, shape (3, 1) [m]
+    parameters: list[Array | None]  # of the formula
+
+    @classmethod
+    def of(cls, solid: Solid) -> _Single:
+        """Prepare ``solid``."""
+        to_own = quaternion_to_matrix(solid.quaternion).T if solid.quaternion[1:].any() else None
+        center = np.array((solid.position if to_own is None else to_own @ solid.position)[:, None])
+        if solid.polytope is not None:
+            return cls(solid.polytope.formula, to_own, center, [])
+        if solid.kind == "half_space":
+            center[2] -= DEPTH
+        family = next(family for family in FAMILIES if solid.kind in family.kinds)
+        parameters = family.prepare([solid.kind], np.array([solid.size], dtype=float))
+        return cls(family.formula, to_own, center, [None if p is None else p[..., 0, None] for p in parameters])
+
+
+def _distance(single: _Single, points: ArrayLike, gradient: bool) -> tuple[Array, Array | None]:
+    """Return the distances (...) [m] of one obstacle and, if ``gradient``, their gradients (..., 3)."""
+    p = finite_points(points)
+    formula, to_own, center, parameters = single
+    columns = (p if p.ndim == 2 else p.reshape(-1, 3)).T
+    if to_own is None:
+        q = np.subtract(columns, center, order="C")
+    else:
+        q = np.dot(to_own, columns)
+        q -= center
+    distance, normal = formula(q, gradient, *parameters)
+    if normal is not None:
+        normal = normal.T if to_own is None else np.dot(normal.T, to_own)
+        normal = normal if p.ndim == 2 else normal.reshape(p.shape)
+    return (distance if p.ndim == 2 else distance.reshape(p.shape[:-1])), normal
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -139,8 +180,8 @@ class Obstacle(ABC):
         return pack((self,), 0.0)
 
     @cached_property
-    def _single(self) -> Single:
-        return Single.of(self.solid())
+    def _single(self) -> _Single:
+        return _Single.of(self.solid())
 
     def signed_distance(self, points: ArrayLike) -> Array:
         """Return the distance to the surface, negative inside.
@@ -154,7 +195,7 @@ class Obstacle(ABC):
         Raises:
             InputError: when the last axis has not length 3 or a number is not finite.
         """
-        return single_distance(self._single, points, False)[0]
+        return _distance(self._single, points, False)[0]
 
     def gradient(self, points: ArrayLike) -> Array:
         """Return the gradient of :meth:`signed_distance`: unit vectors, shape (..., 3).
@@ -179,7 +220,7 @@ class Obstacle(ABC):
         Raises:
             InputError: when the last axis has not length 3 or a number is not finite.
         """
-        distance, gradient = single_distance(self._single, points, True)
+        distance, gradient = _distance(self._single, points, True)
         assert gradient is not None
         return distance, gradient
 
@@ -195,7 +236,7 @@ class Obstacle(ABC):
         Raises:
             InputError: when the last axis has not length 3 or a number is not finite.
         """
-        v = checked_points(directions)
+        v = finite_points(directions)
         return self._support(v.reshape(-1, 3)).reshape(v.shape)
 
     def bounds(self) -> Array:

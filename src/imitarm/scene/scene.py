@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError
 from imitarm.html_table import html_table
 from imitarm.kinematics.pose import Pose
-from imitarm.scene.distances import PackedObstacles, checked_points, distances, distances_and_gradients
+from imitarm.scene.distances import PackedObstacles, distances, distances_and_gradients
 from imitarm.scene.obstacle import Array, Obstacle, pack
-from imitarm.validation import finite_number, whole_number
+from imitarm.validation import finite_number, finite_points, whole_number
 
 _LISTED = 4  # obstacles that a short repr names
 
@@ -187,7 +187,7 @@ class Scene:
             InputError: when the last axis of ``points`` has not length 3 or a number is not finite.
         """
         if not len(self.packed):
-            return np.full(checked_points(points).shape[:-1], -1, dtype=np.intp)
+            return np.full(finite_points(points).shape[:-1], -1, dtype=np.intp)
         return np.asarray(self.distances(points).argmin(axis=0))
 
     def name_of(self, index: SupportsIndex) -> str:
