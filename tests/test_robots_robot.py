@@ -93,20 +93,25 @@ def test_a_period_that_is_measured_anew_in_every_step_takes_no_memory():
     assert len(limits._boxes) <= 8
 
 
-@pytest.mark.parametrize("bad", [np.full(7, np.nan), np.zeros(6), [np.inf] * 7])
+@pytest.mark.parametrize("bad", [np.full(7, np.nan), np.zeros(6), [np.inf] * 7, "fast", None, [[0.1], [0.1, 0.2]]])
 def test_no_velocity_stops_the_robot_and_says_so(bad):
     robot = Paper()
     for _ in range(10):
         robot.move(np.full(7, 0.3), DT)
-    with pytest.raises(InputError, match="7 finite numbers"):
+    with pytest.raises(InputError, match="move: velocity must be"):
         robot.move(bad, DT)
     assert not robot.velocity.any()
 
 
-@pytest.mark.parametrize("dt", [0.0, -0.01, np.inf, np.nan])
-def test_no_time_is_refused(dt):
-    with pytest.raises(InputError, match="dt"):
-        Paper().move(np.zeros(7), dt)
+@pytest.mark.parametrize("dt", [0.0, -0.01, np.inf, np.nan, "soon", None])
+def test_a_time_that_is_none_is_refused_and_stops_the_robot(dt):
+    robot = Paper()
+    robot.move(np.full(7, 0.02), DT)
+    with pytest.raises(InputError, match="move: dt must be"):
+        robot.move(np.full(7, 0.02), dt)
+    assert not robot.velocity.any()
+    with pytest.raises(InputError, match="stop: dt must be"):
+        robot.stop(dt)
 
 
 def test_stop_brakes_as_fast_as_the_accelerations_allow():

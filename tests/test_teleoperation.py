@@ -6,6 +6,7 @@ import pytest
 from imitarm.capture.sources import followed
 from imitarm.capture.stream import SkeletonSender, UdpSource
 from imitarm.demonstrations.recorder import DemonstrationRecorder
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
 from imitarm.retarget import RETARGETERS, Correspondence, ModernRetargeter
@@ -116,6 +117,12 @@ def test_it_ends_with_the_source_or_the_time_and_the_arm_at_rest():
     assert summary.reason == "the source has ended" and not robot.velocity.any()
     summary = loop(Paper(), Listed([None] * 5000)).run(0.5)
     assert summary.reason == "the time is up" and summary.steps + summary.overruns == 50
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, np.nan, np.inf, "long"])
+def test_a_duration_that_is_none_is_refused(seconds):
+    with pytest.raises(InputError, match="Teleoperation: seconds"):
+        loop(Paper()).run(seconds)
 
 
 def test_ctrl_c_ends_it_with_the_arm_at_rest():

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from imitarm.errors import InputError
 from imitarm.transmission.datagram import Encoder, Header
 from imitarm.transmission.datagram_filter import DROP_REASONS, DatagramFilter
 from imitarm.transmission.messages import JointCommand, SkeletonFrame
@@ -295,3 +296,10 @@ def test_another_kind_is_not_wanted():
     opened = datagrams.receive(encoder.encode(skeleton_frame(), 0), 0, SkeletonFrame)
     assert opened is not None and datagrams.dropped == {"kind": 1}
     assert datagrams.receive(encoder.encode(command(), 0), 0, JointCommand) is not None
+
+
+@pytest.mark.parametrize("name", ["max_age", "session_timeout"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, "1 s", None])
+def test_a_time_that_is_none_is_refused(name, value):
+    with pytest.raises(InputError, match=f"DatagramFilter: {name}"):
+        DatagramFilter(**{name: value})

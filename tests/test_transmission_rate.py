@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from imitarm.errors import InputError
 from imitarm.transmission.rate import RateLimiter
 from wire_samples import MS, Clock
 
@@ -48,3 +50,9 @@ def test_the_first_tick_is_now():
     limiter = RateLimiter(0.5, clock_ns=time, sleep=time.sleep)
     assert limiter.remaining == 0.0 and limiter.wait() == 0
     assert abs(limiter.remaining - 0.5) < 1e-9
+
+
+@pytest.mark.parametrize("period", [0.0, -0.01, float("nan"), float("inf"), 1e-10, "10 ms", None])
+def test_a_period_that_is_none_is_refused(period):
+    with pytest.raises(InputError, match="RateLimiter: period"):
+        RateLimiter(period)

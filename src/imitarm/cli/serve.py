@@ -138,7 +138,7 @@ def _show_summary(server: RobotServer) -> None:
                 (f"dropped: {reason}", f"{n} {DROP_REASONS.get(reason, '')}".strip())
                 for reason, n in sorted(dropped.items())
             ),
-            ("at the end", why if why.startswith(status) else ": ".join(filter(None, [status, why]))),
+            ("at the end", ": ".join(filter(None, [status, why]))),
         ],
     )
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.kinematics.limits import JointLimits
+from imitarm.validation import finite_number, finite_vector
 
 Array = NDArray[np.float64]
 
@@ -92,7 +93,7 @@ class Robot(ABC):
         """Move for ``dt`` seconds; the joints reach ``velocity`` at the end.
 
         A velocity beyond the limits is replaced by the nearest one within them (:func:`limit_velocity`), and
-        ``clamped`` names the limits. An invalid velocity (wrong shape, NaN) stops the robot, then raises InputError.
+        ``clamped`` names the limits. An invalid argument (wrong shape, NaN) stops the robot, then raises InputError.
         A joint that is more than 0.1 rad away from its set-point counts as blocked: the robot makes a protective
         stop, sets ``fault`` and does not move any more.
 
@@ -104,16 +105,14 @@ class Robot(ABC):
             The measured state after the motion.
 
         Raises:
-            InputError: when the shape is wrong, a number is not finite or ``dt`` is not positive.
+            InputError: when ``velocity`` is not ``n_joints`` finite numbers, or ``dt`` is not a positive time.
         """
-        requested = np.asarray(velocity, dtype=float)
-        if requested.shape != (self.arm.n_joints,) or not np.isfinite(requested).all():
+        try:
+            requested = finite_vector(velocity, self.arm.n_joints, "move: velocity", "rad/s")
+            dt = finite_number(dt, "move: dt", "s", above=0.0)
+        except InputError as invalid:
             self.stop()
-            raise InputError(
-                f"move: velocity must be {self.arm.n_joints} finite numbers [rad/s], got {velocity!r}; robot stopped"
-            )
-        if not 0.0 < dt < np.inf:
-            raise InputError(f"move: dt must be a positive time [s], got {dt!r}")
+            raise InputError(f"{invalid}; robot stopped") from invalid
         if self.fault:
             return self.state()
         allowed, self.clamped = limit_velocity(self._limits, self.set_point, self.velocity, requested, dt)
@@ -173,7 +172,11 @@ class Robot(ABC):
 
         Returns:
             The measured state at the end.
+
+        Raises:
+            InputError: when ``dt`` is not a positive time.
         """
+        dt = finite_number(dt, "stop: dt", "s", above=0.0)
         while self.velocity.any():
             self.move(np.zeros(self.arm.n_joints), dt)
         return self.state()

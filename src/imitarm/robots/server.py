@@ -12,7 +12,6 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.robots.robot import Robot
 from imitarm.transmission.datagram import Encoder, Header, decode, now_ns
@@ -27,6 +26,7 @@ from imitarm.transmission.messages import (
 )
 from imitarm.transmission.rate import RateLimiter
 from imitarm.transmission.sockets import LOOPBACK, Address, listening, try_to_send, wait_for, waiting
+from imitarm.validation import finite_number
 
 Array = NDArray[np.float64]
 
@@ -296,8 +296,7 @@ class RobotServer:
         clock_ns: Callable[[], int] = now_ns,
         wait: Callable[[socket, float], bool] = wait_for,
     ) -> None:
-        if not 100.0 <= rate <= 1000.0:
-            raise InputError(f"RobotServer: rate must be between 100 and 1000 Hz, got {rate!r}")
+        rate = finite_number(rate, "RobotServer: rate", "Hz", at_least=100.0, at_most=1000.0)
         self._clock_ns, self._wait = clock_ns, wait
         self.rate_limiter = RateLimiter(1.0 / rate, clock_ns=clock_ns)
         self.supervisor = Supervisor(robot, 1.0 / rate, on_event=on_event)
@@ -332,8 +331,14 @@ class RobotServer:
         Args:
             seconds: duration [s]; None: unlimited.
             on_step: called after every period.
+
+        Raises:
+            InputError: when the duration is not positive.
         """
-        until = None if seconds is None else self._clock_ns() + round(1e9 * seconds)
+        until = None
+        if seconds is not None:
+            seconds = finite_number(seconds, "RobotServer: seconds", "s", above=0.0)
+            until = self._clock_ns() + round(1e9 * seconds)
         try:
             while until is None or self._clock_ns() < until:
                 while (left := self.rate_limiter.remaining) > 0.0:

@@ -22,6 +22,7 @@ from imitarm.transmission.datagram import now_ns
 from imitarm.transmission.latency import LatencyLog
 from imitarm.transmission.messages import RobotStatus
 from imitarm.transmission.rate import RateLimiter
+from imitarm.validation import finite_number
 
 Array = NDArray[np.float64]
 
@@ -147,7 +148,12 @@ class Teleoperation:
 
         Args:
             seconds: duration [s]; None: unlimited.
+
+        Raises:
+            InputError: when the duration is not positive.
         """
+        if seconds is not None:
+            seconds = finite_number(seconds, "Teleoperation: seconds", "s", above=0.0)
         dt, summary = self.retargeter.dt, self.summary
         ending: float | None = None
         if self._stream is not None:

@@ -13,6 +13,7 @@ from typing import TypeVar
 
 from imitarm.transmission.datagram import Header, decode
 from imitarm.transmission.messages import DatagramError, JointCommand, JointState, SkeletonFrame
+from imitarm.validation import finite_number
 
 Kind = TypeVar("Kind", SkeletonFrame, JointCommand, JointState)
 
@@ -188,10 +189,16 @@ class DatagramFilter:
         age: delay of the last accepted datagram [s].
         accepted: number of accepted datagrams.
         dropped: number of dropped datagrams by reason, a key of :data:`DROP_REASONS`.
+
+    Raises:
+        InputError: when a time is not positive.
     """
 
     def __init__(self, *, max_age: float = 0.1, session_timeout: float = 0.5) -> None:
-        self._max_age, self._session_timeout = 1e9 * max_age, 1e9 * session_timeout
+        self._max_age = 1e9 * finite_number(max_age, "DatagramFilter: max_age", "s", above=0.0)
+        if session_timeout != math.inf:
+            session_timeout = finite_number(session_timeout, "DatagramFilter: session_timeout", "s", above=0.0)
+        self._session_timeout = 1e9 * session_timeout
         self.session: int | None = None
         self.n_sessions = self.accepted = 0
         self.age = 0.0

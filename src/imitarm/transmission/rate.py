@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from imitarm.validation import finite_number
+
 
 class RateLimiter:
     """Starts control periods at multiples of a fixed time after the first one.
@@ -20,6 +22,9 @@ class RateLimiter:
     Attributes:
         ticks: number of periods so far, including the missed ones.
         overruns: number of missed periods.
+
+    Raises:
+        InputError: when the period is not at least 1 us.
     """
 
     def __init__(
@@ -29,7 +34,7 @@ class RateLimiter:
         clock_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._period = round(1e9 * period)
+        self._period = round(1e9 * finite_number(period, "RateLimiter: period", "s", at_least=1e-6))
         self._clock_ns, self._sleep = clock_ns, sleep
         self._start: int | None = None
         self.ticks = self.overruns = 0
