@@ -19,7 +19,7 @@ from scipy.linalg import lapack
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik_problem import Box, IKProblem, Rows
+from imitarm.kinematics.ik_problem import Box, IKProblem, Rows, TaskRows
 from imitarm.kinematics.limits import JointLimits, Limit
 from imitarm.kinematics.tasks import PostureTask, Task, TwistTask
 from imitarm.validation import choice, finite_number, finite_vector, instance, sequence
@@ -34,6 +34,7 @@ _TINY_ROW = 1e-6
 _ROUNDING = 1e-8  # [rad/s]
 _CLEAR = 1e-3  # squared singular values above this can be factored without losing half of the digits
 _VIOLATED = 1e-9
+_EYE = np.eye(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +161,8 @@ class IKSolver:
         memory = arm.at(q)
         position = np.asarray(q, dtype=float)
         previous = None if velocity is None else finite_vector(velocity, arm.n_joints, "solve_ik: velocity", "rad/s")
-        problem = IKProblem(arm, memory, position, previous, self.dt, self._free, [], [], self._max_speed, self._scaled)
+        free = self._free
+        problem = IKProblem(arm, memory, position, previous, self.dt, free, [], [], self._max_speed, self._scaled)
         first: Task
         others: Sequence[Task]
         if isinstance(tasks, list) or type(tasks) is tuple:  # a NamedTuple is one task
@@ -179,7 +181,7 @@ class IKSolver:
                 continue
             if isinstance(part, Rows):
                 problem.rows.append(part)
-            elif problem.box is self._free:
+            elif problem.box is free:
                 problem.box = part
             else:
                 lower, upper = problem.box
@@ -283,23 +285,21 @@ def _solver(arm: ArmModel, dt: float, method: str) -> IKSolver:
 
 def quadratic_program(problem: IKProblem) -> Array:
     """Minimise the weighted error of the tasks inside the box and under the rows."""
-    first = problem.tasks[0]
-    n = len(problem.box.lower)
-    hessian = first.jacobian.T.dot(first.jacobian)
-    linear = first.target.dot(first.jacobian)
-    for jacobian, target, _ in problem.tasks[1:]:
-        hessian += jacobian.T.dot(jacobian)
-        linear += target.dot(jacobian)
+    jacobian, target, thrift = problem.tasks[0]
+    if len(problem.tasks) > 1:
+        jacobian, target = _stacked(problem.tasks)
+    hessian = jacobian.T.dot(jacobian)
+    linear = target.dot(jacobian)
     effort = _EFFORT
     if problem.velocity is not None:
         effort += _CHANGE
-        linear += (first.effort * _CHANGE) * problem.velocity
-    hessian += _scaled_eye(n, first.effort * effort)
+        linear += (thrift * _CHANGE) * problem.velocity
+    hessian += _scaled_eye(len(linear), thrift * effort)
     matrix, least, light = _sorted_rows(problem.rows) if problem.rows else (None, None, ())
     velocity = _least_cost(problem.box, matrix, least, hessian, linear)
     for rows in light:  # a price is convex: where it is paid at all it stands in full
         active = rows.matrix.dot(velocity) < rows.lower - _VIOLATED
-        if active.any():
+        if True in active.tolist():  # for a few rows in a tenth of the time that any() takes
             part = rows.matrix[active]
             weighted = rows.price / np.einsum("ij,ij->i", part, part)[:, None] * part
             hessian += weighted.T.dot(part)
@@ -308,8 +308,22 @@ def quadratic_program(problem: IKProblem) -> Array:
     return velocity
 
 
+def _stacked(tasks: list[TaskRows]) -> tuple[Array, Array]:
+    """Return what all tasks ask for, one below the other; filling takes half of the time of concatenating."""
+    end, (m, n) = 0, tasks[0].jacobian.shape
+    for part in tasks[1:]:
+        m += len(part.target)
+    jacobian, target = np.empty((m, n)), np.empty(m)
+    for part in tasks:
+        start, end = end, end + len(part.target)
+        jacobian[start:end], target[start:end] = part.jacobian, part.target
+    return jacobian, target
+
+
 def _sorted_rows(rows: list[Rows]) -> tuple[Array | None, Array | None, Sequence[Rows]]:
     """Return all stiff rows together, and the others."""
+    if len(rows) == 1 and rows[0].price == math.inf:
+        return rows[0].matrix, rows[0].lower, ()
     stiff = [part for part in rows if part.price == math.inf]
     light = [part for part in rows if part.price < math.inf]
     if not stiff:
@@ -327,9 +341,11 @@ def _least_cost(box: Box, matrix: Array | None, least: Array | None, hessian: Ar
         return free
     n = len(linear)
     if matrix is None or least is None:
-        matrix, least = np.empty((0, n)), np.empty(0)
-    lower, upper = np.empty(n + len(least)), np.empty(n + len(least))  # daqp takes none that is read-only
-    lower[:n], lower[n:], upper[:n], upper[n:] = box.lower, least, box.upper, 1e30
+        matrix, least = np.empty((0, n)), box.lower[:0]
+        lower, upper = box.lower.copy(), box.upper.copy()  # daqp takes none that is read-only
+    else:
+        lower, upper = np.empty(n + len(least)), np.empty(n + len(least))
+        lower[:n], lower[n:], upper[:n], upper[n:] = box.lower, least, box.upper, 1e30
     velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, _plain(len(lower)))
     if status <= 0 and len(least):
         moved = np.sqrt(np.einsum("ij,ij->i", matrix, matrix)) > _TINY_ROW  # no velocity changes the other rows
@@ -371,7 +387,7 @@ def _unconstrained(box: Box, matrix: Array | None, least: Array | None, hessian:
     for low, value, high in zip(box.lower.tolist(), velocity.tolist(), box.upper.tolist(), strict=True):
         if not low <= value <= high:
             return None
-    if matrix is not None and (matrix.dot(velocity) < least).any():
+    if matrix is not None and True in (matrix.dot(velocity) < least).tolist():
         return None
     return velocity
 
@@ -388,23 +404,27 @@ def _plain(n: int) -> NDArray[np.intc]:
 
 def damped_least_squares(problem: IKProblem) -> Array:
     """Solve thesis Eq 3.8 and 3.9: one damping for all directions, as little as keeps the joints' speed in bounds."""
-    return _damped(problem, subtracted=0.0)
+    scaled, target, _ = problem.tasks[0]
+    length = math.hypot(*target.tolist())
+    gram = scaled.dot(scaled.T)
+    if problem.posture is None and _is_above(gram, max(length * length, _CLEAR)):
+        return _undamped(problem, gram)
+    squares, basis, _ = lapack.dsyev(gram)
+    return _damped(problem, squares, basis, length)
 
 
 def damped_with_small_angle(problem: IKProblem) -> Array:
     """Do the same with the small-angle term that the thesis prints after Eq 3.9."""
-    return _damped(problem, subtracted=0.5)
-
-
-def _damped(problem: IKProblem, subtracted: float) -> Array:
     scaled, target, _ = problem.tasks[0]
-    square = float(target.dot(target))
-    gram = scaled.dot(scaled.T)
-    if problem.posture is None and subtracted == 0.0 and _is_above(gram, max(square, _CLEAR)):
-        return _undamped(problem, gram)
-    squares, basis, _ = lapack.dsyev(gram)
+    squares, basis, _ = lapack.dsyev(scaled.dot(scaled.T))
+    small = 0.5 * math.sqrt(max(float(squares[0]), 0.0))
+    return _damped(problem, squares, basis, max(math.hypot(*target.tolist()) - small, 0.0))
+
+
+def _damped(problem: IKProblem, squares: Array, basis: Array, threshold: float) -> Array:
+    """Solve with the squared singular values and left singular vectors, damped where one is below the threshold."""
+    scaled, target, _ = problem.tasks[0]
     least = math.sqrt(max(float(squares[0]), 0.0))
-    threshold = max(math.sqrt(square) - subtracted * least, 0.0)
     if least >= threshold:
         damping = 0.0
     elif least >= 0.5 * threshold:
@@ -420,8 +440,7 @@ def _damped(problem: IKProblem, subtracted: float) -> Array:
 
 def _is_above(gram: Array, bound: float) -> bool:
     """Return whether all eigenvalues are above ``bound``: then, and only then, a Cholesky factor of the rest exists."""
-    rest = gram.copy()
-    rest.ravel()[::7] -= bound
+    rest = gram - bound * _EYE
     return mujoco.mju_cholFactor(rest, _NULL) == 6
 
 

@@ -67,7 +67,10 @@ class JointLimits(Limit):
 
     def restrict(self, problem: IKProblem) -> Box:
         """Return the bounds at one control step; a joint outside its position limits can only move back."""
-        return self.box(problem.q, problem.dt, problem.velocity)
+        known = self._boxes.get(problem.dt)
+        if known is None:
+            return self.box(problem.q, problem.dt, problem.velocity)
+        return known.at(problem.q, problem.velocity)
 
     def box(self, q: Array, dt: float, velocity: Array | None = None) -> Box:
         """Return the bounds at one posture, not to be written to.
@@ -97,19 +100,19 @@ class _VelocityBox:
         room = self._most * self._most / self._double + self._most * dt  # farther from a limit, v_b exceeds v_max
         # both directions at once: row 0 upwards, row 1 downwards with signs changed
         self._ends = np.stack((arm.upper, -arm.lower))
-        self._inner = list(zip((arm.lower + room).tolist(), (arm.upper - room).tolist(), strict=True))
+        slower = self._most - self._step  # a joint that is no faster can't reach v_max in one step
+        self._inner = list(zip((arm.lower + room).tolist(), (arm.upper - room).tolist(), slower.tolist(), strict=True))
 
     def at(self, q: Array, velocity: Array | None) -> Box:
-        for value, (low, high) in zip(q.tolist(), self._inner, strict=True):
-            if not low <= value <= high:
-                return self._near_a_limit(q, velocity)
         if velocity is None:
+            for value, (low, high, _) in zip(q.tolist(), self._inner, strict=True):
+                if not low <= value <= high:
+                    return self._near_a_limit(q, None)
             return self._free
-        lower = np.minimum(velocity, self._most)
-        lower -= self._step
-        upper = np.maximum(velocity, self._least)
-        upper += self._step
-        return Box(np.maximum(lower, self._least, out=lower), np.minimum(upper, self._most, out=upper))
+        for value, speed, (low, high, slower) in zip(q.tolist(), velocity.tolist(), self._inner, strict=True):
+            if not (low <= value <= high and -slower <= speed <= slower):
+                return self._near_a_limit(q, velocity)
+        return Box(velocity - self._step, velocity + self._step)
 
     def _near_a_limit(self, q: Array, velocity: Array | None) -> Box:
         bound = np.maximum(self._ends - _SIGN * q, 0.0)

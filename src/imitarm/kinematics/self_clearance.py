@@ -149,6 +149,8 @@ class SelfClearance:
 
     def lower(self, room: Array) -> Array:
         """Return the least rate (k,) [m/s] at which each distance may change, for the room (k,) [m] that it has."""
+        if min(room.tolist(), default=0.0) >= 0.0:  # nearly always
+            return -self._gain * room
         return np.where(room < 0.0, -_RETREAT_RATE, -self._gain) * room
 
     def periodic(self, dt: float = 0.01) -> PeriodicSelfClearance:
@@ -158,24 +160,25 @@ class SelfClearance:
     def _found(self, q: ArrayLike) -> tuple[Indices, Indices, Array, Array, Array]:
         """Return the nearest pairs: outer and inner spheres, centres of the outer, normals and distances."""
         centers = self._centers(q)
-        best: list[int] = []
+        chosen = np.zeros(0, dtype=np.intp)
         if self._groups:
+            best: list[int] = []
             coarse = self._coarse_distances(centers)
             least = np.minimum.reduceat(coarse, self._starts)
             for group in least.argsort()[: self._n_rows].tolist():
                 if least[group] < self._near:
                     part = self._groups[group]
                     best.append(part.start + int(coarse[part].argmin()))
-            close = np.flatnonzero(coarse < self._close)
+            close = (coarse < self._close).nonzero()[0]
             if len(close) > _MOST:
                 close = close[np.argpartition(coarse[close], _MOST)[:_MOST]]
-            chosen = np.union1d(close, np.array(best, dtype=np.intp))
-            best = chosen[coarse[chosen].argsort()].tolist()
-        outer, inner = self._outer[best], self._inner[best]
-        outer_centers = centers[outer]
-        between = outer_centers - centers[inner]
+            chosen = np.array(sorted({*close.tolist(), *best}), dtype=np.intp)
+            chosen = chosen.take(coarse.take(chosen).argsort())
+        outer, inner = self._outer.take(chosen), self._inner.take(chosen)
+        outer_centers = centers.take(outer, axis=0)
+        between = outer_centers - centers.take(inner, axis=0)
         lengths = np.sqrt((between * between).sum(axis=1))
-        return outer, inner, outer_centers, between / lengths[:, None], lengths - self._sums[best]
+        return outer, inner, outer_centers, between / lengths[:, None], lengths - self._sums.take(chosen)
 
     def _coarse_distances(self, centers: Array) -> NDArray[np.float32]:
         """Return the distances of all watched pairs, in single precision: good to some um, which tells who is near."""

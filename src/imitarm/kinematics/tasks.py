@@ -22,6 +22,7 @@ from imitarm.validation import finite_number, finite_vector, text
 
 Array = NDArray[np.float64]
 
+_FLOAT64 = np.dtype(np.float64)
 _BENT = 0.1  # squared sine of the angle at the elbow below which the elbow task fades
 _REFERENCE = 0.04  # squared length below which the direction that the SEW angle is measured from fades
 _QUICK = 0.5  # fraction of what the joints can change in a step by which the elbow's speed may change
@@ -62,18 +63,20 @@ class TwistTask(NamedTuple):
 
     def rows(self, problem: IKProblem) -> TaskRows:
         """Return the weighted Jacobian (6, n_joints) and the clamped, weighted twist (6,)."""
+        twist, frame, rotation_length, most = self
         try:
-            weights, scale, effort, site = _scales(self.rotation_length, self.frame, problem.arm, problem.scaled)
+            weights, scale, effort, site = _scales(rotation_length, frame, problem.arm, problem.scaled)
         except TypeError:  # not hashable
-            lengths = tuple(finite_vector(self.rotation_length, 3, "TwistTask: rotation_length", "m").tolist())
-            weights, scale, effort, site = _scales(lengths, text(self.frame, "frame"), problem.arm, problem.scaled)
-        target = finite_vector(self.twist, 6, "TwistTask: twist", "m/s, rad/s") * weights
-        square = float(target.dot(target))
-        most = problem.max_speed
-        if self.max_speed is not None:
-            most = finite_number(self.max_speed, "TwistTask: max_speed", "m/s", at_least=0.0)
-        if not square <= most * most:
-            target *= most / math.hypot(*target.tolist())
+            lengths = tuple(finite_vector(rotation_length, 3, "TwistTask: rotation_length", "m").tolist())
+            weights, scale, effort, site = _scales(lengths, text(frame, "frame"), problem.arm, problem.scaled)
+        most = problem.max_speed if most is None else finite_number(most, "TwistTask: max_speed", "m/s", at_least=0.0)
+        if type(twist) is not np.ndarray or twist.dtype is not _FLOAT64 or twist.shape != (6,):
+            twist = finite_vector(twist, 6, "TwistTask: twist", "m/s, rad/s")
+        target = twist * weights
+        speed = math.hypot(*target.tolist())
+        if not speed <= most:  # too fast, or not finite
+            target *= most / speed
+            finite_vector(twist, 6, "TwistTask: twist", "m/s, rad/s")
         return TaskRows(problem.memory.site_jacobian(site) * scale, target, effort)
 
 
@@ -154,32 +157,35 @@ class ElbowTask(NamedTuple):
         angle, weight, confidence, gain, max_rate, convention = self
         try:
             usable = math.isfinite(angle + weight + confidence + gain + max_rate)
-            usable = usable and min(weight, confidence, gain, max_rate) >= 0.0
+            usable = usable and weight >= 0.0 and confidence >= 0.0 and gain >= 0.0 and max_rate >= 0.0
         except (TypeError, ValueError, OverflowError):
             usable = False
         if not usable:
             raise InputError(f"ElbowTask: needs a finite angle and other numbers that are not negative, got {self!r}")
         if not problem.tasks:
             raise InputError("ElbowTask: must follow a task for the tool, such as TwistTask, in the list of tasks")
-        shoulder, elbow, wrist = problem.memory.sites.take(_landmark_sites(problem.arm), axis=0).tolist()
+        tool, velocity, memory = problem.tasks[0], problem.velocity, problem.memory
+        shoulder, elbow, wrist = memory.sites.take(_landmark_sites(problem.arm), axis=0).tolist()
         now = one_angle(shoulder, elbow, wrist, convention)
         if now is None:
             return None
-        gradient = np.array(now.shoulder + now.elbow + now.wrist).dot(problem.memory.landmark_jacobians())
-        motion = self_motion(problem.tasks[0].jacobian, gradient)
+        gradient = np.array(now.shoulder + now.elbow + now.wrist).dot(memory.landmark_jacobians())
+        motion = self_motion(tool.jacobian, gradient)
         if motion is None:
             return None
         direction, change, by_tool = motion
         factor = min(confidence, 1.0) * min(1.0, now.bend / _BENT) * min(1.0, now.reference / _REFERENCE)
         rate = gain * math.remainder(angle - now.angle, math.tau)
-        speed = factor * (min(max(rate, -max_rate), max_rate) - float(by_tool.dot(problem.tasks[0].target))) / change
-        if problem.velocity is not None:
-            before = float(direction.dot(problem.velocity))
-            widths = zip((problem.box.upper - problem.box.lower).tolist(), direction.tolist(), strict=True)
-            most = 0.5 * _QUICK * min([width / max(abs(part), 1e-9) for width, part in widths])
-            speed = min(max(speed, before - most), before + most)
+        speed = factor * (min(max(rate, -max_rate), max_rate) - float(by_tool.dot(tool.target))) / change
+        if velocity is not None:
+            before = float(direction.dot(velocity))
+            widths = (problem.box.upper - problem.box.lower).tolist()
+            if abs(speed - before) > 0.5 * _QUICK * min(widths):  # less is always possible along a unit vector
+                parts = zip(widths, map(abs, direction.tolist()), strict=True)
+                most = 0.5 * _QUICK * min([width / (part if part > 1e-9 else 1e-9) for width, part in parts])
+                speed = min(max(speed, before - most), before + most)
         root = math.sqrt(weight)
-        return TaskRows((root * direction)[None], np.array([root * speed]))
+        return TaskRows(root * direction[None], np.array([root * speed]))
 
 
 def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] | None:
