@@ -73,9 +73,10 @@ def finite_points(points: Any) -> Array:
     Raises:
         InputError: when they are not numbers, the last axis has not length 3, or a number is not finite.
     """
-    ready = type(points) is np.ndarray and points.dtype == np.float64 and points.shape[-1:] == (3,)
-    if ready and math.isfinite(np.add.reduce(points, axis=None)):  # a sum is finite only if every number is
-        return np.asarray(points)
+    if type(points) is np.ndarray and points.dtype is _FLOAT64 and points.shape[-1:] == (3,):
+        flat = points.ravel()
+        if math.isfinite(flat.dot(flat)):  # a sum of squares is finite only if every number is
+            return points
     return finite_array(points, (..., 3), "points", "m")
 
 

@@ -125,11 +125,10 @@ class PackedObstacles:
         """Return the obstacles ``dt`` seconds later, each moved with its velocity and angular velocity [s]."""
         if self.still or dt == 0.0:
             return self
-        positions = self.positions + dt * self.velocities
         if self.rotating:
             turned = quaternion_multiply(quaternion_exp(dt * self.angular_velocities), self.quaternions)
-            return self._copy(positions=positions, quaternions=turned)
-        return self._copy(positions=positions, _ahead=(self._frames, dt))
+            return self._copy(positions=self.positions + dt * self.velocities, quaternions=turned)
+        return self._copy(_ahead=(self, dt))  # positions and frames are computed when they are asked for
 
     def placed(
         self, positions: Array, quaternions: Array, velocities: Array, angular_velocities: Array, stamp: float
@@ -149,9 +148,18 @@ class PackedObstacles:
     def _copy(self, **changes: object) -> PackedObstacles:
         """Return a copy with other poses, which keeps what was worked out for the shapes."""
         moved = object.__new__(PackedObstacles)
-        moved.__dict__.update(self._shapes)
-        moved.__dict__.update(changes)
+        moved.__dict__.update(self._shapes, **changes)
         return moved
+
+    def __getattr__(self, name: str) -> Array:
+        """Compute the positions of obstacles that :meth:`after` moved, the only attribute that may be missing."""
+        ahead: tuple[PackedObstacles, float] | None = self.__dict__.get("_ahead")
+        if name != "positions" or ahead is None:
+            raise AttributeError(f"PackedObstacles has no attribute {name!r}")
+        earlier, dt = ahead
+        positions = earlier.positions + dt * earlier.velocities
+        object.__setattr__(self, "positions", positions)
+        return positions
 
     @cached_property
     def _shapes(self) -> dict[str, object]:
@@ -199,7 +207,8 @@ class PackedObstacles:
     @cached_property
     def _frames(self) -> _Frames:
         if "_ahead" in self.__dict__:
-            frames, dt = self.__dict__["_ahead"]
+            earlier, dt = self.__dict__["_ahead"]
+            frames: _Frames = earlier._frames
             return frames._replace(center=frames.center + dt * frames.velocity)
         order = self._sorted[0]
         to_own = np.ascontiguousarray(quaternion_to_matrix(self.quaternions[order]).transpose(0, 2, 1))
