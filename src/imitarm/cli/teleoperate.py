@@ -197,6 +197,7 @@ def _show(arguments: argparse.Namespace, summary: Summary, robot: Robot, stream:
         ("skeletons", str(summary.skeletons)),
         ("states", states),
         ("commands changed by a limit", clamped),
+        ("commands changed for a clearance", f"in {summary.filtered} steps; no safe motion in {summary.unsafe} steps"),
         ("largest use of the limits", limits),
     ]
     received = [("skeletons", stream.datagram_filter.dropped)] if stream is not None else []
