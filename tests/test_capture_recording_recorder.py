@@ -115,7 +115,7 @@ def test_an_error_while_recording_keeps_what_came(tmp_path):
 def test_nothing_that_is_there_is_overwritten(tmp_path):
     path = tmp_path / "a.csv"
     recorded(path, 2).close()
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         SkeletonRecorder(path)
     first = SkeletonRecorder(path, replace=True)
     with pytest.raises(InputError, match=r"a\.csv\.part: was left .* or is being written"):

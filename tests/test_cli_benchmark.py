@@ -104,7 +104,7 @@ def test_a_report_replaces_no_document(tmp_path, monkeypatch, capsys):
     text = f"precious\n{BEGIN}\n{END}\n"
     (tmp_path / "paper.md").write_text(text)
     assert cli.main([*SMALL, "--report", "paper.md"]) == 2
-    assert "is there already and is no HTML page; name another file\n" in capsys.readouterr().err
+    assert "already exists and is not an HTML page; name another file\n" in capsys.readouterr().err
     assert cli.main([*SMALL, "--fill", "paper.md", "--report", "paper.md"]) == 2
     assert "--report paper.md: is the file of --fill, too" in capsys.readouterr().err
     (tmp_path / "results").mkdir()

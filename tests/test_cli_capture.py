@@ -75,7 +75,7 @@ def test_a_made_up_person_for_some_seconds(tmp_path):
     ("options", "message"),
     [
         (["--out", "{}/no/a.csv"], "there is no folder"),
-        (["--out", "{}/there.csv"], "is there already; name another file, or replace it with --force"),
+        (["--out", "{}/there.csv"], "already exists; name another file, or replace it with --force"),
         (["--out", "{}/wave.csv"], "is the file of SOURCE, too"),
         (["--out", "{}/wave.csv", "--force"], "is the file of SOURCE, too"),
         (["--out", "{}", "--force"], "is a folder; name a file in it"),

@@ -34,7 +34,7 @@ def place(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("command", "words", "option"), CASES)
 @pytest.mark.parametrize(
-    ("path", "told"), [("nowhere/there", "there is no folder nowhere; make it first"), (".", "is a folder")]
+    ("path", "told"), [("nowhere/there", "there is no folder nowhere; create it first"), (".", "is a folder")]
 )
 def test_a_place_that_can_not_be_written_to_is_told_before_the_work(place, capsys, command, words, option, path, told):
     assert main([command, *words, option, path]) == 2
@@ -56,6 +56,7 @@ def test_no_command_writes_anywhere_else(command, monkeypatch):
     monkeypatch.setattr(argparse._ActionsContainer, "add_argument", noted)
     cli._parser([command])
     reads = {"--calibration", "--scene", "--points", "--config", "--data", "--tool", "--robot", "--package-path"}
-    files = {name for name, action in seen.items() if action.metavar in ("FILE", "FOLDER")} - reads
+    reads |= {"--skill", "--skills"}
+    files = {name for name, action in seen.items() if action.metavar in ("FILE", "FOLDER", "DIR")} - reads
     own = {"benchmark": {"--out", "--report", "--fill"}, "demo": {"--out"}}
     assert files == set(own.get(command, WRITES.get(command, ((), ()))[1]))

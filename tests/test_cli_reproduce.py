@@ -62,7 +62,7 @@ def test_the_demo_replaces_no_file_unasked(tmp_path, monkeypatch, capsys, name):
         patch.setattr("imitarm.cli.demo.SweepTask", lambda **_: pytest.fail("it has begun to work"))
         assert main(["demo", "--out", str(tmp_path)]) == 2
     message = capsys.readouterr().err
-    assert f"{name}: is there already" in message and "--force" in message
+    assert f"{name}: already exists" in message and "--force" in message
     assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "mine"
     monkeypatch.setattr("imitarm.cli.demo.SCENES", ())
     assert main(["demo", "--out", str(tmp_path), "--force"]) in {0, 1}

@@ -250,7 +250,7 @@ def test_wrong_options_are_reported_and_nothing_is_written(shown, tmp_path, monk
         (["--calibration", "mine.json", "--report", "mine.json"], "is the file of --calibration, too"),
         (["--scene", "mine.json", "--out", "mine.json", "--force"], "is the file of --scene, too"),
         (["--robot", "mine.json", "--out", "mine.json", "--force"], "is the file of --robot, too"),
-        (["--report", "mine.json"], "is there already and is no HTML page; name another file"),
+        (["--report", "mine.json"], "already exists and is not an HTML page; name another file"),
         (["--report", "folder"], "--report folder: is a folder; name a file in it"),
         (["--out", "folder"], "--out folder: is a folder; name a file in it"),
         (["--out", "folder", "--force"], "--out folder: is a folder; name a file in it"),
@@ -290,7 +290,7 @@ def test_a_report_replaces_a_page_and_nothing_else_unasked(tmp_path, content, mo
     if replaced:
         assert _output_files(words, ["modern"]) == {}
     else:
-        with pytest.raises(InputError, match="is there already and is no HTML page"):
+        with pytest.raises(InputError, match="already exists and is not an HTML page"):
             _output_files(words, ["modern"])
     assert page.read_text() == content
 
@@ -310,7 +310,7 @@ def test_a_file_that_is_there_is_not_replaced_unasked(shown, tmp_path, capsys):
     out = tmp_path / "demo.csv"
     out.write_text("mine")
     assert run(shown, "--out", out) == 2
-    assert "is there already" in capsys.readouterr().err and out.read_text() == "mine"
+    assert "already exists" in capsys.readouterr().err and out.read_text() == "mine"
     assert run(shown, "--out", out, "--force") == 0
     assert len(Demonstration.load(out)) > 100
 

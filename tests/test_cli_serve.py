@@ -47,7 +47,7 @@ def test_an_address_that_others_reach_is_warned_of(capfd):
         ),
         (["--seconds", "1", "--port", "0", "--rate", "200"], "multiple of the timestep"),
         (["--scene", "{}/no.yaml"], "no.yaml"),
-        (["--port", "0", "--trace", "{}/there.csv"], "is there already; name another file"),
+        (["--port", "0", "--trace", "{}/there.csv"], "already exists; name another file"),
         (["--port", "0", "--trace", "{}/no/there.csv"], "there is no folder"),
         (["--port", "0", "--trace", "{}", "--force"], "is a folder; name a file in it"),
         (

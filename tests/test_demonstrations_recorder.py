@@ -63,7 +63,7 @@ def test_less_than_two_samples_are_no_motion_and_leave_nothing(tmp_path):
 def test_nothing_is_overwritten_unasked(tmp_path):
     path = tmp_path / "reach.csv"
     path.write_text("precious")
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         DemonstrationRecorder(path, ARM)
     recorder = record(path, replace=True)
     assert path.read_text() == "precious"

@@ -1,4 +1,4 @@
-"""``imitarm demo``: learn a sweep from demonstrations, do it around obstacles, write a report."""
+"""``imitarm demo``: learn to sweep from demonstrations, sweep around obstacles, write a report."""
 
 from __future__ import annotations
 
@@ -27,48 +27,52 @@ examples:
   imitarm demo --out results --method mapf
   imitarm demo --seed 7
 
-Eight demonstrations of a sweep come with the package: a seeded synthetic teacher guided the compliant simulated
-Sawyer by hand. They are checked, aligned and learnt; the skill is then reproduced without obstacles and in four scenes
-with obstacles. FOLDER gets skill.json, report.html (opens offline in any browser) and results.json; with --force they
-may replace older ones.
-Exit status 1 when a scene fails or something is touched.
+The package contains eight demonstrations of a sweep, in which a synthetic teacher guides the simulated Sawyer by hand.
+The command checks and aligns them, learns a skill, and reproduces the skill without obstacles and in four scenes with
+obstacles. It writes skill.json, report.html (opens offline in any browser) and results.json to FOLDER. It replaces
+existing files only with --force.
+The exit status is 1 if a scene fails or the arm touches an obstacle.
 """
 
 _SUMMARY = (
-    "A Sawyer learns to sweep crumbs into a dustpan from eight demonstrations, then does it on tables where things "
-    "stand in the way that were not there before. Only the parts of the learnt path near an obstacle move, by the "
-    "least that keeps the asked clearance. The demonstrations were made by a synthetic teacher who hand-guides the "
-    "simulated arm; clearance, torques and crumbs are measured by the simulator, not by the planner."
+    "A Sawyer learns from eight demonstrations to sweep crumbs into a dustpan. It then sweeps tables on which new "
+    "obstacles stand in the way. Only the parts of the learned path near an obstacle are moved, and only as far as the "
+    "required clearance demands. A synthetic teacher gave the demonstrations by guiding the simulated arm by hand. "
+    "Clearance, torques and crumbs are measured in the simulator; they are not taken from the plan."
 )
 
 _CAPTIONS = {
-    "free": "Nothing is in the way: the brush does what it was shown.",
-    "two_boxes": "Two boxes stand on the learnt path, one before the dirt and one behind it.",
-    "tall_and_low": "Boxes of other sizes, each on the other side of the path.",
-    "boxes_and_cone": "A box and a cone stand on the path, and a tall box narrows the way round.",
-    "cone_first": "A cone and a box stand on the path, and a large box narrows the way round.",
+    "free": "No obstacle is in the way: the brush follows the learned path.",
+    "two_boxes": "Two boxes stand on the learned path, one before the crumbs and one behind them.",
+    "tall_and_low": "A tall and a low box stand on opposite sides of the learned path.",
+    "boxes_and_cone": "A box and a cone stand on the learned path, and a tall box narrows the space around them.",
+    "cone_first": "A cone and a box stand on the learned path, and a large box narrows the space around them.",
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes."""
-    parser.add_argument("--out", type=Path, default=Path("demo"), metavar="FOLDER", help="default: demo")
-    parser.add_argument("--seed", type=int, default=0, help="of where the crumbs lie; default: 0")
-    parser.add_argument("--method", choices=ADAPTERS, default="certified", help="how to adapt; default: certified")
-    parser.add_argument("--force", action="store_true", help="replace files that are there")
+    """Add the arguments of the command."""
+    parser.add_argument(
+        "--out", type=Path, default=Path("demo"), metavar="FOLDER", help="folder for the results; default: demo"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed for the places of the crumbs; default: 0")
+    parser.add_argument(
+        "--method", choices=ADAPTERS, default="certified", help="method that adapts the path; default: certified"
+    )
+    parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Learn, reproduce in every scene, report; return 1 when a scene fails.
+    """Learn, reproduce the skill in every scene and write the report; return 1 if a scene fails.
 
     Raises:
-        InputError: when the folder can't be made, or a file in it would be lost.
+        InputError: when the folder cannot be created, or a file in it would be overwritten.
     """
     folder: Path = arguments.out
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"--out {folder}: can't be made ({error.strerror}); name another folder") from error
+        raise InputError(f"--out {folder}: cannot be created ({error.strerror}); name another folder") from error
     skill_file, page_file, results_file = (folder / name for name in ("skill.json", "report.html", "results.json"))
     check_outputs([("--out", path) for path in (skill_file, page_file, results_file)], [], force=arguments.force)
     task = SweepTask(seed=arguments.seed)
@@ -101,9 +105,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def packaged_demonstrations() -> list[Demonstration]:
-    """Return the demonstrations of the sweep that come with the package."""
+    """Return the demonstrations of the sweep that the package contains."""
     paths = sorted(DEMONSTRATIONS.glob("*.csv"))
-    return [replace(Demonstration.load(path), source=path.name) for path in paths]  # a skill file names no folders
+    return [replace(Demonstration.load(path), source=path.name) for path in paths]  # no folder names in the skill file
 
 
 def _sweep(
@@ -138,7 +142,7 @@ def _sweep(
         demonstrations=demonstrations,
         evaluate=task.evaluate,
         caption=_CAPTIONS.get(name, ""),
-        progress=lambda share: progress.update(whole, completed=before + share),
+        progress=lambda fraction: progress.update(whole, completed=before + fraction),
     )
     progress.update(whole, completed=before + 1.0)
     return result

@@ -1,4 +1,4 @@
-"""Where a command writes: whatever would be lost by that is found out before the work."""
+"""The output files of a command, which are checked before the work so that nothing is overwritten by accident."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from imitarm.errors import InputError
 
 PAGE = "--report"
-"""The option that names a page; an older page may be replaced by it."""
+"""The option that names a report page; it may replace an older page."""
 
-_BEGINS = ("<!doctype html", "<html")  # of an HTML page
+_BEGINS = ("<!doctype html", "<html")  # first characters of an HTML page
 
 
 def check_outputs(
@@ -21,39 +21,39 @@ def check_outputs(
     force: bool | None = None,
     new_folders: bool = False,
 ) -> None:
-    """Refuse to write where an input, another output or a file that was there would be lost.
+    """Refuse outputs that would overwrite an input, another output or an existing file.
 
     Args:
-        outputs: the option and the file of each that is written; None: it is not.
-        inputs: the option or the argument of each that is read, and the file, or a source that may be none.
-        force: files that are there may be replaced; None: the command has no such option.
-        new_folders: the command makes folders that are missing.
+        outputs: option and file of each output; None: the output is not written.
+        inputs: option or argument of each input, and its file, or the name of a source that may not be a file.
+        force: whether existing files may be replaced; None: the command has no option ``--force``.
+        new_folders: whether the command creates missing folders.
 
     Raises:
-        InputError: when an output is a folder or in no folder, is the file of an input or of another output, or is
-            there already and may not be replaced. ``--report`` replaces an HTML page always.
+        InputError: when an output is a folder, its folder is missing, it is the file of an input or of another output,
+            or it exists and may not be replaced. ``--report`` always replaces an HTML page.
     """
     taken = [(name, file) for name, word in inputs if word is not None for file in _files(word)]
     for option, path in outputs:
         if path is None:
             continue
-        said = f"{option} {path}"
+        named = f"{option} {path}"
         if path.is_dir():
-            raise InputError(f"{said}: is a folder; name a file in it")
+            raise InputError(f"{named}: is a folder; name a file in it")
         if not new_folders and not path.absolute().parent.is_dir():
-            raise InputError(f"{said}: there is no folder {path.parent}; make it first")
+            raise InputError(f"{named}: there is no folder {path.parent}; create it first")
         for name, other in taken:
             if same_place(path, other):
-                raise InputError(f"{said}: is the file of {name}, too, and would be lost; name another one")
+                raise InputError(f"{named}: is also the file of {name} and would be overwritten; name another file")
         taken.append((option, path))
         if path.exists() and not force and not (option == PAGE and _is_page(path)):
-            what = " and is no HTML page" if option == PAGE else ""
-            way = "" if force is None else ", or replace it with --force"
-            raise InputError(f"{said}: is there already{what}; name another file{way}")
+            what = " and is not an HTML page" if option == PAGE else ""
+            remedy = "" if force is None else ", or replace it with --force"
+            raise InputError(f"{named}: already exists{what}; name another file{remedy}")
 
 
 def same_place(one: Path, other: Path) -> bool:
-    """Whether two paths lead to the same file or folder, which need not be there yet."""
+    """Return whether two paths lead to the same file or folder, which need not exist yet."""
     if one.exists() and other.exists():
         return one.samefile(other)
     return _place(one) == _place(other)
@@ -64,18 +64,18 @@ def _place(path: Path) -> str:
 
 
 def _files(word: str | Path) -> tuple[Path, ...]:
-    """Return the files that a source may mean."""
+    """Return the files that the name of a source may refer to."""
     text = str(word)
     return Path(text), Path(text.removeprefix("video:"))
 
 
 def _is_page(path: Path) -> bool:
-    """Whether a file is an HTML page, or empty, so that nothing is lost."""
-    if not path.is_file():  # a pipe or a device, which must not be waited for
+    """Return whether a file is an HTML page or empty."""
+    if not path.is_file():  # a pipe or a device: reading it could block
         return False
     try:
         with path.open("rb") as file:
             begin = file.read(256).removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     except OSError as error:
-        raise InputError(f"{PAGE} {path}: can't be read: {error.strerror or error}") from error
+        raise InputError(f"{PAGE} {path}: cannot be read: {error.strerror or error}") from error
     return not begin or begin.startswith(tuple(text.encode() for text in _BEGINS))

@@ -1,4 +1,4 @@
-"""What commands print with: results go to stdout, progress and remarks to stderr."""
+"""Printing of commands: results go to stdout, progress and remarks to stderr."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.status import Status
 from rich.table import Table
 
-_WIDTH_IN_FILES = 160  # columns when nobody watches: a path must not be broken
-_LONG = 2.0  # [s] shorter work needs no progress bar
+_WIDTH_IN_FILES = 160  # columns when the output is not a terminal, so that paths are not broken
+_LONG = 2.0  # [s] a progress bar appears after this time
 
 
 def _console(stream: TextIO) -> Console:
     fixed = not stream.isatty() and "COLUMNS" not in os.environ
-    # no markup: "pouring.npy[2]" is a name, not a colour
+    # without markup, because rich would take "[2]" in "pouring.npy[2]" for a style
     return Console(file=stream, width=_WIDTH_IN_FILES if fixed else None, markup=False, emoji=False, highlight=False)
 
 
 def say(*lines: str) -> None:
     """Print lines to stdout."""
     for line in lines:
-        _console(sys.stdout).print(line, soft_wrap=True)  # a path must not be broken
+        _console(sys.stdout).print(line, soft_wrap=True)  # do not break paths
 
 
 def remark(line: str) -> None:
@@ -44,7 +44,7 @@ def show_table(
         columns: headings; one that ends in ``>`` is right-aligned.
         rows: the cells.
         title: above the table.
-        styles: one colour a row; empty: none.
+        styles: one colour for each row; empty: no colours.
     """
     table = Table(title=title or None, title_justify="left", header_style="bold")
     for column in columns:
@@ -56,23 +56,23 @@ def show_table(
 
 
 def working(what: str) -> Status:
-    """Show that something goes on, while the ``with`` block runs; silent when stderr is no terminal."""
+    """Show that work is going on while the ``with`` block runs; silent when stderr is not a terminal."""
     return _console(sys.stderr).status(what)
 
 
 def progress_bar() -> Progress:
-    """Show how much is done and how long it will still take, while the ``with`` block runs."""
+    """Show the progress and the remaining time while the ``with`` block runs."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     return Progress(*columns, console=_console(sys.stderr), transient=True)
 
 
 @contextmanager
-def watched(what: str, share: Callable[[], float]) -> Iterator[None]:
-    """Show how far something has come that can't tell itself, while the ``with`` block runs, once it takes 2 s.
+def watched(what: str, fraction: Callable[[], float]) -> Iterator[None]:
+    """Show the progress of work that does not report it, while the ``with`` block runs; it appears after 2 s.
 
     Args:
-        what: is going on.
-        share: that is done, 0 to 1; asked five times a second from another thread.
+        what: description of the work.
+        fraction: returns the fraction that is done, 0 to 1; called five times per second from another thread.
     """
     over = threading.Event()
 
@@ -82,7 +82,7 @@ def watched(what: str, share: Callable[[], float]) -> Iterator[None]:
         with progress_bar() as progress:
             task = progress.add_task(what, total=1.0)
             while not over.wait(0.2):
-                progress.update(task, completed=min(max(share(), 0.0), 1.0))
+                progress.update(task, completed=min(max(fraction(), 0.0), 1.0))
 
     watcher = threading.Thread(target=watch, daemon=True, name=what)
     watcher.start()

@@ -163,7 +163,7 @@ class Trace:
             self._file: TextIOWrapper = path.open("w" if replace else "x", encoding="utf-8", newline="\n")
         except FileExistsError as error:
             raise InputError(
-                f"--trace {path}: is there already; name another file, or replace it with --force"
+                f"--trace {path}: already exists; name another file, or replace it with --force"
             ) from error
         except OSError as error:
             raise InputError(f"--trace {path}: can't be written: {error.strerror or error}") from error

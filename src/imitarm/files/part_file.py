@@ -39,7 +39,7 @@ class PartFile:
         if self.path.is_dir():
             raise InputError(f"{path}: is a folder; name a file in it")
         if self.path.exists() and not replace:
-            raise InputError(f"{path}: is there already; name another file, or allow it to be replaced")
+            raise InputError(f"{path}: already exists; name another file, or allow it to be replaced")
         try:
             self._file: TextIOWrapper | None = self.part.open("x", encoding="utf-8", newline="\n")
             self._file.write(begin)

@@ -226,7 +226,7 @@ def _draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance
             look = {"levels": [-1e3, 0.0], "colors": [palette.OBSTACLE], "alpha": 0.85, "zorder": 2}
             axes.contourf(grid.across, grid.up, distance, **look)
             if obstacle.name:
-                _name(axes, grid, distance, obstacle.name, path)
+                _name(axes, grid, distance - clearance, obstacle.name, path)
         if distance.min() < clearance:
             look = {"levels": [clearance], "colors": [palette.LIMIT], "linewidths": 0.9, "linestyles": "dashed"}
             axes.contour(grid.across, grid.up, distance, zorder=2, **look)
@@ -234,7 +234,7 @@ def _draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance
 
 
 def _name(axes: Any, grid: Grid, distance: Array, name: str, path: Array) -> None:
-    """Write an obstacle's name beside it, on the side away from the path (n, 2) [m]."""
+    """Write an obstacle's name beside the area where ``distance`` is negative, away from the path (n, 2) [m]."""
     rows, columns = np.nonzero(distance < 0.0)
     across = float(grid.across[columns].mean())
     beside = path[np.argmin(np.abs(path[:, 0] - across)), 1]
