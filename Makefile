@@ -55,7 +55,7 @@ tables: $(VENV)/.dev $(MEDIAPIPE)  ## print all tables of docs/ again, which tak
 	$(BIN)/imitarm benchmark people $(DATA) $(VIDEOS)/cam01.mp4 $(VIDEOS)/cam02.mp4 --fill docs/real_data.md
 
 pictures: demo  ## renew the picture of the report in docs/images, which needs Chromium, Chrome or Edge
-	$(BIN)/python scripts/take_picture.py demo/report.html docs/images/report.png --anchor scene-4-boxes-and-cone --seconds 25
+	$(BIN)/python scripts/take_picture.py demo/report.html docs/images/report.png --anchor scene-4-boxes-and-cone --seconds 40
 
 clean:  ## remove the environment and everything made
 	rm -rf $(VENV) .venv-mediapipe .cache demo .pytest_cache .mypy_cache .ruff_cache .hypothesis

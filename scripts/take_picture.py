@@ -1,6 +1,6 @@
 """Take a picture of a report page, for the documentation.
 
-    python scripts/take_picture.py demo/report.html docs/images/report.png --anchor scene-4-boxes-and-cone --seconds 25
+    python scripts/take_picture.py demo/report.html docs/images/report.png --anchor scene-4-boxes-and-cone --seconds 40
 
 A Chromium browser must be installed on this machine. It is controlled by its DevTools protocol, because a 3-D playback
 needs real time, and the browser's own screenshot option does not wait.

@@ -106,10 +106,10 @@ def test_a_report_replaces_no_document(tmp_path, monkeypatch, capsys):
     assert cli.main([*SMALL, "--report", "paper.md"]) == 2
     assert "already exists and is not an HTML page; name another file\n" in capsys.readouterr().err
     assert cli.main([*SMALL, "--fill", "paper.md", "--report", "paper.md"]) == 2
-    assert "--report paper.md: is the file of --fill, too" in capsys.readouterr().err
+    assert "--report paper.md: is also the file of --fill" in capsys.readouterr().err
     (tmp_path / "results").mkdir()
     assert cli.main([*SMALL, "--out", "results", "--report", "results/mapping.json"]) == 2
-    assert "--report results/mapping.json: is the file of --out, too" in capsys.readouterr().err
+    assert "--report results/mapping.json: is also the file of --out" in capsys.readouterr().err
     assert not list((tmp_path / "results").iterdir())
     assert cli.main([*SMALL, "--out", "paper.md"]) == 2
     assert "--out paper.md: is not a folder" in capsys.readouterr().err

@@ -165,9 +165,9 @@ def test_points_that_will_not_do_are_refused_and_nothing_is_lost(inside, capsys,
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["limbs", "a.csv", "--out", "a.csv"], "--out a.csv: is the file of SOURCE, too"),
-        (["sensor", "a.csv", "--out", "a.csv"], "--out a.csv: is the file of PAIRS, too"),
-        (["sensor", "--source", "webcam:0", "--points", "a.csv", "--out", "a.csv"], "is the file of --points, too"),
+        (["limbs", "a.csv", "--out", "a.csv"], "--out a.csv: is also the file of SOURCE"),
+        (["sensor", "a.csv", "--out", "a.csv"], "--out a.csv: is also the file of PAIRS"),
+        (["sensor", "--source", "webcam:0", "--points", "a.csv", "--out", "a.csv"], "is also the file of --points"),
         (["clutch", "--out", "folder"], "--out folder: is a folder; name a file in it"),
         (["clutch", "--out", "no/a.json"], "there is no folder no"),
     ],

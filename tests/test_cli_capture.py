@@ -76,8 +76,8 @@ def test_a_made_up_person_for_some_seconds(tmp_path):
     [
         (["--out", "{}/no/a.csv"], "there is no folder"),
         (["--out", "{}/there.csv"], "already exists; name another file, or replace it with --force"),
-        (["--out", "{}/wave.csv"], "is the file of SOURCE, too"),
-        (["--out", "{}/wave.csv", "--force"], "is the file of SOURCE, too"),
+        (["--out", "{}/wave.csv"], "is also the file of SOURCE"),
+        (["--out", "{}/wave.csv", "--force"], "is also the file of SOURCE"),
         (["--out", "{}", "--force"], "is a folder; name a file in it"),
         (["--seconds", "0"], "--seconds must be above 0"),
         (["--trim", "3", "1"], "--trim must be two times"),
@@ -98,7 +98,7 @@ def test_the_film_of_a_video_source_is_not_written_over(tmp_path, capsys):
     film = tmp_path / "film.mp4"
     film.write_bytes(b"film")
     assert main(["capture", f"video:{film}", "--out", str(film), "--force"]) == 2
-    assert "is the file of SOURCE, too" in capsys.readouterr().err and film.read_bytes() == b"film"
+    assert "is also the file of SOURCE" in capsys.readouterr().err and film.read_bytes() == b"film"
 
 
 @pytest.mark.parametrize(("persons", "said"), [((0,), "1 (number 0)"), ((2, 0), "2 (numbers 2, 0)")])

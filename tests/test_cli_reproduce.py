@@ -94,7 +94,7 @@ def test_real_recordings_on_the_panda_around_three_obstacles(real_data, tmp_path
 
 def test_reproduce_without_obstacles(sweep, capsys):
     assert main(["reproduce", str(sweep), "--robot", "sawyer", "--tool", "brush", "--keep-height"]) == 0
-    assert "1 of 1 scenes done" in capsys.readouterr().out
+    assert "1 of 1 scenes completed" in capsys.readouterr().out
 
 
 def test_a_refusal_is_a_failed_task_with_the_obstacle_and_the_reason(sweep, tmp_path, capsys):
@@ -117,9 +117,9 @@ def test_a_refusal_is_a_failed_task_with_the_obstacle_and_the_reason(sweep, tmp_
         (["{sweep}", "--robot", "sawyer", "--tool", "hammer"], 2, "hammer"),
         (["{sweep}", "--robot", "sawyer", "--scene", "nosuch.yaml"], 2, "nosuch.yaml"),
         (["{sweep}", "--robot", "sawyer", "--report", "nowhere/page.html"], 2, "there is no folder"),
-        (["{sweep}", "--robot", "sawyer", "--report", "{sweep}"], 2, "is the file of SKILL, too"),
-        (["{sweep}", "--robot", "sawyer", "--out", "{sweep}", "--force"], 2, "is the file of SKILL, too"),
-        (["{sweep}", "--robot", "sawyer", "--out", "new.csv", "--report", "new.csv"], 2, "of --out, too"),
+        (["{sweep}", "--robot", "sawyer", "--report", "{sweep}"], 2, "is also the file of SKILL"),
+        (["{sweep}", "--robot", "sawyer", "--out", "{sweep}", "--force"], 2, "is also the file of SKILL"),
+        (["{sweep}", "--robot", "sawyer", "--out", "new.csv", "--report", "new.csv"], 2, "is also the file of --out"),
         (["{sweep}", "--robot", "sawyer", "--out", ".", "--force"], 2, "is a folder"),
         (["{sweep}", "--robot", "sawyer", "--start", "300", "0", "0"], 2, "can't bring its tool"),
         (["{sweep}", "--robot", "sawyer", "--goal", "300", "0", "0"], 2, "can't bring its tool"),

@@ -52,7 +52,7 @@ def test_an_address_that_others_reach_is_warned_of(capfd):
         (["--port", "0", "--trace", "{}", "--force"], "is a folder; name a file in it"),
         (
             ["--robot", "sawyer", "--scene", "{}/there.csv", "--trace", "{}/there.csv", "--force"],
-            "is the file of --scene, too",
+            "is also the file of --scene",
         ),
         (["--port", "0", "--host", "no.such.host.invalid"], "there is no such host"),
     ],

@@ -412,8 +412,7 @@ def _written_report(
                 scene=setting.scene,
                 summary=f"The {correspondence.side} arm of a person ({Path(arguments.source).name}) moves the tool of "
                 f"{arm.name}. When the hand moves by 10 cm, the tool moves by {10 * correspondence.scale:.1f} cm. "
-                f"The tool rotates {_ROTATES[correspondence.orientation]}."
-                + (f" {hint[0].upper()}{hint[1:]}." if hint else ""),
+                f"{_ORIENTATIONS[correspondence.orientation]}." + (f" {hint[0].upper()}{hint[1:]}." if hint else ""),
                 findings=findings,
                 provenance=provenance(
                     robot=arm.name,
@@ -426,4 +425,8 @@ def _written_report(
         )
 
 
-_ROTATES = {"hand": "with the hand", "upright": "with the hand, but only about the vertical", "fixed": "not at all"}
+_ORIENTATIONS = {
+    "hand": "The tool rotates with the hand",
+    "upright": "The tool rotates with the hand, but only about the vertical axis",
+    "fixed": "The tool keeps its orientation",
+}

@@ -97,7 +97,7 @@ def report_html(report: Report) -> str:
             {
                 "result": scene,
                 "cells": [*_cells(scene), *(str(scene.details.get(key, "–")) for key in extra)],
-                "text": _sentences(scene.caption, scene.reason),
+                "text": _sentences(scene.caption, "" if scene.success else scene.reason),
                 "player": Player(f"3-D playback: {scene.title}", own[scene.name], _KEYS) if scene.name in own else None,
                 "figures": list(_scene_figures(f"s{i + 1}", scene)),
                 "facts": _scene_facts(scene),

@@ -34,10 +34,10 @@ def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> 
     Returns:
         An SVG element.
     """
-    height = 0.62 + 0.24 * len(runs)
+    height = 0.72 + 0.24 * len(runs)
     fractions = "; ".join(f"{title}: following {100 * np.mean(run.states == 'following'):.0f} %" for title, run in runs)
     with canvas(name, f"State over time. {fractions}", (5.5, height + 0.05)) as drawing:
-        axes = drawing.axes(0.95, 0.58, 5.4, height)
+        axes = drawing.axes(0.95, 0.68, 5.4, height)
         longest = max(float(run.times[-1]) for _, run in runs)
         for row, (_, run) in enumerate(runs):
             for first, last in stretches(run.states):
@@ -55,7 +55,7 @@ def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> 
         axes.set_xlim(0.0, longest)
         axes.set_ylim(-len(runs) + 0.5, 0.5)
         axes.grid(axis="y", visible=False)
-        axes.set_xlabel("time [s]", labelpad=1)
+        axes.set_xlabel("time [s]", labelpad=3)
         for state in EngagementState:
             axes.bar(0.0, 0.0, color=STATE_COLOURS[state], label=state)
         drawing.legend(5)
@@ -112,7 +112,7 @@ def _finish(axes: Any, times: Array, label: str, *, last: bool) -> None:
     axes.set_ylabel(label)
     axes.locator_params(axis="y", nbins=4)
     if last:
-        axes.set_xlabel("time [s]", labelpad=1)
+        axes.set_xlabel("time [s]", labelpad=3)
     else:
         axes.tick_params(axis="x", labelbottom=False)
 
