@@ -248,7 +248,7 @@ def test_learn_does_not_overwrite_unasked(shown, tmp_path, capsys):
     one = next(path for path in shown.iterdir())
     before = one.read_bytes()
     assert main([*words, str(one), "--force"]) == 2
-    assert "is the file of FILE, too" in capsys.readouterr().err and one.read_bytes() == before
+    assert "is also the file of FILE" in capsys.readouterr().err and one.read_bytes() == before
     assert main([*words, str(out), "--force"]) == 0
     assert Skill.load(out).n_demonstrations_ == 5
 
