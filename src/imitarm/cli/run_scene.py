@@ -120,7 +120,7 @@ def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
     if rollout is not None and "swept_fraction" in rollout.details:
         details["dirt in the pan"] = f"{100 * rollout.details['swept_fraction']:.0f} %"
     if policy.plan is not None:
-        details["largest displacement [σ of the demonstrations]"] = f"{policy.plan.deviation:.1f}"
+        details["largest displacement [σ]"] = f"{policy.plan.deviation:.1f}"
     return details
 
 
