@@ -21,7 +21,7 @@ def main() -> None:
         motion = one.trajectory
         print(f"{Path(one.source).name}: {len(one)} poses, {motion.duration:.1f} s, {motion.path_length:.2f} m")
 
-    # Check, before anything is learnt. Notes are for information, warnings want a look, errors spoil the result.
+    # Check, before anything is learned. Notes are for information, warnings want a look, errors spoil the result.
     print("\nlint says:")
     for finding in lint(shown):
         print(f"  {finding.severity} {finding.code}: {finding.message}")

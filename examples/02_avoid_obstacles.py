@@ -1,6 +1,7 @@
-"""Adapt a learnt path to a scene: three methods side by side, forbidden directions, and refusals that say why.
+"""Adapt a learned path to a scene: three methods side by side, forbidden directions, and refusals that say why.
 
-Nothing moves here: `adapt` answers with a path and what is proven of it. `03_reproduce_on_an_arm.py` executes one.
+No robot moves here: `adapt` returns a path and the clearance that is certified for it. `03_reproduce_on_an_arm.py`
+    executes one.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ UPRIGHT = [1.0, 0.0, 0.0, 0.0]  # quaternions are w, x, y, z everywhere
 def show(adaptation: Adaptation) -> None:
     verdict = "can be executed" if adaptation.feasible else "refused"
     print(
-        f"  {adaptation.method:9s} {verdict}: {1e3 * adaptation.certified_clearance:.1f} mm proven on the whole path, "
+        f"  {adaptation.method:9s} {verdict}: {1e3 * adaptation.certified_clearance:.1f} mm certified on the whole "
+        f"path, "
         f"{int(adaptation.moved.sum())} of {len(adaptation.moved)} components moved, "
-        f"{1e3 * adaptation.rmse_to_nominal:.0f} mm from the learnt path"
+        f"{1e3 * adaptation.rmse_to_nominal:.0f} mm from the learned path"
     )
     if adaptation.reason:
         print(f"            {adaptation.reason}")
@@ -32,7 +34,7 @@ def main() -> None:
     dirt = task.dirt_time(skill.gmr_.trajectory(1000))
     options = {"tool_radius": task.tool_radius, "clearance": 0.02, "pinned": [dirt]}
 
-    # Obstacles can be moved, turned, named and given a velocity; a scene without a goal keeps the learnt one.
+    # Obstacles can be moved, turned, named and given a velocity; a scene without a goal keeps the learned one.
     cup = Sphere([0.57, -0.28, 0.03], 0.04, name="cup")
     box = Box(Pose([0.66, 0.14, 0.05], UPRIGHT), [0.08, 0.05, 0.1], name="tin")
     scene = Scene(goal=None, obstacles=[cup, box])
@@ -48,7 +50,7 @@ def main() -> None:
     alone = adapt(skill, Scene(None, [box]), forbidden=HORIZONTAL_ONLY, **options)
     show(alone)
     same = np.all(alone.trajectory.positions == alone.nominal.positions, axis=1)
-    print(f"  {same.sum()} of {len(same)} samples of the path are exactly where they were learnt")
+    print(f"  {same.sum()} of {len(same)} samples of the path are exactly where they were learned")
 
     # Directions in which nothing may move decide what "around" means: over it, or beside it.
     print("\na low wall across the table:")

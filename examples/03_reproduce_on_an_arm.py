@@ -1,4 +1,4 @@
-"""Reproduce a skill on a simulated arm around obstacles, and believe only what the simulator measures.
+"""Reproduce a skill on a simulated arm around obstacles, and let the simulator measure the result.
 
 The plan keeps the brush clear. Whether the arm, with its inertias, limits and servos, keeps to the plan, and whether
 its links stay clear as well, is measured by the simulator between its own shapes.
@@ -71,7 +71,7 @@ def main() -> None:
     adaptation = policy.adaptation
     print(f"{'done' if rollout.success else 'FAILED'}: {rollout.reason}")
     print(f"  {rollout.trajectory.duration:.1f} s, shown in {skill.duration_:.1f} s")
-    print(f"  clearance planned and proven for the brush: {1e3 * adaptation.certified_clearance:.1f} mm")
+    print(f"  clearance certified for the brush: {1e3 * adaptation.certified_clearance:.1f} mm")
     print(f"  clearance measured, of arm and brush:       {1e3 * rollout.min_clearance:.1f} mm")
     for pair, steps in nearest.most_common(3):
         print(f"    within 5 cm for {0.01 * steps:.1f} s: {pair}")

@@ -1,6 +1,6 @@
 """Load an arm of your own from a URDF or MJCF file: kinematics, inverse kinematics, gravity, and a simulated body.
 
-Here the file is written first, so that the example needs nothing; yours exists already.
+The example first writes a URDF file, so that it needs no other file; use your own file instead.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main() -> None:
     # A URDF says nothing of accelerations: 10 rad/s^2 is taken. An MJCF file may name them (see ArmModel.load).
     print(f"  accelerations {arm.max_acceleration} rad/s^2, tool {arm.tool_to_flange.position} m from the flange")
 
-    # A posture for a pose. The tool looks down: half a turn about y.
+    # A posture for a pose. The tool points down: rotated by 180 degrees about y.
     down = [0.0, 0.0, 1.0, 0.0]  # quaternion w, x, y, z
     pose = Pose([0.55, 0.1, 0.3], down)
     q = find_posture(arm, pose)

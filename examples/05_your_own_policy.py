@@ -28,12 +28,12 @@ from imitarm import (
 
 
 class Repelled(Policy):
-    """Follow the learnt path by the clock, pushed off whatever is near (the repulsive force of thesis Eq 2.19)."""
+    """Follow the learned path in time, pushed away from near obstacles (the repulsive force of thesis Eq 2.19)."""
 
     influence, gain = 0.06, 4.0  # [m], [1/s]
 
     def reset(self, observation: Observation) -> None:
-        """Take the learnt path from where the tool is."""
+        """Start the learned path at the tool's measured pose."""
         self.path = self.skill.generate(observation.tool_to_base, observation.scene.goal)
 
     def step(self, observation: Observation, dt: float) -> Command:
@@ -48,7 +48,7 @@ class Repelled(Policy):
         return Command(twist, progress=min(observation.time / self.path.duration, 1.0))
 
     def finished(self, observation: Observation) -> bool:
-        """The time is over and the goal is reached."""
+        """Whether the time is over and the goal is reached."""
         away = np.linalg.norm(self.path.positions[-1] - observation.tool_to_base.position)
         return observation.time > self.path.duration and bool(away < 0.005)
 
@@ -57,7 +57,7 @@ POLICIES.register("repelled", Repelled)
 
 
 def reaches(start: Pose, goal: Pose, n: int = 5) -> list[Demonstration]:
-    """Make up demonstrations of a reach with an arch that differs from one to the next."""
+    """Generate synthetic demonstrations of a reach along an arch that differs from one to the next."""
     rng = np.random.default_rng(0)
     u = np.linspace(0.0, 1.0, 150)[:, None]
     pace = 10 * u**3 - 15 * u**4 + 6 * u**5
@@ -92,7 +92,7 @@ def main() -> None:
     for name, scene in scenes.items():
         print(name)
         for key, make in POLICIES.items():
-            # Where a policy fails, the safety filter can still keep every link clear, whatever is asked for.
+            # Where a policy fails, the safety filter can still keep every link clear, whatever the policy commands.
             for clearance in (None, 0.01):
                 robot = SimulatedRobot(arm, scene=scene, q=find_posture(arm, start))
                 policy = make(skill, tool_spheres=[[0.0, 0.0, 0.0, arm.tool_radius]])

@@ -1,7 +1,7 @@
 """Let a person show a robot what to do: five takes before a camera become demonstrations, a skill, and a motion.
 
-The person is made up, and so is the camera with its noise, so that this runs anywhere; `open_source("take.csv")` reads
-a recorded one instead. What is true is known here, so the errors can be told.
+The person and the noisy camera are simulated, so that the example runs anywhere; `open_source("take.csv")` reads a
+recording instead. The true motion is known here, so the errors can be measured.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ REST, DURATION = 1.0, 6.0  # [s] with a still hand, so that the robot can take h
 
 
 def take(number: int) -> SkeletonSource:
-    """One take: the person puts something from the right to the left over an edge, never twice quite alike."""
+    """One take: the person moves something over an edge from right to left, each time a little differently."""
     person = Person.from_seed(4)
     varied = np.random.default_rng(number).normal(0.0, 0.01, (3, 3))
     shoulder = person.shoulder("right", 0.0)
@@ -58,7 +58,8 @@ def following(run: Retargeting) -> slice:
 
 def main() -> None:
     arm = ArmModel.load("sawyer", tool="gripper")
-    # The tool goes as far as the hand does and stays upright; nothing is calibrated, limbs are learnt on the way.
+    # The tool goes as far as the hand does and stays upright; nothing is calibrated, limb lengths are measured
+    # meanwhile.
     correspondence = Correspondence(side="right", scale=1.0, orientation="fixed")
     begin = arm.tool_pose(arm.home)
     start = find_posture(arm, Pose(begin.position + np.array([0.02, -0.25, 0.0]), begin.quaternion))
@@ -89,7 +90,7 @@ def main() -> None:
         )
 
     skill = Skill().fit(align(demonstrations))
-    print(f"learnt {skill.gmr_.n_components_} components from {len(demonstrations)} takes of a person")
+    print(f"learned {skill.gmr_.n_components_} components from {len(demonstrations)} takes of a person")
 
     # The robot does it alone, and round a ball that nobody showed it.
     middle = skill.generate(Pose(skill.start_.position, begin.quaternion)).positions

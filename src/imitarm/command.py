@@ -1,4 +1,4 @@
-"""Command: what a policy asks an arm to do next, and how the motion goes."""
+"""Command: the motion that a policy requests for the next control period, with its status."""
 
 from __future__ import annotations
 
@@ -16,31 +16,32 @@ Array = NDArray[np.float64]
 
 
 class Status(Enum):
-    """How a reproduction goes, as its policy sees it."""
+    """State of a reproduction, as its policy sees it."""
 
     NOMINAL = "nominal"
     """The motion follows the learned path."""
     AVOIDING = "avoiding"
     """The motion differs from the learned path because of an obstacle."""
     WAITING = "waiting"
-    """The motion does not go on: something must change first, for example an obstacle must move away."""
+    """The motion is paused until something changes, for example until an obstacle moves away."""
     BRAKING = "braking"
     """The motion is being stopped: its plan no longer holds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Command:
-    """What a policy asks for in the next control period.
+    """The motion that a policy requests for the next control period.
 
     Attributes:
         twist: of the tool in the base frame, linear velocity first, shape (6,) [m/s, rad/s].
         joint_velocity: of the joints, shape (n_joints,) [rad/s]; it replaces the twist where it is given, for example
             along a planned joint path. None: the inverse kinematics chooses it.
-        posture: joint positions to drift to where the twist leaves freedom, shape (n_joints,) [rad]; None: any.
-        elbow: SEW angle to turn the elbow to where the twist leaves freedom [rad]; None: any.
+        posture: joint positions to drift towards, as far as the twist leaves freedom, shape (n_joints,) [rad]; None:
+            any.
+        elbow: SEW angle to rotate the elbow to, as far as the twist leaves freedom [rad]; None: any.
         progress: fraction of the motion that is done, 0 to 1; nan: unknown.
-        status: how it goes.
-        reason: why it does not go on nominally, in words that name what is in the way; empty when nominal.
+        status: state of the reproduction.
+        reason: why the motion is not nominal, naming the obstacle; empty when nominal.
     """
 
     twist: Array

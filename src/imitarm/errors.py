@@ -22,7 +22,7 @@ class InputError(ImitarmError, ValueError):
 
 
 class FileFormatError(InputError):
-    """A file that is damaged, foreign or not what its name says; the message names file and place."""
+    """A file that is damaged or has another format than expected; the message names the file and the place in it."""
 
 
 class UnknownNameError(InputError):
@@ -48,10 +48,10 @@ class TaskFailedError(ImitarmError):
 
 
 class UnreachableError(TaskFailedError):
-    """No joint configuration within the limits reaches the pose that was asked for: another pose is needed."""
+    """No joint configuration within the limits reaches the requested pose."""
 
     exit_status = 2
 
 
 class InfeasibleError(TaskFailedError):
-    """No path with the asked clearance was found; the message names the obstacle and the reason."""
+    """No path with the required clearance was found; the message names the obstacle and the reason."""

@@ -1,4 +1,4 @@
-"""One registry a family: the classes of this package, and those that other packages add by entry points."""
+"""Registry: the classes of one family, from this package and, by entry points, from other packages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Item = TypeVar("Item")
 
 
 class Registry(Mapping[str, Item], Generic[Item]):
-    """The members of one family by name, each imported when it is first asked for.
+    """The members of one family by name; each is imported when it is first used.
 
     Built-in members are given as ``"module:attribute"``. An installed package adds its own under the entry-point
     group of the family, in its ``pyproject.toml``::

@@ -1,4 +1,4 @@
-"""SafetyFilter: the last word on every joint velocity that is sent to an arm."""
+"""SafetyFilter: the last check of every joint velocity before it is sent to an arm."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _KEPT = 1e-6  # [m/s] a row that is missed by less is kept: what rounding leaves
 
 @dataclass(frozen=True, eq=False)
 class SafetyStep:
-    """What the filter made of one command.
+    """The filter's answer to one command.
 
     Attributes:
         velocity: of the joints, to be sent, shape (n_joints,) [rad/s].
-        changed: how far it differs from what the command alone would give, the joint limits kept, as the norm of the
-            difference [rad/s]; 0 where no clearance row was active.
-        slack: by how much the clearance row that is violated most is violated [m/s]; 0 where all are kept.
-        safe: whether a joint velocity exists that keeps every limit and every row; ``velocity`` is then such a one.
+        changed: norm of the difference between ``velocity`` and the velocity that the command would give within the
+            joint limits alone [rad/s]; 0 when no clearance row was active.
+        slack: largest violation of a clearance row [m/s]; 0 when all rows are kept.
+        safe: whether ``velocity`` keeps every limit and every row; if False, no joint velocity does.
     """
 
     velocity: Array
@@ -54,8 +54,8 @@ class SafetyFilter:
       :class:`~imitarm.scene.clearance_limit.ClearanceLimit` allows, and no link another link faster than
       :class:`~imitarm.kinematics.self_clearance.SelfClearance` allows.
 
-    Where these rows contradict the joint limits, no safe motion exists: the velocity violates them as little as it
-    can, which moves away from what is too near, and ``safe`` is False.
+    Where these rows contradict the joint limits, no safe motion exists: the velocity violates the rows as little as
+        possible, which moves the arm away from what is too near, and ``safe`` is False.
 
     The same filter serves every policy and teleoperation.
 
@@ -63,10 +63,11 @@ class SafetyFilter:
         arm: the arm with its tool.
         dt: control period [s].
         clearance: required distance of every part of the arm to every obstacle [m]; None: obstacles are ignored.
-        allowance: kept beyond the clearance, since no robot moves exactly as commanded [m].
-        self_clearance: required distance between links that are not neighbours [m]; None: not watched.
-        limits: in place of the joint limits; None: position, velocity and acceleration of each joint.
-        method: of the inverse kinematics; only ``"qp"`` keeps clearances, so another one needs both of them None.
+        allowance: distance kept in addition to the clearance, because no robot moves exactly as commanded [m].
+        self_clearance: required distance between links that are not neighbours [m]; None: not checked.
+        limits: limits of the inverse kinematics; None: position, velocity and acceleration of each joint.
+        method: of the inverse kinematics; only ``"qp"`` keeps clearances, so with another method both clearances must
+            be None.
 
     Raises:
         InputError: when a number can't be used, or the method can't keep what is required.
@@ -96,7 +97,7 @@ class SafetyFilter:
         """Return the joint velocity for one control period.
 
         Args:
-            command: what is asked for.
+            command: of the policy.
             q: joint positions, shape (n_joints,) [rad].
             velocity: joint velocity that was sent last, shape (n_joints,) [rad/s]; None: unknown, accelerations are
                 not limited.
@@ -121,7 +122,7 @@ class SafetyFilter:
         return SafetyStep(allowed, changed, max(missing, 0.0), missing <= _KEPT)
 
     def _admits(self, q: Array, wanted: Array, velocity: ArrayLike | None, rows: list[Rows]) -> bool:
-        """Return whether a joint velocity keeps everything as it is."""
+        """Return whether a joint velocity keeps all limits and rows without a change."""
         box = self.solver.problem(q, JointVelocityTask(wanted), velocity).box
         inside = bool((wanted >= box.lower).all() and (wanted <= box.upper).all())
         return inside and all(bool((part.matrix @ wanted >= part.lower).all()) for part in rows)
@@ -133,7 +134,7 @@ class SafetyFilter:
 
 
 def _tasks(command: Command) -> list[Task]:
-    """Return what a command asks of the inverse kinematics."""
+    """Return the tasks of the inverse kinematics for a command."""
     if command.joint_velocity is not None:
         return [JointVelocityTask(command.joint_velocity)]
     tasks: list[Task] = [TwistTask(command.twist)]

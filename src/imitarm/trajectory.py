@@ -146,7 +146,7 @@ class Trajectory:
         return Pose(self.positions[index], q)
 
     def resample(self, n: int) -> Trajectory:
-        """Return ``n`` samples equally spaced in time, first and last kept.
+        """Return ``n`` samples equally spaced in time, including the first and the last one.
 
         Raises:
             InputError: when ``n`` is not a whole number from 2 to 10 million.
@@ -168,7 +168,7 @@ class Demonstration:
         trajectory: timed poses of the tool in the base frame.
         joints: joint angles (n, n_joints) [rad] of the arm that was guided; None when they were not recorded.
         task: what was shown, for example ``"sweep"``.
-        source: where it comes from, for example a file, a range of rows or a recorder.
+        source: where it comes from, for example a file name, a range of rows or the name of a recorder.
         joint_names: one name for each column of ``joints``; ``joint_1``, ``joint_2``, ... when not given.
 
     Raises:

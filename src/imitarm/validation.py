@@ -239,7 +239,7 @@ def file_path(value: Any, what: str) -> Path:
 
 
 def _real(value: Any, what: str, unit: str, n: int | None = None) -> Array:
-    """Convert to float64; refuse what numpy would convert without a word: text, booleans, None, masked entries."""
+    """Convert to float64; refuse values that numpy would convert silently: text, booleans, None, masked entries."""
     if np.ma.is_masked(value):
         raise InputError(f"{what} has masked entries; fill them in or remove them first")
     try:

@@ -278,7 +278,7 @@ class RealtimeSource(SkeletonSource):
     """Delays a source, so that each skeleton comes no earlier than its time since the first one.
 
     Args:
-        source: gives skeletons as fast as they are asked for.
+        source: gives skeletons as fast as they are read.
     """
 
     def __init__(self, source: SkeletonSource) -> None:

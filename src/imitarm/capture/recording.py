@@ -42,7 +42,7 @@ class SkeletonRecording(SkeletonSource):
     Args:
         skeletons: in the order they came.
         name: for messages, for example the file's name.
-        realtime: replay at the recorded speed; else as fast as skeletons are asked for.
+        realtime: replay at the recorded speed; else as fast as skeletons are read.
         issues: found while reading.
         time_unit: unit of the file's time stamps [s], for messages about times that are not plausible.
 

@@ -33,7 +33,7 @@ class SyntheticSource(SkeletonSource):
         truth: true positions of all joints, as a function of time.
         camera: that sees them.
         duration: [s].
-        realtime: give each skeleton when it is due, as a camera does; else as fast as it is asked for.
+        realtime: return each skeleton at its time, as a camera does; else as fast as skeletons are read.
         name: for messages.
 
     Attributes:

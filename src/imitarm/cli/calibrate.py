@@ -48,7 +48,7 @@ _ORIENTATIONS: dict[Orientation, str] = {
     "fixed": "the tool does not rotate",
 }
 _ANCHORS: dict[Anchor, str] = {
-    "shoulder": "your stretched arm is the robot's stretched arm: the whole workspace, less precise",
+    "shoulder": "the robot's arm is stretched when yours is: the whole workspace, less precise",
     "object": "1 cm of the hand is 1 cm of the tool: for objects that you and the robot both have in front of you",
 }
 _TRIES = 3
@@ -152,8 +152,10 @@ def _show_limbs(lengths: LimbLengths, side: str) -> None:
     show_table(
         ["limbs", f"{side} arm"],
         [
-            ("upper arm", f"{1e2 * lengths.upper_arm:.1f} cm, single frames vary by {1e2 * lengths.spread[0]:.1f} cm"),
-            ("forearm", f"{1e2 * lengths.forearm:.1f} cm, single frames vary by {1e2 * lengths.spread[1]:.1f} cm"),
+            ("upper arm", f"{1e2 * lengths.upper_arm:.1f} cm, standard deviation of single frames {1e2 * "
+            "lengths.spread[0]:.1f} cm"),
+            ("forearm", f"{1e2 * lengths.forearm:.1f} cm, standard deviation of single frames {1e2 * "
+            "lengths.spread[1]:.1f} cm"),
             ("standard error", f"{error:.2f} cm from {lengths.n_frames} frames"),
         ],
     )
@@ -196,7 +198,7 @@ def _columns(path: str, names: Sequence[str]) -> list[list[float]]:
 
 
 def _guided(arguments: argparse.Namespace) -> SensorFit:
-    """Let the user touch the points, and touch those again that do not fit."""
+    """Let the user touch all points, and touch the ones with a large residual again."""
     if arguments.source is None or arguments.points is None:
         raise InputError("sensor: a guided calibration needs both --source and --points")
     points = _columns(arguments.points, ("x", "y", "z"))
@@ -304,16 +306,16 @@ def touched_points(
     *,
     only: int | None = None,
 ) -> dict[int, list[float]]:
-    """Let the user put a hand on the robot's tool at one point after the other, and measure the hand's position there.
+    """Ask the user to put a hand on the robot's tool at each point in turn, and measure the hand's position.
 
     A hand that moved or was not seen is measured again.
 
     Args:
-        source: sees the hand; live, or replayed in real time.
+        source: observes the hand, live or replayed in real time.
         points: in the robot's base frame, shape (n, 3) [m].
         side: of the hand.
         seconds: of each measurement.
-        only: the one point to touch, from 0; None: all.
+        only: index of the single point to touch, from 0; None: all points.
 
     Returns:
         position of the hand in the sensor's frame, shape (3,) [m], for each point that was not skipped, from 0.
@@ -325,7 +327,8 @@ def touched_points(
     if only is None:
         if len(points) < LEAST_PAIRS:
             raise InputError(f"sensor calibration: {len(points)} points, at least {LEAST_PAIRS} are needed; add more")
-        remark(f"{len(points)} points. At each: bring the robot's tool there, put the palm of your {side} hand on its")
+        remark(f"{len(points)} points. At each point: bring the robot's tool there, put the palm of your {side} hand "
+        f"on its")
         remark("tip so that the sensor sees the hand, hold still, press Enter. 's' skips a point, 'q' quits.")
     seen: dict[int, list[float]] = {}
     for i in wanted:

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repair", action="store_true", help="drop rows with invalid numbers or times")
     parser.add_argument("--allow-errors", action="store_true", help="learn, and write the skill, in spite of errors")
     learning = parser.add_argument_group("learning")
-    learning.add_argument("--task", default="", metavar="NAME", help="name of what is shown, stored in the skill")
+    learning.add_argument("--task", default="", metavar="NAME", help="name of the task, stored in the skill")
     learning.add_argument("--align", choices=METHODS, default="dtw", help="method of alignment; default: dtw")
     learning.add_argument(
         "--samples", type=int, metavar="N", help="per aligned demonstration; default: 200, more for long paths"
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _samples_needed(demonstrations: Sequence[Demonstration]) -> int:
-    """Return 200, and in proportion more for paths longer than 6 times their extent, up to 2000."""
+    """Return 200 samples; proportionally more, up to 2000, for paths longer than 6 times their extent."""
     most = 1.0
     for one in demonstrations:
         motion = one.trajectory.resample(400)

@@ -1,4 +1,4 @@
-"""The arguments of commands that read demonstrations, and reading with them."""
+"""The shared arguments of commands that read demonstrations, and the function that reads with them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _ARGUMENT = re.compile(
 
 
 def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the files, and all facts that they may not state themselves."""
+    """Add the files, and the options for everything that files may not state themselves."""
     parser.add_argument(
         "files", nargs="+", metavar="FILE", help=f"demonstrations, or folders of them; formats: {', '.join(READERS)}"
     )
-    unsaid = parser.add_argument_group("facts that files may not state")
+    unsaid = parser.add_argument_group("for what the files do not state")
     unsaid.add_argument("--units", choices=LENGTH_UNITS, help="unit of lengths; default: as the file says, else m")
     unsaid.add_argument(
         "--time-units", choices=TIME_UNITS, help="unit of time stamps; default: as the file says, else s"
@@ -38,7 +38,7 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
     unsaid.add_argument(
         "--quaternion-order",
         choices=QUATERNION_ORDERS,
-        help="of columns without names; default: as the file says, else wxyz",
+        help="order of quaternion columns without names; default: as the file says, else wxyz",
     )
     parser.add_argument("--thin", action="store_true", help="drop rows that only repeat a held value")
     parser.add_argument("--all", action="store_true", help="list every finding; default: one row for each kind")
@@ -93,12 +93,12 @@ def read_and_lint(
 
 
 def show_findings(raw: Sequence[RawDemonstration], findings: Sequence[Finding], *, every: bool = False) -> None:
-    """Print the findings as a table, and how many there are of each severity.
+    """Print a table of the findings, and the number of findings of each severity.
 
     Args:
         raw: the demonstrations that were read.
         findings: about them.
-        every: print each finding; else those of one kind share a row that counts them.
+        every: print one row for each finding; otherwise one row for each kind, with a count.
     """
     groups = [[f] for f in findings] if every else _kinds(findings)
     if findings:
@@ -112,7 +112,7 @@ def show_findings(raw: Sequence[RawDemonstration], findings: Sequence[Finding], 
 
 
 def _kinds(findings: Sequence[Finding]) -> list[list[Finding]]:
-    """Return the findings in groups of one code; files that can't be read are grouped by their message."""
+    """Return the findings grouped by their code; files that can't be read are grouped by their message."""
     kinds: dict[tuple[str, ...], list[Finding]] = {}
     for finding in findings:
         message = finding.message if finding.code == "unreadable" else ""

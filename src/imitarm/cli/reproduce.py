@@ -32,7 +32,7 @@ examples:
   imitarm reproduce pour.json --robot panda --scene bottles.yaml --clearance 30 --goal 40 -30 25
 
 The arm is simulated with its inertias and limits; the clearance is measured by the simulator between its own shapes.
-Exit status 1: there is no path with the required clearance, or the motion touched something or did not finish.
+The exit status is 1 when no path keeps the required clearance, something was touched, or the motion did not finish.
 """
 
 FORBIDDEN = {"keep_height": HORIZONTAL_ONLY, "not_down": NOT_DOWN}
@@ -42,21 +42,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes."""
     parser.add_argument("skill", metavar="SKILL", type=Path, help="a skill file, as 'imitarm learn' writes it")
     add_robot_options(parser)
-    parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles and goal (YAML); default: nothing")
+    parser.add_argument("--scene", type=Path, metavar="FILE", help="file of obstacles and goal (YAML); default: no "
+    "obstacles")
     avoid = parser.add_argument_group("avoidance")
-    avoid.add_argument("--policy", choices=POLICIES, default="acfra", help="what decides the motion; default: acfra")
+    avoid.add_argument("--policy", choices=POLICIES, default="acfra", help="policy that reproduces the skill; "
+    "default: acfra")
     avoid.add_argument("--method", choices=ADAPTERS, help="how acfra adapts the path; default: certified")
     avoid.add_argument(
         "--clearance", type=float, default=20.0, metavar="MM", help="required distance to every obstacle; default: 20"
     )
     avoid.add_argument(
-        "--tool-radius", type=float, metavar="MM", help="of a sphere about the tip; default: the tool's own shape"
+        "--tool-radius", type=float, metavar="MM", help="radius of a sphere about the tip, in place of the tool's own "
+        "shape"
     )
-    avoid.add_argument("--tool-only", action="store_true", help="do not keep the other links clear (to compare)")
+    avoid.add_argument("--tool-only", action="store_true", help="let the links come near obstacles; only the tool "
+    "keeps its clearance (for comparison)")
     held = avoid.add_mutually_exclusive_group()
     held.add_argument("--keep-height", action="store_true", help="move the path only sideways, as on a table")
     held.add_argument("--not-down", action="store_true", help="never move the path downwards")
-    moved = parser.add_argument_group("from and to somewhere else")
+    moved = parser.add_argument_group("other start and goal")
     triple = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     moved.add_argument("--start", **triple, help="where the motion begins [cm]; default: as learned")  # type: ignore[arg-type]
     moved.add_argument("--goal", **triple, help="where it ends [cm]; default: as the scene says, else as learned")  # type: ignore[arg-type]
@@ -119,7 +123,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _policy(arguments: argparse.Namespace, skill: Skill, spheres: NDArray[np.float64]) -> Policy:
-    """Return the policy that was chosen, with what every policy takes."""
+    """Return the chosen policy, built with the arguments that every policy takes."""
     options: dict[str, Any] = {
         "tool_spheres": spheres,
         "clearance": 1e-3 * arguments.clearance,
@@ -133,14 +137,14 @@ def _policy(arguments: argparse.Namespace, skill: Skill, spheres: NDArray[np.flo
 
 
 def _start(skill: Skill, arm: ArmModel, centimetres: Sequence[float] | None) -> Pose:
-    """Return where the tool begins; a skill without orientation keeps the tool as it is at the arm's home."""
-    learnt = skill.start_
-    position = learnt.position if centimetres is None else 0.01 * np.array(centimetres)
-    return Pose(position, learnt.quaternion if skill.gmr_.has_orientation_ else arm.tool_pose(arm.home).quaternion)
+    """Return the start pose of the tool; for a skill without orientation, the rotation is that at the arm's home."""
+    learned = skill.start_
+    position = learned.position if centimetres is None else 0.01 * np.array(centimetres)
+    return Pose(position, learned.quaternion if skill.gmr_.has_orientation_ else arm.tool_pose(arm.home).quaternion)
 
 
 def _tool(skill: Skill, arm: ArmModel, millimetres: float | None) -> NDArray[np.float64]:
-    """Return the spheres that hold the tool, rows x y z r [m]."""
+    """Return spheres that cover the tool, one row x y z r for each [m]."""
     if millimetres is not None:
         return np.array([[0.0, 0.0, 0.0, 1e-3 * millimetres]])
     if skill.gmr_.has_orientation_:

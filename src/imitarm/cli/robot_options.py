@@ -1,4 +1,4 @@
-"""The options that name a robot arm: the same in every command that needs one."""
+"""The options that select a robot arm; they are the same in every command."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def add_robot_options(parser: argparse.ArgumentParser, *, default: str | None = 
         metavar="FOLDER",
         action="append",
         default=[],
-        help="folder in which ROS packages and meshes of the file are looked for; may be given several times",
+        help="folder to search for the ROS packages and meshes of the file; may be given several times",
     )
     group.add_argument(
-        "--discard-meshes", action="store_true", help="leave out all meshes; only primitive shapes count for contact"
+        "--discard-meshes", action="store_true", help="ignore all meshes; contact is checked with primitive shapes only"
     )
 
 
 def load_robot(arguments: argparse.Namespace) -> ArmModel:
-    """Load the arm that the options name, and tell what its file does not say.
+    """Load the arm that the options name, and print what had to be assumed about it.
 
     Raises:
         InputError: if no robot is named but another option needs one, or the robot can't be loaded.
@@ -57,7 +57,7 @@ def load_robot(arguments: argparse.Namespace) -> ArmModel:
 
 
 def load_optional_robot(arguments: argparse.Namespace) -> ArmModel | None:
-    """Do what :func:`load_robot` does; None if no robot is named.
+    """Load the arm as :func:`load_robot` does; return None if no robot is named.
 
     Raises:
         InputError: if no robot is named but another option needs one, or the robot can't be loaded.

@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print one arm, or the list of all.
 
     Raises:
-        InputError: if the robot can't be loaded, or two are named.
+        InputError: if the robot can't be loaded, or two robots are named.
     """
     if arguments.arm is not None:
         if arguments.robot not in (None, arguments.arm):

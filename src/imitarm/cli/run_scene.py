@@ -1,4 +1,4 @@
-"""Reproducing a skill in one scene, and collecting what the report needs."""
+"""Reproduce a skill in one scene, and collect the content of the report."""
 
 from __future__ import annotations
 
@@ -55,16 +55,15 @@ def run_scene(
         robot: at its start posture, in its scene.
         policy: not yet reset.
         clearance: required clearance [m].
-        link_clearance: required clearance of every link [m]; None: only the tool keeps one.
+        link_clearance: required clearance of every link [m]; None: only the tool keeps a clearance.
         tool_radius: for the drawing [m].
-        tool_spheres: for the drawing, instead of a radius, shape (m, 4) [m].
+        tool_spheres: for the drawing, in place of ``tool_radius``: rows x, y, z, radius, shape (m, 4) [m].
         demonstrations: aligned, to measure the distance to.
         evaluate: the task's success test; returns the rollout with its verdict.
         caption: a sentence about what the scene shows.
         progress: called with the fraction of the motion that is done, 0 to 1.
 
-    Returns:
-        The result; when the policy refuses, one without a rollout and with the reason.
+    Returns: The result; when the policy refuses, it has no rollout, but the reason.
     """
     scene = robot.scene_at_start
     frames = FrameRecorder(robot.model)
@@ -115,7 +114,7 @@ def run_scene(
 
 
 def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
-    """Return what else the table shows."""
+    """Return further values for the table."""
     details: dict[str, object] = {}
     if rollout is not None and "swept_fraction" in rollout.details:
         details["dirt in the pan"] = f"{100 * rollout.details['swept_fraction']:.0f} %"
@@ -127,8 +126,8 @@ def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
 def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | None, phases: Sequence[float]) -> float:
     """Return the root mean square distance [m] of the measured tool to all demonstrations at the same phase.
 
-    This is thesis Eq 4.9 with the root that the print lacks. Comparing at the same phase instead of the same time does
-    not count a robot that waits as inaccurate.
+    This is thesis Eq 4.9 with the square root that is missing in print. The comparison is at the same phase, not at the
+    same time, so that a robot that waits does not count as inaccurate.
     """
     if rollout is None or not demonstrations or not phases:
         return float("nan")
@@ -144,7 +143,7 @@ def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | Non
 def learning_summary(
     skill: Skill, demonstrations: Sequence[Demonstration], findings: Sequence[Finding], alignment: Alignment | None
 ) -> LearningSummary:
-    """Return what the report shows of learning."""
+    """Return the content of the report about learning."""
     gmr = skill.gmr_
     predicted: Trajectory = gmr.trajectory(200)
     return LearningSummary(

@@ -32,9 +32,9 @@ class Step:
         time: since the reproduction began [s].
         tool_to_base: measured pose of the tool after the step.
         state: measured state of the arm after the step.
-        scene: what was observed.
-        command: what the policy asked for.
-        safety: what the safety filter made of it.
+        scene: the observed scene.
+        command: the policy's command.
+        safety: the safety filter's answer to this command.
         clearance: measured distance from arm and tool to the nearest obstacle [m].
     """
 
@@ -62,25 +62,26 @@ def reproduce(
     Every ``dt``: the scene is observed, the policy answers with a :class:`~imitarm.command.Command`, the
     :class:`~imitarm.safety.SafetyFilter` turns it into joint velocities within the arm's limits and clearances, and
     the robot moves. The motion ends when the policy has finished, when the robot has stopped to protect itself, or at
-    ``timeout``. Whatever happens, also an exception, the robot is braked to a stop.
+    ``timeout``. The robot is always braked to a stop, also after an exception.
 
     Args:
-        policy: what decides; its ``reset`` is called first.
+        policy: decides the motion; its ``reset`` is called first.
         robot: what moves.
-        observe: the scene as it is known at a time since the beginning [s]; it may have been seen earlier, as its
-            ``stamp`` says.
+        observe: returns the scene that is known at a time since the start [s]. The scene may be older; its ``stamp``
+            says when it was seen.
         dt: control period [s]; a simulated robot needs a multiple of its timestep.
         timeout: longest duration [s].
         safety: the filter; None: one for this arm that keeps its limits, keeps links 10 mm apart and touches no
             obstacle. Its ``dt`` must be this ``dt``.
-        on_step: called after each step, for progress or drawing; what it raises stops the robot and is passed on.
+        on_step: called after each step, for progress or drawing; an exception in it stops the robot and is raised
+            again.
 
     Returns:
-        The measured motion from rest to rest. ``success`` means finished in time, no contact, and, where the filter
-        requires a clearance, nowhere nearer than that. ``details`` holds ``"twists"`` (n, 6) as asked for,
-        ``"clamped"``: how often each limit changed a command, ``"filtered"``: in how many steps the filter changed one
-        for a clearance, ``"unsafe"``: in how many no safe motion existed, ``"statuses"``: steps by the policy's
-        status, and what the robot has in its :meth:`~imitarm.robots.robot.Robot.report`.
+        The measured motion from rest to rest. ``success`` means that the motion finished in time, touched nothing, and
+        kept the clearance that the filter requires. ``details`` holds the commanded ``"twists"`` (n, 6), ``"clamped"``:
+        how often each limit changed a command, ``"filtered"``: in how many steps the filter changed one for a
+        clearance, ``"unsafe"``: in how many no safe motion existed, ``"statuses"``: steps by the policy's status, and
+        what the robot has in its :meth:`~imitarm.robots.robot.Robot.report`.
 
     Raises:
         InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not answer with a Command.
@@ -132,14 +133,14 @@ def _unfinished(timeout: float, last: Command, robot: Robot) -> str:
 
 
 def _nearest(robot: Robot) -> str:
-    """Return what is nearest to the arm, and how near."""
+    """Return the name of the obstacle nearest to the arm, and its distance."""
     pair = robot.nearest_pair() or ("the arm", "an obstacle")
     return f"{pair[0]} and {pair[1]}, {1e3 * robot.clearance():.1f} mm apart"
 
 
 @dataclass
 class _Log:
-    """What is recorded during a reproduction."""
+    """The record of a reproduction."""
 
     robot: Robot
     states: list[ArmState] = field(default_factory=list)
@@ -192,7 +193,7 @@ class _Log:
         if not fault and required is not None and nearest < required:
             fault = f"clearance fell to {1e3 * nearest:.1f} mm, {1e3 * required:.1f} mm required"
             if self.clearances[0] < required:
-                fault += f"; it began at {1e3 * self.clearances[0]:.1f} mm"
+                fault += f"; it was {1e3 * self.clearances[0]:.1f} mm at the start"
         details: dict[str, Any] = {
             "twists": np.array(self.twists),
             "clamped": dict(self.clamped),

@@ -1,4 +1,4 @@
-"""Documents on disk: text that is written whole or not at all, and contents that are checked against a schema."""
+"""Documents on disk: atomic writing of text, and checking of contents against a schema."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ Document = TypeVar("Document")
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file. It is written beside its place and then renamed, so an existing file stays whole until then.
+    """Write a text file. The text goes to a temporary file in the same folder, which is then renamed, so an existing
+    file stays intact until then.
 
     Args:
         path: of the file; an existing file is replaced.

@@ -14,7 +14,7 @@ PART = ".part"
 
 
 class PartFile:
-    """A file for recorders: it is ``PATH.part`` until it is finished.
+    """A text file for recorders, named ``PATH.part`` until it is finished.
 
     Each text is handed to the operating system before :meth:`write` returns: a program that is killed leaves all of it
     in ``PATH.part``. An older file ``PATH`` stays intact until the new one is complete.

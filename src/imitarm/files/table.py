@@ -48,7 +48,7 @@ class Table:
         remarks: the ``key: value`` remarks before the numbers, keys in lower case.
         names: the column names, None when the file has none. They stand in a row of their own, or else in the last
             remark before the numbers that has one word for each column.
-        values: the numbers, shape (n, columns). They may include nan and inf: the caller checks.
+        values: the numbers, shape (n, columns). They may include nan and inf, which the caller must check.
         lines: the line in the file of each row, from 1, shape (n,).
         ends_in_newline: False when the last line may have been cut off.
         names_line: the line of ``names``, from 1; None when there are no names.
@@ -87,7 +87,7 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def kind_of(content: bytes) -> str | None:
-    """Name the kind of a binary file by how it begins; None when it looks like text."""
+    """Return the kind of a binary file, recognised by its first bytes; None when it looks like text."""
     for signature, kind in SIGNATURES.items():
         if content.startswith(signature):
             return kind
@@ -154,7 +154,8 @@ def _row(path: str | Path, number: int, fields: Sequence[str], width: int, last:
 
 
 def _names_in_remarks(remarks: Sequence[tuple[int, str]], width: int) -> tuple[int | None, tuple[str, ...] | None]:
-    """Return line and words of the last remark that has one word, and no number, for each of ``width`` columns."""
+    """Return the line and the words of the last remark that has exactly one word, not a number, for each of ``width``
+    columns."""
     for number, text in reversed(remarks):
         for part in (text, text.partition(":")[2]):  # "t x y z" as well as "columns: t x y z"
             names = split_names(part)
@@ -168,8 +169,8 @@ def read_table(path: str | Path) -> Table:
 
     Raises:
         InputError: when the file can't be opened.
-        FileFormatError: when it is empty, binary, not UTF-8, holds no rows, a row has another length than the first
-            one, or something is not a number; the message names file and line.
+        FileFormatError: when it is empty, binary, not UTF-8, holds no rows, a row differs in length from the first one,
+            or an entry is not a number; the message names file and line.
     """
     return parse_table(path, read_bytes(path))
 
@@ -219,7 +220,7 @@ def write_table(
 
     Args:
         path: where to; an existing file is replaced.
-        remarks: written first, one ``# key: value`` a line; line breaks become blanks.
+        remarks: written first, one line ``# key: value`` for each; line breaks become blanks.
         names: the column names.
         values: the numbers, shape (n, len(names)).
 

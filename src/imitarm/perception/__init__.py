@@ -1,4 +1,4 @@
-"""How a camera sees obstacles: depth pictures, and what is found in them."""
+"""How a camera sees obstacles: depth images, and the obstacles found in them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""DepthFrame: one picture of a depth camera, with all that is needed to turn it into points in the base frame."""
+"""DepthFrame: one image of a depth camera, with everything needed to convert it to points in the base frame."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Intrinsics:
         return np.stack([self.fx * x / ahead + self.cx, self.fy * y / ahead + self.cy], axis=-1)
 
     def rays(self) -> Array:
-        """Return where each pixel looks, shape (height, width, 3): the point of its ray with ``z = 1``."""
+        """Return the viewing direction of each pixel, shape (height, width, 3): the point of its ray with ``z = 1``."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)
 
@@ -90,7 +90,7 @@ class DepthFrame:
         depth: distance of the surface from the camera's plane (its z, not the length of the ray), shape
             (height, width) [m]; nan where nothing was measured. 0 and infinity are replaced by nan.
         intrinsics: the camera.
-        camera_to_base: where the camera was.
+        camera_to_base: pose of the camera when the image was taken.
 
     Raises:
         InputError: when the shape is not that of the camera, a depth is negative, or a number is not finite.
@@ -116,7 +116,7 @@ class DepthFrame:
         object.__setattr__(self, "depth", depth)
 
     def points(self) -> Array:
-        """Return what was measured as points in the base frame, row by row, shape (n, 3) [m]."""
+        """Return the measured points in the base frame, row by row of the image, shape (n, 3) [m]."""
         measured = ~np.isnan(self.depth)
         rays = self.intrinsics.rays()[measured]
         return self.camera_to_base.apply(rays * self.depth[measured][:, None])
