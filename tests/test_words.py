@@ -16,7 +16,10 @@ from sample_sentences import PAGES, ROOT, sentences
 from imitarm import cli
 
 CODE = sorted(
-    path for folder in ("src/imitarm", "examples", "benchmarks") for path in (ROOT / folder).rglob("*.py*") if path.suffix in {".py", ".pyi"}
+    path
+    for folder in ("src/imitarm", "examples", "benchmarks")
+    for path in (ROOT / folder).rglob("*.py*")
+    if path.suffix in {".py", ".pyi"}
 )
 EXAMPLES = sorted(path for path in (ROOT / "examples").rglob("*.yaml"))
 

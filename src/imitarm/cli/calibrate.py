@@ -152,10 +152,8 @@ def _show_limbs(lengths: LimbLengths, side: str) -> None:
     show_table(
         ["limbs", f"{side} arm"],
         [
-            ("upper arm", f"{1e2 * lengths.upper_arm:.1f} cm, standard deviation of single frames {1e2 * "
-            "lengths.spread[0]:.1f} cm"),
-            ("forearm", f"{1e2 * lengths.forearm:.1f} cm, standard deviation of single frames {1e2 * "
-            "lengths.spread[1]:.1f} cm"),
+            ("upper arm", f"{1e2 * lengths.upper_arm:.1f} cm, standard deviation {1e2 * lengths.spread[0]:.1f} cm"),
+            ("forearm", f"{1e2 * lengths.forearm:.1f} cm, standard deviation {1e2 * lengths.spread[1]:.1f} cm"),
             ("standard error", f"{error:.2f} cm from {lengths.n_frames} frames"),
         ],
     )
@@ -327,8 +325,10 @@ def touched_points(
     if only is None:
         if len(points) < LEAST_PAIRS:
             raise InputError(f"sensor calibration: {len(points)} points, at least {LEAST_PAIRS} are needed; add more")
-        remark(f"{len(points)} points. At each point: bring the robot's tool there, put the palm of your {side} hand "
-        f"on its")
+        remark(
+            f"{len(points)} points. At each point: bring the robot's tool there, put the palm of your {side} hand "
+            f"on its"
+        )
         remark("tip so that the sensor sees the hand, hold still, press Enter. 's' skips a point, 'q' quits.")
     seen: dict[int, list[float]] = {}
     for i in wanted:

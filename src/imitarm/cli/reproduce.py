@@ -42,21 +42,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what the command takes."""
     parser.add_argument("skill", metavar="SKILL", type=Path, help="a skill file, as 'imitarm learn' writes it")
     add_robot_options(parser)
-    parser.add_argument("--scene", type=Path, metavar="FILE", help="file of obstacles and goal (YAML); default: no "
-    "obstacles")
+    parser.add_argument(
+        "--scene", type=Path, metavar="FILE", help="file of obstacles and goal (YAML); default: no obstacles"
+    )
     avoid = parser.add_argument_group("avoidance")
-    avoid.add_argument("--policy", choices=POLICIES, default="acfra", help="policy that reproduces the skill; "
-    "default: acfra")
+    avoid.add_argument(
+        "--policy", choices=POLICIES, default="acfra", help="policy that reproduces the skill; default: acfra"
+    )
     avoid.add_argument("--method", choices=ADAPTERS, help="how acfra adapts the path; default: certified")
     avoid.add_argument(
         "--clearance", type=float, default=20.0, metavar="MM", help="required distance to every obstacle; default: 20"
     )
     avoid.add_argument(
-        "--tool-radius", type=float, metavar="MM", help="radius of a sphere about the tip, in place of the tool's own "
-        "shape"
+        "--tool-radius",
+        type=float,
+        metavar="MM",
+        help="radius of a sphere about the tip, in place of the tool's own shape",
     )
-    avoid.add_argument("--tool-only", action="store_true", help="let the links come near obstacles; only the tool "
-    "keeps its clearance (for comparison)")
+    avoid.add_argument(
+        "--tool-only",
+        action="store_true",
+        help="let the links come near obstacles; only the tool keeps its clearance (for comparison)",
+    )
     held = avoid.add_mutually_exclusive_group()
     held.add_argument("--keep-height", action="store_true", help="move the path only sideways, as on a table")
     held.add_argument("--not-down", action="store_true", help="never move the path downwards")

@@ -1,6 +1,7 @@
 """Align demonstrations: trim idle ends, and bring matching parts of all motions to the same time.
 
-People never show a motion twice at the same pace. Averaged at equal times, a bend that comes early in one demonstration
+People never show a motion twice at the same speed. If they are averaged at equal times, a bend that comes early in one
+demonstration
 and late in another is smeared: the mean cuts corners and flattens peaks. Alignment changes when a demonstration reaches
 each point, never the points.
 
@@ -10,8 +11,8 @@ path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` obeys
     D(i, j) = c(i, j) + min(D(i-1, j-1) + c(i, j), D(i-1, j) + p, D(i, j-1) + p)
 
 (Sakoe and Chiba 1978, symmetric form: the diagonal counts twice). The price ``p`` of a step that is not diagonal keeps
-noise from bending time, and |i - j| stays within the band. All cells of one anti-diagonal are computed together, for
-all pairs of motions.
+noise from distorting time; |i - j| stays within the band. All cells of one anti-diagonal are computed together, for all
+pairs of motions.
 """
 
 from __future__ import annotations
@@ -109,7 +110,8 @@ def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Meth
         Demonstrations with the same ``n`` times; ``source`` names the rows that were kept.
 
     Raises:
-        InputError: when there are none, ``n`` is below 10, one does not move, or only some have rotations.
+        InputError: when the list is empty, ``n`` is below 10, a demonstration does not move, or only some have
+            rotations.
         UnknownNameError: when the method is unknown.
     """
     return list(compute_alignment(demonstrations, n=n, method=method).demonstrations)
@@ -170,8 +172,8 @@ def _retimed(demonstration: Demonstration, warp: Array, times: Array) -> Demonst
 def noise_level(values: Array) -> float:
     """Return the standard deviation of white noise on smooth samples (n, d), from their third differences.
 
-    For white noise of deviation s the variance of a third difference is 20 s^2; the median excludes what is left of
-    the motion itself. With fewer than 20 samples, noise and motion can't be separated: the result is 0.
+    For white noise of deviation s the variance of a third difference is 20 s^2; the median makes the result robust to
+    the remaining motion. With fewer than 20 samples, noise and motion can't be separated: the result is 0.
     """
     if len(values) < 20:
         return 0.0
@@ -189,10 +191,10 @@ def turns(quaternions: Array) -> Array:
 def moving_rows(times: Array, positions: Array, quaternions: Array | None = None) -> tuple[int, int] | None:
     """Return the first and the last row between which the tool moves; None when it never does.
 
-    The motion begins at the last row within 0.1 mm of the start before the tool is 0.5 mm away from it. Its speed does
-    not matter, so slow motion is never taken for standing. The end is found in the same way, backwards; 0.1 s more is
-    kept on both sides. With noisy samples, both distances are at least 4 standard deviations of the averaged noise.
-    Rotation on the spot counts as motion.
+    The motion begins at the last row within 0.1 mm of the start before the tool is 0.5 mm away from it. Speed does not
+    matter, so a slow motion is never taken for rest. The end is found in the same way, from the last row backwards; 0.1
+    s more is kept on both sides. With noisy samples, both distances are at least 4 standard deviations of the averaged
+    noise. Rotation on the spot counts as motion.
 
     Args:
         times: strictly increasing, shape (n,) [s].
@@ -232,7 +234,7 @@ def _moving(times: Array, values: Array, still: float) -> tuple[int, int] | None
 
 
 def held_rows(values: Array) -> NDArray[np.bool_]:
-    """Return which rows of one recorded quantity (n, d) only repeat a held value, shape (n,)."""
+    """Return whether each row of one recorded quantity (n, d) only repeats a held value, shape (n,)."""
     none = np.zeros(len(values), dtype=bool)
     steps = np.abs(np.diff(values, axis=0))
     same = np.asarray(~(steps > 0.0).any(axis=1))
@@ -295,7 +297,7 @@ def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, In
 
     Returns:
         cost: D(n-1, n-1) of each pair, shape (pairs,).
-        path: index pairs (i, j) from the end to the start, which is repeated, shape (pairs, 2 n - 1, 2).
+        path: index pairs (i, j) from the end to the start, padded with the start, shape (pairs, 2 n - 1, 2).
     """
     n = a.shape[1]
     # one row for each anti-diagonal i + j, one column for each offset i - j; cells outside grid or band cost inf
@@ -346,8 +348,8 @@ def identity_warps(n_demonstrations: int, n: int) -> Array:
 def features(trajectories: Sequence[Trajectory]) -> Array:
     """Return the features by which motions are compared, shape (n_demonstrations, n, 3), or 6 with rotations [m].
 
-    Each path is carried to the common start and goal: a motion that began elsewhere did not begin earlier. Rotations
-    count as rotation vectors from their mean, times a lever of 0.1 m.
+    Each path is moved to the common start and goal, because a motion that began at another place did not begin earlier.
+    Rotations count as rotation vectors from their mean, times a lever of 0.1 m.
     """
     parts = [to_common_ends(np.stack([trajectory.positions for trajectory in trajectories]))]
     if trajectories[0].quaternions is not None:
@@ -356,14 +358,14 @@ def features(trajectories: Sequence[Trajectory]) -> Array:
 
 
 def rotation_paths(trajectories: Sequence[Trajectory]) -> Array:
-    """Return the rotation vectors from the mean rotation of all, continuous beyond half a turn (m, n, 3) [rad]."""
+    """Return the rotation vectors from the mean rotation, continuous beyond 180 degrees (m, n, 3) [rad]."""
     q = np.stack([one.quaternions for one in trajectories if one.quaternions is not None])
     first = quaternion_log(quaternion_multiply(q[:, 0], quaternion_conjugate(mean_quaternion(q))))
     return np.stack([f + turns(one) for f, one in zip(first, q, strict=True)])
 
 
 def to_common_ends(values: Array) -> Array:
-    """Return motions (m, n, d) carried to the mean of their starts and the mean of their goals."""
+    """Return motions (m, n, d) moved to the mean of their starts and the mean of their goals."""
     fraction = np.linspace(0.0, 1.0, values.shape[1])[:, None]
     start, goal = values[:, :1], values[:, -1:]
     return np.asarray(values - (1.0 - fraction) * (start - start.mean(axis=0)) - fraction * (goal - goal.mean(axis=0)))
@@ -382,13 +384,14 @@ def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0
 
     The first barycentre is the medoid. Each motion is matched with the barycentre by :func:`dtw`, its matched times are
     smoothed into a warp, and the mean of the warped motions is the next barycentre (averaging as in Petitjean et al.
-    2011, with one smooth warp for each motion in place of sets of matched samples). The warps are centred: at every
-    time of the common motion their mean is that time, so the common pace is the mean pace and not the medoid's.
+    2011, with one smooth warp for each motion in place of sets of matched samples). The warps are centred: their mean
+    at every time of the common motion is that time. So the common speed profile is the mean one, not that of the
+    medoid.
 
     Args:
         values: features, shape (n_demonstrations, n, d), evenly spaced in time.
         band: largest time shift before centring, as a fraction of the duration.
-        stiffness: price of bending time, in mean squared deviations from the barycentre.
+        stiffness: price of warping time, in mean squared deviations from the barycentre.
         n_iterations: largest number of rounds.
 
     Returns:
@@ -434,6 +437,6 @@ def _smooth_warp(path: Indices, n: int) -> Array:
 
 
 def _centred(warps: Array, even: Array) -> Array:
-    """Change the common time so that the mean of all warps is even time."""
+    """Change the common time so that the mean of all warps is the identity."""
     back = np.interp(even, warps.mean(axis=0), even)
     return np.stack([np.interp(back, even, warp) for warp in warps])

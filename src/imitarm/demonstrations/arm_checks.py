@@ -24,7 +24,7 @@ _DEGREES = 2.5 * np.pi  # [rad] no joint rotates farther, so these are degrees
 
 
 def check_arm(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
-    """Find joints of another arm, in degrees, beyond limits or too fast, and positions out of reach."""
+    """Find joints of another arm, joints in degrees, beyond their limits or too fast, and positions out of reach."""
     if motion.joints is None:
         yield from _check_reach(motion, arm)
         return
@@ -52,7 +52,7 @@ def check_arm(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
             "joint-limit",
             f"{arm.joint_names[joint]} is at {q[row, joint]:.3f} rad, {over[row, joint]:.3f} beyond its limit "
             f"[{arm.lower[joint]:.3f}, {arm.upper[joint]:.3f}]",
-            f"show the motion within the limits of {arm.name}, or give the arm that was recorded",
+            f"repeat the motion within the limits of {arm.name}, or give the arm that was recorded",
             int(row),
         )
     speed = np.abs(smooth_slope(motion.times, q, _SPEED_WINDOW)[0]) / arm.max_velocity
@@ -61,8 +61,8 @@ def check_arm(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
         yield motion.finding(
             "warning",
             "joint-speed",
-            f"{arm.joint_names[joint]} turns at {speed[row, joint] * arm.max_velocity[joint]:.2f} rad/s, "
-            f"{arm.name} can {arm.max_velocity[joint]:.2f}",
+            f"{arm.joint_names[joint]} rotates at {speed[row, joint] * arm.max_velocity[joint]:.2f} rad/s, but "
+            f"{arm.name} allows {arm.max_velocity[joint]:.2f}",
             "reproduce it with a longer duration",
             int(row),
         )

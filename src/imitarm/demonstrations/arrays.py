@@ -1,4 +1,4 @@
-"""Columns without names, whose number decides what they are; and the reader of NumPy files (.npy, .npz).
+"""Reader of NumPy files (.npy, .npz), and the meaning of columns without names, which follows from their number.
 
 Nothing is ever unpickled.
 """
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 # columns without names, by their number ("q": the four numbers of a quaternion)
 UNNAMED = {2: "xy", 3: "xyz", 4: "txyz", 7: "xyzq", 8: "txyzq"}
-COUNTS = "2 (x y), 3 (x y z), 7 (x y z and quaternion), with the time before them 4 or 8"
+COUNTS = "2 (x y), 3 (x y z), 7 (x y z and quaternion), or 4 or 8 with the time in front"
 
 _NPY, _NPZ = b"\x93NUMPY", b"PK\x03\x04"
 _FEWEST_ROWS = 20  # of a demonstration; a stack with fewer rows than this and than demonstrations is transposed
@@ -32,8 +32,8 @@ class NumpyReader(Reader):
     """Arrays of numbers.
 
     An array (n, columns) is one motion, an array (n_demonstrations, n, columns) is several; the columns are those of a
-    text table without names. An .npz with an array ``positions`` holds one set of motions, with ``times``,
-    ``quaternions`` and ``joints`` beside it; in any other .npz each array holds motions.
+    text table without names. An .npz with an array ``positions`` holds one set of motions, and may also hold the arrays
+    ``times``, ``quaternions`` and ``joints``; in any other .npz each array holds motions.
     """
 
     suffixes = (".npy", ".npz")
@@ -59,7 +59,7 @@ class NumpyReader(Reader):
 def unnamed_columns(
     source: str, values: Array, options: ReadOptions, said: SaidUnits | None = None
 ) -> RawDemonstration:
-    """Sort the columns of a table without names by how many there are (see ``UNNAMED``).
+    """Assign the columns of a table without names by their number (see ``UNNAMED``).
 
     Raises:
         InputError: when that number has no meaning, or the options do not fit.
@@ -108,7 +108,7 @@ def _load(path: str, content: bytes) -> Any:
 
 
 def _check_size(content: bytes) -> None:
-    """Refuse a header that promises more than the file holds, before that much memory is allocated."""
+    """Refuse a header that states more data than the file holds, before memory for it is allocated."""
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

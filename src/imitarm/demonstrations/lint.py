@@ -1,8 +1,8 @@
 """Lint: list what is wrong with demonstrations before a skill is learned from them.
 
-Each check yields findings. Here are the checks of one motion, and of the motions against each other: the mean of
-demonstrations that run backwards, stop early, end elsewhere or take another path is a motion that nobody has shown.
-Checks of the numbers in a file are in ``raw.py``, checks against an arm in ``arm_checks.py``.
+Each check yields findings. This module checks each motion, and compares the motions with each other. If some
+demonstrations run backwards, stop early, end elsewhere or take another path, the mean of all is a motion that nobody
+has shown. Checks of the numbers in a file are in ``raw.py``, checks against an arm in ``arm_checks.py``.
 """
 
 from __future__ import annotations
@@ -75,18 +75,18 @@ _ON_PATH = 0.35  # an incomplete motion ends this much nearer to the path of ano
 
 
 def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: ArmModel | None = None) -> list[Finding]:
-    """Check each demonstration, each against the arm, and all against each other.
+    """Check each demonstration by itself and against the arm, and compare all with each other.
 
     Args:
-        demonstrations: of one motion. Raw ones (``read_raw``) are checked with all their faults; a Demonstration has
-            none of the faults that reading refuses.
+        demonstrations: of one motion. Raw demonstrations (``read_raw``) may contain invalid numbers, which are
+            reported; a Demonstration can't contain any.
         arm: the arm that was recorded, with its tool; None: joint limits and reach are not checked.
 
     Returns:
         Findings, errors first, then warnings, then notes; empty when nothing was found.
 
     Raises:
-        InputError: when there are no demonstrations, or something else was given.
+        InputError: when there are no demonstrations, or another object was given.
     """
     check_arm_model(arm, "lint: arm")
     if not sequence(demonstrations, object, "lint: demonstrations"):
@@ -132,7 +132,7 @@ def check_gaps(motion: ValidRows) -> Iterator[Finding]:
 
 
 def check_idle(motion: ValidRows) -> Iterator[Finding]:
-    """Find standing before and after the motion, and motions that never move."""
+    """Find rest before and after the motion, and recordings without motion."""
     rows = moving_rows(motion.times, motion.positions, motion.quaternions)
     if rows is None:
         yield motion.finding("error", "still", "the tool does not move", "leave it out, or check units and columns")
@@ -148,7 +148,7 @@ def check_idle(motion: ValidRows) -> Iterator[Finding]:
 
 
 def check_jumps(motion: ValidRows) -> Iterator[Finding]:
-    """Find steps that are much faster than those around them: lost samples, glitches, a tracker that switched."""
+    """Find steps that are much faster than those around them: lost samples, glitches, a tracker that jumped."""
     remedy = "record again, or cut the file before or after it"
     jumps, size = _jumps(motion.times, motion.positions, _JUMP_DISTANCE)
     if len(jumps):
@@ -163,10 +163,10 @@ def check_jumps(motion: ValidRows) -> Iterator[Finding]:
 
 
 def _jumps(times: Array, values: Array, floor: float) -> tuple[NDArray[np.int64], Array]:
-    """Return the samples (k,) before which ``values`` (n, d) jump, and by how much (k,).
+    """Return the samples (k,) before which ``values`` (n, d) jump, and the size of each jump (k,).
 
-    A step is compared with the median of the steps two and three before and after it: neither a single bad sample (two
-    large steps) nor a quick start hides among its own neighbours.
+    A step is compared with the median of the steps two and three before and after it, so that neither a single bad
+    sample (two large steps) nor a quick start is hidden by its own neighbours.
     """
     if len(times) < 8:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -180,7 +180,7 @@ def _jumps(times: Array, values: Array, floor: float) -> tuple[NDArray[np.int64]
 
 
 def check_units(motion: ValidRows) -> Iterator[Finding]:
-    """Find lengths that can't be metres, and offer every unit that fits."""
+    """Find lengths that can't be metres, and propose every unit that fits."""
     distance = np.abs(motion.positions).max(axis=1)
     extent = float(np.ptp(motion.positions, axis=0).max())
     if distance.max() > _FAR:
@@ -194,7 +194,7 @@ def check_units(motion: ValidRows) -> Iterator[Finding]:
         yield motion.finding("error", "units", f"{distance[row]:.4g} m from the base: hardly metres", remedy, row)
     elif _NO_MOTION < extent < _TINY and motion.quaternions is None:
         message = f"the whole motion is {1e3 * extent:.2g} mm large"
-        yield motion.finding("warning", "units", message, "check units: were they metres?")
+        yield motion.finding("warning", "units", message, "check units: are the numbers metres?")
 
 
 def check_speed(motion: ValidRows) -> Iterator[Finding]:
@@ -210,9 +210,9 @@ MOTION_CHECKS = (check_gaps, check_idle, check_jumps, check_units, check_speed)
 
 
 def check_number(motions: Sequence[ValidRows]) -> Iterator[Finding]:
-    """Find that there is only one demonstration."""
+    """Report when there is only one demonstration."""
     if len(motions) == 1:
-        message = "only one demonstration: it does not show how exact each part of the motion must be"
+        message = "only one demonstration: it does not show how precise each part of the motion must be"
         yield motions[0].finding("warning", "single", message, "show the motion three times or more")
 
 
@@ -221,10 +221,10 @@ def check_kinds(motions: Sequence[ValidRows]) -> Iterator[Finding]:
     rotations, joints = ([getattr(m, what) is not None for m in motions] for what in ("quaternions", "joints"))
     count = f"of {len(motions)} demonstrations have"
     if any(rotations) and not all(rotations):
-        message = f"{sum(rotations)} {count} rotations, this one has none"
+        message = f"{sum(rotations)} {count} rotations, but this one has no rotations"
         yield motions[rotations.index(False)].finding("error", "mixed-rotations", message, "leave it out")
     if any(joints) and not all(joints):
-        message = f"{sum(joints)} {count} joints, this one has none"
+        message = f"{sum(joints)} {count} joints, but this one has no joints"
         yield motions[joints.index(False)].finding("note", "mixed-joints", message, "none: skills ignore joints")
     flat = [bool(np.ptp(m.positions[:, 2]) == 0.0) for m in motions]
     deep = [float(np.ptp(m.positions[:, 2])) > _FLAT for m in motions]
@@ -235,7 +235,7 @@ def check_kinds(motions: Sequence[ValidRows]) -> Iterator[Finding]:
 
 
 def check_durations(motions: Sequence[ValidRows]) -> Iterator[Finding]:
-    """Find that some take much longer than others."""
+    """Find demonstrations that take much longer than others."""
     durations = np.array([motion.duration for motion in motions])
     if durations.max() > _DURATION_RATIO * durations.min():
         slow = int(np.argmax(durations))
@@ -288,7 +288,8 @@ def check_agreement(motions: Sequence[ValidRows]) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class _Scale:
-    """How differences are reported: a factor, its unit, and the smallest difference that counts [m] or [rad]."""
+    """How differences are reported: factor to the unit, the unit, and the smallest one that counts.
+    """
 
     factor: float
     unit: str
@@ -299,7 +300,7 @@ _Odd = tuple[int, str, str, str]  # which demonstration, message, code, remedy
 
 
 def _by_length(positions: Array) -> Array:
-    """Return the path (n, 3) at equal distances along it, whatever its pace."""
+    """Return the path (n, 3) at equal distances along it, independent of its speed."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     even = np.linspace(0.0, length[-1], len(positions))
     return np.stack([np.interp(even, length, column) for column in positions.T], axis=1)
@@ -351,7 +352,7 @@ def _aligned(trajectories: Sequence[Trajectory]) -> tuple[Array, Array | None]:
 
 
 def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | None, size: float) -> Iterator[Finding]:
-    """Find demonstrations that fall apart in two groups: by starts, goals, paths between them, or rotations."""
+    """Find demonstrations that form two groups: by starts, goals, paths between them, or rotations."""
     between = to_common_ends(positions)
     kinds: list[tuple[str, Severity, str, Array, float, float, str]] = [
         ("ends", "warning", "starts", _largest(positions[:, :1]), _ENDS_APART * size, 1e3, "mm"),
@@ -387,7 +388,7 @@ def _angles(rotations: Array, reference: Array) -> Array:
 
 
 def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | None:
-    """Return one of two groups as a mask (m,), and the gap between both; None when there is one group.
+    """Return one of two groups as a mask (m,), and the gap between the groups; None when there is only one group.
 
     The gap is the longest link of the minimum spanning tree. It must exceed ``floor``, and the next longest link by a
     factor: then neighbours are much nearer within the groups.

@@ -41,7 +41,7 @@ _NUMBER_AT_END = re.compile(r"(\d+)$")
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault of demonstrations, or one fact worth knowing before a skill is learned from them.
+    """One fault of demonstrations, or one useful fact about them.
 
     Attributes:
         severity: ``"error"``: no good skill can be learned; ``"warning"``: check it; ``"note"``: for information.
@@ -63,7 +63,7 @@ class Finding:
 
     @property
     def place(self) -> str:
-        """Where to look: ``line 12``, ``row 10`` or nothing."""
+        """Place of the finding: ``line 12``, ``row 10`` or an empty text."""
         if self.line is not None:
             return f"line {self.line}"
         return "" if self.row is None else f"row {self.row}"
@@ -75,7 +75,7 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class RawDemonstration:
-    """One motion as it was recorded: in SI units, with all its faults.
+    """One motion as it was recorded, in SI units, before invalid rows are refused.
 
     :class:`~imitarm.trajectory.Demonstration` refuses times that do not increase, numbers that are not finite and
     quaternions whose length is not one. ``lint`` checks the raw demonstration instead, so that it can list them all.
@@ -120,7 +120,7 @@ class RawDemonstration:
 
     @classmethod
     def of(cls, demonstration: Demonstration | RawDemonstration) -> RawDemonstration:
-        """Return a demonstration as if it had just been read; a raw one as it is."""
+        """Return a demonstration as a raw one; a raw one is returned unchanged."""
         if isinstance(demonstration, RawDemonstration):
             return demonstration
         motion = instance(demonstration, Demonstration, "a demonstration").trajectory
@@ -153,11 +153,11 @@ class RawDemonstration:
     def joints_of(self, arm: ArmModel) -> Array:
         """Return the joint angles (n, arm.n_joints) [rad] in the order of the arm's joints.
 
-        Columns are chosen by the arm's joint names. Generic names (``joint_1``, ``j1``, ``q1``) are sorted by their
+        Columns are selected by the arm's joint names. Generic names (``joint_1``, ``j1``, ``q1``) are sorted by their
         numbers, which must follow one another.
 
         Raises:
-            InputError: when there are no joints, they are those of another arm, or their order is not known.
+            InputError: when there are no joints, the joints are those of another arm, or their order is not known.
         """
         if self.joints is None:
             raise InputError(f"{self.source}: holds no joint angles")
@@ -179,10 +179,10 @@ class RawDemonstration:
         return self.joints[:, np.argsort(numbers)]
 
     def with_poses(self, arm: ArmModel | None) -> RawDemonstration:
-        """Return this with the tool's poses; they are computed from the joints when they were not recorded.
+        """Return a copy with the tool's poses, which are computed from the joints if they were not recorded.
 
         Raises:
-            InputError: when the arm is needed and is not given, or is another one.
+            InputError: when the arm is needed and not given, or the joints are those of another arm.
         """
         check_arm_model(arm, "arm")
         if self.positions is not None:
@@ -198,21 +198,22 @@ class RawDemonstration:
         return replace(self, positions=positions, quaternions=quaternions, joints=q, joint_names=arm.joint_names)
 
     def not_finite(self) -> NDArray[np.bool_]:
-        """Return which rows hold nan, inf or a number above 1e30, shape (n,)."""
+        """Return whether each row holds nan, inf or a number above 1e30, shape (n,)."""
         columns = [self.times[:, None], self.positions, self.quaternions, self.joints]
         table = np.hstack([part for part in columns if part is not None])
         return np.asarray(~(np.abs(table) < _BOUND).all(axis=1))
 
     def late(self) -> NDArray[np.bool_]:
-        """Return which rows are not later than all rows before them, shape (n,)."""
+        """Return whether each row is not later than all rows before it, shape (n,)."""
         times = np.where(np.isfinite(self.times), self.times, -np.inf)
         before = np.concatenate([[-np.inf], np.maximum.accumulate(times)[:-1]])
         return np.asarray(np.isfinite(self.times) & (self.times <= before))
 
     def held(self) -> NDArray[np.bool_]:
-        """Return which rows only repeat a held value, shape (n,); all False unless values are sampled and held.
+        """Return whether each row only repeats a held value, shape (n,); all False unless values are sampled and held.
 
-        A recorder that runs faster than its sensor repeats each value (sample and hold). Standing is not holding,
+        A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest does not count
+        as held values,
         nor is rounding: the value must be held many times during the motion, and must change by more than its last
         digits between.
         """
@@ -220,7 +221,7 @@ class RawDemonstration:
         return max(masks, key=lambda mask: int(mask.sum()), default=np.zeros(len(self), dtype=bool))
 
     def thinned(self) -> RawDemonstration:
-        """Return this without the rows that only repeat a held value; a note says how many were dropped."""
+        """Return a copy without the rows that only repeat a held value; a note says how many were dropped."""
         held = self.held()
         if not held.any():
             return self
@@ -236,7 +237,7 @@ class RawDemonstration:
         )
 
     def demonstration(self, arm: ArmModel | None = None, *, repair: bool = False) -> Demonstration:
-        """Check everything and return it as a demonstration.
+        """Check all rows and return a valid demonstration.
 
         Args:
             arm: the arm that was recorded; needed when only joints were recorded.
@@ -274,7 +275,7 @@ class RawDemonstration:
 
 
 def check_arm_model(arm: object, what: str) -> None:
-    """Raise InputError unless ``arm`` is an ArmModel or None, whose module is not imported for this."""
+    """Raise InputError unless ``arm`` is an ArmModel or None, without importing the module of ArmModel."""
     if arm is not None and not hasattr(arm, "tool_path"):
         raise InputError(f"{what} must be an ArmModel, got {arm!r:.60}; load it with ArmModel.load('sawyer')")
 
@@ -433,7 +434,7 @@ def check_held(raw: RawDemonstration) -> Iterator[Finding]:
 
 
 def check_notes(raw: RawDemonstration) -> Iterator[Finding]:
-    """Pass on what the reader left out or assumed."""
+    """Turn the reader's notes, on what it left out or assumed, into findings."""
     for note in raw.notes:
         yield raw.finding("note", "reader", note, "none, unless it matters to you")
 

@@ -1,8 +1,8 @@
-"""Reading demonstrations: the options, the readers, and ``read``.
+"""Read demonstrations: options, registry of readers, and ``read``.
 
 A file becomes a :class:`~imitarm.demonstrations.raw.RawDemonstration` by the first reader in ``READERS`` that
-recognises its content. A raw demonstration becomes a :class:`~imitarm.trajectory.Demonstration` when nothing in it is
-invalid.
+recognises its content. If all its numbers are valid, the raw demonstration becomes a
+:class:`~imitarm.trajectory.Demonstration`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _HEAD = 65536  # bytes of a file that a reader sees before it says whether it re
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Facts that a file may not state itself.
+    """Facts for which a file may have no entry, such as units.
 
     Attributes:
         units: unit of lengths, a key of ``LENGTH_UNITS``; None: as the file says, else m.
@@ -74,7 +74,7 @@ class ReadOptions:
             if value is not None:
                 finite_number(value, what, above=0.0)
         if self.duration is not None and self.rate is not None:
-            raise InputError("give duration or rate, not both: each follows from the other")
+            raise InputError("give duration or rate, not both")
         text(self.task, "task")
 
     def metres(self, source: str, positions: Array, said: str | None = None) -> Array:
@@ -138,7 +138,7 @@ def _factor(
 
 @dataclass(frozen=True)
 class SaidUnits:
-    """Units, and the order of quaternions, that a file states outside its column names; None: it states none."""
+    """Units, and the order of quaternions, that a file states outside its column names; None: not stated."""
 
     length: str | None = None
     time: str | None = None
@@ -182,7 +182,7 @@ READERS: Registry[type[Reader]] = Registry("reader", "imitarm.readers", _BUILT_I
 
 
 def files_of(paths: Paths) -> list[str]:
-    """Return the files to read: a file itself, and of a folder the files whose suffix a reader knows.
+    """Return the files to read; a folder stands for those of its files that have the suffix of a reader.
 
     Files of a folder come in natural order, ``demo_2`` before ``demo_10``; its subfolders are not entered.
 

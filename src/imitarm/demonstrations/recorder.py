@@ -1,4 +1,5 @@
-"""DemonstrationRecorder: write a motion to a file while it happens; nothing is lost when the program is killed."""
+"""DemonstrationRecorder: write a motion to a file while it happens; a killed program loses nothing.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 class DemonstrationRecorder:
-    """Writes each sample to a line of ``PATH.part``, and makes a demonstration file of it when closed.
+    """Writes each sample as a line of ``PATH.part``, which becomes the demonstration file when the recorder is closed.
 
     Each line is handed to the operating system before :meth:`write` returns: a program that is killed leaves
     ``PATH.part``, which :meth:`Demonstration.load <imitarm.trajectory.Demonstration.load>` can read. An older file
@@ -60,7 +61,7 @@ class DemonstrationRecorder:
         return "\n".join([*(f"# {key}: {value}" for key, value in remarks.items()), ",".join(names), ""])
 
     def write(self, time: float, q: Array) -> None:
-        """Add a sample. A sample that is not later than the last one is left out.
+        """Add a sample. A sample that is not later than the last one is ignored.
 
         Args:
             time: [s].
@@ -83,7 +84,7 @@ class DemonstrationRecorder:
         A second call does nothing.
 
         Raises:
-            InputError: when that is not possible; what was written stays in ``PATH.part``.
+            InputError: when the file can't be completed; the samples stay in ``PATH.part``.
         """
         self._file.finish(self._take)
 

@@ -1,7 +1,7 @@
 """Readers of text tables: imitarm's own CSV, and any other table of numbers.
 
-Column names come from a row of their own or from a remark. Only when nothing in the file looks like names does the
-number of columns decide. A name, a unit or a remark that is not understood is an error: nothing is guessed.
+Column names come from a row of their own or from a remark. The number of columns decides only when nothing in the file
+looks like column names. A name, unit or remark that is not understood is an error.
 """
 
 from __future__ import annotations
@@ -100,10 +100,10 @@ class Column:
     """The meaning of one column name.
 
     Attributes:
-        what: ``t``, ``x``, ``y``, ``z``, ``qw`` to ``qz``, ``joint``; empty when the name is not known.
+        what: ``t``, ``x``, ``y``, ``z``, ``qw`` to ``qz`` or ``joint``; empty when the name is not known.
         unit: as in the name, in lower case; None when the name has none.
         joint: the name of the joint, without words such as ``position.``.
-        not_angle: what a joint's column holds that is not its angle, such as ``"velocities"``.
+        not_angle: the quantity in a joint's column if it is not its angle, for example ``"velocities"``.
     """
 
     what: str
@@ -153,13 +153,13 @@ def _meaning(base: str, words: Sequence[str]) -> tuple[str, None, str, str]:
 def named_columns(
     source: str, names: Sequence[str], values: Array, options: ReadOptions, said: SaidUnits | None = None
 ) -> RawDemonstration:
-    """Sort the columns of a table by their names.
+    """Assign the columns of a table by their names.
 
     Args:
         source: name of the file, for messages.
         names: one for each column; joints are known by names such as ``right_j0`` or ``panda_joint1``.
         values: shape (n, len(names)).
-        options: facts that the file may not state itself.
+        options: facts for which the file may have no entry.
         said: units that the file states outside its column names.
 
     Raises:
@@ -235,7 +235,10 @@ def _one_unit(
     columns: Iterable[int],
     elsewhere: str | None,
 ) -> str | None:
-    """Return the one unit of ``columns``; those whose names have none take the unit stated ``elsewhere``."""
+    """Return the common unit of ``columns``.
+
+    Columns without a unit in their names take the unit stated ``elsewhere``.
+    """
     found = {units[i] or elsewhere for i in columns}
     if None in found and len(found) > 1:
         silent = next(names[i] for i in columns if units[i] is None)
@@ -263,7 +266,7 @@ def _times(
     options: ReadOptions,
     said: SaidUnits,
 ) -> Array:
-    """Return the time stamps (n,) [s]; whole seconds and a column with the rest of the second are added."""
+    """Return the time stamps (n,) [s]; a column of whole seconds and one of fractions are added."""
     if not units:
         return options.even_times(source, len(values))
     if len(units) == 1:
@@ -279,7 +282,7 @@ def _times(
             return options.seconds(source, seconds + rest, "s")
     both = " and ".join(repr(names[i]) for i in units)
     raise FileFormatError(
-        f"{source}: columns {both} both hold t, and are not whole seconds with the rest of a second; remove one"
+        f"{source}: columns {both} both hold t, and are not whole seconds with fractions of a second; remove one"
     )
 
 
@@ -332,7 +335,7 @@ class TextTableReader(Reader):
         raw = named_columns(path, names, table.values, options, said) if names else None
         raw = raw or unnamed_columns(path, table.values, options, said)
         if raw.positions is None and options.units is not None:
-            raise InputError(f"{path}: holds joint angles, no lengths; leave out units")
+            raise InputError(f"{path}: holds joint angles and no lengths; leave out units")
         limbs = {name.partition("_")[0] for name in raw.joint_names if re.fullmatch(r"(left|right)_.*", name)}
         if len(limbs) > 1:
             raise FileFormatError(f"{path}: holds joints of two limbs, left and right; keep the columns of one")
@@ -340,7 +343,7 @@ class TextTableReader(Reader):
 
 
 def _said_units(table: Table) -> SaidUnits:
-    """Return what the remarks say of units (``# units: cm``, ``# time unit: ms``) and of the order of quaternions."""
+    """Return the units (``# units: cm``, ``# time unit: ms``) and the order of quaternions that the remarks state."""
     words: list[str] = []
     for _, text in table.remark_lines:
         if (match := _UNITS_REMARK.fullmatch(text.strip().lower())) is not None:
@@ -409,7 +412,8 @@ def _looks_like_names(words: Sequence[str]) -> bool:
 
 
 def _run_of_names(words: Sequence[str], width: int) -> tuple[str, ...] | None:
-    """Return ``width`` known names that stand together in a sentence, with none before or after them."""
+    """Return ``width`` known names that are consecutive words of a remark and the only names in it.
+    """
     known = [bool(column_of(word).what) for word in words]
     starts = [i for i, here in enumerate(known) if here and (i == 0 or not known[i - 1])]
     runs = [words[i : i + next((k for k, here in enumerate(known[i:]) if not here), len(words))] for i in starts]
@@ -418,7 +422,7 @@ def _run_of_names(words: Sequence[str], width: int) -> tuple[str, ...] | None:
 
 
 def _other_units(words: Sequence[str], run: Sequence[str], text: str) -> bool:
-    """Whether the words beside the names hold a unit that :func:`_said_units` does not use."""
+    """Return whether the words beside the names contain a unit that :func:`_said_units` does not use."""
     beside = {word.lower() for word in words} - {word.lower() for word in run} - set(_PROSE_UNIT.findall(text.lower()))
     units = {word: unit for known in _UNITS.values() for word, unit in known.items()}
     return any(units.get(word, "m") not in ("m", "s", "rad") for word in beside - {"in"})

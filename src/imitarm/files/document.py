@@ -13,8 +13,7 @@ Document = TypeVar("Document")
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file. The text goes to a temporary file in the same folder, which is then renamed, so an existing
-    file stays intact until then.
+    """Write a text file to a temporary file, which is then renamed; an existing file stays intact until then.
 
     Args:
         path: of the file; an existing file is replaced.

@@ -154,8 +154,7 @@ def _row(path: str | Path, number: int, fields: Sequence[str], width: int, last:
 
 
 def _names_in_remarks(remarks: Sequence[tuple[int, str]], width: int) -> tuple[int | None, tuple[str, ...] | None]:
-    """Return the line and the words of the last remark that has exactly one word, not a number, for each of ``width``
-    columns."""
+    """Return line and words of the last remark with exactly ``width`` words, none of them a number."""
     for number, text in reversed(remarks):
         for part in (text, text.partition(":")[2]):  # "t x y z" as well as "columns: t x y z"
             names = split_names(part)

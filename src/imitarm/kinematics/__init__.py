@@ -1,7 +1,7 @@
 """How an arm, human or robot, moves.
 
-``pose`` has positions and rotations, ``arm`` the model of a robot arm, ``ik`` the way from a wanted motion of the tool
-to the motion of the joints.
+``pose`` has positions and rotations, ``arm`` the model of a robot arm, ``ik`` the inverse kinematics: the joint
+velocities for a desired motion of the tool.
 """
 
 from __future__ import annotations

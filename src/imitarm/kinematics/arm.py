@@ -1,4 +1,7 @@
-"""ArmModel: how a robot arm moves and what it weighs; ArmState: what it does at one instant."""
+"""ArmModel: kinematics and dynamics of a robot arm.
+
+ArmState: its joint positions, velocities and torques at one time.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ _FLOAT64 = np.dtype(np.float64)
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
-    """What an arm does at one instant.
+    """Measured state of an arm at one time.
 
     Attributes:
         q: joint positions, shape (n,) [rad].
@@ -62,7 +65,9 @@ class ArmState:
 
 
 class ArmModel(ArmKinematics):
-    r"""A robot arm, with or without a tool: kinematics, dynamics and limits. It never changes once built.
+    r"""A robot arm, with or without a tool: kinematics, dynamics and limits.
+
+    A model can't be changed after it is built.
 
     The equation of motion of the arm's links and tool, which :meth:`inverse_dynamics` evaluates, is
 
@@ -83,13 +88,13 @@ class ArmModel(ArmKinematics):
         max_velocity: largest joint speeds, shape (n_joints,) [rad/s].
         max_acceleration: largest joint accelerations, shape (n_joints,) [rad/s^2].
         max_torque: largest joint torques, shape (n_joints,) [N m]; inf where the file has no limit.
-        home: a posture to begin in, shape (n_joints,) [rad].
+        home: a posture to start in, shape (n_joints,) [rad].
         tool_to_flange: pose of the tool's tip in the flange frame; the identity without a tool.
         tool_radius: radius of the cylinder about the tool's axis that contains the tool's head [m]; 0 without a tool.
         sphere_bodies: for each sphere of :meth:`collision_spheres` the name of its body.
-        cover: the spheres themselves.
+        cover: the spheres of :meth:`collision_spheres`.
         landmarks: shoulder, elbow and wrist, from sites of these names in the file; None if the file has none.
-        notes: what the file does not say and was assumed, and which of its joints are not part of the arm.
+        notes: assumptions about what the file does not say, and joints that are not part of the arm.
     """
 
     lower: Array
@@ -123,7 +128,7 @@ class ArmModel(ArmKinematics):
 
         ``home`` is the keyframe of that name, else the first keyframe. A file without keyframes gets the middle of the
         joints' ranges if that is a usable posture: not singular, with 20 mm between the links. Otherwise it gets the
-        best of 1024 postures in this sense.
+        posture, of 1024, that is farthest from singularities and limits.
 
         Args:
             name_or_path: ``"sawyer"``, ``"panda"`` or a path.
@@ -131,8 +136,7 @@ class ArmModel(ArmKinematics):
             flange: name of the body or site that is the flange; None: a site named ``flange``, else the end of the only
                 arm in the file, before jaws and fingers.
             package_path: one or more folders in which meshes and ROS packages are looked for.
-            discard_meshes: leave out all meshes. Links then keep only their primitive shapes, so that contact and
-                :meth:`collision_spheres` see no more than those.
+            discard_meshes: leave out all meshes. Contact and :meth:`collision_spheres` then use only primitive shapes.
 
         Raises:
             UnknownNameError: if an arm, tool or flange of that name is not known.
@@ -154,7 +158,10 @@ class ArmModel(ArmKinematics):
         return cls(read_arm(name_or_path, **options), (name_or_path, options))  # type: ignore[arg-type]
 
     def __init__(self, file: ArmFile, source: tuple[str | Path, dict[str, Any]]) -> None:
-        """Build from what :func:`~imitarm.kinematics.arm_file.read_arm` returned; use :meth:`load` instead."""
+        """Build a model from the result of :func:`~imitarm.kinematics.arm_file.read_arm`.
+
+        Users call :meth:`load` instead.
+        """
         whole = compiled(file.spec, file.name)
         # Shapes without mass are left out of the working model: its kinematics then takes a third of the time.
         model = compiled(without_geoms(file.spec, _massless), file.name)
@@ -205,12 +212,12 @@ class ArmModel(ArmKinematics):
         return self._spec.copy()
 
     def posture(self, model: mujoco.MjModel, q: ArrayLike | None = None, *, prefix: str = "") -> Array:
-        """Return the whole ``qpos`` of a world that contains this arm: the arm at ``q``, the rest as the world has it.
+        """Return the ``qpos`` of a world that contains this arm, with the arm at ``q``.
 
         Args:
             model: a compiled world.
             q: joint positions, shape (n_joints,) [rad]; None: ``home``.
-            prefix: what the world has put before the arm's names.
+            prefix: the prefix of the arm's names in the world.
 
         Returns:
             shape (model.nq,).
@@ -244,7 +251,7 @@ class ArmModel(ArmKinematics):
 
     @property
     def tool_spheres(self) -> Array:
-        """Spheres that cover all that moves rigidly with the tool: last link, hand, and fingers in their home position.
+        """Spheres that cover everything that moves rigidly with the tool: last link, hand and fingers.
 
         Rows x y z r in the tool's frame, shape (m, 4) [m]; a policy keeps these clear of obstacles.
         """
@@ -258,19 +265,19 @@ class ArmModel(ArmKinematics):
 
     @property
     def has_masses(self) -> bool:
-        """Whether every moving link has a mass and an inertia, as torques and simulation need."""
+        """Whether every moving link has a mass and an inertia, which torques and simulation need."""
         return not self._mass_faults
 
     def check_dynamics(self) -> None:
-        """Do nothing if every moving link has a mass and an inertia, as torques and simulation need.
+        """Check that every moving link has a mass and an inertia, which torques and simulation need.
 
         Raises:
             InputError: naming the links that do not, and their lines in the file.
         """
         if self._mass_faults:
             raise InputError(
-                f"{self.name}: {'; '.join(self._mass_faults)}. Kinematics works without, but torques and simulation "
-                "need a mass and an inertia of every moving link: add them to the file (<inertial>)"
+                f"{self.name}: {'; '.join(self._mass_faults)}. Kinematics needs neither, but torques and simulation "
+                f"need a mass and an inertia of every moving link: add them to the file (<inertial>)"
             )
 
     def gravity_torque(self, q: ArrayLike) -> Array:

@@ -68,9 +68,9 @@ class ArmFile:
         max_velocity: largest speed of each joint [rad/s] or [m/s].
         max_acceleration: largest acceleration of each joint [rad/s^2] or [m/s^2].
         max_torque: largest torque of each joint [N m] or force [N]; inf when the file has no limit.
-        home: position of every joint by name, those of the tool included.
+        home: position of every joint by name, including the joints of the tool.
         tool_radius: radius of the cylinder about the tool's axis that holds the tool's head [m]; 0 without a tool.
-        notes: what the file does not say and was assumed, and which joints were left out.
+        notes: assumptions about what the file does not say, and joints that were left out.
         mass_faults: links whose mass or inertia can't be used, so that no torque can be computed.
     """
 
@@ -114,7 +114,7 @@ def read_arm(
     Raises:
         UnknownNameError: when the name is neither a packaged one nor a file.
         FileFormatError: when the file can't be read as a robot.
-        InputError: when it has no joint, or the flange or the tool is not what was asked for.
+        InputError: when it has no joint, or the requested flange or tool can't be used.
     """
     path, folders = _located(source, ARMS, "robot"), [Path(folder) for folder in package_path]
     for folder in folders:
@@ -170,7 +170,7 @@ def _located(source: str | Path, packaged: Mapping[str, str], kind: str) -> Path
     if path.suffix or len(path.parts) > 1:
         raise InputError(f"{kind}: no such file: {path}")
     known = UnknownNameError.among(kind, str(source), packaged)
-    raise UnknownNameError(f"{known}; the path of an MJCF or URDF file will do as well")
+    raise UnknownNameError(f"{known}; or give the path of an MJCF or URDF file")
 
 
 def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _Part:
@@ -210,7 +210,7 @@ def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _P
 
 @contextmanager
 def _no_engine_log() -> Iterator[None]:
-    """Keep MuJoCo from writing its warnings into the current folder; what it warns of is checked in this module."""
+    """Keep MuJoCo from writing its warnings into the current folder; this module checks for their causes."""
     former = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
@@ -220,7 +220,7 @@ def _no_engine_log() -> Iterator[None]:
 
 
 def _check_kind(path: Path, root: XmlElement) -> None:
-    """Refuse files that are no MJCF or URDF, with what they are.
+    """Refuse files that are not MJCF or URDF; the message says what they are.
 
     Raises:
         FileFormatError: when the file is a xacro file, a part of an MJCF file or something else.
@@ -279,7 +279,7 @@ def _check_numbers(path: Path, root: XmlElement) -> None:
 
 
 def _numbers(value: str) -> list[float]:
-    """Return the numbers of an attribute; none when it holds anything else."""
+    """Return the numbers of an attribute; an empty list when it holds anything else."""
     try:
         return [float(word) for word in value.split()]
     except ValueError:
@@ -287,7 +287,7 @@ def _numbers(value: str) -> list[float]:
 
 
 def _check_sizes(model: mujoco.MjModel, path: Path, root: XmlElement) -> None:
-    """Refuse a model with NaN, which included files may have brought in, or with sizes that no robot has."""
+    """Refuse a model with NaN (which may come from an included file) or with sizes that no robot has."""
     kinds = {"body": model.body, "jnt": model.joint, "geom": model.geom, "site": model.site}
     for kind, item in kinds.items():
         for field in ("mass", "inertia", "pos", "ipos", "axis", "size"):
@@ -307,7 +307,7 @@ def _check_sizes(model: mujoco.MjModel, path: Path, root: XmlElement) -> None:
 
 
 def _name_all(spec: mujoco.MjSpec) -> None:
-    """Give every joint and body without a name one of its own: joint1, joint2, ..., body1, body2, ..."""
+    """Name every joint and body that has no name: joint1, joint2, ..., body1, body2, ..."""
     for kind, items in (("joint", list(spec.joints)), ("body", list(spec.bodies)[1:])):
         taken = {item.name for item in items}
         free = (name for i in range(1, 2 * len(items) + 1) if (name := f"{kind}{i}") not in taken)
@@ -318,8 +318,7 @@ def _name_all(spec: mujoco.MjSpec) -> None:
 def _replace_unusable_masses(spec: mujoco.MjSpec, path: Path, root: XmlElement) -> tuple[str, ...]:
     """Give links without a usable mass and inertia placeholders, so that the kinematics can be built.
 
-    Returns:
-        For each such link what is wrong with it.
+    Returns: A description of the fault for each such link.
     """
     faults: list[str] = []
     for _ in range(len(spec.bodies)):
@@ -352,7 +351,7 @@ def compiled(spec: mujoco.MjSpec, what: object) -> mujoco.MjModel:
     """Compile a copy of ``spec``.
 
     Raises:
-        FileFormatError: with MuJoCo's own words and what to do about the usual cause.
+        FileFormatError: with MuJoCo's message and a remedy for the usual cause.
     """
     try:
         return spec.copy().compile()
@@ -390,7 +389,7 @@ def _separate_contact_shapes(spec: mujoco.MjSpec) -> None:
 def _set_flange(
     spec: mujoco.MjSpec, flange: str | None, path: Path, root: XmlElement
 ) -> tuple[tuple[str, ...], list[str]]:
-    """Make sure of a site ``flange``; return the names of the joints from the base to it, and notes."""
+    """Add a site ``flange`` if it is missing; return the names of the joints from the base to it, and notes."""
     notes: list[str] = []
     site = spec.site(flange or "flange")
     if site is not None:
@@ -403,7 +402,7 @@ def _set_flange(
         raise UnknownNameError.among(f"flange in {path}: body or site", flange, _names(spec))
     if site is None or site.name != "flange":
         former = spec.site("flange")
-        if former is not None:  # the file has a flange of its own; the one that was asked for counts
+        if former is not None:  # the file has a flange of its own; the requested one takes its place
             former.name = "former_flange"
         pose = {} if site is None else {"pos": site.pos, "quat": site.quat}
         body.add_site(name="flange", group=4, **pose)
@@ -429,7 +428,7 @@ def _attach(spec: mujoco.MjSpec, tool: mujoco.MjSpec, path: Path) -> float:
         tool.delete(key)
     radius = tool.numeric("tool_radius")
     for site in spec.sites:
-        if site.name == "tool":  # the file has a tool of its own; the one that was asked for counts
+        if site.name == "tool":  # the file has a tool of its own; the requested one takes its place
             site.name = "former_tool"
     spec.attach(tool, prefix=TOOL_PREFIX, site=spec.site("tool_mount") or spec.site("flange"))
     spec.site(f"{TOOL_PREFIX}tool").name = "tool"
@@ -437,7 +436,7 @@ def _attach(spec: mujoco.MjSpec, tool: mujoco.MjSpec, path: Path) -> float:
 
 
 def without_geoms(spec: mujoco.MjSpec, unwanted: Callable[[mujoco.MjsGeom], bool]) -> mujoco.MjSpec:
-    """Return a copy of ``spec`` without the geoms that are ``unwanted``."""
+    """Return a copy of ``spec`` without the geoms for which ``unwanted`` is true."""
     copy = spec.copy()
     for geom in list(copy.geoms):
         if unwanted(geom):

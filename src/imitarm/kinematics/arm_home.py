@@ -1,4 +1,4 @@
-"""A usable posture to begin in, for an arm whose file has no keyframe."""
+"""Choice of a usable home posture for an arm whose file has no keyframe."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class _HomeSearch:
         return np.asarray(self._low + (0.1 + 0.8 * fractions) * (self._high - self._low))
 
     def bend(self, q: Array) -> float:
-        """Return how far a posture is from a singular one [m/rad]; 0 where singular.
+        """Return a measure of the distance of a posture from a singularity [m/rad]; 0 at a singularity.
 
         It is the smallest singular value of the flange's Jacobian, whose rotations are weighted by 0.3 m, and of its
         linear part: an arm with few joints may lose a direction while it can still rotate. Singular values that are 0
@@ -103,7 +103,7 @@ class _HomeSearch:
         return np.linalg.svd(linear, compute_uv=False), np.linalg.svd(stacked, compute_uv=False)
 
     def score(self, q: Array) -> float:
-        """Return how good a home is: far from singular, not near limits, the flange not below the base."""
+        """Return a score of a home posture: higher far from singularities and limits and above the base."""
         bend = self.bend(q)
         margin = float(np.min(np.minimum(q - self._low, self._high - q) / (self._high - self._low)))
         below = self._data.site_xpos[self._flange, 2] < 0.0

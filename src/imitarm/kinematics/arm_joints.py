@@ -1,4 +1,4 @@
-"""The joints of an arm: which joints of a file belong to it, their limits, and where they stand at home."""
+"""The joints of an arm: which joints of a file belong to it, their limits, and their home position."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class JointLimits:
         velocity: largest speed [rad/s] or [m/s].
         acceleration: largest acceleration [rad/s^2] or [m/s^2].
         torque: largest torque [N m] or force [N]; inf where the file has no limit.
-        notes: what the file does not say and was assumed.
+        notes: assumptions about what the file does not say.
     """
 
     velocity: Array
@@ -134,7 +134,7 @@ def _last_fixed(body: mujoco.MjsBody) -> mujoco.MjsBody:
 
 
 def _hand_joints(spec: mujoco.MjSpec) -> frozenset[str]:
-    """Return the joints of jaws and fingers; nothing but other such joints is moved by them."""
+    """Return the joints of jaws and fingers: joints that move nothing but jaws and fingers."""
     owners = {joint.name: body for body in spec.bodies for joint in body.joints}
     prefix = len(os.path.commonprefix(list(owners))) if len(owners) > 1 else 0  # noqa: RUF071 (names, not paths)
     suspects = {name for name, body in owners.items() if _is_hand_name(name[prefix:], body.name)}
@@ -154,7 +154,7 @@ def _is_hand_name(joint: str, link: str) -> bool:
 
 
 def _is_short_slide(name: str, body: mujoco.MjsBody) -> bool:
-    """Return whether a joint is a slide with a jaw's stroke behind at least four hinges, with nothing after it."""
+    """Return whether a joint is a slide at the end of a chain of four or more hinges, with a jaw's stroke."""
     joint = next(joint for joint in body.joints if joint.name == name)
     stroke = float(joint.range[1] - joint.range[0])
     if int(joint.type) != SLIDE or not 0.0 < stroke <= _JAW_STROKE or len(_joints_below(body)) > 1:
@@ -163,7 +163,7 @@ def _is_short_slide(name: str, body: mujoco.MjsBody) -> bool:
 
 
 def _parallel_mimics(spec: mujoco.MjSpec, owners: Mapping[str, mujoco.MjsBody]) -> set[str]:
-    """Return the joints of each group of coupled joints of which two stand side by side, as fingers do."""
+    """Return each group of coupled joints in which at least two joints are parallel branches, as fingers are."""
     groups: list[set[str]] = []
     for follower, leader in mimics(spec):
         touched = [group for group in groups if group & {follower, leader}]
@@ -178,7 +178,7 @@ def _parallel_mimics(spec: mujoco.MjSpec, owners: Mapping[str, mujoco.MjsBody]) 
 
 
 def mimics(spec: mujoco.MjSpec) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return every coupling of two joints, (follower, leader), with the offset and the factor of its first order."""
+    """Return every coupling of two joints, (follower, leader), with the offset and the linear factor."""
     return {
         (equality.name1, equality.name2): (float(equality.data[0]), float(equality.data[1]))
         for equality in spec.equalities
@@ -207,7 +207,7 @@ def _joints_below(body: mujoco.MjsBody) -> set[str]:
 
 
 def check_joints(spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], path: Path, root: XmlElement) -> None:
-    """Refuse joints that an arm can't have: of other kinds than hinge and slide, or coupled to one another.
+    """Refuse joints that an arm can't have: joints other than hinges and slides, and coupled joints.
 
     Raises:
         InputError: naming the joint and its line.
@@ -236,7 +236,7 @@ def check_joints(spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], path: Path,
 
 
 def place(path: Path, root: XmlElement, joint: str) -> str:
-    """Return how messages name a joint: file, joint and, where it stands in this file, line."""
+    """Return the name of a joint for messages: file, joint and, if it is defined in this file, line."""
     line = next((f" (line {e.line})" for e in root.walk() if e.tag == "joint" and e.get("name") == joint), "")
     return f"{path}: joint {joint!r}{line}"
 
@@ -251,7 +251,7 @@ def read_limits(
 
     Args:
         spec: the file as MuJoCo has read it.
-        model: the same, compiled.
+        model: the compiled ``spec``.
         joints: names of the arm's joints.
         path: of the file, for messages.
         root: the file's own elements, which hold what MuJoCo drops from a URDF.
@@ -293,7 +293,7 @@ def read_limits(
 def _urdf_limits(joint: XmlElement, where: str) -> tuple[float, float]:
     """Return a URDF joint's limits of velocity, nan where it has none, and of effort, inf where it has none.
 
-    A velocity or effort of 0 means that it was not filled in, as exporters do.
+    A velocity or effort of 0 counts as missing, because exporters write 0 for values that were not filled in.
     """
     limit = joint.find("limit")
     kind = joint.get("type")
@@ -333,7 +333,7 @@ def _limit(limit: XmlElement, key: str, where: str) -> float | None:
 
 
 def _torque_limit(model: mujoco.MjModel, name: str) -> float:
-    """Return the joint's own force range, else that of its actuator, else inf."""
+    """Return the joint's own force range, else the force range of its actuator, else inf."""
     joint = model.joint(name).id
     if model.jnt_actfrclimited[joint]:
         return float(np.max(np.abs(model.jnt_actfrcrange[joint])))
@@ -350,7 +350,7 @@ def _torque_limit(model: mujoco.MjModel, name: str) -> float:
 
 
 def _located(names: list[str], all_names: tuple[str, ...], root: XmlElement) -> str:
-    """Return names of joints with their lines, or that it is all of them."""
+    """Return the names of joints with their lines, or "all joints" when it is all of them."""
     if len(names) == len(all_names):
         return "any joint"
     lines = {e.get("name"): e.line for e in reversed(list(root.walk())) if e.tag == "joint"}
@@ -405,8 +405,8 @@ def complete_home(
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return a position for every joint of ``model``, and notes on it.
 
-    Joints that are given keep their values. A tool's fingers are open; other joints that do not belong to the arm
-    stand in the middle of their ranges, coupled ones as their leader says. The arm's own joints stand in the middle
+    Joints with given values keep them. A tool's fingers are open; other joints that do not belong to the arm are
+    in the middle of their ranges; coupled joints follow their leader. The arm's own joints are in the middle
     of their ranges too where that is a usable posture: away from singularities and with the links apart. Else the
     most usable of many postures is taken.
     """

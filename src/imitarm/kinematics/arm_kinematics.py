@@ -1,4 +1,4 @@
-"""ArmKinematics: poses and Jacobians of an arm, computed in a working memory of each thread."""
+"""ArmKinematics: poses and Jacobians of an arm; each thread has its own working memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LANDMARKS = ("shoulder", "elbow", "wrist")  # sites that mark the three points
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Shoulder, elbow and wrist of an arm, and the joints that bend there, as the sites of these names define them.
+    """Shoulder, elbow and wrist of an arm, defined by the sites of these names, and the joints that bend there.
 
     The site ``elbow`` is on the link that the elbow's joint moves, the site ``wrist`` on the link that the bending
     joint of the wrist moves.
@@ -57,11 +57,11 @@ class Landmarks:
 
 
 class ArmMemory:
-    """MuJoCo's working memory of one arm, and the posture it holds; for one thread.
+    """MuJoCo's working memory for one arm in one thread, and the posture for which it holds the kinematics.
 
     Attributes:
         data: the kinematics of the posture.
-        jacobian: Jacobian of the site that was asked for last, shape (6, nv), linear rows first.
+        jacobian: Jacobian of the last requested site, shape (6, nv), linear rows first.
         linear: its first three rows.
         angular: its last three rows.
         sites: positions of the sites in the base frame, shape (nsite, 3) [m].
@@ -97,7 +97,7 @@ class ArmMemory:
         self._qpos = self.data.qpos  # asking MuJoCo for it takes as long as the kinematics of one link
 
     def move_to(self, q: Array) -> None:
-        """Compute the kinematics at ``q``, shape (n,), unless the memory holds it already."""
+        """Compute the kinematics at ``q``, shape (n,), unless it was computed for this posture last."""
         posture = q.tobytes()
         if posture != self._posture:
             self._qpos[self._positions] = q
@@ -161,9 +161,10 @@ class ArmKinematics:
         return self._tool != self._flange
 
     def at(self, q: ArrayLike) -> ArmMemory:
-        """Return this thread's working memory with the kinematics at ``q``, for loops that need much of one posture.
+        """Return this thread's working memory with the kinematics at ``q``.
 
-        It is computed only when the posture is a new one, and is valid until the next posture is asked for.
+        It serves loops that need several results for one posture. It is recomputed only for a new posture, and is valid
+        until a method is called with another posture.
         """
         posture = self._checked(q, "q")
         memory: ArmMemory
@@ -260,7 +261,7 @@ class ArmKinematics:
         return np.array(self.at(q).landmark_jacobians()).reshape(3, 3, -1)
 
     def required_landmarks(self) -> Landmarks:
-        """Return ``landmarks``, which the caller can't do without.
+        """Return ``landmarks``, or raise an error if the arm has none.
 
         Raises:
             InputError: if the arm's file does not say where shoulder, elbow and wrist are.

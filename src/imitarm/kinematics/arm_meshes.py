@@ -1,4 +1,4 @@
-"""Finding the meshes that a URDF or MJCF file names, and saying which of them can't be read and why."""
+"""Find the meshes that a URDF or MJCF file names, and report those that can't be read."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MOST_FOLDERS = 300  # of one folder that are looked into
 
 
 def find_meshes(spec: mujoco.MjSpec, path: Path, root: XmlElement, package_path: Iterable[Path]) -> None:
-    """Replace the file of every mesh in ``spec`` by the place where it was found.
+    """Replace the file name of every mesh in ``spec`` by the path at which it was found.
 
     A file is looked for as it is written (below the file's ``meshdir``), relative to the robot's file, and in the
     folders of ``package_path``. For ``package://NAME/...`` the package is a folder of that name, or one whose
@@ -50,7 +50,7 @@ def find_meshes(spec: mujoco.MjSpec, path: Path, root: XmlElement, package_path:
 
 
 def _places(file: str, folder: Path, meshdir: str, extra: list[Path]) -> Iterator[Path]:
-    """Yield where a mesh may be, best guess first."""
+    """Yield possible paths of a mesh, the most likely one first."""
     file = file.replace("\\", "/")
     scheme, separator, rest = file.partition(":")
     if separator and scheme in {"package", "model"}:
@@ -122,7 +122,7 @@ def _name_in(manifest: Path, _changed: int) -> str | None:
 
 
 def _check_format(mesh: Path, where: str) -> None:
-    """Refuse what MuJoCo can't read, with the format's name."""
+    """Refuse a mesh that MuJoCo can't read; the message names its format."""
     convert = (
         "convert it to binary STL or to OBJ (for example with MeshLab or Blender) and name the new file, or leave all "
         "meshes out with discard_meshes=True (--discard-meshes on the command line)"

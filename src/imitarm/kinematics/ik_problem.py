@@ -1,4 +1,4 @@
-"""What tasks, limits and methods of the inverse kinematics tell each other."""
+"""Data that tasks, limits and methods of the inverse kinematics exchange."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ class Rows(NamedTuple):
 
 
 class TaskRows(NamedTuple):
-    """What a task asks for at one step: ``jacobian @ v`` should equal ``target``, both already weighted.
+    """The rows of a task at one step: ``jacobian @ v`` should equal ``target``; both are already weighted.
 
     Attributes:
         jacobian: shape (m, n_joints).
         target: shape (m,).
-        effort: factor of the cost of joint motion beside this task: less for a task with small weights.
+        effort: factor of the cost of joint motion; smaller for a task with small weights.
     """
 
     jacobian: Array
@@ -64,18 +64,19 @@ class TaskRows(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class IKProblem:
-    """One control step: what is known of the arm, and what the tasks and limits ask for so far.
+    """The problem of one control step: the arm's state, and the rows of the tasks and limits so far.
 
     Attributes:
         arm: the arm.
         memory: its kinematics at ``q``.
         q: joint positions, shape (n_joints,) [rad].
-        velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: unknown, any is assumed.
+        velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: unknown, accelerations are not
+            limited.
         dt: length of the control step [s].
-        box: hard bounds of the joint velocity: those of the velocity limits until the limits have been asked.
-        tasks: what the tasks ask for, the tool's first.
+        box: hard bounds of the joint velocity; before the limits are applied, the arm's velocity limits.
+        tasks: rows of the tasks; those of the tool come first.
         rows: soft inequalities.
-        max_speed: longest target of a twist, where the task does not say [m/s].
+        max_speed: norm to which a twist is scaled down, for tasks that do not set their own [m/s].
         scaled: whether each joint velocity is counted in units of its velocity limit, as in damped least squares.
         posture: drift in the null space, shape (n_joints,) [rad/s], for the damped methods; None: none.
     """
@@ -94,5 +95,5 @@ class IKProblem:
 
     @property
     def moving(self) -> bool:
-        """Whether the tool's task asks for any motion; True while that is not known."""
+        """Whether the target of the tool's task is not zero; True before it is known."""
         return not self.tasks or bool(self.tasks[0].target.any())

@@ -1,7 +1,7 @@
-"""Limits of the joint velocity: what a control step must not exceed, as small objects that combine.
+"""Limits of the joint velocity in one control step, as small objects that can be combined.
 
-A :class:`Limit` answers, at one control step, with a :class:`Box` (hard: always kept) or with :class:`Rows`
-(soft: linear inequalities that give way only when they contradict a box, or at a price).
+A :class:`Limit` answers, at one control step, with a :class:`Box` (hard: always kept) or with :class:`Rows` (soft:
+linear inequalities that may be violated when they contradict a box, or at a given price).
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ _SIGN = np.array([[1.0], [-1.0]])
 
 
 class Limit(ABC):
-    """One restriction of the joint velocity. A limit of your own is one class with this one method.
+    """One limit of the joint velocity. A limit of your own is one class with this one method.
 
     Attributes:
-        soft: whether it answers with rows, which only the method ``"qp"`` can keep.
+        soft: whether the limit returns rows, which only the method ``"qp"`` can keep.
     """
 
     soft: ClassVar[bool] = False
 
     @abstractmethod
     def restrict(self, problem: IKProblem) -> Box | Rows | None:
-        """Return the restriction at one control step; None when nothing is near enough to restrict it."""
+        """Return the box or the rows for one control step; None when the limit is too far away to matter."""
 
 
 class JointLimits(Limit):
@@ -54,7 +54,7 @@ class JointLimits(Limit):
     lower bound is its mirror image. When :math:`v_p` kept this bound one step ago, braking with a keeps it now, so
     the box always holds a velocity.
 
-    The bound assumes that the joint moves by :math:`v\,dt` in one step. A robot changes its speed evenly and moves by
+    The bound assumes that the joint moves by :math:`v\,dt` in one step. A robot with constant acceleration moves by
     :math:`(v_p + v)\,dt/2`; ``imitarm.robots.limit_velocity`` therefore evaluates this box at :math:`q + v_p\,dt/2`.
 
     Args:
@@ -73,12 +73,13 @@ class JointLimits(Limit):
         return known.at(problem.q, problem.velocity)
 
     def box(self, q: Array, dt: float, velocity: Array | None = None) -> Box:
-        """Return the bounds at one posture, not to be written to.
+        """Return the bounds at one posture; the arrays must not be changed.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
             dt: length of the control step [s].
-            velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: any is assumed.
+            velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: accelerations are not
+                limited.
         """
         known = self._boxes.get(dt)
         if known is None:
@@ -133,7 +134,7 @@ class ElbowSingularityLimit(Limit):
 
     Where the upper arm and the forearm of an SRS arm are in line, the shoulder-wrist distance can't change any
     faster: the arm is singular. The margin acts like one more position limit of the elbow joint (see
-    :class:`JointLimits`). An arm that starts inside the margin can only leave it.
+    :class:`JointLimits`). An arm that starts inside the margin can only move out of it.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.
@@ -155,7 +156,7 @@ class ElbowSingularityLimit(Limit):
         self._braking_distance = self._most * self._most / (2.0 * self._acceleration)
 
     def restrict(self, problem: IKProblem) -> Box | None:
-        """Return a bound of the elbow joint alone; None when it is farther away than it needs to brake."""
+        """Return a bound of the elbow joint; None when the margin is farther away than the braking distance."""
         position = float(problem.q[self._joint])
         side = -1.0 if position < self._straight else 1.0
         if not self._sides[0 if side > 0.0 else 1]:
@@ -180,8 +181,8 @@ class WristSingularityLimit(Limit):
 
     The wrist is singular where the axes before and after its joint are parallel, at every multiple of pi. With D the
     distance to 0.1 rad from the nearest of them, the joint's velocity away from it must be at least
-    :math:`-v_b(D)` (see :class:`JointLimits`), or 5/s times what is missing once it is nearer. The price of a
-    violation is low enough for a hand that must rotate through to do so.
+    :math:`-v_b(D)` (see :class:`JointLimits`), or 5/s times what is missing once it is nearer. The price of a violation
+    is low, so that a hand can rotate through a singular position when it must.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.
@@ -204,7 +205,7 @@ class WristSingularityLimit(Limit):
             self._rows.append(row)
 
     def restrict(self, problem: IKProblem) -> Rows | None:
-        """Return one row for the wrist joint; None when any velocity will do."""
+        """Return one row for the wrist joint; None when no velocity can violate it."""
         position = float(problem.q[self._joint])
         away = position - math.pi * round(position / math.pi)
         distance = abs(away) - WRIST_MARGIN

@@ -1,8 +1,8 @@
 """Positions and rotations: quaternions (w, x, y, z) as arrays, and the typed :class:`Pose`.
 
-All functions take and return arrays with any leading shape and are vectorised over it. They compute and do not check;
-:class:`Pose` checks what it is built from. A single rotation is computed with plain numbers, because numpy takes longer
-for an array of four and control steps need many.
+All functions take and return arrays with any leading shape and are vectorised over it. They do not check their
+arguments; :class:`Pose` does. A single rotation is computed with plain floats, which is faster than numpy for an array
+of four; control steps need many.
 
 Rotation vectors (axis times angle) are in rad. Twists have shape (6,): linear velocity [m/s] first, then angular
 velocity [rad/s], both in the base frame.
@@ -121,7 +121,7 @@ def matrix_to_quaternion(matrix: ArrayLike) -> Array:
 
 
 def _largest_column(m: Array) -> Array:
-    """Do what :func:`matrix_to_quaternion` does, for one matrix (3, 3)."""
+    """Convert one matrix (3, 3) as :func:`matrix_to_quaternion` does."""
     (a, b, c), (d, e, f), (g, h, i) = m.tolist()
     diagonal = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
     best = diagonal.index(max(diagonal))
@@ -218,7 +218,7 @@ def checked_unit_quaternions(quaternions: ArrayLike, what: str) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A position and a rotation: where a frame is, seen from another one.
+    """A position and a rotation: the pose of one frame relative to another.
 
     The name of a pose names both frames: ``tool_to_base`` maps tool coordinates to base coordinates,
     ``p_base = R p_tool + position``.
@@ -251,7 +251,7 @@ class Pose:
 
     @classmethod
     def trusted(cls, position: Array, quaternion: Array) -> Pose:
-        """Build without checks from arrays that nobody else holds; for control steps, where the checks take too long.
+        """Build without checks, for control steps, where checks take too long; the caller gives the arrays away.
 
         Args:
             position: shape (3,) [m]; from now on read-only.
@@ -266,7 +266,7 @@ class Pose:
 
     @classmethod
     def identity(cls) -> Pose:
-        """Return the pose of a frame in itself."""
+        """Return the identity: no displacement and no rotation."""
         return cls(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
     @classmethod
@@ -274,7 +274,8 @@ class Pose:
         """Build from a homogeneous transform, shape (4, 4).
 
         Raises:
-            InputError: if the matrix is not a rotation and a displacement: mirrored, scaled or sheared.
+            InputError: if the matrix is not a rotation and a displacement, for example because it mirrors, scales or
+                shears.
         """
         m = finite_array(matrix, (4, 4), "matrix")
         rotation = m[:3, :3]

@@ -1,4 +1,4 @@
-"""Finding a posture of an arm in which its tool has a given pose."""
+"""Find a posture of an arm in which its tool has a given pose."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def find_posture(
         pose: desired pose in the base frame.
         q0: posture to start from and to stay near to, shape (n_joints,) [rad]; None: ``home``.
         frame: the frame that is to have this pose, ``"tool"`` or ``"flange"``.
-        restarts: number of random postures to start from.
+        restarts: number of random start postures.
         seed: seed of the random postures.
 
     Returns:
@@ -107,7 +107,7 @@ def _descend(arm: ArmModel, start: Array, pose: Pose, frame: str) -> tuple[Array
 
 
 def _step(arm: ArmModel, q: Array, jacobian: Array, error: Array, reference: Array) -> Array:
-    """Return one step; joints at a limit that it would exceed stay where they are."""
+    """Return one step; a joint at a limit does not move beyond it."""
     free = np.ones(len(q), dtype=bool)
     step = np.zeros(len(q))
     damping = 1e-3 * float(error @ error) + 1e-12

@@ -1,4 +1,4 @@
-"""Covering the collision shapes of an arm with spheres, so that all of it can be kept clear of obstacles."""
+"""Cover the collision shapes of an arm with spheres, so that the whole arm can be kept clear of obstacles."""
 
 from __future__ import annotations
 
@@ -113,7 +113,8 @@ class SphereCover:
         Args:
             data: the kinematics of a posture.
             outer: indices of the spheres farther from the base, shape (k,); all joints of the inner ones move them.
-            inner: indices of the spheres nearer to the base, shape (k,); those of the base follow after all others.
+            inner: indices of the spheres nearer to the base, shape (k,); indices of the base's spheres come after all
+                others.
             centers: centers of the outer spheres, shape (k, 3) [m].
             normals: unit vectors from inner to outer, shape (k, 3).
         """
@@ -146,7 +147,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _carries(model: mujoco.MjModel, carrier: int, body: int) -> bool:
-    """Return whether ``carrier`` is ``body`` or one of its parents."""
+    """Return whether ``carrier`` is ``body`` or an ancestor of it."""
     while body > carrier:  # parents have smaller indices
         body = int(model.body_parentid[body])
     return body == carrier
@@ -187,7 +188,7 @@ def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:
 
 
 def _pieces(half_length: float, radius: float) -> int:
-    """Return into how many pieces a round bar is cut; a thin wire gets fewer and larger spheres."""
+    """Return the number of spheres that cover a round bar; a thin wire gets fewer and larger ones."""
     return max(1, math.ceil(min(2.0 * half_length / (_SPACING * radius), _MOST_PIECES)))
 
 
@@ -209,7 +210,7 @@ def _cylinder(half_length: float, radius: float) -> tuple[Array, float]:
 
 
 def _grid(half_size: Array) -> tuple[Array, float]:
-    """Cover a box by cells that are about as long as the box is thin, yet not very many."""
+    """Cover a box by a limited number of cells that are about as long as the box is thin."""
     cell = max(2.0 * float(np.min(half_size)), _SMALLEST_CELL, 2.0 * float(np.max(half_size)) / _LONGEST_ROW)
     counts = np.maximum(1, np.ceil(2.0 * half_size / cell - 1e-9)).astype(int)
     axes = [h * (2.0 * np.arange(n) + 1.0 - n) / n for h, n in zip(half_size, counts, strict=True)]

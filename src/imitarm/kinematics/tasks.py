@@ -1,6 +1,6 @@
-r"""Tasks of the inverse kinematics: what the joints should do, as small objects that combine.
+r"""Tasks of the inverse kinematics: desired motions, as small objects that can be combined.
 
-Each task asks for a velocity :math:`t` of some quantity that moves with :math:`J v`. The quadratic program minimises
+Each task sets a target velocity :math:`t` for a quantity whose velocity is :math:`J v`. The quadratic program minimises
 the sum of :math:`\tfrac12 |J v - t|^2` over all tasks, inside the limits.
 """
 
@@ -34,7 +34,7 @@ class Task(Protocol):
     """One wanted motion. A task of your own is one class with this one method."""
 
     def rows(self, problem: IKProblem) -> TaskRows | None:
-        """Return what is asked for at one control step; None: nothing.
+        """Return the weighted rows of the task for one control step; None: no rows.
 
         Raises:
             InputError: when a number of the task can't be used.
@@ -44,15 +44,17 @@ class Task(Protocol):
 class TwistTask(NamedTuple):
     r"""Move the tool (or the flange) with a twist.
 
-    Rotations count as displacements: 1 rad as ``rotation_length``. A twist longer than ``max_speed``, so weighted, is
-    scaled down: damped least squares fed with an unclamped error stops short of its target, since its damping grows
-    with the error (thesis Eq 3.9).
+    A rotation of 1 rad counts like a displacement of ``rotation_length``. A twist longer than ``max_speed``, so
+    weighted, is
+    scaled down: without this, damped least squares stops short of its target, because its damping grows with the error
+        (thesis Eq 3.9).
 
     Attributes:
-        twist: wanted velocity in the base frame, linear rows first, shape (6,) [m/s, rad/s].
-        frame: what moves, ``"tool"`` or ``"flange"``.
-        rotation_length: what 1 rad counts as, beside a metre, where the joints can't do all of the twist [m]; less
-            gives up rotation first. Three numbers: for rotations about the base's x, y and z.
+        twist: desired velocity in the base frame, linear rows first, shape (6,) [m/s, rad/s].
+        frame: the frame that moves, ``"tool"`` or ``"flange"``.
+        rotation_length: displacement that counts like a rotation of 1 rad when the joints can't do the whole twist [m].
+            With a smaller value, the tool gives up more of its rotation and less of its displacement. Three numbers are
+            for rotations about the base's x, y and z axes.
         max_speed: the twist is scaled down to this weighted norm [m/s]; None: the default of the solver's method.
     """
 
@@ -84,8 +86,8 @@ class JointVelocityTask(NamedTuple):
     """Move the joints at given velocities, for example along a planned joint path.
 
     Attributes:
-        velocity: wanted joint velocity, shape (n_joints,) [rad/s].
-        weight: beside a twist, whose weight is 1 [m^2].
+        velocity: desired joint velocity, shape (n_joints,) [rad/s].
+        weight: of this task; that of a twist is 1 [m^2].
     """
 
     velocity: ArrayLike
@@ -99,12 +101,12 @@ class JointVelocityTask(NamedTuple):
 
 
 class PostureTask(NamedTuple):
-    """Drift to a posture where the other tasks leave freedom: :math:`v = k (q_{ref} - q)`.
+    """Drift to a posture, as far as the other tasks leave freedom: :math:`v = k (q_{ref} - q)`.
 
     Attributes:
         q: joint positions to drift to, shape (n_joints,) [rad].
         gain: k [1/s].
-        weight: beside a twist, whose weight is 1 [m^2].
+        weight: of this task; that of a twist is 1 [m^2].
     """
 
     q: ArrayLike
@@ -112,7 +114,7 @@ class PostureTask(NamedTuple):
     weight: float = 1e-4
 
     def drift(self, problem: IKProblem) -> Array:
-        """Return the wanted joint velocity inside the box, shape (n_joints,) [rad/s]."""
+        """Return the desired joint velocity, clipped to the box, shape (n_joints,) [rad/s]."""
         gain = finite_number(self.gain, "PostureTask: gain", "1/s")
         drift = gain * (finite_vector(self.q, len(problem.q), "PostureTask: q", "rad") - problem.q)
         return np.minimum(np.maximum(drift, problem.box.lower), problem.box.upper)
@@ -124,24 +126,25 @@ class PostureTask(NamedTuple):
 
 
 class ElbowTask(NamedTuple):
-    r"""Turn the elbow to an SEW angle while the tool does its task.
+    r"""Rotate the elbow to an SEW angle while the tool does its task.
 
-    The elbow swings by the self-motion: the unit vector n along :math:`(I - J^+ J) J_\psi^T`, which leaves the tool
-    (the first task, with Jacobian J and target e) as it is. The task adds :math:`\tfrac{w}2\,(n^T v - s)^2` with
+    The elbow moves by the self-motion: the unit vector n along :math:`(I - J^+ J) J_\psi^T`, which does not move the
+    tool (the first task, with Jacobian J and target e). The task adds :math:`\tfrac{w}2\,(n^T v - s)^2` with
 
     .. math:: s = c\,\min(1, 10\sin^2\!\beta)\;\frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
 
     where :math:`\psi` is the arm's :func:`~imitarm.kinematics.sew.sew_angle` and :math:`\beta` the angle at its elbow.
-    The swing fades to none as the arm gets straight, and near the one direction in which the stereographic angle is
-    not defined. From one step to the next s changes by at most half of what the joints can change. As long as no limit
-    is active this takes nothing from the tool, whatever the weight. At the limits the weight decides.
+    The elbow's speed goes to zero as the arm becomes straight, and near the one direction in which the stereographic
+    angle is undefined. From one step to the next, s changes by at most half of the change that the joints'
+    accelerations allow. As long as no limit is active, this does not affect the tool, whatever the weight. At the
+    limits the weight decides.
 
     Attributes:
-        angle: wanted SEW angle :math:`\psi_h` [rad].
-        weight: w beside the tool's task, whose weight is 1 [m^2]; 0 leaves the self-motion free.
-        confidence: c, 0 to 1: how surely the wanted angle is known; 0: no swing.
+        angle: desired SEW angle :math:`\psi_h` [rad].
+        weight: w; the weight of the tool's task is 1 [m^2]; 0 leaves the self-motion free.
+        confidence: c, 0 to 1: certainty of the desired angle; 0: the elbow is not moved.
         gain: k [1/s].
-        max_rate: the wanted rate of the angle is limited to this [rad/s].
+        max_rate: limit of the desired rate of the angle [rad/s].
         convention: of the angle.
     """
 
@@ -189,10 +192,10 @@ class ElbowTask(NamedTuple):
 
 
 def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] | None:
-    r"""Return the joint motion that leaves the tool as it is and changes some quantity most.
+    r"""Return the joint motion that does not move the tool and changes a given quantity most.
 
-    With J the tool's Jacobian and g the quantity's gradient, it is along :math:`(I - J^+ J)\,g`; what the tool's own
-    motion e does to the quantity is :math:`g^T J^+ e`.
+    With J the tool's Jacobian and g the gradient of the quantity, the motion is along :math:`(I - J^+ J)\,g`; a motion
+    e of the tool changes the quantity by :math:`g^T J^+ e`.
 
     Args:
         jacobian: of the tool, shape (m, n_joints).
@@ -229,7 +232,7 @@ def _root(weight: float, task: str) -> float:
 def _scales(
     rotation_length: float | tuple[float, float, float], frame: str, arm: ArmModel, scaled: bool
 ) -> tuple[Array, Array, float, int]:
-    """Return the weights of a twist (6,), the factors of its Jacobian (6, n_joints), that of the effort, the site."""
+    """Return weights of a twist (6,), factors of its Jacobian (6, n_joints) and of the effort, and the site."""
     try:
         lengths = np.broadcast_to(np.asarray(rotation_length, dtype=float), 3)
         usable = bool(np.isfinite(lengths).all() and lengths.min() > 0.0)

@@ -1,4 +1,4 @@
-"""The goal and what is in the way: obstacles with exact signed distances, scenes and scene files."""
+"""Scenes: a goal and obstacles with exact signed distances, and scene files."""
 
 from __future__ import annotations
 

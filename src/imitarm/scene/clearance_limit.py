@@ -1,4 +1,4 @@
-"""ClearanceLimit: no part of the arm may approach an obstacle faster than it can still stay clear."""
+"""ClearanceLimit: bounds the speed at which every part of the arm approaches an obstacle."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ class ClearanceLimit:
     r"""Inequalities on the joint velocity that keep every link, and the tool, clear of every obstacle.
 
     Spheres cover the arm and its tool (``ArmModel.collision_spheres``). For the sphere with centre ``c`` and radius
-    ``r`` near an obstacle with signed distance ``sd`` and outward normal ``n``, the room left is
+    ``r`` near an obstacle with signed distance ``sd`` and outward normal ``n``, the distance left is
     ``h = sd(c) - r - clearance``. With ``v_o`` the velocity of the obstacle's nearest point, the row
 
     .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - \xi h
 
-    lets the room shrink at most exponentially: it never gets below zero. Where it is negative, because links move on
-    arcs and control steps are finite, it must grow back, at ``retreat_rate`` in place of :math:`\xi`. Every
-    sphere within ``influence`` of an obstacle has a row; none is left out. The spheres stand out from the shapes
-    they cover, so the true distance is never smaller than the one that is used.
+    lets this distance shrink at most exponentially, so that it stays positive. It can still become negative, because
+    links move on arcs and control steps are finite. Then it must grow, with ``retreat_rate`` in place of :math:`\xi`.
+    Every sphere within ``influence`` of an obstacle has a row; none is left out. The spheres contain the shapes they
+    cover, so the true distance is never smaller than that of the spheres.
 
     Args:
         arm: the arm with its tool.
         clearance: required distance of every link to every obstacle [m].
-        rate: ``xi``, the fraction of the room that may be used up per second [1/s].
-        influence: room beyond which a sphere has no row [m].
-        retreat_rate: fraction of missing room that is regained per second [1/s].
+        rate: ``xi``, the fraction of h by which h may shrink per second [1/s].
+        influence: value of h beyond which a sphere has no row [m].
+        retreat_rate: fraction of a negative h that is regained per second [1/s].
 
     Raises:
         InputError: when ``arm`` is not an ArmModel, or a number is not finite or is negative.

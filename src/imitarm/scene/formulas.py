@@ -1,7 +1,7 @@
 """The distance formula of each family of shapes, in the obstacle's own frame, for any number of obstacles and points.
 
-A formula takes points ``q`` (3, ...), whether normals are wanted, and the parameters of its shapes, which broadcast
-against ``q``. It returns signed distances (...) [m] and outward unit normals (3, ...), or None.
+A formula takes points ``q`` (3, ...), a flag for normals, and the parameters of its shapes, which broadcast against
+``q``. It returns signed distances (...) [m] and outward unit normals (3, ...), or None.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Formula = Callable[..., tuple[Array, Any]]  # distances, and normals where they were asked for
+Formula = Callable[..., tuple[Array, Any]]  # distances, and normals where requested
 Parameters = tuple[Array | None, ...]
 
 TINY = 1e-9  # [m] a direction shorter than this is mostly rounding error; a fixed direction replaces it
@@ -65,11 +65,11 @@ def _prepare_rounds(kinds: Sequence[str], sizes: Array) -> Parameters:
 def slabs(
     q: Array, gradient: bool, half: Array, rounding: Array | None, turned: Array | None
 ) -> tuple[Array, Array | None]:
-    """Boxes, cylinders and half-spaces: a box of half size ``half``, rounded by ``rounding``.
+    """Boxes, cylinders and half-spaces are boxes of half size ``half``, rounded by ``rounding``.
 
-    With ``a = |q| - half`` the distance is ``|max(a, 0)| + min(max_j a_j, 0) - rounding``. A half-space is a
-    box without ends. A cylinder (``turned``) is a box in ``(rho, z)`` with ``rho^2 = x^2 + y^2``. Beside them a sphere
-    is a rounded point and a capsule a rounded segment.
+    With ``a = |q| - half`` the distance is ``|max(a, 0)| + min(max_j a_j, 0) - rounding``. A half-space is a box of
+    infinite size. A cylinder (``turned``) is a box in ``(rho, z)`` with ``rho^2 = x^2 + y^2``. Next to them in a scene,
+    a sphere is computed as a rounded point and a capsule as a rounded segment.
 
     Args:
         q: points in the own frames, shape (3, ...) [m].
@@ -243,7 +243,7 @@ FAMILIES = (
 
 @dataclass(frozen=True)
 class Polytope:
-    """Faces and edges of a hull in its own frame, so that a hull that moves keeps them.
+    """Faces and edges of a hull in its own frame, so that they stay valid when the hull moves.
 
     With the planes ``n_i.x = b_i`` of its faces, inside ``sd = max_i (n_i.x - b_i)``. Outside, that maximum is a lower
     bound. It is the distance when its foot ``x - sd n_i`` is on the face; otherwise the nearest point is on an edge or
@@ -313,7 +313,7 @@ class Polytope:
         )
 
     def formula(self, q: Array, gradient: bool) -> tuple[Array, Array | None]:
-        """Return distances and normals as the other formulas do, see the module."""
+        """Return distances and normals like the other formulas of this module."""
         distance, rows = self.distance_and_normal(np.ascontiguousarray(q.reshape(3, -1).T))
         return distance.reshape(q.shape[1:]), rows.T.reshape(q.shape) if gradient else None
 

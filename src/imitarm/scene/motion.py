@@ -23,16 +23,16 @@ from imitarm.validation import finite_array, finite_number
 
 Array = NDArray[np.float64]
 Motion = Callable[[float], "Pose | ArrayLike"]
-"""Where an obstacle is at a time [s]: its pose, or its position (3,) [m] when it does not rotate. Both are those of the
-obstacle's own frame (:class:`~imitarm.scene.distances.PackedObstacles`): the centre of a shape, the mean of a hull's
-points."""
+"""A function of time [s] that returns the pose of an obstacle, or its position (3,) [m] when it does not rotate. Both
+are those of the obstacle's own frame (:class:`~imitarm.scene.distances.PackedObstacles`): the centre of a shape, the
+mean of a hull's points."""
 
 _STEP = 1e-4  # [s] half of the interval over which velocities are differences
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A recorded motion: straight lines and shortest rotations between the poses, at rest before and after.
+    """A recorded motion, interpolated linearly and along the shortest rotations, and at rest before and after.
 
     Attributes:
         times: strictly increasing, shape (n,) [s].
@@ -68,11 +68,11 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class MovingScene:
-    """A scene of which some obstacles follow functions of time; the others keep their velocity.
+    """A scene in which some obstacles follow functions of time; the others keep their velocity.
 
     Attributes:
-        scene: all obstacles; where the motions say nothing, as they are at ``scene.stamp``.
-        motions: for some obstacles, by index or by name, where they are at each time.
+        scene: all obstacles at ``scene.stamp``; those without a motion start from there.
+        motions: the motion of some obstacles, by index or by name.
 
     Raises:
         InputError: when there is no such obstacle, or a motion does not return a pose or a position.
@@ -99,7 +99,7 @@ class MovingScene:
         self.at(self.scene.stamp)
 
     def poses(self, time: float) -> tuple[Array, Array]:
-        """Return where the own frames of all obstacles are.
+        """Return the poses of all obstacles' own frames.
 
         Args:
             time: on the clock of ``scene.stamp`` [s].
@@ -122,7 +122,7 @@ class MovingScene:
     def at(self, time: float) -> Scene:
         """Return the scene at ``time`` [s], with the velocities that the obstacles have then.
 
-        The velocity of an obstacle that follows a function is its difference over 0.2 ms.
+        The velocity of an obstacle that follows a function is computed from its displacement within 0.2 ms.
         """
         time = finite_number(time, "MovingScene.at: time", "s")
         if not self._moved:

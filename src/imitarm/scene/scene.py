@@ -23,7 +23,7 @@ _LISTED = 4  # obstacles that a short repr names
 class Scene:
     """A goal and obstacles at one time, all in the base frame.
 
-    A goal inside an obstacle is allowed, because a scene is what a sensor saw; :meth:`check` refuses it.
+    A goal inside an obstacle can be constructed, because a sensor may see such a scene; :meth:`check` refuses it.
 
     Attributes:
         goal: tool_to_base at the end of the motion; None for the goal that the skill has learned.
@@ -51,7 +51,7 @@ class Scene:
 
     @classmethod
     def predicted(cls, seen: Scene, packed: PackedObstacles, stamp: float) -> Scene:
-        """Return ``seen`` with its obstacles where ``packed`` has them; for code that moves obstacles itself.
+        """Return ``seen`` with the obstacle poses of ``packed``, for code that moves obstacles itself.
 
         Args:
             seen: the scene from which the shapes, the goal and the fixtures are taken.
@@ -64,7 +64,7 @@ class Scene:
 
     @cached_property
     def packed(self) -> PackedObstacles:
-        """The obstacles as arrays, which is what distances are computed from."""
+        """The obstacles as arrays, from which distances are computed."""
         return pack(self.obstacles, self.stamp)
 
     def at(self, time: float) -> Scene:
@@ -72,7 +72,7 @@ class Scene:
 
         Each obstacle keeps its velocity and its angular velocity; the goal stays. The result has ``stamp = time``;
         ``packed.stamps`` keep when each obstacle was seen. It takes microseconds: only the packed arrays are moved, and
-        the obstacle objects are built when they are asked for.
+        the obstacle objects are built when ``obstacles`` is read.
 
         Args:
             time: on the clock of ``stamp`` [s].
@@ -87,7 +87,7 @@ class Scene:
         return Scene.predicted(seen, seen.packed.after(time - seen.stamp), time)
 
     def now(self, time: float) -> Scene:
-        """Return :meth:`at`, or the scene itself where no obstacle moves or it was seen at that time.
+        """Return :meth:`at`, or the scene itself if no obstacle moves or the scene was seen at that time.
 
         Args:
             time: on the clock of ``stamp`` [s].
@@ -95,12 +95,12 @@ class Scene:
         return self if time == self.stamp or self.packed.still else self.at(time)
 
     def poses(self, time: float) -> tuple[Array, Array]:
-        """Return where the obstacles' own frames are at ``time`` [s]: positions (n, 3) [m], quaternions (n, 4)."""
+        """Return the poses of the obstacles' own frames at ``time`` [s]: positions (n, 3) [m], quaternions (n, 4)."""
         packed = self.packed.after(time - self.stamp)
         return packed.positions, packed.quaternions
 
     def __getattr__(self, name: str) -> Any:
-        """Build the obstacles of a predicted scene, the only attribute that may be missing."""
+        """Build the obstacles of a predicted scene; no other attribute can be missing."""
         seen: Scene | None = self.__dict__.get("_seen")
         if name != "obstacles" or seen is None:
             raise AttributeError(f"Scene has no attribute {name!r}")
@@ -220,7 +220,7 @@ class Scene:
 
         Raises:
             InputError: when the goal is nearer than ``tool_radius`` to an obstacle or inside it; the message names
-                the obstacle and by how much. Also when ``tool_radius`` is not a length.
+                the obstacle and by how much. The error is also raised when ``tool_radius`` is not a length.
         """
         tool_radius = finite_number(tool_radius, "Scene.check: tool_radius", "m", at_least=0.0)
         if self.goal is None or not self.obstacles:

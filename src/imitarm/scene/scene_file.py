@@ -44,15 +44,15 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     """Read a scene file.
 
     Args:
-        path: a YAML file as docs/scene.md describes it.
+        path: a YAML file in the format of docs/scene.md.
 
     Returns:
         The scene in metres, whatever the file's units.
 
     Raises:
         InputError: when there is no such file or it can't be read.
-        FileFormatError: when it is not a scene file or something in it is wrong; the message names the file, the
-            entry and the key, and lists what is known there.
+        FileFormatError: when it is not a scene file or an entry is wrong; the message names the file, the entry and the
+            key, and lists the known keys or values.
     """
     path = file_path(path, "path")
     try:
@@ -101,7 +101,7 @@ _INTEGER_TAG, _REAL_TAG = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain YAML, where no key is given twice and numbers are decimal, without leading zeros."""
+    """Plain YAML in which duplicate keys and numbers that are not plain decimals are refused."""
 
     yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own attribute)
         first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INTEGER_TAG, _REAL_TAG)]
@@ -119,7 +119,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def number(self, node: yaml.ScalarNode) -> int | float:
-        """Return a number, also one with an explicit tag, which must be written in the same way."""
+        """Return a number; one with an explicit tag must also be a plain decimal."""
         if _INTEGER.match(node.value):
             return int(node.value)
         if _REAL.match(node.value):
@@ -139,7 +139,7 @@ for _tag, _pattern in ((_INTEGER_TAG, _INTEGER), (_REAL_TAG, _REAL)):
 
 
 def _parsed(text: str) -> object:
-    """Return what the YAML says, in plain Python types."""
+    """Return the content of the YAML text in plain Python types."""
     try:
         return yaml.load(text, _Loader)  # a SafeLoader
     except yaml.YAMLError as error:
@@ -184,7 +184,7 @@ def _obstacles(content: Mapping[Any, Any], key: str, metres: float) -> tuple[Obs
 
 
 def _check_distances(goal: Pose | None, obstacles: Iterable[Obstacle], units: str) -> None:
-    """Refuse a scene that lies within the robot's base: its numbers are metres, not ``units``."""
+    """Refuse a scene that lies within the robot's base, because its numbers are probably metres, not ``units``."""
     corners = [obstacle.bounds() for obstacle in obstacles] + ([] if goal is None else [goal.position])
     farthest = max((float(np.abs(corner).max()) for corner in corners), default=np.inf)
     if farthest < _NEAREST:
@@ -235,7 +235,7 @@ def _obstacle(entry: object, where: str, metres: float) -> Obstacle:
 
 
 def _check_size(key: str, value: Any, where: str) -> None:
-    """Refuse an obstacle of less than 1 mm: its numbers are in another unit."""
+    """Refuse an obstacle of less than 1 mm, because its numbers are probably in another unit."""
     numbers = np.asarray(value)
     sizes = np.ptp(numbers, axis=0) if key == "points" else np.atleast_1d(numbers)
     smallest = float(sizes.min()) * (2.0 if key in ("radius", "semi_axes") else 1.0)
@@ -318,7 +318,7 @@ def _check_keys(entry: Mapping[Any, Any], known: Iterable[str], where: str) -> N
 
 
 def _suggestion(word: object, known: Iterable[str]) -> str:
-    """Return `` (did you mean "size"?)`` or nothing."""
+    """Return a hint such as `` (did you mean "size"?)``, or an empty text."""
     close = difflib.get_close_matches(str(word).lower(), list(known), n=1, cutoff=0.5)
     return f' (did you mean "{close[0]}"?)' if close else ""
 
@@ -330,7 +330,7 @@ def _pose_entry(pose: Pose) -> dict[str, Any]:
 def _obstacle_entry(obstacle: Obstacle) -> dict[str, Any]:
     known = imitarm.scene.OBSTACLES
     if type(obstacle) is not known.get(obstacle.kind):
-        raise InputError(f"no scene file can hold a {type(obstacle).__name__}; known types: {', '.join(known)}")
+        raise InputError(f"a scene file can't hold a {type(obstacle).__name__}; known types: {', '.join(known)}")
     entry: dict[str, Any] = {"type": obstacle.kind}
     if obstacle.name:
         entry["name"] = obstacle.name

@@ -29,7 +29,7 @@ _FLAT = 1e-6  # [fraction of the longest extent] a thinner hull is refused as fl
 
 
 def _unit(vectors: Array) -> Array:
-    """Return rows (n, 3) over their length; z where there is no direction."""
+    """Return rows (n, 3) scaled to length one; z for rows of length zero."""
     length = lengths(vectors.T)[:, None]
     return np.where(length < TINY, [0.0, 0.0, 1.0], vectors / np.where(length < TINY, 1.0, length))
 
@@ -54,7 +54,7 @@ class Sphere(Obstacle):
         self._set(center=center, radius=checked_length(self.radius, f"{self._label}: radius"))
 
     def solid(self) -> Solid:
-        """Return the geometry: at the centre, not rotated."""
+        """Return the geometry; its frame is at the centre and not rotated."""
         return Solid(self.kind, self.center, UPRIGHT, (self.radius, 0.0, 0.0))
 
     def _support(self, directions: Array) -> Array:
@@ -69,7 +69,7 @@ class Capsule(Obstacle):
     """All points within ``radius`` of the segment from ``start`` to ``end``: ``sd(x) = |x - s(x)| - r``.
 
     ``s(x) = a + clip((x - a).u, 0, L) u`` is the nearest point of the segment, with ``u`` its direction and
-    ``L`` its length. The overall length is ``L + 2 r``. A segment of length zero makes a sphere.
+    ``L`` its length. The overall length is ``L + 2 r``. With a segment of length zero the capsule is a sphere.
 
     Attributes:
         start: one end of the segment, in the base frame, shape (3,) [m].
@@ -91,7 +91,7 @@ class Capsule(Obstacle):
         checked_length(float(np.linalg.norm(end - start)) + self.radius, f"{self._label}: length")
 
     def solid(self) -> Solid:
-        """Return the geometry: at the middle of the segment, z along it."""
+        """Return the geometry; its frame is at the middle of the segment, with z along it."""
         axis = self.end - self.start
         length = float(np.linalg.norm(axis))
         quaternion = rotation_from_z(axis) if length > TINY else UPRIGHT
@@ -223,11 +223,11 @@ class HalfSpace(Obstacle):
         self._set(point=point, normal=normal / length)
 
     def solid(self) -> Solid:
-        """Return the geometry: at ``point``, z along ``normal``."""
+        """Return the geometry; its frame is at ``point``, with z along ``normal``."""
         return Solid(self.kind, self.point, rotation_from_z(self.normal), (0.0, 0.0, 0.0))
 
     def _support(self, directions: Array) -> Array:
-        raise InputError(f"{self._label}: a half-space has no farthest point; it has no end")
+        raise InputError(f"{self._label}: a half-space is infinite and has no farthest point")
 
     def bounds(self) -> Array:
         """Return infinite bounds, shape (2, 3) [m], finite only where the plane is across an axis of the base frame."""
@@ -282,13 +282,13 @@ class ConvexHull(Obstacle):
         return points
 
     def solid(self) -> Solid:
-        """Return the geometry: at the mean of the points."""
+        """Return the geometry; its frame is at the mean of the points."""
         half = 0.5 * np.ptp(self._polytope.vertices, axis=0)
         return Solid(self.kind, self._center, self._quaternion, half, self._polytope)
 
     @property
     def vertices(self) -> Array:
-        """Those of ``points`` that are corners of the hull, shape (v, 3) [m]."""
+        """The corners of the hull, a subset of ``points``, shape (v, 3) [m]."""
         return rotate(self._quaternion, self._polytope.vertices) + self._center
 
     @property
@@ -308,7 +308,7 @@ class ConvexHull(Obstacle):
 
 
 def rotation_from_z(axis: Array) -> Array:
-    """Return a quaternion wxyz (4,) that turns z into the direction of ``axis`` (3,)."""
+    """Return a quaternion wxyz (4,) that rotates z into the direction of ``axis`` (3,)."""
     x, y, z = axis.tolist()
     across = math.hypot(x, y)
     if across < 1e-12 * abs(z):

@@ -45,16 +45,16 @@ _SHORTEST_STEP, _LONGEST_STEP = 1e-100, 100.0  # in durations: the spring's numb
 
 
 class DMPState(NamedTuple):
-    """State of a primitive on its way. Made by ``DMP.begin``, advanced by ``DMP.step``.
+    """State of a primitive during a motion. Made by ``DMP.begin``, advanced by ``DMP.step``.
 
     Attributes:
         motion: [x; T x'] with T the duration, shape (2, 3) [m].
         fraction: of the duration that is over on the primitive's own clock; the phase is ``exp(-alpha fraction)``.
-        target: the motion that was asked for: its start, goal and duration.
+        target: start, goal and duration of the motion.
         rotation: state of the rotation; None when none was learned.
         steps: length of the steps so far, as a fraction of the duration, and their number; None when they differed.
-        checked: ``motion`` itself when it is known to be finite. A step checks a state that was changed by hand, and
-            spends no time on one that comes from the step before.
+        checked: ``motion`` itself when it is known to be finite. A step checks only states that were changed by the
+            caller, and not those returned by the previous step.
     """
 
     motion: Array
@@ -76,7 +76,7 @@ class DMPState(NamedTuple):
 
     @property
     def phase(self) -> float:
-        """Phase s, from 1 at the start to 0.01 at the end and on towards 0."""
+        """Phase s: 1 at the start, 0.01 at the end, then towards 0."""
         return float(np.exp(-DECAY * self.fraction))
 
     @property
@@ -98,20 +98,23 @@ class DMP:
 
         f(s) &= \frac{\sum_i w_i \psi_i(s) s}{\sum_i \psi_i(s)}, \quad \psi_i(s) = \exp(-h_i (s - c_i)^2)
 
-    It replaces thesis Eqs 2.8 to 2.12, whose force is scaled by g - x_0 and fails for an axis that does not move. tau
+    It replaces thesis Eqs 2.8 to 2.12, in which the force is scaled by g - x_0 and fails for an axis that does not
+    move. tau
     is the duration, so K and D have no unit: ``"critical"`` gains have D = 2 sqrt(K); the ``"thesis"`` gains
-    K = 139.26, D = 28 have a damping ratio of 1.186. Written differently, the spring follows a moving target
-    ``y(s) = g - (g - x_0) s + f(s)`` that ends at the goal.
+    K = 139.26, D = 28 have a damping ratio of 1.186. Equivalently, the spring follows a moving target ``y(s) = g - (g -
+    x_0) s + f(s)`` that ends at the goal.
 
-    **Fitting** (:func:`~imitarm.skills.dynamical_systems.fit_weights`) is ridge regression on the positions: nothing
-    measured is differentiated, samples may lie at any times, and the motion is at the goal when the duration is over.
+    **Fitting** (:func:`~imitarm.skills.dynamical_systems.fit_weights`) is ridge regression on the positions. Measured
+    positions are not differentiated, samples may have any times, and the motion reaches the goal at the end of the
+    duration.
 
-    **Another start or goal.** With ``p`` the fraction of the path that is done (a primitive from 0 to 1 with weights
-    w_p), ``adjustment`` selects the weights:
+    **Another start or goal.** With ``p`` the fraction of the path that has been travelled (a primitive from 0 to 1 with
+    weights w_p), ``adjustment`` selects the weights:
 
-    * ``"progress"``: w + (change of g - x_0) w_p. The change enters as the path is travelled: while the demonstration
-      rests, nothing moves; half the distance never goes backwards; an axis without motion is no special case.
-    * ``"hoffmann"``: w as learned, the published form. The change enters as fast as the spring allows.
+    * ``"progress"``: w + (change of g - x_0) w_p. The change is added in proportion to the travelled path. So the
+      motion rests where the demonstration rests, it never goes backwards when the distance is halved, and an axis
+      without motion needs no special treatment.
+    * ``"hoffmann"``: w as learned, the published form. The change is added as fast as the spring allows.
     * ``"rotodilatation"``: w rotated and stretched as g - x_0 is (Ginesi et al. 2019), for a shape that scales.
 
     **Integration.** A step is exact for a target that is a parabola within each 1/200 of the duration, so ``step`` and
@@ -153,12 +156,12 @@ class DMP:
         self.regularisation = finite_number(regularisation, "DMP: regularisation", above=0.0)
 
     def fit(self, trajectory: Trajectory, *, exact_ends: bool = False) -> Self:
-        """Learn from one trajectory; its times may start anywhere.
+        """Learn from one trajectory; its first time need not be 0.
 
         Args:
             trajectory: the motion to reproduce.
             exact_ends: start and end exactly at the first and the last sample and rotation. Otherwise a noisy first or
-                last sample is smoothed: where it lies more than 0.1 mm beside the path that fits all samples, the
+                last sample is smoothed: if it is more than 0.1 mm from the path that fits all samples, the
                 motion starts or ends on that path.
 
         Raises:
@@ -194,7 +197,7 @@ class DMP:
         path_length: float,
         orientation: QuaternionDMP | None = None,
     ) -> DMP:
-        """Build from weights that were learned before; the arguments are the attributes of the class.
+        """Build a primitive from learned weights; the arguments are the attributes of the class.
 
         Raises:
             InputError: when shapes disagree, a number is not finite, or the duration or a gain is not above 0.
@@ -229,7 +232,7 @@ class DMP:
             raise InputError("DMP: not fitted yet; call fit first")
 
     def progress(self, times: ArrayLike) -> Array:
-        """Return p, the fraction of the learned path that is done at ``times`` (n,) [s] of the learned duration.
+        """Return p, the fraction of the learned path that has been travelled at ``times`` (n,) [s].
 
         Raises:
             InputError: when not fitted, or the times are not finite numbers.
@@ -267,7 +270,7 @@ class DMP:
 
         Raises:
             InputError: when not fitted, a shape is wrong, or the duration is not above 0.
-            UnknownNameError: when ``adjustment`` is none of the three.
+            UnknownNameError: when ``adjustment`` is not one of the three names.
         """
         self._check_fitted()
         choice(adjustment, ADJUSTMENTS, "adjustment")
@@ -300,11 +303,11 @@ class DMP:
             dt: [s], above 0.
             goal: another goal position (3,) [m] from now on, for a goal that moves.
             coupling: function from position (3,) [m] and velocity (3,) [m/s] to an acceleration (3,) [m/s^2] that is
-                added during this step, for example away from an obstacle. With (6,) the last three are an angular
-                acceleration [rad/s^2].
+                added during this step, for example away from an obstacle. If it returns six numbers, the last three are
+                an angular acceleration [rad/s^2].
             measured: measured position of the robot (3,) [m]. The primitive's clock slows down by
                 ``1 / (1 + |lag| / patience)`` (phase stopping), so that the primitive waits for a robot that lags.
-            patience: the lag that halves the speed [m].
+            patience: lag at which the clock runs at half speed [m].
 
         Raises:
             InputError: when an argument is not finite or of a wrong shape, ``dt`` is not above 0 or above

@@ -1,7 +1,7 @@
 """The two dynamical systems of a movement primitive.
 
-The canonical system is its clock: the phase, and the basis functions over it. The transformation system is a spring and
-damper that follows a moving target; it is integrated exactly.
+The canonical system is the primitive's clock: the phase, and the basis functions over the phase. The transformation
+system is a spring and damper that follows a moving target; it is integrated exactly.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _NOISE = 1e-4  # [m] the repeatability of industrial arms
 
 @dataclass(frozen=True)
 class PhaseBasis:
-    r"""Basis functions over the phase s, which falls from 1 to 0.01 during the motion and on towards 0 afterwards.
+    r"""Basis functions over the phase s, which falls from 1 to 0.01 during the motion and then towards 0.
 
     .. math::
         \tau \dot s = -\alpha s, \qquad b_i(s) = \frac{\psi_i(s) s}{\sum_j \psi_j(s)}, \qquad
@@ -73,7 +73,7 @@ class PhaseBasis:
 
 @lru_cache(maxsize=8)
 def phase_basis(n_basis: int) -> PhaseBasis:
-    """Return the basis of that size, the same object at every call."""
+    """Return the basis of ``n_basis`` functions; every call returns the same object."""
     return PhaseBasis(n_basis)
 
 
@@ -103,7 +103,7 @@ class Gains(NamedTuple):
 
     @property
     def damping_ratio(self) -> float:
-        """``D / (2 sqrt(K))``: 1 is critical; above 1 the spring is slower than it could be."""
+        """Damping ratio ``D / (2 sqrt(K))``: 1 is critical damping; above 1 the spring is overdamped, hence slower."""
         return float(self.damping / (2.0 * np.sqrt(self.stiffness)))
 
     @classmethod
@@ -141,8 +141,9 @@ class Propagator(NamedTuple):
     Attributes:
         transition: shape (2, 2).
         drive: shape (2, 2 m + 1).
-        push: what an acceleration of 1 (in units of the duration) adds when it is held during the step, shape (2,).
-        instants: where the target is needed, as fractions of the duration since the step began, shape (2 m + 1,).
+        push: change of z by an acceleration of 1 (in units of the duration) that is held during the step, shape (2,).
+        instants: times at which the target is needed, as fractions of the duration since the start of the step, shape
+            (2 m + 1,).
     """
 
     transition: Array
@@ -223,7 +224,7 @@ class PlannedSteps(NamedTuple):
 
     Attributes:
         transition: of one step, shape (2, 2).
-        pushes: what the target adds, for each of the n steps an array of shape (2, 3).
+        pushes: contribution of the target to each of the n steps, arrays of shape (2, 3).
     """
 
     transition: Array
@@ -234,7 +235,7 @@ class PlannedSteps(NamedTuple):
 class MovingTarget:
     """The target that the spring follows, as a function of the phase: ``y(s) = g + sum_i (w_i - (g - x_0)) b_i(s)``.
 
-    The basis functions b_i sum to s, so that is ``g - (g - x_0) s + f(s)``.
+    The basis functions b_i sum to s, so y(s) equals ``g - (g - x_0) s + f(s)``.
 
     Attributes:
         start: x_0, position (3,) [m].
@@ -260,10 +261,11 @@ class MovingTarget:
         return np.asarray(self.goal + basis_on_grid(len(self.drive), n_steps)[1] @ self.drive)
 
     def plan(self, gains: Gains, step: float) -> PlannedSteps | None:
-        """Return all steps of this fraction of the duration, from the second call with the same ``step`` on.
+        """Return all steps of length ``step`` [fraction of the duration]; None in the first call with this length.
 
-        The target does not depend on the state, so a caller that uses a fixed step needs it computed only once. A goal
-        that moves makes a new target at every step. That one is asked once, and no plan is computed for it.
+        The target does not depend on the state, so a caller that uses a fixed step needs it computed only once. A
+        moving goal gives a new target at every step. Such a target is used only once, so no plan is computed in the
+        first call.
         """
         if step not in self._plans:
             self._plans[step] = None
@@ -332,17 +334,17 @@ def fit_weights(
 ) -> FittedWeights:
     r"""Return the weights with which the primitive reproduces a path.
 
-    The motion is linear in the drives ``d_i = w_i - (g - x_0)``: with R the spring's responses to a start, a rate, a
-    goal and each basis function, ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression
-    compares forces, ``tau v' + D v`` and so on, and needs measured accelerations. Here both sides are filtered by the
-    spring itself, which turns forces into positions. So noise is not differentiated, samples may lie at any times, and
-    the regression minimises the error of the reproduction in metres.
+    The motion is linear in ``d_i = w_i - (g - x_0)``. With R the spring's responses to a start, a rate, a goal and each
+    basis function, ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression compares
+    forces, ``tau v' + D v`` and so on, and needs measured accelerations. Here both sides are filtered by the spring
+    itself, which turns forces into positions. So noise is not differentiated, samples may lie at any times, and the
+    regression minimises the error of the reproduction in metres.
 
-    The motion passes exactly through its start and its goal. These are the first and the last sample. Where noise has
-    put one of them more than 0.1 mm beside the path that fits all samples, it is that path's end instead, unless
-    ``exact_ends``: forced through a noisy sample, the motion would jerk there. The last drive is 0, so that the target
-    is the goal when the duration is over. (The regression hardly determines it; left free, it can pull the tool
-    decimetres off the goal after the end.)
+    The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. If noise
+    moves one of them more than 0.1 mm away from the path that fits all samples, the end of this path is used instead,
+    because a motion forced through a noisy sample would jerk there. ``exact_ends`` turns this off. The last drive is 0,
+    so that the target is the goal when the duration is over. (The regression hardly determines it; left free, it can
+    pull the tool decimetres off the goal after the end.)
 
     Args:
         fraction: of the duration, from 0 to 1, shape (n,).
@@ -374,7 +376,7 @@ def fit_weights(
 
 
 def progress_at(fraction: Array, progress_weights: Array, gains: Gains) -> Array:
-    """Return the fraction of the path, from 0 to 1, that is done at ``fraction`` (n,) of the duration."""
+    """Return the fraction of the path, 0 to 1, that has been travelled at ``fraction`` (n,) of the duration."""
     R = _responses(gains, len(progress_weights)).spline(np.clip(fraction, 0.0, 1.0))
     return np.asarray(R[:, 2] + R[:, 3:] @ (progress_weights - 1.0))
 
@@ -386,7 +388,7 @@ def _without_last(R: Array, y: Array, force: Array, regularisation: float, end: 
 
 
 def _beside(R: Array, y: Array, n_basis: int, regularisation: float) -> Array:
-    """Return how far the best path passes from the first and from the last sample, rows (start, 0, goal) [m]."""
+    """Return the distance of the best path from the first and the last sample, rows (start, 0, goal) [m]."""
     columns = np.concatenate([R[:, :1], R[:, 3:-1]], axis=1)
     solution = _ridge(columns, y, np.append(1.0, phase_basis(n_basis).centers[:-1]), regularisation)
     start, goal = columns[[0, -1]] @ solution - y[[0, -1]]
@@ -409,9 +411,9 @@ def _ridge(R: Array, y: Array, force: Array, regularisation: float, end: Array |
 
 
 def _progress(rate: Array) -> tuple[Array, float]:
-    """Return the fraction of the path that is done, on the fine grid, and its length [m].
+    """Return the fraction of the path that has been travelled, on the fine grid, and the path length [m].
 
-    A motion without length gets a minimum-jerk profile.
+    For a path of length 0 the fraction is a minimum-jerk profile.
     """
     speed = np.linalg.norm(rate, axis=1)
     done = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))]) / (len(rate) - 1)

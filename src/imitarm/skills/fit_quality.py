@@ -50,7 +50,7 @@ class FitQuality:
     """How well a skill fits its demonstrations.
 
     The bias is the distance between the skill and the average of the demonstrations at the same times, root mean
-    square. Differences between demonstrations do not count in it, they are the skill's tolerance. A skill with a bias
+    square. Differences between demonstrations do not count as bias; they are the skill's tolerance. A skill with a bias
     above 5 % of the motion's extent is not :attr:`faithful`.
 
     Attributes:
@@ -61,7 +61,7 @@ class FitQuality:
         primitive_bias: of the movement primitive's path [m].
         rotation_extent: largest angle between the average rotation and its start [rad]; 0 without rotations.
         rotation_bias: of the nominal rotation [rad]; 0 without rotations.
-        period: after which the motion repeats [s]; None when it does not, or does so less than three times.
+        period: time after which the motion repeats [s]; None when it repeats less than three times.
     """
 
     distances: tuple[DemonstrationDistance, ...]
@@ -75,7 +75,7 @@ class FitQuality:
 
     @property
     def relative_bias(self) -> float:
-        """The larger of both biases of the position, as a fraction of the motion's extent."""
+        """The larger of ``bias`` and ``primitive_bias``, as a fraction of the motion's extent."""
         largest = max(self.bias, self.primitive_bias)
         if largest <= _ROUNDING:
             return 0.0
@@ -111,7 +111,7 @@ class FitQuality:
 
     @property
     def suggestion(self) -> str:
-        """Advice for a motion that repeats; empty for other motions."""
+        """A hint for a motion that repeats; empty for other motions."""
         if self.period is None:
             return ""
         return (
@@ -170,10 +170,11 @@ def _rms(differences: Array) -> float:
 
 
 def _period(times: Array, positions: Array) -> float | None:
-    """Return after which time [s] a motion repeats, apart from a constant drift; None when it does not three times.
+    """Return the period [s] of a motion, apart from a constant drift; None when it repeats less than three times.
 
-    It is the first local minimum of the mean squared difference between the motion and itself a lag later that falls
-    below 10 % of what independent positions would give, after having been above half of it.
+    For each lag, the mean squared difference between the motion and the motion one lag later is compared with the value
+    for independent positions. The period is the first local minimum below 10 % of that value, after the difference has
+    been above 50 % of it.
     """
     n = len(times)
     drift = np.linspace(0.0, 1.0, n)[:, None] * (positions[-1] - positions[0])

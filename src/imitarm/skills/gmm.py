@@ -27,7 +27,7 @@ _MOST_COMPONENTS = 10_000
 
 
 class DegenerateAxisWarning(UserWarning):
-    """A column does not move, so nothing can be learned from it; it does not influence the other columns."""
+    """A column does not change, so nothing can be learned from it; it does not influence the other columns."""
 
 
 def ellipsoid_scale(probability: float, n_dims: int) -> float:
@@ -35,7 +35,8 @@ def ellipsoid_scale(probability: float, n_dims: int) -> float:
 
     The squared Mahalanobis distance of a Gaussian in ``n_dims`` dimensions has a chi-square distribution with
     ``n_dims`` degrees of freedom. So the semi-axes are ``scale * sqrt(eigenvalue)`` with the scale 1.960, 2.448, 2.796
-    for 95 % in 1, 2, 3 dimensions. The one-dimensional 1.960 contains only 85 % in the plane and 72 % in space.
+    for 95 % in 1, 2, 3 dimensions. The factor 1.960 for one dimension contains only 85 % in the plane and 72 % in
+    space.
 
     Raises:
         InputError: when ``probability`` is not in [0, 1) or ``n_dims`` is below 1.
@@ -61,7 +62,8 @@ class GaussianMixture:
 
     * Columns are standardised internally, so the result does not depend on the units.
     * ``init="time"`` starts from the best division of column 0 into K segments
-      (:func:`~imitarm.skills.mixture_fitting.responsibilities_by_segments`). It is deterministic, and right for [t; x].
+      (:func:`~imitarm.skills.mixture_fitting.responsibilities_by_segments`). It is deterministic and meant for samples
+      [t; x].
     * A column that does not move (a planar task has a constant z) does not influence the other columns. It is listed
       in ``degenerate_axes_`` and reported by a :class:`DegenerateAxisWarning`.
 

@@ -37,7 +37,7 @@ _CLOCK_DIGITS = 6  # microseconds, the resolution of epoch times: rounded, they 
 
 
 class SingleDemonstrationWarning(UserWarning):
-    """There is only one demonstration: its covariance shows how well it was fitted, not how much a person varies."""
+    """There is only one demonstration, so the covariance shows the error of the fit, not how much a person varies."""
 
 
 class UnalignedWarning(UserWarning):
@@ -48,7 +48,7 @@ class GMR:
     r"""Gaussian mixture regression over time, of positions and rotations.
 
     A :class:`~imitarm.skills.gmm.GaussianMixture` is fitted to all samples z = [t; x] of all demonstrations, and then
-    conditioned on t (thesis Eq 2.6, whose print lacks the responsibilities h_k):
+    conditioned on t (thesis Eq 2.6, in which the responsibilities h_k are missing in print):
 
     .. math::
         \beta_k = \Sigma_k^{xt} / \Sigma_k^{tt}, \quad
@@ -78,7 +78,7 @@ class GMR:
 
     Attributes:
         n_components_: number K of Gaussians.
-        selection_: what ``"auto"`` tried, one entry per number of components; empty when the number was given.
+        selection_: results of ``"auto"``, one entry per number of components; empty when the number was given.
         duration_: demonstrated span [s]; the median when demonstrations differ.
         n_demonstrations_: number of demonstrations.
         has_orientation_: whether rotations were learned.
@@ -147,7 +147,7 @@ class GMR:
         min_std = np.array([0.0, *[self.min_std[0]] * 3, *[self.min_std[1]] * 3])[: tables[0].shape[1]]
         if len(tables) == 1:
             warnings.warn(
-                "only one demonstration: the covariance shows how well it was fitted, not how much a person varies; "
+                "only one demonstration: the covariance shows the error of the fit, not how much a person varies; "
                 "give 3 or more",
                 SingleDemonstrationWarning,
                 stacklevel=2,
@@ -201,7 +201,8 @@ class GMR:
     ) -> GMR:
         """Build from a mixture that was learned before.
 
-        The arguments are the attributes of the class. Without ``ends``, they are those of the mixture's mean.
+        The arguments are the attributes of the class. Without ``ends``, the start and the goal of the mixture's mean
+        are used.
 
         Raises:
             InputError: when shapes disagree, the weights do not sum to one, a covariance is not symmetric and positive
@@ -365,7 +366,7 @@ class GMR:
         return x[:, :3], None if self.reference_ is None else self.reference_.to_quaternions(t, x[:, 3:])
 
     def _end_correction(self, t: Array) -> Array:
-        """Return what the nominal path adds to the mean at clamped times (n,), shape (n, D)."""
+        """Return the correction that the nominal path adds to the mean at clamped times (n,), shape (n, D)."""
         T, centres = self.duration_, self.time_means_
         widths = np.clip(np.array([centres[0], T - centres[-1]]), _LEAST_CORRECTED * T, T)
         u = np.minimum(np.stack([t, T - t], axis=1) / widths, 1.0)

@@ -5,8 +5,8 @@ The logarithm of a weighted Gaussian is linear in the quadratic features ``phi(z
     log pi_k N(z; mu_k, Sigma_k) = theta_k . phi(z)
 
 so all log-densities are one matrix product ``theta @ phi``, and all sufficient statistics are another one,
-``responsibilities @ phi^T``. There is no loop over components or samples. Written as a symmetric matrix, the
-statistics of one component are the second moments of ``[1; z]``, and its inverse holds all parts of ``theta_k``
+``responsibilities @ phi^T``. There is no loop over components or samples. Written as a symmetric matrix M, the
+statistics of one component are the second moments of ``[1; z]``. The inverse of M contains all parts of ``theta_k``
 (``P = Sigma^-1``)::
 
     M = [1     mu^T             ]     M^-1 = [1 + mu^T P mu   -mu^T P]     det M = det Sigma
@@ -58,7 +58,7 @@ class Fit(NamedTuple):
         moments: second moments of [1; z], the matrix M in the docstring of this module, shape (B, K, d + 1, d + 1).
         theta: weights of the quadratic features, shape (B, K, F), F = (d + 1) (d + 2) / 2.
         log_likelihood: mean log-likelihood per sample at exactly these parameters, shape (B,).
-        converged: whether its last change was below the tolerance, shape (B,).
+        converged: whether the last change of ``log_likelihood`` was below the tolerance, shape (B,).
         n_iter: number of iterations, the same for all fits.
     """
 
@@ -202,7 +202,7 @@ def expectation_maximisation(
 
 
 def responsibilities_by_segments(features: Array, column: Array, numbers: Sequence[int]) -> list[Array]:
-    """Divide time into the K segments that Gaussians describe best, for several K at once.
+    """Divide time into the K segments that are described best by one Gaussian each, for several K at once.
 
     The span of ``column`` is divided into equal slots. A segment with n of the N samples and covariance Sigma
     costs ``n (log det Sigma / 2 - log(n / N))``, the negative log-likelihood under a Gaussian of its own, plus a small
@@ -242,7 +242,7 @@ def responsibilities_by_segments(features: Array, column: Array, numbers: Sequen
 
 
 def _segment_costs(statistics: Array, n_samples: int) -> Array:
-    """Return the costs of segments with these sums of features, inf for those of too few samples."""
+    """Return the costs of segments with these sums of features; inf for segments with too few samples."""
     number = statistics[:, 0]
     size = round(float(np.sqrt(8 * statistics.shape[1] + 1) - 1) / 2)
     moments = (statistics / np.maximum(number, 1.0)[:, None]).take(packing(size)[1], axis=-1)
@@ -264,7 +264,8 @@ def _cut(slot: NDArray[np.intp], came_from: list[NDArray[np.intp]], n_slots: int
 
 
 def responsibilities_by_bins(column: Array, n_bins: int) -> Array:
-    """Return responsibilities of 0 or 1, shape (K, n), of equally wide bins, or equally full ones for few samples."""
+    """Return responsibilities of 0 or 1, shape (K, n), of equally wide (few samples: equally full) bins.
+    """
     low, high = column.min(), column.max()
     labels = np.minimum(((column - low) * (n_bins / max(high - low, 1e-300)) + _EDGE).astype(np.intp), n_bins - 1)
     if np.bincount(labels, minlength=n_bins).min() < 2:
@@ -302,7 +303,8 @@ def choose(candidates: Sequence[Candidate]) -> int:
 
     * whose held-out error is within 2 % (or 0.1 mm) of the smallest, so it generalises as well as any, and
     * whose bias is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small beside the
-      differences between demonstrations. The held-out error alone hardly shows such a bias, because squares add.
+      differences between demonstrations. The held-out error alone hardly shows a bias, because it adds in squares to
+      the larger differences.
 
     If no K meets both, it is the smallest K that generalises and whose bias is within a tenth of the smallest bias
     among those. BIC alone keeps growing with K on data over time, because neighbouring samples are not independent. It
@@ -332,9 +334,9 @@ def try_numbers_of_components(
     """Evaluate several numbers of components.
 
     For each, the fit to all demonstrations and the fits that leave one out run side by side, as rows of the same
-    matrix products. A part of the samples is used, more of them the longer the path is. Where only the rotation moves,
-    errors are those of a point 100 mm away. Larger numbers are not tried
-    when four in a row brought no smaller held-out error (by 0.5 %) and a good one (:func:`choose`) was found.
+    matrix products. Only a part of the samples is used; a longer path uses more. For a motion of the rotation alone,
+    errors are those of a point 100 mm from the axis. The search stops when four numbers in a row did not reduce the
+    held-out error by 0.5 %, and one number meets both conditions of :func:`choose`.
 
     Args:
         tables: samples [t, x, y, z, ...] of each demonstration, over the same span of time.
@@ -415,7 +417,7 @@ def _enough(evaluated: Sequence[Candidate]) -> bool:
 
 
 def _samples_needed(tables: Sequence[Array]) -> int:
-    """Return how many samples per demonstration show the motion."""
+    """Return how many samples per demonstration are enough to represent the motion."""
     grid = np.linspace(tables[0][0, 0], tables[0][-1, 0], 4 * _SAMPLES)
     mean = np.mean([_resampled(table, np.arange(1, table.shape[1]), grid) for table in tables], axis=0)
     only_rotates = mean.shape[1] > 3 and np.ptp(mean[:, :3], axis=0).max() < _NO_MOTION
@@ -437,7 +439,7 @@ def _resampled(Z: Array, places: NDArray[np.intp], grid: Array) -> Array:
 
 
 def _regression(fit: Fit, which: NDArray[np.intp], t: Array, places: NDArray[np.intp]) -> Array:
-    """Return the mean of some columns at standardised times (n,), each from the fit numbered ``which`` (n,)."""
+    """Return the mean of some columns at standardised times (n,), each from the fit with the index ``which`` (n,)."""
     means, covariances = fit.means, fit.covariances
     variance = covariances[:, :, 0, 0]
     slopes = covariances[:, :, 0, :] / variance[..., None]

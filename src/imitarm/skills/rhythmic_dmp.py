@@ -24,7 +24,7 @@ _CLOSES = 0.1  # of the extent: a motion that ends a period further than this fr
 
 
 class RhythmicDMPState(NamedTuple):
-    """State of a rhythmic primitive on its way. Made by ``RhythmicDMP.begin``, advanced by ``RhythmicDMP.step``.
+    """State of a rhythmic primitive during a motion. Made by ``RhythmicDMP.begin``, advanced by ``RhythmicDMP.step``.
 
     Attributes:
         motion: [x; P x'], shape (2, D): position [m], and the rotation vector [rad] where rotation was learned.
@@ -110,15 +110,15 @@ class RhythmicDMP:
         return CubicSpline(np.linspace(0.0, 1.0, _GRID + 1), closed, bc_type="periodic"), rates[0]
 
     def fit(self, trajectory: Trajectory, period: float | None = None) -> Self:
-        """Learn from one trajectory of one or more periods.
+        """Learn from one trajectory that contains one or more periods.
 
         Args:
-            trajectory: its times may start anywhere.
+            trajectory: the motion; its first time need not be 0.
             period: [s]; None: the trajectory is exactly one period.
 
         Raises:
-            InputError: when the period is not above 0 or is longer than the trajectory, when the motion does not return
-                to where it was a period before, or when it rotates too far.
+            InputError: when the period is not above 0 or is longer than the trajectory, when positions one period apart
+                differ too much, or when the motion rotates too far.
         """
         instance(trajectory, Trajectory, "RhythmicDMP.fit: trajectory")
         t = trajectory.times - trajectory.times[0]
@@ -164,7 +164,7 @@ class RhythmicDMP:
         """Return the state at phase 0.
 
         Args:
-            start: where the tool is, at rest; the motion approaches the rhythm from there. None: the motion begins in
+            start: position of the tool at rest, from which the motion approaches the rhythm. None: the motion begins in
                 the rhythm.
             center: another centre of the positions (3,) [m]; None: as learned.
             amplitude: factor on the learned motion.
@@ -209,7 +209,7 @@ class RhythmicDMP:
 
         Args:
             state: from :meth:`begin` or the last step; replace ``amplitude``, ``center`` or ``period`` in it to change
-                the rhythm on the way.
+                the rhythm during the motion.
             dt: [s], above 0.
             coupling: function from position and velocity to an acceleration (3,) [m/s^2] that is added during this
                 step.

@@ -37,7 +37,7 @@ from imitarm.validation import (
 Array = NDArray[np.float64]
 
 _CLOSED = 0.1  # net motion below this fraction of the path length gives no direction to rotate and stretch by
-_FARTHEST = np.deg2rad(120.0)  # from the reference; beyond 180 degrees the logarithm goes the other way round
+_FARTHEST = np.deg2rad(120.0)  # from the reference; beyond 180 degrees the logarithm reverses its direction
 _KEYS = (1, 5, 9, 17, 33)  # numbers of key rotations that are tried
 _DEGREE = 3
 _END_WEIGHT = 100.0  # the first and the last sample count so much more than the others
@@ -152,15 +152,15 @@ def left_jacobian(vectors: Array) -> Array:
 
 
 class RotationState(NamedTuple):
-    """State of the rotation on its way.
+    """State of the rotation during a motion.
 
     Attributes:
         quaternion: wxyz, shape (4,).
         offset: [r; T r'] with T the duration and r the rotation vector from the target to the rotation, in the base
-            frame, shape (2, 3) [rad]. Only a coupling makes it differ from 0.
+            frame, shape (2, 3) [rad]. It differs from 0 only because of a coupling.
         fraction: of the duration that is over.
-        start_change: rotation vector (3,) [rad] from the learned start to the one asked for, in the base frame.
-        goal_change: likewise for the goal.
+        start_change: rotation vector (3,) [rad] from the learned start to the new one, in the base frame.
+        goal_change: rotation vector (3,) [rad] from the learned goal to the new one, in the base frame.
     """
 
     quaternion: Array
@@ -181,9 +181,10 @@ class QuaternionDMP:
 
     with c an angular acceleration from outside. Only ``r``, the distance from the target, goes through a logarithm,
     never the distance to the goal. So a rotation by 270 degrees, or by three full revolutions, is reproduced as it was
-    shown. (Forms that use log(q_goal conj(q)) go the other way round beyond 180 degrees.) The target is a cubic spline
-    through quaternions with continuous signs, normalised. Another start or goal rotates the target in the base frame,
-    blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both changes take the shorter way.
+    shown. (Forms that use log(q_goal conj(q)) rotate in the opposite direction beyond 180 degrees.) The target is a
+    cubic spline through quaternions with continuous signs, normalised. Another start or goal rotates the target in the
+    base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both changes are the
+    shorter of the two rotations.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
@@ -245,7 +246,7 @@ class QuaternionDMP:
 
     @classmethod
     def from_spline(cls, knots: ArrayLike, coefficients: ArrayLike, gains: Gains) -> QuaternionDMP:
-        """Build from a spline that was learned before; the arguments are the attributes of the class.
+        """Build a primitive from a learned spline; the arguments are the attributes of the class.
 
         Raises:
             InputError: when the knots don't run from 0 to 1 in order, shapes disagree, or the spline passes near zero,
@@ -358,7 +359,7 @@ def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, go
         quaternions: R, the learned rotations wxyz, shape (n, 4).
         fraction: fraction of the duration at each of them, shape (n,).
         start_change: d_start, rotation vector in the base frame, shape (3,) [rad].
-        goal_change: d_goal, likewise.
+        goal_change: d_goal, rotation vector in the base frame, shape (3,) [rad].
     """
     u = np.clip(fraction, 0.0, 1.0)[:, None]
     blend = u**3 * (10.0 + u * (6.0 * u - 15.0))
@@ -367,10 +368,10 @@ def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, go
 
 
 def rotodilatation(learned: Array, asked: Array, path_length: float) -> Array:
-    """Return the smallest rotation, times a factor, that takes ``learned`` to ``asked``, shape (3, 3).
+    """Return the smallest rotation, times a factor, that maps ``learned`` to ``asked``, shape (3, 3).
 
-    After Ginesi, Sansonetto and Fiorini (2019), "DMP++". A motion that comes back to near its start gives no direction
-    to rotate and no length to stretch by: the result is then the identity.
+    After Ginesi, Sansonetto and Fiorini (2019), "DMP++". A motion that returns to near its start defines no direction
+    and no length; the result is then the identity.
 
     Args:
         learned: from the learned start to the learned goal, shape (3,) [m].

@@ -1,4 +1,4 @@
-"""A skill: a motion learned from demonstrations, and how exact each part of it must be."""
+"""A skill: a motion learned from demonstrations, and the required precision of each part of it."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _CLOSE_ENOUGH = 1e-4, 0.002  # [m], or of the motion's extent: root mean square 
 class Skill:
     """A motion learned from demonstrations (thesis Chapter 5: GMM, then GMR, then DMP).
 
-    A :class:`~imitarm.skills.gmr.GMR` learns the mean motion, and as its covariance how much the demonstrations differ
-    at each time. A :class:`~imitarm.skills.dmp.DMP` is trained on the nominal path: it reproduces the motion from
-    another start, to another goal, in another time. The covariance is the tolerance: where the person was exact, the
+    A :class:`~imitarm.skills.gmr.GMR` learns the mean motion and its covariance, which shows how much the
+    demonstrations differ at each time. A :class:`~imitarm.skills.dmp.DMP` is trained on the nominal path: it can change
+    the start, the goal and the duration of the motion. The covariance is the tolerance: where the person was exact, the
     robot must be. A skill knows nothing of obstacles; policies do.
 
     The nominal path and the primitive start and end exactly at the means of the demonstrated starts and goals.
@@ -46,7 +46,7 @@ class Skill:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains` (see DMP).
         n_basis: number of basis functions of the primitive, or ``"auto"``: 40, 80 or 160, the first that follows the
             nominal path within 0.1 mm or 0.2 % of the motion's extent (root mean square).
-        random_state: seed of everything random in learning.
+        random_state: seed of all random choices in learning.
 
     Attributes:
         gmr_: mean and covariance over time.
@@ -54,7 +54,7 @@ class Skill:
         task_: what was shown, for example ``"sweep"``.
         duration_: learned duration [s].
         start_: learned start, tool_to_base; its rotation is the identity when none was learned.
-        goal_: learned goal, likewise.
+        goal_: learned goal, tool_to_base.
         n_demonstrations_: number of demonstrations.
         fit_quality_: the distance to each demonstration, and whether the skill is faithful to them; None in a skill
             from a file that does not contain it.
@@ -93,7 +93,7 @@ class Skill:
 
         Args:
             demonstrations: at least one; three or more show how much a person varies.
-            notes: facts worth knowing later, for example what lint found.
+            notes: facts to keep with the skill, for example the findings of lint.
             date: when it was learned; left out when None, so that the same input gives the same file.
 
         Raises:
@@ -190,12 +190,12 @@ class Skill:
         r"""Return the nominal path, which policies reproduce, at ``times`` [s] of the learned duration.
 
         It starts and ends exactly at ``start`` and ``goal``, for any number of samples. The learned path is
-        :meth:`~imitarm.skills.gmr.GMR.nominal`. Another start or goal changes it as the primitive's adjustment
-        ``"progress"`` does:
+        :meth:`~imitarm.skills.gmr.GMR.nominal`. Another start or goal changes the path in the same way as the
+        primitive's adjustment ``"progress"``:
 
         .. math:: x(t) = \bar x(t) + (1 - p(t)) \delta_{start} + p(t) \delta_{goal}
 
-        with p the fraction of the path that is done. The rotation changes along a minimum-jerk profile.
+        with p the fraction of the path that has been travelled. The rotation changes along a minimum-jerk profile.
 
         Args:
             times: strictly increasing, from 0 to the learned duration, shape (n,) [s].
@@ -260,7 +260,7 @@ class Skill:
         """Write a skill file (:mod:`imitarm.skills.skill_file`): JSON, human-readable, checked when it is read.
 
         Args:
-            path: of the file; an existing file is replaced.
+            path: file to write; an existing file is replaced.
 
         Raises:
             InputError: when not learned yet, or the file can't be written.

@@ -1,9 +1,10 @@
-"""The skill file: JSON that a person can read. It is checked when it is read, and nothing in it is ever executed.
+"""The skill file: human-readable JSON. It is checked when it is read, and nothing in it is ever executed.
 
 Layout: ``format``, ``version``, the meaning of the numbers (``units``, ``frames``), their origin (``task``,
 ``provenance``), the numbers (``gmr``, ``dmp``, ``fit``), and last a ``checksum``: SHA-256 of everything else in
-canonical form (sorted keys, no spaces), so the layout may change but no digit may. Floats are written with all their
-digits and come back exactly. The classes below are the schema: they define what is written and what is accepted.
+canonical form (sorted keys, no spaces), so that a change of any digit is detected, but not a change of layout. Floats
+are written with all their digits and come back exactly. The classes below are the schema: they define what is written
+and what is accepted.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ Table = list[Row]
 
 
 class Provenance(msgspec.Struct, omit_defaults=True):
-    """Where a skill comes from, see ``Skill.provenance_``."""
+    """Origin of a skill, see ``Skill.provenance_``."""
 
     imitarm: str
     sources: list[str]
@@ -263,7 +264,7 @@ def fit_of(fields: FitFields, sources: list[str], n_components: int) -> FitQuali
 def write_skill(
     path: str | os.PathLike[str], task: str, provenance: Mapping[str, Any], gmr: GMR, dmp: DMP, fit: FitQuality | None
 ) -> None:
-    """Write a skill file. An existing file stays whole until the new one is.
+    """Write a skill file. An existing file stays intact until the new one is complete.
 
     Raises:
         InputError: when a number is not finite, or the file can't be written.
