@@ -1,7 +1,7 @@
-"""How a person becomes numbers: skeletons, and the sources they come from.
+"""Capture: a person as skeletons, and the sources that deliver them.
 
 ``SOURCES`` is the registry: a new source is one class and one line here, or one line in the entry points of another
-package (group ``imitarm.sources``). It then appears in every command that takes a source, and in its ``--help``.
+package (group ``imitarm.sources``). The source then appears in the ``--help`` of every command that takes a source.
 """
 
 from imitarm.capture.skeleton import Arm, HandState, Skeleton, SkeletonSource, Tracking

@@ -68,7 +68,7 @@ def _mixing() -> Array:
 
 
 def _white_ratios() -> Array:
-    """Return white noise over sigma: at rest, and its increase per m/s, shape (2, 25)."""
+    """Return the white noise relative to sigma: at rest, and its increase per m/s, shape (2, 25)."""
     return np.array([_WHITE.get(name.removesuffix("_left").removesuffix("_right"), _WHITE_BODY) for name in JOINTS]).T
 
 
@@ -80,7 +80,7 @@ class SkeletonCamera:
     r"""A simulated skeleton camera with the errors of a real one; docs/capture.md says how they were measured.
 
     A joint at x is seen at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma`` on each axis
-    across the line of sight and 1.4 times that along it; both are half as large again for finger tips and thumbs. It is
+    across the line of sight and 1.4 times that along it; both are 1.5 times as large for finger tips and thumbs. It is
     a Matern process of order 3/2 over time t and path length :math:`|dx|` together,
 
     .. math:: du = dt / 5\,\mathrm{s} + |dx| / 8\,\mathrm{cm}, \qquad
@@ -95,10 +95,10 @@ class SkeletonCamera:
     * Dropouts: ``dropout`` times per second an arm is inferred (error three times as large), or lost, or nobody is
       seen at all, for 2 to 20 frames.
     * Occlusion: a forearm behind the torso, and an elbow behind its own hand, are inferred.
-    * Now and then the hand state is wrong for one or two frames.
+    * Occasionally the hand state is wrong for one or two frames.
 
     Args:
-        seed: of everything random.
+        seed: seed of all random values.
         sigma: standard deviation of the slow error [m].
         rate: frames per second [Hz].
         jitter: standard deviation of the time between frames [s].
@@ -145,7 +145,7 @@ class SkeletonCamera:
 
     @classmethod
     def from_seed(cls, seed: int, *, rate: float = 30.0) -> SkeletonCamera:
-        """Return camera number ``seed``: its sigma is between 1 and 2 cm, everything else is default."""
+        """Return camera number ``seed``: its sigma is between 1 and 2 cm, and all other values are the defaults."""
         return cls(seed, sigma=float(np.random.default_rng([30314, seed]).uniform(0.01, 0.02)), rate=rate)
 
     @classmethod
@@ -166,7 +166,7 @@ class SkeletonCamera:
         """Return the skeleton the camera reports, or None when it reports none.
 
         Args:
-            truth: at one instant, later than that of the previous call.
+            truth: the true skeleton, later than that of the previous call.
         """
         period = max(truth.time - self._time, 0.0) if math.isfinite(self._time) else 0.0
         error = self._error(truth.positions, period)
@@ -190,7 +190,7 @@ class SkeletonCamera:
         return Skeleton(truth.time, positions, tracking, hands, truth.person)
 
     def _error(self, points: Array, period: float) -> Array:
-        """Return the errors of this frame over sigma and scale, shape (25, 3)."""
+        """Return the errors of this frame relative to sigma and scale, shape (25, 3)."""
         step = points - self._last if period > 0.0 else np.zeros(_SHAPE)
         path = np.nan_to_num(np.sqrt(np.sum(step * step, axis=1)))[:, None]
         u = period / MEMORY + path / MEMORY_LENGTH

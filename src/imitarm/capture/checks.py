@@ -1,4 +1,4 @@
-"""check: what is wrong with a recording of a person; repaired: fixes what can be fixed without guessing."""
+"""check finds faults in a recording of a person; repaired fixes those that can be fixed without guessing."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _TRUNK = np.array([JOINT[name] for name in ("spine_base", "spine_mid", "spine_sh
 
 
 def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIssue]:
-    """Return everything that is wrong with a recording, errors first.
+    """Return all faults of a recording, errors first.
 
     Args:
         recording: as read or captured.
@@ -74,14 +74,14 @@ def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIs
 
 
 def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]]:
-    """Fix what can be fixed without guessing, and say what was done.
+    """Fix the faults that can be fixed without guessing, and report each change.
 
     Of several persons the one with the most frames is kept. A frame is dropped when it is not later than the one
-    before, or repeats it exactly. Joints in a spike, and those of an arm that stands frozen while the body moves, are
-    taken as lost. Left and right that were exchanged from one frame to the next are exchanged back.
+    before, or repeats it exactly. Joints in a spike count as lost, and so do the joints of an arm that is frozen while
+    the body moves. Left and right that were exchanged from one frame to the next are exchanged back.
 
     Returns:
-        the repaired recording, and a line for each kind of change; without lines nothing was changed.
+        the repaired recording, and a line for each kind of change; no lines if nothing was changed.
     """
     notes: list[str] = []
     frames = recording.skeletons
@@ -121,7 +121,7 @@ def _without_repeats(frames: list[Skeleton], notes: list[str]) -> list[Skeleton]
         note = f"dropped {int(whole.sum())} frames that repeat the one before, for up to {longest:.2f} s on end"
         notes.append(note)
     if lost.any():
-        notes.append(f"took an arm as lost in {int(lost.any(axis=1).sum())} frames in which it was frozen")
+        notes.append(f"marked an arm as lost in {int(lost.any(axis=1).sum())} frames in which it was frozen")
     changed = [_with_lost(skeleton, joints) for skeleton, joints in zip(frames, lost, strict=True)]
     return [changed[0], *(s for s, repeated in zip(changed[1:], whole, strict=True) if not repeated)]
 
@@ -133,7 +133,7 @@ def _without_spikes(frames: list[Skeleton], notes: list[str]) -> list[Skeleton]:
     spikes, _ = find_spikes(times, np.array([skeleton.positions for skeleton in frames]))
     if not spikes.any():
         return frames
-    notes.append(f"took joints as lost in {int(spikes.any(axis=1).sum())} frames with a spike")
+    notes.append(f"marked joints as lost in {int(spikes.any(axis=1).sum())} frames with a spike")
     return [_with_lost(skeleton, joints) for skeleton, joints in zip(frames, spikes, strict=True)]
 
 
@@ -181,10 +181,10 @@ class _View:
         return RecordingIssue(severity, code, message, self.frames[i], float(self.times[i] - self.times[0]), remedy)
 
     def unit_remedy(self) -> str:
-        """Return the unit of time that fits; when none does, what to look at instead."""
+        """Return a remedy: the unit of time that fits, or, if none fits, what to check instead."""
         fit = time_unit_that_fits(1.0 / self.period, self.time_unit)
         if fit is None:
-            return "look at the spikes and jumps; without them, check the units of time and length"
+            return "look at the spikes and jumps; if there are none, check the units of time and length"
         name, factor = fit
         return (
             f"the times were read in units of {time_unit_name(self.time_unit)} and fit in {name} "
@@ -297,9 +297,9 @@ def _spikes(view: _View) -> Iterator[RecordingIssue]:
     if spikes.any():
         frames = np.flatnonzero(spikes.any(axis=1))
         i, joint = divmod(int(np.argmax(size)), len(joints))
-        message = f"single-frame spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints leap away and "
+        message = f"single-frame spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints jump away and "
         message += f"back, {JOINTS[joints[joint]]} by {size[i, joint]:.2f} m"
-        remedy = "repair takes these joints as lost there"
+        remedy = "repair marks these joints as lost there"
         severity = _severity_of(joints, spikes)
         yield view.issue(severity, "spike", message, remedy, int(view.later[frames[0]]))
 
@@ -327,7 +327,7 @@ def _followed(view: _View) -> list[int]:
 
 
 def _severity_of(joints: list[int], found: Mask) -> Severity:
-    """Return a warning when only finger tips and thumbs leap: they rotate the tool, but do not move it."""
+    """Return a warning when only finger tips and thumbs jump: they rotate the tool, but do not move it."""
     return "error" if any(found[:, i].any() for i, joint in enumerate(joints) if joint not in _TIPS) else "warning"
 
 

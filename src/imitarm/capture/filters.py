@@ -23,18 +23,18 @@ class PersonFilter(SkeletonSource):
     """Passes on one person of a source that may see several.
 
     The first person seen is followed until they have been out of view for more than ``patience`` on the source's
-    clock; everybody else is ignored. Only then is another person followed: after so long a gap every retargeter has
-    stopped and engages anew. A source that sees only one person may give the next one the same number; so a person who
-    appears farther away than anyone can have walked is ignored, too.
+    clock; everybody else is ignored. Another person is followed only after that, when every retargeter has stopped and
+    engages anew. A source that sees only one person may give the next one the same number; so a person who appears
+    farther away than anyone can have walked is also ignored.
 
     Args:
-        source: what sees people.
+        source: the source to filter.
         person: follow only this person, by the source's number; None: the first who is seen.
         patience: [s].
 
     Attributes:
         followed: number of the followed person; None: nobody yet.
-        passed_over: number of skeletons of other persons so far.
+        passed_over: number of ignored skeletons of other persons.
 
     Raises:
         InputError: when the patience is negative, or the source is not a SkeletonSource.
@@ -72,7 +72,7 @@ class PersonFilter(SkeletonSource):
         return None
 
     def _is_followed(self, skeleton: Skeleton) -> bool:
-        """Return whether a skeleton is that of the followed person, and remember where that person is."""
+        """Return whether a skeleton is that of the followed person, and store the place of that person."""
         if self._only is not None and skeleton.person != self._only:
             self.passed_over += 1
             return False
@@ -95,7 +95,7 @@ class PersonFilter(SkeletonSource):
         return True
 
     def _can_be_there(self, time: float, torso: Array | None) -> bool:
-        """Return whether the followed person can have walked there, and no other person was seen closer to there."""
+        """Return whether the followed person can have walked to a place, and no other person was seen closer to it."""
         if torso is None or self._place is None:
             return self._stranger is None
         before, place = self._place
@@ -126,7 +126,7 @@ def _torso(skeleton: Skeleton) -> Array | None:
 
 MEMORY = 0.5  # [s] older positions of a joint are not used
 _TRUNK_SPEED, _ARM_SPEED = 0.5, 4.0  # [m/s] joints that appear to move faster have exchanged sides
-_LEAST = 0.15  # [m] sides closer than half of this can't be told apart by their motion
+_LEAST = 0.15  # [m] sides closer than half of this can't be distinguished by their motion
 
 _PAIRED = tuple(name.removesuffix("_left") for name in JOINTS if name.endswith("_left"))
 
@@ -155,12 +155,12 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
 
     summed over n pairs of joints that are seen in both frames. Shoulders and hips (v = 0.5 m/s) decide about the whole
     body; then hands, with or without elbows (v = 4 m/s), decide about arms that were exchanged while the body was not.
-    Hands that meet are too close to each other to fulfil the inequality and stay as they are. When one joint of a pair
+    Hands that meet are too close to each other to fulfil the inequality and are not exchanged. When one joint of a pair
     is lost, the other one decides.
 
     Args:
         skeleton: as the camera reports it.
-        before: the frame before, with its sides right.
+        before: the frame before, with correct sides.
 
     Returns:
         the same skeleton when nothing was exchanged.
@@ -201,7 +201,7 @@ def _gain(now: Array, before: Array, pairs: NDArray[np.int64], margin: float) ->
         margin: for each pair [m].
 
     Returns:
-        shape (2, n) [m]; nan where a joint is lost, or one of its pair was.
+        shape (2, n) [m]; nan where a joint is lost, or was lost in the frame before.
     """
     there, here = before[pairs], now[pairs]
     straight, crossed = here - there, here - there[::-1]
@@ -224,7 +224,7 @@ class SideMemory:
         self._seen = np.full(len(JOINTS), -np.inf)
 
     def update(self, skeleton: Skeleton) -> Skeleton:
-        """Return the next skeleton with its sides right."""
+        """Return the next skeleton with correct sides."""
         right = skeleton
         period = abs(skeleton.time - self._time)
         if period <= MEMORY:
@@ -240,8 +240,8 @@ class SideMemory:
 class SideFilter(SkeletonSource):
     """Passes on a source with left and right kept apart, for each person; see :func:`unswapped`.
 
-    Only motion decides: the sides of the first frame are taken as right. After half a second without frames it starts
-    anew; by then every retargeter has stopped.
+    Only motion is used: the sides of the first frame are assumed to be correct. After half a second without frames it
+    starts anew; by then every retargeter has stopped.
 
     Args:
         source: a source that may exchange left and right.
@@ -267,7 +267,7 @@ class SideFilter(SkeletonSource):
         self._source.close()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton with its sides right; None when none came within ``timeout`` seconds."""
+        """Return the next skeleton with correct sides; None when none came within ``timeout`` seconds."""
         skeleton = self._source.read(timeout)
         if skeleton is None:
             return None
@@ -275,7 +275,7 @@ class SideFilter(SkeletonSource):
 
 
 class RealtimeSource(SkeletonSource):
-    """Delays a source, so that each skeleton comes no earlier than its time since the first one.
+    """Delays a source so that it runs in real time: each skeleton comes no earlier than its time since the first one.
 
     Args:
         source: gives skeletons as fast as they are read.

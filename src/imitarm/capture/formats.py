@@ -30,7 +30,7 @@ NAMES = (
     *(f"{joint}_{part}" for joint in JOINTS for part in ("x", "y", "z", "tracking")),
 )
 UNFINISHED = "not closed"
-"""What the header gives as the number of frames while they are still being written."""
+"""The number of frames in the header of a file that is still being written."""
 
 TICK = 1e-7  # [s] time unit of the Kinect SDK
 _KINECT_COLUMNS = 1 + 4 * len(JOINTS)
@@ -51,7 +51,7 @@ _UPPER_ARM = (0.1, 0.6)  # [m] of motion capture
 
 
 def is_native(head: bytes) -> bool:
-    """Return whether a file begins as imitarm's own format does: with the remark ``# format: imitarm-skeletons``."""
+    """Return whether a file begins with the remark ``# format: imitarm-skeletons`` of imitarm's own format."""
     return _MARK.match(head.replace(b"\r\n", b"\n").replace(b"\r", b"\n")) is not None
 
 
@@ -60,7 +60,7 @@ def native_header(source: str, frames: str) -> str:
 
     Args:
         source: where the skeletons are from.
-        frames: how many there are, or :data:`UNFINISHED`; padded, so that it can be overwritten in place.
+        frames: number of frames, or :data:`UNFINISHED`; padded, so that it can be overwritten in place.
     """
     remarks = {
         "format": FORMAT,
@@ -88,8 +88,8 @@ def native_line(skeleton: Skeleton) -> str:
 def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read imitarm's own format.
 
-    A recording that was not closed, because its writer was killed or is still at work, is read up to its last whole
-    line, and an issue says what was lost.
+    A recording that was not closed, because its writer was killed or is still running, is read up to its last complete
+    line; an issue reports the loss.
 
     Args:
         path: for messages.
@@ -119,7 +119,7 @@ def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[Recordi
     if not unfinished and announced != str(n):
         raise FileFormatError(
             f"{path}, line {int(table.lines[-1])}: ends after {n} frames where {announced} are announced: the file was "
-            "cut off; copy it again, or write the number there is after '# frames:'"
+            "cut off; copy it again, or correct the number after '# frames:'"
         )
     issues = []
     if unfinished:
@@ -197,7 +197,7 @@ def _skeletons(
     """Build skeletons from columns.
 
     Args:
-        table: what was read, for messages.
+        table: the table that was read, for messages.
         times: shape (n,) [s].
         joints: x, y, z [m] and tracking state of each joint, shape (n, 25, 4).
         hands: state of the left and of the right hand, shape (n, 2); None: not in the file.
@@ -235,7 +235,7 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
     message = (
         f"{int(far.sum())} joints in {int(far.any(axis=1).sum())} frames are not finite or farther than "
         f"{FARTHEST:.0f} m, first {JOINTS[int(np.argmax(far[frame]))]} in line {int(table.lines[frame])}; "
-        "they are taken as lost"
+        "they count as lost"
     )
     remedy = "check units and sensor"
     if far.mean() > 0.5:

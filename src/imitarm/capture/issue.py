@@ -1,4 +1,4 @@
-"""RecordingIssue: one thing that is wrong with a recording of a person."""
+"""RecordingIssue: one fault of a recording of a person."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class RecordingIssue:
-    """One thing that is wrong with a recording of a person, or worth knowing before a robot follows it.
+    """One fault of a recording of a person, or one useful fact before a robot follows it.
 
     Attributes:
         severity: ``"error"``: no robot can follow this recording as it is; ``"warning"``: look at it; ``"note"``: for
@@ -33,7 +33,7 @@ class RecordingIssue:
 
     @property
     def place(self) -> str:
-        """Where to look: ``frame 12 (0.40 s)``, or nothing."""
+        """Place of the issue: ``frame 12 (0.40 s)``, or an empty text."""
         if self.frame is None:
             return ""
         return f"frame {self.frame}" + ("" if self.time is None else f" ({self.time:.2f} s)")

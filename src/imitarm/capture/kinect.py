@@ -42,7 +42,7 @@ class BodyCamera(SkeletonSource):
 
     @abstractmethod
     def _frame(self, timeout: float) -> list[Skeleton] | None:
-        """Return all bodies of the next frame, or None when none came within ``timeout`` seconds.
+        """Return all bodies of the next frame, or None when no frame came within ``timeout`` seconds.
 
         Raises:
             TaskFailedError: when the driver reports a failure.
@@ -53,7 +53,7 @@ class BodyCamera(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether the source is closed, or the camera gone."""
+        """Whether the source is closed, or the camera is gone."""
         return self._over
 
     def close(self) -> None:
@@ -89,10 +89,10 @@ class BodyCamera(SkeletonSource):
         return True
 
     def _wait_for_first(self, seconds: float, missing: str) -> None:
-        """Wait for the first frame of all.
+        """Wait for the very first frame.
 
         Raises:
-            InputError: when none came within ``seconds``, or the driver fails; the camera is released.
+            InputError: when no frame came within ``seconds``, or the driver fails; the camera is released.
         """
         until = clock.monotonic() + seconds
         try:
@@ -106,7 +106,7 @@ class BodyCamera(SkeletonSource):
             raise
 
     def _number(self, driver_id: int) -> int:
-        """Return the person for a driver's number: 0 for the first who was seen, and so on."""
+        """Return the person's number for a driver's body number; persons are counted from 0."""
         return self._numbers.setdefault(int(driver_id), len(self._numbers))
 
     def _failed(self, why: str) -> TaskFailedError:
@@ -130,7 +130,7 @@ class KinectV2Source(BodyCamera):
     Coordinate frame and joints are those of the SDK. A hand state is used when the SDK reports high confidence. Times
     are those of the sensor's clock.
 
-    Written after the documentation of `kinect-next` 3.0; not yet tested on a device.
+    It was written from the documentation of `kinect-next` 3.0 and has not been tested on a device.
 
     Raises:
         InputError: when driver or camera is missing; the message says which, and what to do.
@@ -193,7 +193,7 @@ _TRACKING = np.array([Tracking.LOST, Tracking.INFERRED, Tracking.TRACKED, Tracki
 
 
 def _joint_indices() -> tuple[tuple[int, ...], ...]:
-    """Return, for each of the 25 joints, the indices of the SDK's joints; the joint is their middle."""
+    """Return, for each of the 25 joints, the indices of the SDK's joints; the joint is midway between them."""
     named: dict[str, tuple[int, ...]] = {"spine_base": (0,), "spine_mid": (1,), "spine_shoulder": (4, 11)}
     named |= {"neck": (3,), "head": (26,)}  # spine_shoulder: between the clavicles
     arm = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
@@ -216,7 +216,7 @@ class AzureKinectSource(BodyCamera):
     `pykinect-azure` ends the program when the SDK fails; this class raises an error instead. Frames are fetched by the
     C functions that it wraps, because these distinguish a late frame from a failure.
 
-    Written after the documentation of the SDKs; not yet tested on a device.
+    It was written from the documentation of the SDKs and has not been tested on a device.
 
     Raises:
         InputError: when driver, SDK or camera is missing; the message says which, and what to do.

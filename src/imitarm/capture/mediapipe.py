@@ -1,9 +1,9 @@
-r"""MediaPipe: skeletons of a person in a video or in front of a webcam, and how its 33 landmarks become a Skeleton.
+r"""MediaPipe: skeletons of a person in a video or in front of a webcam, converted from MediaPipe's 33 landmarks.
 
 MediaPipe gives each landmark twice: in the image, and in metres relative to the middle of the hips (x to the image's
 right, y down, z away), as seen by a camera that looks straight at the person. The sensor frame of
-:class:`~imitarm.capture.skeleton.Skeleton` (x to the sensor's left, y up, z away) is that one rotated by 180 degrees
-about z.
+:class:`~imitarm.capture.skeleton.Skeleton` (x to the sensor's left, y up, z away) is MediaPipe's frame rotated by 180
+degrees about z.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _LEAST_WEIGHT = 2.0  # sum of the visibilities needed to locate a person
 
 
 def _joint_weights() -> Array:
-    """Return the weights that make joints from landmarks, joints = weights @ landmarks, shape (25, 33)."""
+    """Return the weights that compute joints from landmarks, joints = weights @ landmarks, shape (25, 33)."""
     mixed: dict[str, dict[int, float]] = {
         "spine_base": {23: 0.5, 24: 0.5},
         "spine_mid": {11: 0.25, 12: 0.25, 23: 0.25, 24: 0.25},
@@ -65,12 +65,13 @@ _TO_SENSOR = np.array([-1.0, -1.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class PoseLandmarks:
-    """What MediaPipe found in one image.
+    """The landmarks that MediaPipe found in one image.
 
     Attributes:
         time: of the image [s].
         world: relative to the middle of the hips, x to the image's right, y down, z away, shape (33, 3) [m].
-        image: place in the image, 0 to 1 from the left and from the top, shape (33, 2); outside when not in view.
+        image: place in the image, 0 to 1 from the left and from the top, shape (33, 2); beyond this range when not in
+            view.
         visibility: of each landmark, 0 to 1, shape (33,).
 
     Raises:
@@ -95,12 +96,12 @@ class LandmarkConverter:
     r"""Converts landmarks to skeletons.
 
     **Where the person stands.** MediaPipe's metres are relative to the hips, so a hip that moves would move a hand that
-    is at rest. The translation t of the hips is the one for which landmarks :math:`X_j, Y_j, Z_j` and image agree. With
-    image coordinates :math:`u, v` from the middle, in units of the focal length, and visibility :math:`k`,
+    is at rest. The translation t of the hips is chosen so that the landmarks :math:`X_j, Y_j, Z_j` agree with the
+    image. With image coordinates :math:`u, v` from the middle, in units of the focal length, and visibility :math:`k`,
 
     .. math:: \min_t \sum_j k_j^2 \left( (X_j + t_x - u_j (Z_j + t_z))^2 + (Y_j + t_y - v_j (Z_j + t_z))^2 \right)
 
-    which is linear in t. Across the line of sight t is accurate to centimetres. Along it, t is as accurate as
+    which is linear in t. Across the line of sight, t is accurate to centimetres. Along it, t is as accurate as
     MediaPipe's metres and the field of view, and noisy; so the distance is averaged over 0.1 s before x and y are
     fitted again. All joints move by the same t, so positions relative to other joints do not change.
 
@@ -128,9 +129,9 @@ class LandmarkConverter:
     def skeleton(self, landmarks: PoseLandmarks) -> Skeleton | None:
         """Return the skeleton; None when the image shows too little of the person to locate them.
 
-        A joint is tracked, inferred or lost according to the least visibility of the landmarks that it is made of;
-        outside the image it is inferred at best. MediaPipe can't tell open from closed hands, so hand states are
-        unknown.
+        A joint is tracked, inferred or lost according to the smallest visibility of the landmarks from which it is
+        computed; outside the image it is inferred or lost. MediaPipe can't tell open from closed hands, so hand states
+        are unknown.
         """
         uv = (landmarks.image - 0.5) * self._scale
         world, place = landmarks.world, None
@@ -150,7 +151,7 @@ class LandmarkConverter:
 
     @staticmethod
     def _fit(world: Array, uv: Array, visibility: Array) -> Array | None:
-        """Return the translation from the hips to the camera, shape (3,) [m]; None when there is none that fits."""
+        """Return the translation from the hips to the camera, shape (3,) [m]; None when none fits."""
         weight = visibility[_FITTED]
         if weight.sum() < _LEAST_WEIGHT:
             return None
@@ -209,12 +210,13 @@ class MediaPipeSource(SkeletonSource):
 
     MediaPipe tracks one person. It runs in another process, in another environment (see
     :mod:`imitarm.capture.mediapipe_environment`), and sends its landmarks as lines of text, which
-    :class:`LandmarkConverter` turns into skeletons. Times are the video's own, from zero; for a webcam, the monotonic
-    clock when an image came.
+    :class:`LandmarkConverter` turns into skeletons. Times are those of the video, from 0 s; for a webcam, the monotonic
+    clock at which an image arrived.
 
     Args:
         film: a video file, or the number of a webcam.
-        realtime: give a video's skeletons no earlier than the video would show them; else as fast as they are tracked.
+        realtime: return a video's skeletons no earlier than the video would show them; else as fast as they are
+            tracked.
         field_of_view: of the longer side of the image [deg].
         python: interpreter that has MediaPipe; None: :func:`~imitarm.capture.mediapipe_environment.find_python`.
 
@@ -224,7 +226,7 @@ class MediaPipeSource(SkeletonSource):
     Raises:
         InputError: when MediaPipe is not installed, the file is not a video, or there is no such webcam.
         TaskFailedError: from :meth:`read`, when MediaPipe's process dies, hangs or sends invalid lines, the video is
-            cut off, or the webcam is gone. Skeletons that came before are valid.
+            cut off, or the webcam is gone. Earlier skeletons are valid.
     """
 
     def __init__(
@@ -288,7 +290,7 @@ class MediaPipeSource(SkeletonSource):
         return None
 
     def _due(self, time: float, until: float) -> bool:
-        """In real time wait until a skeleton is due; return False when that is later than ``until``."""
+        """In real time, wait until a skeleton is due; return False when it is due later than ``until``."""
         if not self._realtime:
             return True
         if self._began == -np.inf:
@@ -298,7 +300,7 @@ class MediaPipeSource(SkeletonSource):
         return wait <= 0.0 or clock.monotonic() >= self._began + time
 
     def _line(self, timeout: float) -> list[bytes] | None:
-        """Return the next line's words; None when none came in time."""
+        """Return the words of the next line; None when no line came in time."""
         before = clock.monotonic()
         try:
             line = self._process.line(min(timeout, max(_SILENT - self._silent, 0.0) + _TICK))
@@ -327,13 +329,13 @@ class MediaPipeSource(SkeletonSource):
         if words[0] == b"error":
             raise InputError(f"{self._shown_name}: {_text(words[1:])}")
         if words[:2] != [b"imitarm-mediapipe", str(PROTOCOL).encode()] or len(words) != 4:
-            raise InputError(f"{python} does not send what MediaPipe's process should: {_text(words)[:80]!r}")
+            raise InputError(f"{python} does not send the lines of MediaPipe's process: {_text(words)[:80]!r}")
         if not (words[2].isdigit() and words[3].isdigit()):
             raise InputError(f"{python} gives no image size: {_text(words)[:80]!r}")
         return int(words[2]), int(words[3])
 
     def _parsed(self, words: list[bytes]) -> Skeleton | None:
-        """Return the skeleton in a line, None when nobody is in the image; close after the last line."""
+        """Return the skeleton in a line, None when nobody is in the image; close the source after the last line."""
         kind = words[0]
         if kind == b"error":
             raise self._failed(_text(words[1:]))
@@ -355,7 +357,7 @@ class MediaPipeSource(SkeletonSource):
         return self._converter.skeleton(PoseLandmarks(self._last, each[:, :3], each[:, 3:5], each[:, 5]))
 
     def _failed(self, why: str) -> TaskFailedError:
-        """Close, and return the error that says why."""
+        """Close the source, and return the error with the reason."""
         self.close()
         return TaskFailedError(f"{self._shown_name}: {why}; {self.images} images were processed before")
 

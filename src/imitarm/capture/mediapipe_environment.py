@@ -1,4 +1,4 @@
-"""MediaPipe's own Python environment: how it is found, made, and run as a process that writes lines of text.
+"""MediaPipe's own Python environment: find it, make it, and run it as a process that writes lines of text.
 
 MediaPipe 0.10.21, the last version that includes its models, needs numpy below 2; imitarm needs numpy 2. So MediaPipe
 is installed in another environment, without imitarm::
@@ -38,7 +38,7 @@ REQUIREMENTS = (
     "flatbuffers>=2.0",
     "matplotlib",
 )
-"""What pose tracking needs. MediaPipe also requires jax, sentencepiece and sounddevice, which are for other tasks, and
+"""What pose tracking needs. MediaPipe also requires jax, sentencepiece and sounddevice, which serve other tasks, and
 an OpenCV with windows; so it is installed without its requirements."""
 
 _STAMP = "imitarm-mediapipe.txt"  # written last: without it the environment is incomplete
@@ -47,10 +47,10 @@ _TRIAL = "import cv2, mediapipe; mediapipe.solutions.pose.Pose(model_complexity=
 
 
 def find_python() -> Path:
-    """Return the Python that has MediaPipe: ``IMITARM_MEDIAPIPE_PYTHON``, else that of the first of :func:`folders`.
+    """Return the Python that has MediaPipe: ``IMITARM_MEDIAPIPE_PYTHON``, or one in :func:`folders`.
 
     Raises:
-        InputError: when there is none; the message says how to make the environment.
+        InputError: when no such Python is found; the message says how to make the environment.
     """
     named = os.environ.get(VARIABLE)
     if named:
@@ -62,7 +62,7 @@ def find_python() -> Path:
             return python_of(folder)
     raise InputError(
         f"video and webcam need MediaPipe in an environment of its own; make it, once: '{sys.executable} {_COMMAND}' "
-        f"(130 MB to fetch, 410 MB on disk), or let {VARIABLE} name a Python that has mediapipe {VERSION}"
+        f"(130 MB to fetch, 410 MB on disk), or set {VARIABLE} to a Python that has mediapipe {VERSION}"
     )
 
 
@@ -111,7 +111,7 @@ def suitable_python() -> str:
     """Return a Python for which MediaPipe exists: this one, else one on the path.
 
     Raises:
-        InputError: when there is none.
+        InputError: when no such Python is found.
     """
     (major, oldest), (_, newest) = VERSIONS
     if VERSIONS[0] <= sys.version_info[:2] <= VERSIONS[1]:
@@ -122,8 +122,8 @@ def suitable_python() -> str:
             return found
     raise InputError(
         f"mediapipe {VERSION} exists for Python {major}.{oldest} to {major}.{newest}; this is "
-        f"{sys.version_info[0]}.{sys.version_info[1]} and none of these is on the path; install one, or let {VARIABLE} "
-        "name a Python that has mediapipe"
+        f"{sys.version_info[0]}.{sys.version_info[1]} and none of these is on the path; install one, or set "
+        f"{VARIABLE} to a Python that has mediapipe"
     )
 
 
@@ -155,17 +155,18 @@ _READ, _TAIL = 20000, 600  # [characters] of its last output that are read, and 
 class LineProcess:
     """Another program whose standard output is read line by line, with a timeout.
 
-    The program must end when its standard input ends, so it does not outlive this process even if that is killed.
+    The program must end when its standard input ends, so that it also ends when this process is killed.
     :meth:`close` ends it in any case, and so does deleting this object.
 
     Args:
         command: with all its arguments.
         keep: number of lines that may wait to be read.
-        newest: when more would wait, drop the oldest line, but never the first of all; else the program waits.
+        newest: when more lines would wait, drop the oldest line, but never the very first one; otherwise the program
+            waits.
         chatter: regular expression of lines on its standard error to leave out of :meth:`ended`.
 
     Raises:
-        OSError: when it can't be started.
+        OSError: when the program can't be started.
     """
 
     def __init__(
@@ -194,7 +195,7 @@ class LineProcess:
         return self._process.pid
 
     def line(self, timeout: float) -> bytes | None:
-        """Return the next line without its end, or None when none came within ``timeout`` seconds.
+        """Return the next line without its line break, or None when no line came within ``timeout`` seconds.
 
         Raises:
             EOFError: when there will be no more.

@@ -31,7 +31,7 @@ _SLIP = 1e-4  # [s] each image must be later than the one before by more than th
 
 
 class StopError(Exception):
-    """A reason to stop, in one line."""
+    """A reason to stop; its text is one line."""
 
 
 def main(arguments: list[str], out: TextIO) -> int:
@@ -75,7 +75,7 @@ def _pose(mediapipe: Any) -> Any:
     """Return the tracker; model 1 is in the package, 0 and 2 would be downloaded."""
     if not hasattr(mediapipe, "solutions"):
         version = getattr(mediapipe, "__version__", "of unknown version")
-        raise StopError(f"mediapipe {version} has no solutions, which is where the models are; 0.10.21 is needed")
+        raise StopError(f"mediapipe {version} has no module 'solutions' with the models; version 0.10.21 is needed")
     return mediapipe.solutions.pose.Pose(model_complexity=1, smooth_landmarks=True)
 
 
@@ -117,7 +117,7 @@ def _film(cv2: Any, path: str) -> Iterator[tuple[float, Any]]:
 
 
 def _webcam(cv2: Any, number: int) -> Iterator[tuple[float, Any]]:
-    """Yield a webcam's newest image, whenever there is a new one, and the time at which it came [s]."""
+    """Yield each new image of a webcam and the time at which it arrived [s]."""
     camera = cv2.VideoCapture(number)
     if not camera.isOpened():
         raise StopError(f"there is no camera number {number}, or another program uses it")
@@ -145,7 +145,7 @@ def _webcam(cv2: Any, number: int) -> Iterator[tuple[float, Any]]:
 
 
 def _end_with(parent: TextIO, leave: Callable[[int], Any] = os._exit) -> None:
-    """End as soon as the process that started this one has closed our standard input, or is gone."""
+    """End this process as soon as the process that started it closes our standard input, or ends."""
     parent.read()
     leave(0)
 

@@ -1,4 +1,4 @@
-"""What a synthetic person does with a hand: seeded reaches, and shapes drawn over and over."""
+"""Motions of a synthetic person's hand: seeded reaches, and shapes drawn repeatedly."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from imitarm.validation import finite_number
 
 Array = NDArray[np.float64]
 Truth = Callable[[float], Skeleton]
-"""A person in motion: maps a time [s] to the true position of every joint."""
+"""A moving person: a function from a time [s] to the true position of every joint."""
 
 REACHES = ("inside", "edge")
 REST = 1.0  # [s] the hand is still at the beginning, so that a robot can engage
@@ -114,10 +114,10 @@ DRAWINGS: dict[str, tuple[_Shape, tuple[float, float, float], tuple[float, float
 
 
 def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "circle") -> Truth:
-    r"""Return the motion of a person who draws a shape over and over with the right hand.
+    r"""Return the motion of a person who draws a shape repeatedly with the right hand.
 
-    The angle along the shape is :math:`\omega\,s(t)`. The warped time s rests during the first second and at the end,
-    runs at the rate of t in between, and speeds up and slows down as a minimum-jerk motion does.
+    The angle along the shape is :math:`\omega\,s(t)`. The warped time s stands still during the first second and at the
+    end and runs at the rate of t in between; it changes its rate with a minimum-jerk profile.
 
     Args:
         person: who moves.

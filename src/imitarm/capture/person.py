@@ -49,14 +49,14 @@ class Person:
 
     An arm is two straight bones, of lengths :math:`L_U` and :math:`L_F`. For a given shoulder S and wrist W the elbow E
     lies on a circle about the line from S to W. With :math:`\hat w` along that line, and :math:`\hat d` (down) and
-    :math:`\hat o` (outwards) perpendicular to it (those of an arm that points forward, rotated by the smallest rotation
-    to where the arm points), it is at
+    :math:`\hat o` (outwards) perpendicular to it (both rotate with the arm from their directions for an arm that points
+    forward), the elbow is at
 
     .. math:: E = S + a\,\hat w + h\,(\cos\psi\,\hat d + \sin\psi\,\hat o), \qquad
               a = \frac{L_U^2 + r^2 - L_F^2}{2r},\quad h = \sqrt{L_U^2 - a^2},\quad r = |W - S| .
 
     Attributes:
-        seed: of everything below, when made by :meth:`from_seed`.
+        seed: seed of all attributes below, for a person made by :meth:`from_seed`.
         stature: height [m].
         upper_arm: shoulder to elbow [m].
         forearm: elbow to wrist [m].
@@ -142,7 +142,7 @@ class Person:
                 arm stretches towards it.
             swivel: psi [rad]; None: this person's habit, :attr:`swivel` and :attr:`lift`.
             hand: rotation of the hand in the sensor's frame, shape (3, 3), its x along the hand, its y towards the
-                thumb; None: in line with the forearm, the thumb up as far as that goes.
+                thumb; None: in line with the forearm, with the thumb up as far as possible.
             closed: whether the hand is a fist.
             side: of the arm that moves.
 
@@ -236,7 +236,7 @@ def _is_rotation(matrix: Array) -> bool:
 
 
 def _hand_along(forearm: Array) -> Array:
-    """Return the rotation of a hand in line with the forearm; its thumb is up when the forearm points forward."""
+    """Return the rotation of a hand in line with the forearm; the thumb is up when the forearm points forward."""
     x = forearm / np.linalg.norm(forearm)
     y = _rotated(np.array([0.0, 1.0, 0.0]), x)
     return np.array([x, y, _cross(x, y)]).T
@@ -251,7 +251,8 @@ def _cross(a: Array, b: Array) -> Array:
 def _rotated(vector: Array, direction: Array) -> Array:
     """Return a vector, perpendicular to forward, after the smallest rotation from forward to ``direction``.
 
-    So up and down beside an arm that points forward change without a jump as the arm moves, except straight backwards.
+    Directions defined for an arm that points forward so change continuously as the arm moves, except when it points
+    straight backwards.
     """
     both = direction + _FORWARD
     square = float(both @ both)

@@ -1,4 +1,4 @@
-"""Whether numbers can be those of a person in front of a sensor: units, axes, repeated frames, spikes."""
+"""Checks whether a recording can be that of a person in front of a sensor: units, axes, repeated frames, spikes."""
 
 from __future__ import annotations
 
@@ -48,9 +48,7 @@ def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
         rate: frame rate when the stamps are read in ``unit`` [Hz].
         unit: the unit in which the stamps were read [s].
 
-    Returns:
-        the unit's name, and its length over that of ``unit``: what the times must be multiplied by. None when no
-        other unit fits.
+    Returns: the name of the unit, and the factor by which the times must be multiplied. None when no other unit fits.
     """
     low, high = PLAUSIBLE_RATE
     fits = [
@@ -81,11 +79,11 @@ def length_unit_that_fits(limb: float) -> str | None:
 
 
 def axes_that_fit(positions: Array) -> tuple[str, str] | None:
-    """Return what is wrong with the axes of positions, shape (n, 25, 3), and the axes that fit; None when these do.
+    """Return the fault of the axes of positions (n, 25, 3), and the axes that fit; None when the axes are right.
 
     In the sensor's frame the spine points up (y), and the trunk is in front of the sensor (z above 0). Of all axes in
     which both hold, those are proposed in which the person also faces the sensor: the right shoulder has a larger x
-    than the left one. A right-handed choice goes before a mirrored one.
+    than the left one. A right-handed choice is preferred to a mirrored one.
     """
     spine = _median(_mean(positions[:, _UPPER]) - _mean(positions[:, _LOWER]))
     trunk = _median(_mean(positions[:, _TRUNK]))
@@ -126,16 +124,16 @@ def _mean(points: Array) -> Array:
 
 
 def _median(points: Array) -> Array:
-    """Return the median over the frames that are known, shape (3,); nan when there is none."""
+    """Return the median over the frames without nan, shape (3,); nan when all frames have nan."""
     known = points[np.isfinite(points).all(axis=1)]
     return np.median(known, axis=0) if len(known) else np.full(3, np.nan)
 
 
-# --- frames that repeat, joints that leap
+# --- frames that repeat, joints that jump
 
 
 def repeats_previous(positions: Array) -> Mask:
-    """Return which frames, after the first, repeat the one before in every digit; shape (n - 1,)."""
+    """Return whether each frame, after the first, repeats the one before in every digit; shape (n - 1,)."""
     same = (positions[1:] == positions[:-1]) | (np.isnan(positions[1:]) & np.isnan(positions[:-1]))
     seen = np.any(np.all(np.isfinite(positions[1:]), axis=2), axis=1)
     return np.asarray(same.all(axis=(1, 2)) & seen)
@@ -175,11 +173,11 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
 
 
 def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
-    r"""Find joints that leap away for one to three frames and come back.
+    r"""Find joints that jump away for one to three frames and come back.
 
     A joint is in a spike when it is more than 0.2 m from the straight line between the frames before and after, these
     two are less than half as far apart, and either it gets there and back faster than 10 m/s, or a bone of the arm
-    that ends in it is more than 0.12 m longer or shorter than in those two frames. At both ends of a recording a leap
+    that ends in it is more than 0.12 m longer or shorter than in those two frames. At both ends of a recording, a jump
     of more than 0.3 m faster than 10 m/s is enough.
 
     Args:
@@ -187,7 +185,7 @@ def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
         positions: shape (n, 25, 3) [m].
 
     Returns:
-        whether each joint is in a spike, shape (n, 25), and how far it leaps there, shape (n, 25) [m].
+        whether each joint is in a spike, shape (n, 25), and how far it jumps there, shape (n, 25) [m].
     """
     n = len(times)
     found, size = np.zeros(positions.shape[:2], dtype=bool), np.zeros(positions.shape[:2])

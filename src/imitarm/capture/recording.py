@@ -36,7 +36,7 @@ _GAP: Final = 0.25  # [s] a longer gap in a recording is not filled with frames
 class SkeletonRecording(SkeletonSource):
     """Skeletons in the order in which they were recorded; as a source it replays them once.
 
-    Nothing is checked and nothing is changed: times may run backwards, and there may be several persons.
+    Skeletons are neither checked nor changed: times may run backwards, and there may be several persons.
     :func:`~imitarm.capture.checks.check` says what is wrong.
 
     Args:
@@ -47,7 +47,7 @@ class SkeletonRecording(SkeletonSource):
         time_unit: unit of the file's time stamps [s], for messages about times that are not plausible.
 
     Attributes:
-        skeletons: all of them.
+        skeletons: all skeletons, in the order in which they were recorded.
         issues: found while reading.
         time_unit: as given.
     """
@@ -112,7 +112,7 @@ class SkeletonRecording(SkeletonSource):
         return self.with_skeletons(kept)
 
     def trim(self, start: float = 0.0, end: float | None = None) -> SkeletonRecording:
-        """Return what was recorded between two times; time stamps stay as they are.
+        """Return the part of the recording between two times; time stamps do not change.
 
         Args:
             start: since the first frame [s].
@@ -132,7 +132,7 @@ class SkeletonRecording(SkeletonSource):
         return self.with_skeletons(kept)
 
     def with_skeletons(self, skeletons: Iterable[Skeleton]) -> SkeletonRecording:
-        """Return the same recording with other skeletons in it."""
+        """Return a recording with other skeletons and the same name and time unit."""
         return SkeletonRecording(
             skeletons, name=self.name, realtime=self._realtime, issues=self.issues, time_unit=self.time_unit
         )
@@ -141,11 +141,11 @@ class SkeletonRecording(SkeletonSource):
         """Write imitarm's own format, from which every skeleton is read back bit for bit.
 
         Args:
-            path: of the file; it is written under another name and renamed when it is whole.
+            path: file to write; it is written under another name and renamed when it is complete.
             replace: an existing file may be replaced.
 
         Raises:
-            InputError: when there is nothing to write, or it can't be written.
+            InputError: when there are no skeletons, or the file can't be written.
         """
         if not self.skeletons:
             raise InputError(f"{path}: not written: {self.name} holds no skeletons; was a person in view?")
@@ -167,7 +167,7 @@ class SkeletonRecording(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether all of it has been replayed."""
+        """Whether the whole recording has been replayed."""
         return self._next >= len(self.skeletons)
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
@@ -190,7 +190,7 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
     """Read a recording: imitarm's own format, a Kinect SDK table, or motion capture; the content decides which.
 
     Args:
-        path: the file; also the ``.part`` of a recorder that was killed.
+        path: the file; it may be the ``.part`` file of a recorder that was killed.
         realtime: replay at the recorded speed.
 
     Raises:
@@ -201,7 +201,9 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
     path = Path(path)
     part = path.with_name(path.name + PART)
     if not path.exists() and part.exists():
-        raise InputError(f"{path}: is not there, but {part} is, left by a recording that was not closed; read that one")
+        raise InputError(
+            f"{path}: does not exist, but {part} does; it was left by a recording that was not closed: read that file"
+        )
     content = read_bytes(path)
     head = content[:65536]
     unit = 1.0
@@ -219,12 +221,12 @@ class SkeletonRecorder:
     """Writes skeletons to ``PATH.part``, one whole line each, and renames it to ``PATH`` when it is closed.
 
     Each line is handed to the operating system before :meth:`write` returns: a program that is killed loses at most
-    the frame it was writing, and :func:`read_recording` reads ``PATH.part``. An older file ``PATH`` stays whole until
-    the new one is.
+    the frame it was writing, and :func:`read_recording` reads ``PATH.part``. An older file ``PATH`` stays intact until
+    the new one is complete.
 
     Args:
         path: of the file.
-        source: where the skeletons are from, for whoever reads the file.
+        source: origin of the skeletons, written into the file.
         replace: an existing file may be replaced.
 
     Attributes:
@@ -251,12 +253,12 @@ class SkeletonRecorder:
         self.n_frames += 1
 
     def close(self) -> None:
-        """Write the number of frames into the header and rename the file; without any frame there is no file.
+        """Write the number of frames into the header and rename the file; a recorder without frames leaves no file.
 
         A second call does nothing.
 
         Raises:
-            InputError: when that is not possible; what was written stays in ``PATH.part``.
+            InputError: when the file can't be completed; the frames stay in ``PATH.part``.
         """
         self._file.finish(self._take, begin=native_header(self._source, str(self.n_frames)))
 
@@ -275,8 +277,9 @@ class SkeletonRecorder:
 def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
     """Return a recording at a fraction of its speed, for a robot whose joints are slower than a person's.
 
-    Frames are inserted, so that the frame rate stays about the same: joints move straight between two frames, and a
-    joint that is lost in either keeps its earlier position. Gaps are not filled, and grow.
+    Frames are inserted, so that the frame rate stays about the same: joints are interpolated linearly between two
+        frames, and a joint that is lost in one of them keeps its earlier position. Gaps are not filled; they become
+        longer.
 
     Args:
         skeletons: in the order of their times.
@@ -299,7 +302,7 @@ def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
 
 
 def _between(before: Skeleton, after: Skeleton, fraction: float) -> Skeleton:
-    """Return the person between two frames, at a fraction of the time from one to the other."""
+    """Return the person between two frames; ``fraction`` is that of the time from the first to the second."""
     tracking = np.minimum(before.tracking, after.tracking)
     lost = tracking == Tracking.LOST
     positions = before.positions + fraction * (after.positions - before.positions)

@@ -1,4 +1,4 @@
-"""How good a skeleton camera is, measured on its skeletons: noise, bone lengths, frame intervals, agreement of views.
+"""Quality of a skeleton camera, measured on its skeletons: noise, bone lengths, frame intervals, agreement of views.
 
 As a program it measures how well MediaPipe sees a person in videos, and how well several views of one motion agree::
 
@@ -52,7 +52,7 @@ class SensorNoise:
         longest_interval: [s].
         at_rest: white noise of each joint while it is slower than 0.1 m/s, root mean square over the axes, shape (25,)
             [m]; nan where the joint was not that slow for long enough.
-        in_motion: the same while it is faster than 0.4 m/s.
+        in_motion: white noise of each joint while it is faster than 0.4 m/s, shape (25,) [m].
         bones: mean and standard deviation of the length of each bone of both arms, by name (``"left forearm"``) [m].
         inferred: fraction of the frames in which each joint is inferred or lost, shape (25,).
     """
@@ -148,7 +148,7 @@ _LIMBS = {"upper arm": (0, 1), "forearm": (1, 2)}
 
 
 def guarded(recording: SkeletonRecording) -> SkeletonRecording:
-    """Return a recording with left and right kept apart, which is what a retargeter gets."""
+    """Return a recording filtered by :class:`SideFilter`, as a retargeter receives it."""
     return SkeletonRecording(list(SideFilter(recording)), name=recording.name)
 
 
@@ -171,7 +171,7 @@ def bone(recording: SkeletonRecording, side: str, name: str) -> tuple[float, flo
 def arm_raised(recording: SkeletonRecording, side: str) -> dict[float, float]:
     """Return the angle between arm (shoulder to wrist) and spine, by time rounded to a millisecond [rad].
 
-    It does not depend on where the camera is; times at which the arm is not tracked are left out.
+    The angle does not depend on the place of the camera; times at which the arm is not tracked are left out.
     """
     return _angles(recording, (f"shoulder_{side}", f"wrist_{side}"), ("spine_base", "spine_shoulder"), side)
 
@@ -211,7 +211,7 @@ def wrist_difference(one: SkeletonRecording, other: SkeletonRecording) -> float:
     """Return the root mean square difference of two views of the wrists, relative to the shoulders [m].
 
     The best rotation between the views, one for the whole recording, is removed first, so the cameras' places and axes
-    do not count. What remains is the error of both views together; nan when they have fewer than 20 frames in common.
+    do not count. The result is the error of both views together; nan when they have fewer than 20 frames in common.
     """
     found = [{round(s.time, 3): s for s in view.skeletons} for view in (one, other)]
     pairs: list[tuple[Array, Array]] = []

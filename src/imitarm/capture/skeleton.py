@@ -1,4 +1,4 @@
-"""Skeleton: a person at one instant, as a camera reports them; SkeletonSource: where skeletons come from."""
+"""Skeleton: a person at one time, as a camera reports it; SkeletonSource: delivers skeletons."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ CONFIDENCE.setflags(write=False)
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """One arm of a person at one instant, in the sensor's frame.
+    """One arm of a person at one time, in the sensor's frame.
 
     Attributes:
         time: [s].
@@ -116,12 +116,12 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A person at one instant, as a camera reports them.
+    """A person at one time, as a camera reports it.
 
     The coordinate frame is that of the Kinect v2: origin in the sensor, x to the sensor's left, y up, z away from the
     sensor, right-handed. The right hand of a person who faces the sensor has a larger x than the left one.
 
-    A position that can't have been measured (not finite, or farther than 20 m) is taken as lost. Every lost position
+    A position that can't have been measured (not finite, or farther than 20 m) counts as lost. Every lost position
     is nan, so that it can't be used by mistake.
 
     Attributes:
@@ -205,7 +205,7 @@ def number_after_colon(word: str, what: str, text: str, largest: int) -> int:
 
 
 class SkeletonSource(ABC):
-    """Where skeletons come from: a recording, a camera, a stream, a synthetic person.
+    """A source of skeletons: a recording, a camera, a stream, or a synthetic person.
 
     Iterating gives skeletons in the order of their times until the source is over::
 
@@ -218,7 +218,7 @@ class SkeletonSource(ABC):
         class GloveSource(SkeletonSource):
             argument, description, live = "PORT", "a data glove at a serial port", True
 
-    and a line in your package's ``pyproject.toml``, by which every command of imitarm accepts ``glove:PORT``::
+    and one line in the ``pyproject.toml`` of your package, which makes every command of imitarm accept ``glove:PORT``::
 
         [project.entry-points."imitarm.sources"]
         glove = "my_package.glove:GloveSource"
@@ -228,7 +228,7 @@ class SkeletonSource(ABC):
         argument: what a user writes after the colon, for example ``"SEED"``; empty: there is no colon.
         description: one line for ``--help``.
         live: whether the source goes on until it is stopped.
-        has_realtime: whether :meth:`open` itself heeds ``realtime``; if not, the commands delay its skeletons.
+        has_realtime: whether :meth:`open` implements ``realtime``; if not, the commands delay its skeletons.
     """
 
     name: str = "skeletons"
@@ -239,11 +239,11 @@ class SkeletonSource(ABC):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> SkeletonSource:
-        """Open the source for what a user wrote after the colon; by default it is passed to the constructor.
+        """Open the source with the argument that a user wrote after the colon; by default the constructor gets it.
 
         Args:
-            argument: what stands after the colon; empty when :attr:`argument` is.
-            realtime: for a source that is not live: give each skeleton when it is due.
+            argument: the text after the colon; empty when :attr:`argument` is empty.
+            realtime: for a source that is not live: return each skeleton at its time.
 
         Raises:
             InputError: when the argument is wrong, or a device or a program is missing.

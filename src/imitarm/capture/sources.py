@@ -1,4 +1,4 @@
-"""open_source: from a word that a user types, such as ``webcam:0``, to the source of skeletons that it names."""
+"""open_source: open the source of skeletons that a word such as ``webcam:0`` names."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ def open_source(word: str | Path, *, realtime: bool = False) -> SkeletonSource:
     Args:
         word: a file's name, or ``NAME`` or ``NAME:ARGUMENT`` of one of :data:`~imitarm.capture.SOURCES`; an existing
             file of that name takes precedence.
-        realtime: give skeletons of a source that is not live at the speed at which they happened; else as fast as
-            they are asked for.
+        realtime: replay a source that is not live at the recorded speed; else as fast as skeletons are read.
 
     Raises:
         UnknownNameError: when there is neither such a file nor such a source.
@@ -31,11 +30,11 @@ def open_source(word: str | Path, *, realtime: bool = False) -> SkeletonSource:
 
 
 def find_source(word: str | Path) -> tuple[type[SkeletonSource], str]:
-    """Return the source that a word names, and its argument; nothing is opened.
+    """Return the source that a word names, and its argument, without opening it.
 
     Raises:
         UnknownNameError: when there is neither such a file nor such a source.
-        InputError: when an argument is missing or there must be none, or the package that adds the source is faulty.
+        InputError: when an argument is missing or not allowed, or the package that adds the source is faulty.
     """
     text = str(word)
     name, colon, argument = text.partition(":")
@@ -70,7 +69,7 @@ def _class_of(name: str) -> type[SkeletonSource]:
 
 
 def source_words() -> dict[str, str]:
-    """Return what a user may write for each source, with its description; this imports all of them."""
+    """Return the form of each source's word, with a description; this imports all sources."""
     words = {}
     for name in SOURCES:
         try:
@@ -84,7 +83,7 @@ def source_words() -> dict[str, str]:
 
 
 def is_live(word: str | Path) -> bool:
-    """Return whether the source that a word names goes on until it is stopped; nothing is opened.
+    """Return whether the source that a word names runs until it is stopped, without opening it.
 
     Raises:
         InputError: as :func:`find_source`.

@@ -1,4 +1,4 @@
-"""Skeletons over UDP: SkeletonSender sends what a source sees, UdpSource receives it."""
+"""Skeletons over UDP: SkeletonSender sends the skeletons of a source, UdpSource receives them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _LONGEST_WAIT = 60_000_000_000  # [ns] the longest that a datagram can state
 
 
 class SkeletonSender:
-    """Sends skeletons to one address, one datagram each, without waiting and without repetition.
+    """Sends skeletons to one address, one datagram for each, without waiting and without repetition.
 
-    A lost skeleton is not sent again: the next one follows in a thirtieth of a second, and is newer.
+    A lost skeleton is not sent again, because a newer one follows within a thirtieth of a second.
 
     Args:
         address: host and port of the receiver.
@@ -28,7 +28,7 @@ class SkeletonSender:
 
     Attributes:
         sent: number of skeletons sent.
-        failed: number of skeletons not sent, because nobody listens or the system could not take them.
+        failed: number of skeletons not sent, because nobody listens or the operating system refused them.
 
     Raises:
         InputError: when there is no such host.
@@ -83,7 +83,7 @@ class Arrival(NamedTuple):
 
     Attributes:
         waited: time between exposure and sending [s].
-        queued: time between sending and receiving [s]; from another machine, beyond the shortest one so far.
+        queued: time between sending and receiving [s]; from another machine, the excess over the shortest time so far.
         received_ns: time of receiving [ns].
     """
 
@@ -141,7 +141,7 @@ class UdpSource(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether it was closed: a stream does not end by itself."""
+        """Whether the source was closed; a stream does not end by itself."""
         return self._closed
 
     def close(self) -> None:
@@ -150,12 +150,12 @@ class UdpSource(SkeletonSource):
         self._socket.close()
 
     def flush(self) -> None:
-        """Discard what has arrived so far, so that the next skeleton read is a new one."""
+        """Discard all skeletons that have arrived, so that the next one read is new."""
         for _ in waiting(self._socket):
             pass
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton; None when none came within ``timeout`` seconds, or it was closed."""
+        """Return the next skeleton; None when none came within ``timeout`` seconds, or the source was closed."""
         until = clock.monotonic() + timeout
         while not self._closed:
             for data, address in waiting(self._socket):
@@ -172,7 +172,7 @@ class UdpSource(SkeletonSource):
         return None
 
     def _skeleton(self, frame: SkeletonFrame, now: int, queued: float) -> Skeleton:
-        """Return the skeleton that was sent, at a time that continues from one session of the sender to the next."""
+        """Return the received skeleton, with a time that increases also when the sender is started again."""
         if self.datagram_filter.n_sessions != self._sessions:
             self._sessions = self.datagram_filter.n_sessions
             silent = 0.0 if self.arrival is None else 1e-9 * (now - self.arrival.received_ns)

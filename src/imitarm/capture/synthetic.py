@@ -31,7 +31,7 @@ class SyntheticSource(SkeletonSource):
 
     Args:
         truth: true positions of all joints, as a function of time.
-        camera: that sees them.
+        camera: the simulated camera.
         duration: [s].
         realtime: return each skeleton at its time, as a camera does; else as fast as skeletons are read.
         name: for messages.
@@ -72,7 +72,7 @@ class SyntheticSource(SkeletonSource):
             seed: of person, motion and camera.
             duration: [s]; the hand is still during the first second.
             kind: of motion, one of :data:`MOTIONS`.
-            realtime: give each skeleton when it is due.
+            realtime: return each skeleton at its time.
 
         Raises:
             UnknownNameError: when there is no such motion.
@@ -98,7 +98,7 @@ class SyntheticSource(SkeletonSource):
         return self._next > self._duration
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton; None when the camera lost this frame or none is due within ``timeout`` seconds."""
+        """Return the next skeleton; None when its frame is lost or it is not due within ``timeout`` seconds."""
         if self.over:
             return None
         if self._realtime:

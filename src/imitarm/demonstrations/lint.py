@@ -288,8 +288,7 @@ def check_agreement(motions: Sequence[ValidRows]) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class _Scale:
-    """How differences are reported: factor to the unit, the unit, and the smallest one that counts.
-    """
+    """How differences are reported: factor to the unit, the unit, and the smallest one that counts."""
 
     factor: float
     unit: str

@@ -1,5 +1,4 @@
-"""DemonstrationRecorder: write a motion to a file while it happens; a killed program loses nothing.
-"""
+"""DemonstrationRecorder: write a motion to a file while it happens; a killed program loses nothing."""
 
 from __future__ import annotations
 

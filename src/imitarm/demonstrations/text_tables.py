@@ -412,8 +412,7 @@ def _looks_like_names(words: Sequence[str]) -> bool:
 
 
 def _run_of_names(words: Sequence[str], width: int) -> tuple[str, ...] | None:
-    """Return ``width`` known names that are consecutive words of a remark and the only names in it.
-    """
+    """Return ``width`` known names that are consecutive words of a remark and the only names in it."""
     known = [bool(column_of(word).what) for word in words]
     starts = [i for i, here in enumerate(known) if here and (i == 0 or not known[i - 1])]
     runs = [words[i : i + next((k for k, here in enumerate(known[i:]) if not here), len(words))] for i in starts]

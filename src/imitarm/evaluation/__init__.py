@@ -1,1 +1,1 @@
-"""Measures of a motion that was done, and their confidence intervals; for the CLI and the benchmark."""
+"""Measures of executed motions, and confidence intervals; used by the CLI and the benchmark."""

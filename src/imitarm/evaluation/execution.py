@@ -1,4 +1,4 @@
-"""What an arm makes of commanded joint positions: within its limits alone, and as a simulated robot with drives."""
+"""Execution of commanded joint positions: by an ideal arm with limits, and by a simulated robot with drives."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class Execution:
         error_rms: root mean square over time of the position error of the worst joint [rad].
         error_max: largest position error of a joint [rad].
         peak_torque_ratio: largest torque of a drive, relative to the rated torque.
-        limited: frames in which the robot's own limits changed a command.
+        limited: frames in which a limit of the robot changed a command.
         clearance: smallest distance of the arm to an obstacle [m]; inf without obstacles.
         touched: names of the obstacles that were touched.
-        fault: why the robot stopped itself; empty when it did not.
-        duration: until then, or of the whole motion [s].
+        fault: reason of a protective stop; empty without one.
+        duration: time until the protective stop, or of the whole motion [s].
     """
 
     error_rms: float

@@ -50,7 +50,7 @@ class Interval:
 
 
 Values = Mapping[tuple[int, Any], float]
-"""A measured value of each recording, by person and another key; nan where there is none."""
+"""A measured value of each recording, by person and a second key; nan where it is missing."""
 
 
 def person_means(values: Values) -> Array:
@@ -108,9 +108,10 @@ class Comparison:
 
     Attributes:
         difference: first method minus second, over the recordings for which both have a value.
-        relative: that difference relative to the absolute mean of the second; nan where that is zero.
-        p: probability of such a large difference if there is none, by sign flips of the persons' differences.
-        corrected: the same after Holm's correction for the comparisons made together.
+        relative: ``difference`` relative to the absolute mean of the second method; nan where that mean is zero.
+        p: probability of a difference at least as large if the methods were equal, by sign flips of the persons'
+            differences.
+        corrected: ``p`` after Holm's correction for all comparisons made together.
     """
 
     difference: Interval
@@ -138,15 +139,15 @@ def rate_interval(outcomes: Values) -> Interval:
     r"""Return a success rate, the mean over persons of each one's own rate, with its 95 % interval.
 
     It is Wilson's interval with :math:`N / D` trials instead of the N actual ones (Rao and Scott, Biometrics 1992):
-    trials of one person are similar, and the design effect :math:`D = 1 + (m - 1) \rho` says how much less m of them
-    tell than trials of m persons. :math:`\rho` is their correlation, estimated from how much the persons' rates differ
-    beyond chance. A few persons estimate it poorly, so it is averaged with a prior correlation of 0.3 that counts as
-    two persons; when all trials had the same result, or there is only one person, it is 0.3. N / D is never above N,
-    nor below the number of persons.
+    trials of one person are similar, and the design effect :math:`D = 1 + (m - 1) \rho` says by which factor m trials
+    of one person count less than trials of m persons. :math:`\rho` is their correlation, estimated from how much the
+    persons' rates differ beyond chance. A few persons estimate it poorly, so it is averaged with a prior correlation of
+    0.3 that counts as two persons; when all trials had the same result, or there is only one person, it is 0.3. N / D
+    lies between the number of persons and N.
 
-    Failures of one person indicate that persons differ, and one more failure of another person that they do not. So by
-    this alone, an additional failure could narrow the interval. The lower end is therefore the lowest of all results
-    that are at least as good in every trial, and the upper end the highest of all that are at least as bad.
+    Failures of one person indicate that persons differ, and one more failure of another person that they do not. So an
+    additional failure could narrow the interval. The lower end is therefore the lowest of all results that are at least
+    as good in every trial, and the upper end the highest of all that are at least as bad.
 
     Args:
         outcomes: of each trial, 1 for success, 0 for failure.
@@ -164,7 +165,7 @@ def rate_interval(outcomes: Values) -> Interval:
 
 
 def _lower_end(rates: Array, each: float, step: int) -> float:
-    """Return the lowest lower end of all results in which every person has this rate or a better one.
+    """Return the lowest lower end of all results in which every person has at least this rate.
 
     Among those with the same mean, the end is lowest where persons differ most: where the best person becomes perfect
     before another improves (that result majorises all others). So only these need to be examined.
@@ -172,7 +173,7 @@ def _lower_end(rates: Array, each: float, step: int) -> float:
     Args:
         rates: of the persons, shape (n,).
         each: trials per person, on average.
-        step: rates are examined in steps of one over it.
+        step: rates are examined in steps of ``1 / step``.
     """
     own = np.sort(rates)[::-1]
     room = 1.0 - own
@@ -183,7 +184,7 @@ def _lower_end(rates: Array, each: float, step: int) -> float:
 
 
 def _design_effect(rates: Array, each: float) -> Array:
-    """Return the design effect: how many trials of one person tell as much as one of an independent person, (k,).
+    """Return the design effect: the number of trials of one person that count as one independent trial, (k,).
 
     Args:
         rates: of n persons, in k results, shape (k, n).
@@ -217,14 +218,13 @@ def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tup
 def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
     """Return the two-sided probability of such a large mean if every difference could have either sign.
 
-    Exact for up to 14 differences: all sign flips are evaluated. With n of them it can't be less than 2 / 2^n.
+    Exact for up to 14 differences: all sign flips are evaluated. With n differences it can't be less than 2 / 2^n.
 
     Args:
         differences: one per person, shape (n,).
-        seed: of the draws, when there are more.
+        seed: of the random sign flips, when there are more differences.
 
-    Returns:
-        1 when there is none.
+    Returns: The probability; 1 without differences.
     """
     d = np.asarray(differences, dtype=float)
     n = len(d)

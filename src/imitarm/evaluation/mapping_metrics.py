@@ -51,19 +51,19 @@ class MappingMetrics:
         engaged_fraction: fraction of the frames in which the person led: following, coasting, holding.
         engagements: how often the person began to lead.
         tool_rms: distance of the tool to the reference, including the lag, root mean square [m].
-        tool_rms_without_lag: the same after removing the best constant lag [m].
+        tool_rms_without_lag: ``tool_rms`` after removing the best constant lag [m].
         lag: that lag [s].
         tool_rms_from_first: distance to the reference of the first engagement over all frames after it, in any state,
             including the lag [m].
         executed_rms: distance of the tool to the reference, including the lag, when an arm that keeps its limits of
             position, velocity and acceleration executes the commands [m]: commands beyond the limits bring no
             advantage.
-        executed_rms_without_lag: the same after removing the best constant lag [m].
+        executed_rms_without_lag: ``executed_rms`` after removing the best constant lag [m].
         target_rms: distance of the tool to the method's own target [m].
         orientation_rms: angle between the tool's rotation and the reference [rad].
         elbow_direction_rms: angle between the actual and the correct direction of the robot's upper arm, see
             :func:`~imitarm.evaluation.tracking.elbow_direction_errors` [rad].
-        elbow_angle_rms: difference of the changes of the SEW angles of robot and person [rad].
+        elbow_angle_rms: difference between the changes of the robot's and the person's SEW angle [rad].
         path_length: of the tool [m].
         settling_time: from the end of the true hand's motion until the tool stays within 1 cm of the method's last
             target for 0.5 s [s]; nan when it never does.
@@ -72,7 +72,7 @@ class MappingMetrics:
         mean_gravity_torque: mean absolute torque that holds the weight alone [N m].
         mean_motion_torque: mean absolute torque without the part that holds the weight [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
-        gravity_effort: the same for the torques that hold the weight [N^2 m^2 s].
+        gravity_effort: ``effort`` of the torques that hold the weight alone [N^2 m^2 s].
         peak_torque_ratio: largest torque relative to the rated one.
         position_violations: frames in which a joint is outside its range; all violations are computed by finite
             differences of the positions alone.
@@ -139,7 +139,7 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
         run: of the method.
         correspondence: that the method was given.
         true: the person's arm at the times of the run, or, for a method that slows the motion down, at its shown times;
-            None when it is unknown, as with a real camera: whatever needs it is nan.
+            None when it is unknown, as with a real camera: the measures that need it are nan.
 
     Raises:
         InputError: when the run is shorter than 4 control periods or a joint position is not finite.
@@ -242,7 +242,7 @@ def _settling(
     correspondence: Correspondence,
     true: TrueArm | None,
 ) -> float:
-    """Return the settling time; the last target is the mean of the method's own over its last half second."""
+    """Return the settling time; the last target is the mean of the method's targets in the last half second."""
     if true is None or not periods.engaged.any():
         return math.nan
     late = run.times >= run.times[-1] - _REST

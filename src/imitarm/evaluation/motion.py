@@ -46,7 +46,7 @@ class ArmMotion:
 
     @classmethod
     def of(cls, arm: ArmModel, times: ArrayLike, joints: ArrayLike) -> ArmMotion:
-        """Compute them from joint positions.
+        """Compute all quantities from joint positions.
 
         Velocity and acceleration are central differences of the positions.
 
@@ -88,7 +88,7 @@ class ArmMotion:
 
 @dataclass(frozen=True)
 class Violations:
-    """In how many frames a motion exceeds the limits of its arm, and by how much.
+    """Number of frames in which a motion exceeds the limits of its arm, and the largest excess.
 
     Attributes:
         position: frames in which a joint is outside its range.
@@ -156,8 +156,7 @@ def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
         speed: of a point, shape (n,) [m/s].
         dt: sampling period [s].
 
-    Returns:
-        Without unit; nan for a point that does not move.
+    Returns: A number without unit; nan for a point that does not move.
     """
     v = np.asarray(speed, dtype=float)
     n = 2 ** (int(np.ceil(np.log2(len(v)))) + _PADDING)

@@ -1,4 +1,4 @@
-"""evaluate_run: how good one retargeting is, in figures, in one line, and in warnings; for the CLI and from Python."""
+"""evaluate_run: evaluate one retargeting by measures, one summary line, and warnings, for the CLI and from Python."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ class TargetTracking:
 
     It tracked the target if the person led for at least half of the time, the distance was at most :data:`FAR` (RMS),
     and the tool was farther away for at most :data:`FAR_FRACTION` of the time with a target. These limits are a choice:
-    within 5 cm a gripper is still at the object that it should grasp, and the normal lag of ``modern`` at the speed of
-    arms stays below both.
+    within 5 cm a gripper is still at the object that it should grasp, and the normal lag of ``modern`` exceeds neither
+    limit.
 
     Attributes:
         title: of the method.
         rms: root mean square distance to the target [m]; nan when there was none.
         far_fraction: fraction of the time with a target in which the tool was farther than :data:`FAR`, 0 to 1; or nan.
-        far_time: the same as a time [s].
+        far_time: time in which the tool was farther than :data:`FAR` [s].
         farthest: largest distance [m]; or nan.
         engagements: how often the person began to lead.
         engaged_fraction: fraction of the whole time in which the person led, 0 to 1.
@@ -99,7 +99,7 @@ class TargetTracking:
         return self.followed and not self.violations
 
     def verdict(self) -> str:
-        """Return the result in one line: first whether the tool followed and how well, then the limits."""
+        """Return the result in one line: whether and how well the tool followed, then whether limits were exceeded."""
         limits = f"limits are exceeded in {self.violations} frames" if self.violations else "no joint exceeds a limit"
         if not np.isfinite(self.rms):
             return f"{self.title}: followed nothing; {limits}"
@@ -115,14 +115,14 @@ class RunEvaluation:
     """The result of :func:`evaluate_run`.
 
     Attributes:
-        run: that was evaluated.
-        metrics: against the person's arm.
+        run: the evaluated run.
+        metrics: comparison with the person's arm.
         tracking: how well the tool tracked its own target.
         target_lag: of the tool behind its own target [s]; nan when it does not follow.
         hand_lag: of the tool behind the hand [s]; nan when it does not follow.
         link_distance: smallest distance between links that are not neighbours [m], between the spheres that cover them.
-        truth_known: whether the hand is the true one; otherwise it is the hand as the camera saw it.
-        warnings: what the user should know of this run, a sentence each.
+        truth_known: whether measures compare with the true hand; otherwise with the hand as the camera saw it.
+        warnings: remarks for the user about this run, one sentence each.
     """
 
     run: Retargeting
@@ -141,12 +141,12 @@ def evaluate_run(
     correspondence: Correspondence,
     truth: Truth | None = None,
 ) -> RunEvaluation:
-    """Measure how good a retargeting is.
+    """Measure the quality of a retargeting.
 
     Args:
         run: of a method.
-        skeletons: of the person, as the method got them.
-        correspondence: that the method was given.
+        skeletons: of the person, the input of the method.
+        correspondence: between person and robot, the input of the method.
         truth: the true positions of the person over time; None: what the camera saw is used instead.
 
     Raises:
@@ -179,7 +179,7 @@ def evaluate_run(
 def warnings_of(
     run: Retargeting, metrics: MappingMetrics, tracking: TargetTracking, link_distance: float = math.inf
 ) -> list[str]:
-    """Return what the user should know of a run, a sentence each.
+    """Return remarks for the user about a run, one sentence each.
 
     Args:
         run: of a method.
@@ -221,7 +221,7 @@ def warnings_of(
 
 
 def winding(run: Retargeting) -> float:
-    """Return the largest difference between two headings of the tool's target, full turns counted [rad]."""
+    """Return the largest difference between two headings of the tool's target, including full rotations [rad]."""
     rotations = run.targets[1]
     rotations = rotations[np.isfinite(rotations).all(axis=1)]
     if not len(rotations):
@@ -237,7 +237,7 @@ def _waiting_again(states: NDArray[np.str_]) -> int:
 
 
 def _percent(fraction: float) -> str:
-    """Return a fraction in words: never 0 % of what is more than nothing, nor 100 % of what is not all."""
+    """Return a fraction as text; it is 0 % or 100 % only if the fraction is exactly 0 or 1."""
     whole = round(100.0 * fraction)
     if 0.0 < fraction < 0.01:
         return "under 1 %"

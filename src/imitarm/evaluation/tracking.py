@@ -1,4 +1,4 @@
-"""How well a robot's tool and elbow follow a person's arm, compared with its true or its measured positions."""
+"""Tracking errors of a robot's tool and elbow, relative to a person's true or measured arm."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _FOLLOWS = 0.5  # of the target's own motion (RMS); a tool with a larger error d
 
 @dataclass(frozen=True, eq=False)
 class TrueArm:
-    """Where a person's arm was, in the axes of the robot's base.
+    """Positions of a person's arm, in the axes of the robot's base.
 
     Attributes:
-        times: of each sample of the run it is compared with, shape (n,) [s]; non-decreasing.
+        times: of the samples of the run with which it is compared, shape (n,) [s]; non-decreasing.
         shoulder: shape (n, 3) [m].
         elbow: shape (n, 3) [m].
         wrist: shape (n, 3) [m].
@@ -82,14 +82,15 @@ class TrueArm:
         return cls(t, points[:, 0], points[:, 1], points[:, 2], matrix_to_quaternion(hands))
 
     def wrist_at(self, times: Array) -> Array:
-        """Return the position of the wrist at times (m,) [s], shape (m, 3) [m]; beyond the ends that of the end."""
+        """Return the position of the wrist at times (m,) [s], shape (m, 3) [m]; beyond the ends it is constant."""
         return np.column_stack([np.interp(times, self.times, column) for column in self.wrist.T])
 
 
 def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Correspondence) -> TrueArm:
     """Return a person's arm as a recording shows it, with its noise, linearly interpolated between frames.
 
-    Compared with it, no method can be better than the camera, and a smooth method appears slightly worse than it is.
+    In a comparison with a recording, no method can be better than the camera, and a smooth method appears slightly
+    worse than it is.
 
     Args:
         skeletons: in order of time.
@@ -120,7 +121,7 @@ def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Co
 
 @dataclass(frozen=True, eq=False)
 class EngagementPeriods:
-    """When the person led during a run, and from where.
+    """Times at which the person led during a run, and the start of each engagement.
 
     Attributes:
         engaged: whether the person led, shape (n,).
@@ -198,7 +199,7 @@ def reference_rotations(true: TrueArm, quaternions: Array, periods: EngagementPe
 
 
 def rms(errors: ArrayLike) -> float:
-    """Return the root mean square of numbers (n,) or of the norms of vectors (n, d); nan if there are none."""
+    """Return the root mean square of numbers (n,) or of the norms of vectors (n, d); nan without numbers."""
     values = np.asarray(errors, dtype=float)
     if len(values) == 0:
         return float("nan")
@@ -234,7 +235,7 @@ def target_lag(times: ArrayLike, tool: ArrayLike, targets: ArrayLike) -> float:
     Args:
         times: evenly spaced, shape (n,) [s].
         tool: positions, shape (n, 3) [m].
-        targets: shape (n, 3) [m]; nan where there is none.
+        targets: shape (n, 3) [m]; nan where there is no target.
 
     Returns:
         nan when there is no target, it does not move, or the tool does not follow it: at every lag its error exceeds
@@ -264,8 +265,8 @@ def rotation_errors(first: Array, second: Array) -> Array:
 def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) -> Array:
     """Return the angle between the actual and the correct direction of the robot's upper arm, shape (n,) [rad].
 
-    Since the person began to lead, it should have rotated by the smallest rotation that took the person's upper arm
-    from its direction then to that now.
+    The correct direction follows from the direction at the start of the engagement by the smallest rotation that maps
+    the person's upper arm at that time to its present direction.
 
     Args:
         true: the person's arm, in the axes of the base.

@@ -1,4 +1,7 @@
-"""Human arm to robot arm. The built-in methods, and those of other packages, are in :data:`RETARGETERS`."""
+"""Retargeting: from the motion of a human arm to that of a robot arm.
+
+The built-in methods, and those of other packages, are in :data:`RETARGETERS`.
+"""
 
 from imitarm.registry import Registry
 from imitarm.retarget.correspondence import FACING, Correspondence

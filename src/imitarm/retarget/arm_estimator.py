@@ -71,7 +71,7 @@ class ArmEstimator:
     All methods share it, so that they differ only in the method.
 
     Args:
-        correspondence: which arm, and the pose of the sensor.
+        correspondence: gives the side of the arm and the pose of the sensor.
         smoothing: filter by One-Euro, and remove jumps that come with a change of tracking
             (:class:`~imitarm.retarget.smoothing.TrackingOffsets`); off: return the corrected points unfiltered.
         limbs: how bone lengths are corrected: ``"fit"`` by the smallest change of all three points, ``"direction"`` as
@@ -150,8 +150,8 @@ class ArmEstimator:
     def _weights(self, confidence: Array) -> Array:
         """Return the weights of the three points; that of the elbow decreases with the error of its inferred position.
 
-        Otherwise the elbow would pull the wrist along, through the length of the forearm, and the tool follows the
-        wrist.
+        Otherwise an error of the elbow would move the wrist, because the forearm has a fixed length, and the tool
+        follows the wrist.
         """
         offset = self._offsets.offset(1)
         if offset == 0.0:
@@ -172,7 +172,10 @@ class ArmEstimator:
             self._learning = []
 
     def _hand_rotation(self, points: Array, confidence: list[float], forearm: Array) -> tuple[Array, float]:
-        """Return the hand's rotation in the base frame and its confidence; moved with the forearm when not seen."""
+        """Return the hand's rotation in the base frame and its confidence.
+
+        A hand that is not seen rotates with the forearm.
+        """
         length = math.sqrt(float(forearm.dot(forearm)))
         fore = forearm / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
         seen = min(confidence[2], confidence[4], confidence[5]) >= 1.0

@@ -43,11 +43,11 @@ class Calibration:
     """Measurements that are valid until the person changes or the sensor is moved; None: not measured.
 
     Attributes:
-        side: which arm of the person.
+        side: arm of the person, ``"left"`` or ``"right"``.
         lengths: of that arm.
         sensor_to_base: pose of the sensor in the robot's base frame.
         sensor_rms: RMS residual of that pose [m].
-        scale: robot's motion over the person's; None: 1.
+        scale: motion of the robot over motion of the person; None: 1.
         orientation: how the tool rotates with the hand; None: exactly as the hand does.
 
     Raises:
@@ -67,7 +67,7 @@ class Calibration:
             raise InputError(f"Calibration: sensor_rms must be a finite length [m], got {self.sensor_rms!r}")
 
     def correspondence(self) -> Correspondence:
-        """Return the correspondence; with defaults for what was not measured."""
+        """Return the correspondence, with default values for everything that was not measured."""
         return Correspondence(
             self.side,
             FACING if self.sensor_to_base is None else self.sensor_to_base,

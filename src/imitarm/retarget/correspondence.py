@@ -1,4 +1,4 @@
-"""Correspondence: which arm of the person leads, how the frames are related, the scale, and what rotates."""
+"""Correspondence: the leading arm of the person, the pose of the sensor, the scale, and how the tool rotates."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Orientation = Literal["hand", "upright", "fixed"]
 
 FACING = Pose(np.zeros(3), matrix_to_quaternion(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])))
-"""``sensor_to_base`` for a person who faces the sensor and imagines to stand where the robot stands: the person's
+"""``sensor_to_base`` for a person who faces the sensor and imagines standing at the robot's place: the person's
 forward is the robot's x, the person's left is its y, up is its z."""
 
 
@@ -35,10 +35,10 @@ class Correspondence:
     rotation.
 
     Attributes:
-        side: which arm of the person, ``"left"`` or ``"right"``.
+        side: arm of the person, ``"left"`` or ``"right"``.
         sensor_to_base: pose of the sensor in the robot's base frame; only its rotation matters for relative motion.
         lengths: of the person's arm; None: they are measured in the first frames.
-        scale: robot's motion over the person's, rho.
+        scale: rho, motion of the robot over motion of the person.
         orientation: how the tool rotates: ``"hand"`` as the hand does; ``"upright"`` only about the vertical, so that a
             tool that points down keeps pointing down; ``"fixed"`` not at all.
 

@@ -20,9 +20,9 @@ LONGEST_GAP = 0.1  # [s] between two estimates; a longer gap restarts that count
 
 
 class EngagementState(StrEnum):
-    """What the robot does at a time. A member equals its value, so ``state == "following"`` works.
+    """State of the engagement at a time. A member equals its value, so ``state == "following"`` works.
 
-    * ``WAITING``: the arm stands still until a person has been seen for half a second.
+    * ``WAITING``: the arm is at rest until a person has been seen for half a second.
     * ``FOLLOWING``: the person is seen and leads the tool.
     * ``COASTING``: the person has just been lost; the motion is extrapolated.
     * ``HOLDING``: the person has been lost for longer; the last target is held.
@@ -46,7 +46,7 @@ _ENGAGED = frozenset({EngagementState.FOLLOWING, EngagementState.COASTING, Engag
 
 
 def engaged_samples(states: ArrayLike) -> NDArray[np.bool_]:
-    """Return in which samples of a run the person leads the tool, shape (n,).
+    """Return whether the person leads the tool in each sample of a run, shape (n,).
 
     Args:
         states: of the run, values of :class:`EngagementState`, shape (n,).
@@ -61,8 +61,8 @@ class EngagementRule:
     Attributes:
         seen_for: how long the arm must be seen before the robot follows it.
         follow_until: time since the arm was last seen, up to which the state is FOLLOWING (a camera drops frames).
-        coast_until: likewise COASTING.
-        hold_until: likewise HOLDING; inf: the robot never stops.
+        coast_until: the same for COASTING.
+        hold_until: the same for HOLDING; inf: the robot never stops.
     """
 
     seen_for: float = SEEN_FOR
@@ -110,8 +110,8 @@ class Engagement:
         Args:
             estimate: of the person's arm from a new frame; None: there was no frame, or it does not show the arm.
             period: since the last call [s].
-            at_rest: whether the robot stands still: only then can a person begin to lead it. How long the person has
-                been seen is counted meanwhile.
+            at_rest: whether the robot is at rest: only then can a person begin to lead it. The time for which the
+                person has been seen is counted meanwhile.
         """
         self.time_since_seen = self.time_since_seen + period if estimate is None else 0.0
         self.ready = False
@@ -132,7 +132,7 @@ class Engagement:
         return self.state
 
     def engage(self, wrist: ArrayLike, hand: Array, tool_to_base: Pose) -> Clutch:
-        """Let the person lead from here on; call it when :attr:`ready`.
+        """Let the person lead from now on; call this method when :attr:`ready` is true.
 
         Args:
             wrist: position of the person's wrist in the base frame, shape (3,) [m].

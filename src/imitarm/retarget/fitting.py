@@ -1,4 +1,4 @@
-r"""Fitting: a start for the robot, and a scale, with which a recorded motion is within its reach.
+r"""Fitting: find a start posture and a scale with which a recorded motion is within the robot's reach.
 
 A live motion can't be fitted, because it is not known yet; a recording can. The tool will be at
 
@@ -48,7 +48,7 @@ _MOST_CENTRES: Final = 60
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where the robot begins, ``q`` (n_joints,) [rad], and the ``scale`` of its motion."""
+    """Start posture of the robot, ``q`` (n_joints,) [rad], and the ``scale`` of its motion."""
 
     q: Array
     scale: float
@@ -68,7 +68,7 @@ def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: floa
 
     Raises:
         InputError: if the wrist was never seen, or an argument can't be used.
-        UnreachableError: if the motion does not fit even at a seventh of its size.
+        UnreachableError: if the motion is not within reach even at a seventh of its size.
     """
     instance(arm, ArmModel, "arm")
     path, begin = real_array(wrist, (None, 3), "wrist", "m"), real_array(start, (3,), "start", "m")
@@ -102,14 +102,14 @@ class _Search:
         self._far: list[tuple[Array, Array]] | None = None
 
     def reach(self) -> float:
-        """Return how far from the middle of its workspace the tool gets, at most [m]."""
+        """Return the largest distance of the tool from the middle of its workspace [m]."""
         low, high = np.maximum(self.arm.lower, -np.pi), np.minimum(self.arm.upper, np.pi)
         random = np.random.default_rng(0)
         self._tips = self.arm.tool_path(random.uniform(low, high, size=(_SAMPLES, self.arm.n_joints)))[0]
         return float(np.linalg.norm(self._tips - self._tips.mean(axis=0), axis=1).max())
 
     def centres(self) -> Iterator[tuple[Array, Array]]:
-        """Yield places (3,) [m] for the middle of the motion, each with a posture near it: near home first."""
+        """Yield places (3,) [m] for the middle of the motion, each with a posture near it, beginning near home."""
         for shift in _NEAR_HOME:
             yield self.home.position + shift, self.arm.home
         if self._far is None:  # the same for all scales
@@ -122,8 +122,8 @@ class _Search:
         Args:
             centre: of the motion, shape (3,) [m].
             near: a posture near it, shape (n_joints,) [rad].
-            begin: where the motion begins, from its centre, shape (3,) [m].
-            outermost: its outermost points, from its centre, shape (k, 3) [m].
+            begin: start of the motion relative to its centre, shape (3,) [m].
+            outermost: the outermost points relative to the centre, shape (k, 3) [m].
         """
         first = self._posture(centre + begin, near, _EASY)
         if first is None or not self._stands(first):
@@ -147,7 +147,10 @@ class _Search:
                 yield centre, q
 
     def _posture(self, position: Array, near: Array, smallest: float) -> Array | None:
-        """Return a posture near another one, shape (n_joints,); None if there is none so far from a singularity."""
+        """Return a posture near another one, shape (n_joints,).
+
+        None if there is none that is far enough from singularities.
+        """
         try:
             q = find_posture(self.arm, Pose(position, self.home.quaternion), q0=near, restarts=2)
         except UnreachableError:
@@ -158,7 +161,7 @@ class _Search:
         return q if regular and self.links.distance(q) >= self.links.clearance else None
 
     def _stands(self, q: Array) -> bool:
-        """Return whether an arm that avoids its singularities stands still there, and does not drift off."""
+        """Return whether an arm that avoids its singularities stays at a posture and does not drift away."""
         if self.arm.landmarks is None:
             return True
         still = np.zeros(self.arm.n_joints)

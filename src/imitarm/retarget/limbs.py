@@ -59,7 +59,7 @@ class LimbLengths:
 
     @property
     def standard_error(self) -> float:
-        """Standard error of the less certain length [m]; 0 when the lengths were given."""
+        """The larger standard error of the two lengths [m]; 0 when the lengths were given."""
         return max(self.spread) / self.n_frames**0.5 if self.n_frames else 0.0
 
     @property
@@ -150,7 +150,7 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
         points: shoulder, elbow, wrist, shape (3, 3) [m].
         confidence: of each, above 0, shape (3,).
         lengths: of this person.
-        rounds: number of steps.
+        rounds: number of Gauss-Newton steps.
 
     Returns:
         shoulder, elbow, wrist, shape (3, 3) [m]; the bones have exactly the given lengths.

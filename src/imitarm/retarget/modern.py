@@ -1,4 +1,4 @@
-"""ModernRetargeter: the method to use on a robot; it keeps every limit, follows the elbow and bridges losses."""
+"""ModernRetargeter: the method to use on a robot; it keeps every limit, follows the elbow and bridges short losses."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ class ModernRetargeter(Retargeter):
     :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. Its weight decreases when the camera sees the person's elbow poorly
     and when either arm is nearly straight.
 
-    When the person is lost, the arm coasts for 0.1 s, holds its target until 0.3 s, then stops. It starts again from
-    where both are once the person has been seen for half a second, so that nothing jumps.
+    When the person is lost, the arm coasts for 0.1 s, holds its target until 0.3 s, then stops. Once the person has
+    been seen again for half a second, it starts anew from the present poses of both, so that nothing jumps.
 
     Args:
         arm: the robot's arm with its tool.
@@ -81,7 +81,7 @@ class ModernRetargeter(Retargeter):
         elbow: weight of the elbow's motion relative to the tool's [m^2]; 0: the elbow is free.
         clearance: required distance from the scene [m].
         own_clearance: required distance between links [m]; None: not checked.
-        max_speed: the twist is cut to this [m/s], with 1 rad counted as ``rotation_length``.
+        max_speed: the twist is scaled down to this norm [m/s], with 1 rad counted as ``rotation_length``.
         max_lead: how far a joint's command may be ahead of its measured position [rad]; a robot that responds late
             needs more.
 
@@ -164,7 +164,7 @@ class ModernRetargeter(Retargeter):
         return wrist, hand
 
     def _at_rest(self) -> bool:
-        """Return whether the arm stands still; the rest of its motion, too slow to be seen, is removed."""
+        """Return whether the arm is at rest; a remaining motion that is too slow to be seen is removed."""
         if max(np.abs(self._velocity).max(), np.abs(self._limiter.velocity).max()) > _STILL:
             return False
         if self._velocity.any() or self._limiter.velocity.any():
@@ -221,8 +221,8 @@ class ModernRetargeter(Retargeter):
     def _slip(self, target: Pose, measured: Array) -> None:
         """Move the clutch's origin while the hand pulls the target away from a blocked tool that stands still.
 
-        Otherwise the tool would jump to the target, and against whatever is there, as soon as it is free. A robot that
-        only responds late keeps moving, and is not mistaken for a blocked one.
+        Otherwise the tool would jump to the target, and against any object on its path, as soon as it is free. A robot
+        that only responds late keeps moving, and is not mistaken for a blocked one.
         """
         at = self.arm.tool_pose(measured).position
         moved, offset = at - self._held_at, target.position - at

@@ -51,7 +51,7 @@ class RetargetStep:
 
 
 class Goal(NamedTuple):
-    """What a method is asked for in one control step while the person leads.
+    """The input of a method in one control step while the person leads.
 
     Attributes:
         target: desired pose of the tool in the base frame, now.
@@ -235,10 +235,11 @@ class Retargeter(ABC):
     def _advance(self, goal: Goal | None, measured: Array) -> Array:
         """Return the joint positions to reach by the end of this period, shape (n_joints,) [rad].
 
-        The last commanded ones are ``self.latest.q``.
+        The last commanded positions are ``self.latest.q``.
 
         Args:
-            goal: what the person asks for; None while nobody leads: the robot must come to rest and stay there.
+            goal: the pose to reach, with its context; None while nobody leads: the robot must come to rest and stay
+                there.
             measured: measured joint positions, shape (n_joints,) [rad].
         """
 
@@ -248,7 +249,7 @@ class Retargeter(ABC):
         """Forget the past; called by :meth:`start`, before ``_rest_at``."""
 
     def _rest_at(self, q: Array) -> None:  # noqa: B027 (optional)
-        """The robot is at rest at ``q``, shape (n_joints,) [rad]: at the start, or since it was pushed there."""
+        """Note that the robot is at rest at ``q``, shape (n_joints,) [rad]: at the start, or after it was pushed."""
 
     def _new_estimator(self) -> ArmEstimator:
         """Return the estimator of the person's arm."""
@@ -272,13 +273,16 @@ class Retargeter(ABC):
         return True
 
     def _velocity_at(self, before: Array, after: Array) -> Array:
-        """Return the joint velocities at the end of this period, shape (n_joints,) [rad/s]; the mean over it."""
+        """Return the joint velocities at the end of this period, shape (n_joints,) [rad/s].
+
+        By default the mean over the period.
+        """
         return (after - before) / self.dt
 
     # --- the same for all
 
     def _start_where_pushed(self, measured: Array) -> None:
-        """Rest where the arm is when somebody has moved it by hand while nobody led it."""
+        """Rest at the measured posture when somebody has moved the arm by hand while nobody led it."""
         if float(np.abs(measured - self.latest.q).max()) > PUSHED:
             q = np.clip(measured, self.arm.lower, self.arm.upper)
             self.latest = RetargetStep(self.latest.time, q, np.zeros(self.arm.n_joints), state=self.latest.state)
@@ -309,8 +313,8 @@ class Retargeting:
         notes: counts and figures of the method, by name.
         title: of the method for tables and reports; empty: ``method``.
         caption: one sentence about the method for reports.
-        shown_times: for each sample the time since the first skeleton at which the person showed it, shape (n,) [s]:
-            methods that slow the motion down afterwards are later than that. None: ``times``.
+        shown_times: time since the first skeleton at which the person showed each sample, shape (n,) [s]; earlier than
+            ``times`` for methods that slow the motion down. None: ``times``.
     """
 
     method: str
@@ -392,7 +396,7 @@ def in_order(skeletons: Iterable[Skeleton]) -> list[Skeleton]:
 
 
 def ticks(frames: Sequence[Skeleton], dt: float) -> Iterable[Skeleton | None]:
-    """Yield for each control period of a recording the newest skeleton that came in during it, or None.
+    """Yield for each control period of a recording the newest skeleton of that period, or None.
 
     Args:
         frames: in order of time, at least one.

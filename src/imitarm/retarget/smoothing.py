@@ -42,9 +42,9 @@ class OneEuro:
     .. math:: \hat x \leftarrow \hat x + \alpha(f_c)\,(x - \hat x), \qquad f_c = f_{min} + \beta\,|\hat{\dot x}|
 
     The speed is that of the whole vector, not of each axis, so the filter acts equally in all directions. It is
-    computed from two measured values. The usual difference to the previous smoothed value contains the filter's own lag
-    and is too large during steady motion, which matters when the velocity is used for prediction. A value with a
-    confidence c below 1 gets c times the weight.
+    computed from the difference of two measured values. The usual difference to the previous smoothed value contains
+    the filter's own lag and is too large during steady motion, which matters when the velocity is used for prediction.
+    The weight of a value is multiplied by its confidence c.
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].
@@ -170,7 +170,8 @@ class Hampel:
 
     Args:
         window: duration [s].
-        least: r, a distance that is never an outlier [m]: more than a fast hand moves within half the window.
+        least: r, a distance within which no value is an outlier [m]; choose more than a fast hand moves within half the
+            window.
     """
 
     def __init__(self, window: float = 0.3, least: float = 0.02) -> None:
@@ -206,7 +207,7 @@ class TrackingOffsets:
     .. math:: o = x_p + v\,\Delta t - \tilde x, \qquad x = \tilde x + o
 
     with :math:`x_p` the previous position and v its velocity. While the joint is inferred, the offset is constant: the
-    joint's motion is used, its absolute position is not. When the joint is tracked again, a new offset is set in the
+    joint's motion is used, but not its absolute position. When the joint is tracked again, a new offset is set in the
     same way; while the joint is tracked, the offset decays with time and with the distance that the joint moves,
 
     .. math:: o \leftarrow o\,\exp(-\Delta t / T - |\Delta x| / L).
@@ -214,15 +215,14 @@ class TrackingOffsets:
     A person who watches the robot does not notice the decay, but would notice a robot that jumps away and back.
 
     A joint that flickers between tracked and inferred keeps one offset for each, for up to 0.12 s. Otherwise the
-    measured position would never count, and the estimate would drift away at its own velocity. An offset is at most 0.2
-    m long.
+    measured position would never have an effect, and the estimate would drift away. An offset is at most 0.2 m long.
 
     Args:
         time: T [s].
         distance: L [m].
 
     Raises:
-        InputError: when one of them is not positive.
+        InputError: when an argument is not positive.
     """
 
     def __init__(self, time: float = 10.0, distance: float = 0.15) -> None:

@@ -1,4 +1,4 @@
-"""A simulated depth camera: it looks at the world of a simulated robot, without a display and without OpenGL."""
+"""A simulated depth camera in the world of a simulated robot; it needs neither a display nor OpenGL."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ _SEEN = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # groups of geoms that hav
 
 
 class DepthCamera:
-    """Takes depth pictures by casting one ray through each pixel: exact, without noise, the same on every machine.
+    """Takes depth images by casting one ray through each pixel.
+
+    They are exact, without noise, and the same on every machine.
 
     Args:
-        robot: whose world is seen, the arm itself included.
+        robot: the camera sees the world of this robot, including the arm.
         intrinsics: the camera.
-        pose: camera_to_base for a camera that stands; camera_to_tool for one that is mounted on the tool. Its frame has
+        pose: camera_to_base for a fixed camera; camera_to_tool for a camera that is mounted on the tool. Its frame has
             x to the right of the picture, y down and z forward.
         on_tool: whether the camera moves with the tool.
-        farthest: depth beyond which nothing is measured [m].
+        farthest: largest depth that is measured [m].
 
     Raises:
         InputError: when an argument is of a wrong type or ``farthest`` is not positive.
@@ -48,11 +50,11 @@ class DepthCamera:
 
     @property
     def camera_to_base(self) -> Pose:
-        """Where the camera is now."""
+        """The present pose of the camera."""
         return self.robot.tool_to_base @ self._pose if self._on_tool else self._pose
 
     def frame(self) -> DepthFrame:
-        """Return what the camera sees now."""
+        """Return an image of the present scene."""
         camera_to_base = self.camera_to_base
         directions = self._directions @ camera_to_base.rotation.T
         n = len(directions)

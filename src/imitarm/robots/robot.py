@@ -22,12 +22,12 @@ _CHANGED = 1e-9  # relative change of a velocity above which a limit counts as h
 def limit_velocity(
     limits: JointLimits, q: ArrayLike, previous: ArrayLike, velocity: ArrayLike, dt: float
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return the velocity nearest to the requested one that the joints can reach and can still brake from.
+    """Return the velocity nearest to the requested one that the joints can reach and from which they can brake in time.
 
     First, all joints are slowed by one factor until none exceeds its maximum velocity, so that the tool keeps its
     direction. Then each joint is clipped to the box of :class:`~imitarm.kinematics.limits.JointLimits`, evaluated at
-    ``q + previous * dt / 2`` and not at ``q``: that box assumes that the set-point moves by ``velocity * dt``, while
-    a robot changes its speed evenly and moves by ``(previous + velocity) / 2 * dt``.
+    ``q + previous * dt / 2`` and not at ``q``: the box assumes that the set-point moves by ``velocity * dt``, but with
+    constant acceleration a robot moves by ``(previous + velocity) / 2 * dt``.
 
     Args:
         limits: limits of the arm.
@@ -56,7 +56,7 @@ class Robot(ABC):
 
     :meth:`move` limits a velocity and sends it. The sent velocities are integrated to ``set_point``, the joint
     positions that the drives track. The limits therefore hold for the commands and do not depend on measurement
-    noise. Between two calls the speed changes evenly: the set-point moves by ``(previous + velocity) / 2 * dt``.
+    noise. Between two calls the acceleration is constant: the set-point moves by ``(previous + velocity) / 2 * dt``.
 
     Attributes:
         arm: the model of the arm, with its limits.
@@ -87,7 +87,7 @@ class Robot(ABC):
 
     @abstractmethod
     def _send(self, previous: Array, velocity: Array, dt: float) -> None:
-        """Drive from ``set_point`` for ``dt`` while the speed changes evenly from ``previous`` to ``velocity``."""
+        """Drive from ``set_point`` for ``dt`` with constant acceleration from ``previous`` to ``velocity``."""
 
     def move(self, velocity: ArrayLike, dt: float) -> ArmState:
         """Move for ``dt`` seconds; the joints reach ``velocity`` at the end.

@@ -71,12 +71,12 @@ class SimulatedRobot(Robot):
 
         Args:
             arm: the arm with its tool.
-            scene: its obstacles and fixtures become solid bodies; None for none. Its ``stamp`` is the time of the
-                world's beginning. Without fixtures and ``world`` it gets a floor and a pedestal.
-            motion: for some obstacles, by name or index, where they are at each time on the scene's clock: any function
-                of time, or a recorded :class:`~imitarm.scene.motion.Track`. The others keep their velocities.
-            world: a world that holds the arm, as :func:`~imitarm.robots.world.arm_world` returns it, with more
-                furniture; it is copied. None: built from the scene.
+            scene: its obstacles and fixtures become solid bodies; None: no obstacles. Its ``stamp`` is the start time
+                of the world. Without fixtures and ``world`` it gets a floor and a pedestal.
+            motion: motions of some obstacles, by name or index: functions of the time on the scene's clock, or a
+                recorded :class:`~imitarm.scene.motion.Track`. Other obstacles keep their velocities.
+            world: a world with the arm, made by :func:`~imitarm.robots.world.arm_world`, to which furniture was added;
+                it is copied. None: the world is built from the scene.
             control: ``"position"`` or ``"torque"``.
             q: joint angles to start at, shape (n_joints,) [rad]; None for ``arm.home``.
             timestep: of the physics and of the drives [s].
@@ -112,7 +112,7 @@ class SimulatedRobot(Robot):
         self.reset()
 
     def _index(self, arm: ArmModel) -> None:
-        """Find the arm's tool and geoms, the obstacles and what moves in the compiled world."""
+        """Find the arm's tool and geoms, the obstacles and the moving bodies in the compiled world."""
         m = self.model
         self._tool = m.site("tool" if arm.has_tool else "flange").id
         arm_bodies = {m.body(body.name).id for body in arm.spec().bodies if body.name and body.name != "world"}
@@ -160,17 +160,17 @@ class SimulatedRobot(Robot):
 
     @property
     def time(self) -> float:
-        """Since the last reset [s]."""
+        """Time since the last reset [s]."""
         return float(self.data.time)
 
     @property
     def scene(self) -> Scene:
-        """The scene as it truly is now, with true velocities; ``stamp`` is its time on the scene's clock."""
+        """The true present scene, with true velocities; ``stamp`` is its time on the scene's clock."""
         return self._source.at(self.scene_at_start.stamp + self.time)
 
     @property
     def tool_to_base(self) -> Pose:
-        """Pose of the tool as the simulator has it."""
+        """True pose of the tool in the simulator."""
         matrix = self.data.site_xmat[self._tool].reshape(3, 3)
         return Pose(self.data.site_xpos[self._tool], matrix_to_quaternion(matrix))
 
@@ -200,7 +200,7 @@ class SimulatedRobot(Robot):
         """Return the smallest distance from the arm or its tool to an obstacle [m].
 
         It is measured between the simulator's geoms, negative when they overlap and inf without obstacles. While two
-        links touch each other it is at most minus the depth of that contact.
+        links touch each other, it is at most minus the depth of their contact.
         """
         return self._gauge.measure(self.data)[0]
 
@@ -242,7 +242,7 @@ class SimulatedRobot(Robot):
         """Let a hand lead the arm by its tool for ``dt`` seconds while the drives carry the arm's weight.
 
         Makers of robot arms call this zero gravity or free drive. The drives also compensate most of the dry friction
-        and damp a little, see :meth:`Drives.free`. Afterwards the set-point is where the arm is.
+        and damp a little, see :meth:`Drives.free`. Afterwards the set-point is the arm's posture.
 
         Args:
             wrench: force [N] then torque [N m] of the hand on the tool's tip, in the base frame, shape (6,).

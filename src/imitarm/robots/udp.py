@@ -48,8 +48,8 @@ class UdpRobot(Robot):
 
     :meth:`move` limits a velocity as every robot does and sends the resulting set-point; the server checks it again.
     The client sends commands only while the server reports that it follows this client, in a state that is at most
-    0.1 s old. Otherwise it sends no command and takes over the server's set-point. A restart of the client or of the
-    server, or an interrupted connection, therefore never makes the arm jump.
+    0.1 s old. Otherwise it sends no command and takes over the server's set-point. Therefore the arm never jumps after
+    a restart of the client or the server, or after an interrupted connection.
 
     A stopped robot moves again only after :meth:`enable`, which a person must decide.
 

@@ -1,4 +1,4 @@
-"""A MuJoCo world around an arm: what stands in it, and how near the arm is to it by the simulator's own geometry."""
+"""A MuJoCo world around an arm: fixtures, obstacles, and distances measured by the simulator's own geometry."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _FAR = 100.0  # [m] farther pairs are not measured
 
 
 def standard_fixtures(*, floor: float = -0.75, pedestal_radius: float = 0.12) -> tuple[Obstacle, ...]:
-    """Return what an arm stands on: a floor, and a pedestal below the base.
+    """Return the standard fixtures under an arm: a floor, and a pedestal below the base.
 
     Args:
         floor: height of the floor in the base frame [m]; at 0 or above there is no pedestal.
@@ -47,13 +47,13 @@ def standard_fixtures(*, floor: float = -0.75, pedestal_radius: float = 0.12) ->
 def arm_world(
     arm: ArmModel, *, floor: float = -0.75, pedestal_radius: float = 0.12, fixtures: Sequence[Obstacle] | None = None
 ) -> mujoco.MjSpec:
-    """Return a world with the arm, its base at the origin, on what it stands on; more furniture can be added.
+    """Return a world with the arm, its base at the origin, on its fixtures; furniture can be added.
 
     Args:
         arm: the arm with its tool.
         floor: as for :func:`standard_fixtures`.
         pedestal_radius: as for :func:`standard_fixtures`.
-        fixtures: what the arm stands on, instead of the standard ones.
+        fixtures: replace the standard fixtures.
 
     Returns:
         A specification that :class:`~imitarm.robots.simulated.SimulatedRobot` takes as ``world``.
@@ -82,7 +82,7 @@ def add_fixtures(spec: mujoco.MjSpec, fixtures: Sequence[Obstacle]) -> None:
     """Add fixtures as solids that never move, each a geom of its name (``fixture/0`` and so on without one).
 
     Args:
-        spec: the world; changed in place. A fixture whose name is a geom's already is there and is not added again.
+        spec: the world; changed in place. A fixture is not added when a geom of its name exists.
         fixtures: in the base frame, which is the world frame.
     """
     there = {geom.name for geom in spec.geoms}
@@ -158,7 +158,7 @@ def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
 
 
 class ClearanceGauge:
-    """Smallest distance from an arm to obstacles, and what touches what, from the simulator's geoms.
+    """Smallest distance from an arm to obstacles, and pairs in contact, from the simulator's geoms.
 
     Bounding spheres come first: the distance between centres less both radii is a lower bound of a pair's distance.
     Pairs are then measured by ``mj_geomDistance``, nearest bound first, until the next bound exceeds the smallest
@@ -169,7 +169,7 @@ class ClearanceGauge:
         arm_geoms: ids of the geoms of arm and tool.
         obstacle_geoms: ids of the geoms whose distance is measured.
         fixture_geoms: ids of geoms that count for contact only: what the arm stands on.
-        links: for each arm geom how many of the arm's joints move it. Two geoms with different numbers that touch are
+        links: number of the arm's joints that move each arm geom. Two geoms with different numbers that touch are
             a self-contact; None for no self-contacts.
     """
 
@@ -195,13 +195,14 @@ class ClearanceGauge:
         self._from_to = np.zeros(6)
 
     def ignore_present_self_contacts(self, data: mujoco.MjData) -> None:
-        """Take the pairs of links that touch now for overlaps of the model, as neighbours have in some files."""
+        """Ignore the pairs of links that touch now, because the models of neighbouring links overlap in some files."""
         self._by_design = {(first, second) for _, first, second in self._self_contacts(data)}
 
     def measure(self, data: mujoco.MjData) -> tuple[float, tuple[int, int] | None]:
         """Return the smallest signed distance [m], negative in contact, and the ids of the two geoms.
 
-        A self-contact counts with its depth. Without obstacles, or when all are farther than 100 m: inf and None.
+        A self-contact counts with its depth. Without obstacles, or when all are farther than 100 m, the result is inf
+        and None.
         """
         smallest, pair = _FAR, None
         for depth, first, second in self._self_contacts(data):

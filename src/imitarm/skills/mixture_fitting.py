@@ -264,8 +264,7 @@ def _cut(slot: NDArray[np.intp], came_from: list[NDArray[np.intp]], n_slots: int
 
 
 def responsibilities_by_bins(column: Array, n_bins: int) -> Array:
-    """Return responsibilities of 0 or 1, shape (K, n), of equally wide (few samples: equally full) bins.
-    """
+    """Return responsibilities of 0 or 1, shape (K, n), of equally wide (few samples: equally full) bins."""
     low, high = column.min(), column.max()
     labels = np.minimum(((column - low) * (n_bins / max(high - low, 1e-300)) + _EDGE).astype(np.intp), n_bins - 1)
     if np.bincount(labels, minlength=n_bins).min() < 2:

@@ -38,12 +38,12 @@ _GRIP = 0.2  # [s] in which the closure follows a closing hand
 class JointPlant:
     """The arm on which a joint controller is simulated: in MuJoCo, with gravity, without contacts.
 
-    It includes what ``ArmModel`` leaves out: rotor inertia, viscous damping and dry friction of the joints. So a
+    It includes rotor inertia, viscous damping and dry friction of the joints, which ``ArmModel`` leaves out. So a
     controller that uses an ``ArmModel`` does not know them.
 
     Args:
         arm: whose dynamics.
-        dt: how long a torque is applied [s].
+        dt: time for which a torque is applied [s].
 
     Attributes:
         substeps: number of simulation steps in ``dt``.
@@ -68,7 +68,10 @@ class JointPlant:
         self.start(arm.home)
 
     def start(self, q: ArrayLike) -> None:
-        """Be at rest at ``q``, shape (n_joints,) [rad]; the fingers of a gripper stay as they are at home."""
+        """Reset the arm to rest at ``q``, shape (n_joints,) [rad].
+
+        The fingers of a gripper stay in their home position.
+        """
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[:] = self._arm.posture(self._model, q)
         mujoco.mj_forward(self._model, self._data)
@@ -86,7 +89,7 @@ class JointPlant:
 
     @property
     def energy(self) -> float:
-        """Kinetic plus potential energy of the last state from which a step was made [J]."""
+        """Kinetic plus potential energy of the arm at the start of the last step [J]."""
         return float(self._data.energy.sum())
 
     def step(self, torque: Array) -> None:
@@ -100,7 +103,7 @@ class Torques:
     """Torques of one period.
 
     Attributes:
-        wanted: as computed by the law, shape (n_joints,) [N m].
+        wanted: computed by the law, before the limits, shape (n_joints,) [N m].
         applied: limited to the rated torques, shape (n_joints,) [N m].
     """
 

@@ -43,7 +43,7 @@ class BaselineRetargeter(Retargeter):
         velocity_scaling: scale every step as a whole so that no joint exceeds its velocity limit.
 
     Attributes:
-        counts: since :meth:`start`, by name; see ``notes``.
+        counts: the counts of ``notes`` since :meth:`start`, by name.
     """
 
     def __init__(
@@ -62,10 +62,10 @@ class BaselineRetargeter(Retargeter):
 
     @abstractmethod
     def _wanted(self, goal: Goal) -> Array:
-        """Return the joint positions wanted at the end of this period, shape (n_joints,) [rad], before any limit."""
+        """Return the desired joint positions at the end of this period, shape (n_joints,) [rad], before any limit."""
 
     def _holding(self) -> Array:
-        """Return them while the person is lost: where the joints are."""
+        """Return the desired joint positions while the person is lost: the present ones."""
         return self.latest.q
 
     @property
@@ -101,7 +101,7 @@ class BaselineRetargeter(Retargeter):
         return max(math.ceil(self._period / self.dt - 1e-6), 1)
 
     def _limited(self, wanted: Array) -> Array:
-        """Return the joints that are reached: always within their range, velocities scaled where that is asked for."""
+        """Return the joints that are reached: within their range, and with velocity scaling if requested."""
         before = self.latest.q
         step = wanted - before
         fractions = np.abs(step) / (self.dt * self.arm.max_velocity)

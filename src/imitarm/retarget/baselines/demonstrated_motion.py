@@ -37,7 +37,7 @@ class DemonstratedMotion:
             the motion is slowed down.
         points: shoulder, elbow, wrist in the base frame, as corrected so far, shape (n, 3, 3) [m].
         hands: rotations of the hand, quaternions wxyz, shape (n, 4).
-        shown: points as the person had them, shape (n, 3, 3) [m]; never corrected.
+        shown: the person's points before all corrections, shape (n, 3, 3) [m].
         closed: whether the hand was closed; None where unknown.
         joints: of the robot, shape (n, n_joints) [rad]; without columns until they are mapped.
     """
@@ -77,7 +77,7 @@ class DemonstratedMotion:
         return map(self.estimate, range(len(self)))
 
     def at(self, where: Array) -> DemonstratedMotion:
-        """Return the motion at fractional sample numbers, shape (m,): slower where they are closer together."""
+        """Return the motion at fractional sample numbers, shape (m,); it is slower where they are closer together."""
         n = np.arange(len(self))
         near = tuple(self.closed[int(i)] for i in np.clip(where.astype(int), 0, len(self) - 1))
 
@@ -98,7 +98,7 @@ class DemonstratedMotion:
 def engagements(
     frames: Iterable[Skeleton], correspondence: Correspondence, rule: EngagementRule
 ) -> Iterator[tuple[ArmEstimate, ...]]:
-    """Yield for each engagement in a recording its estimates, at least two, by the rule that all methods share.
+    """Yield the estimates, at least two, of each engagement in a recording; all methods share the engagement rule.
 
     Args:
         frames: in order of time.

@@ -108,7 +108,7 @@ class DemonstrationModification(BaselineRetargeter):
         seed: of the samples that repair key frames.
 
     Attributes:
-        check: finds what the arm can't do.
+        check: finds the infeasible samples.
 
     Raises:
         InputError: when the arm does not have the joint axes of a person's arm, or a number is out of range.
@@ -159,10 +159,10 @@ class DemonstrationModification(BaselineRetargeter):
         return np.asarray(q + step)
 
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
-        """Retarget a whole recording and correct it; ``notes`` says what was done.
+        """Retarget a whole recording and correct it; ``notes`` lists the changes.
 
         Where the motion is slowed, the result is longer than the recording; ``shown_times`` says when the person showed
-        each sample. The targets are those of that time: slowed with the motion, but otherwise not corrected.
+        each sample. The targets are slowed down with the motion, but not corrected in any other way.
 
         Args:
             skeletons: in order of time.
@@ -208,7 +208,7 @@ class DemonstrationModification(BaselineRetargeter):
         }
 
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
-        """Complete the shown times: the last steps show ``shown``, those before them are waiting."""
+        """Complete the shown times: the last steps show ``shown``, and in the steps before them the robot waits."""
         rest = len(steps) - len(self._shown_times) - len(shown)
         begin = float(self._shown_times[-1]) if len(self._shown_times) else -self.dt
         waited = begin + self.dt * np.arange(1, rest + 1)
@@ -216,13 +216,13 @@ class DemonstrationModification(BaselineRetargeter):
         self._shown_times = np.concatenate([self._shown_times, np.minimum(waited, ahead), shown])
 
     def _rest(self, steps: list[RetargetStep], duration: float, state: EngagementState) -> None:
-        """Stand still for a while, at the end or between two engagements."""
+        """Rest for a time, at the end or between two engagements."""
         q = self.latest.q
         for _ in range(round(duration / self.dt)):
             self._append(steps, RetargetStep(0.0, q, q, None, state), q)
 
     def _perform(self, steps: list[RetargetStep], motion: DemonstratedMotion, clutch: Clutch) -> None:
-        """Move to where the motion begins, at limited speed, then through it."""
+        """Move to the start of the motion at limited speed, then along it."""
         approach = Approach(self.arm, self.dt)
         start = np.clip(motion.joints[0], self.arm.lower, self.arm.upper)
         at = self.latest.q

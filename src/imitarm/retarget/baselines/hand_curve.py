@@ -1,4 +1,4 @@
-"""HandCurve: a smooth curve of a hand's position and rotation, fitted live and read with a fixed delay."""
+"""HandCurve: a smooth curve of a hand's position and rotation, fitted live and evaluated with a fixed delay."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class RotationCurve:
     r"""Rotations along a curve: :math:`R(t) = R_0 \exp(c(t))` with c a :class:`NURBS` of rotation vectors.
 
     Roll, pitch and yaw would wrap around and have singularities; rotation vectors relative to a mean rotation have
-    neither within a full turn.
+    neither below 360 degrees.
 
     Attributes:
         reference: :math:`R_0`, quaternion wxyz, shape (4,).
@@ -66,7 +66,7 @@ def fit_rotations(
         times: strictly increasing, shape (k,) [s].
         quaternions: unit, wxyz, shape (k, 4); signs do not matter.
         confidence: 0 to 1, shape (k,); None: all 1.
-        degree: as for :func:`fit_nurbs`, and so are the others.
+        degree: as for :func:`fit_nurbs`, like all other arguments.
         n_control: number of control points.
         smoothing: a number, ``"gcv"`` or ``"morozov"``.
         sigma: standard deviation of a rotation vector on each axis [rad].
@@ -94,9 +94,9 @@ def fit_rotations(
 
 
 def _continuous(vectors: Array) -> Array:
-    """Return rotation vectors (k, 3) without jumps by a full turn where the angle passes pi."""
+    """Return rotation vectors (k, 3) without jumps by 2 pi where the angle passes pi."""
     length = np.sqrt(np.sum(vectors * vectors, axis=1))
-    if not length.max() > 0.5 * math.pi:  # no two of them differ by half a turn
+    if not length.max() > 0.5 * math.pi:  # no two of them differ by 180 degrees
         return vectors
     result, middle = vectors.copy(), int(np.argmin(length))
     for k, beside in [(k, k - 1) for k in range(middle + 1, len(length))] + [(k, k + 1) for k in range(middle)[::-1]]:
@@ -166,22 +166,22 @@ class HandCurve:
         return cls(wrist, hand)
 
     def at(self, time: float) -> tuple[Array, Array]:
-        """Return wrist (3,) and hand (4,) at a time; beyond the ends those of the end."""
+        """Return wrist (3,) and hand (4,) at a time; beyond the ends they are constant."""
         return self.wrist.evaluate(time), self.hand.evaluate(time)
 
 
 class DelayedCurve:
     """Smooths a hand's motion live: fits a curve to the last 0.6 s and evaluates it ``lag`` seconds in the past.
 
-    The end of a fitted curve changes with every new frame; a little earlier it is supported by frames on both sides.
-    That is what the lag is for. Frames arrive irregularly, so time is counted in control steps and only corrected by
-    the frames.
+    The end of a fitted curve changes with every new frame, while a slightly earlier point is supported by frames on
+    both sides. The lag is chosen for this reason. Frames arrive irregularly, so time is counted in control steps and
+    only corrected by the frames.
 
     Args:
         window: duration to which the curve is fitted [s].
         lag: delay of the evaluation [s].
         smooth: False: return the newest frame unchanged.
-        whole: a curve of a complete motion to evaluate instead, without lag.
+        whole: a curve of the complete motion, which is then evaluated without lag instead.
     """
 
     def __init__(

@@ -24,7 +24,8 @@ class IncrementalIK(BaselineRetargeter):
     r"""Baseline M3: our reading of "incremental inverse kinematics" in the thesis.
 
     The thesis cites Ijspeert et al. 2002 for it, which is the paper on movement primitives; its abstract has no
-    incremental inverse kinematics. So this is not a published method, but what the name says: once per frame
+    incremental inverse kinematics. So this is not a published method, but an interpretation of the name. Once per frame
+    it computes
 
     .. math:: \Delta q = J^+ \left(\Delta x_d + K\,e\right), \qquad e = \log(T_d\,T(q)^{-1}),
 
@@ -91,7 +92,7 @@ class IncrementalIK(BaselineRetargeter):
         return np.asarray(np.linalg.pinv(self.arm.tool_jacobian(q), rcond=_RCOND) @ twist)
 
     def _capped(self, step: Array) -> Array:
-        """Limit each joint to its velocity, or scale the step as a whole."""
+        """Limit each joint to its maximum velocity, or scale the step as a whole."""
         most = self.dt * self.arm.max_velocity
         if self.velocity_scaling:
             return np.asarray(step / max(float((np.abs(step) / most).max()), 1.0))

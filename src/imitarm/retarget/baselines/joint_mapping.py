@@ -1,4 +1,4 @@
-"""JointMapping: the person's joint angles become the robot's, for methods that map joints instead of the tool."""
+"""JointMapping: map a person's joint angles to the robot's, for methods that map joints instead of the tool."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class JointMapping:
     r"""Maps the seven angles of a person's arm to seven robot joints with the same order of axes.
 
     When the arm is stretched forward, a person's joints rotate about z, y, x, y, x, y, x
-    (:mod:`imitarm.retarget.human_arm`). So do Sawyer's at zero, and the Panda's when its second joint is at a right
-    angle, some of them in the opposite direction. With that posture :math:`q^*` and the directions :math:`\sigma_i =
-    \pm 1` the mapping is
+    (:mod:`imitarm.retarget.human_arm`). Sawyer's joints do the same at zero, and the Panda's when its second joint is
+    at a right angle, some of them in the opposite direction. With that posture :math:`q^*` and the directions
+    :math:`\sigma_i = \pm 1` the mapping is
 
     .. math:: q_i = q^*_i + \sigma_i\,\theta_i \quad\text{(absolute)}, \qquad
               q_i = q_{i,0} + \sigma_i\,(\theta_i - \theta_{i,0}) \quad\text{(relative)},
@@ -39,7 +39,7 @@ class JointMapping:
     mapping is absolute and the correspondence follows the whole hand, otherwise that of the clutch's target. Link
     lengths are not used, so the tool is not where the hand is: this is inherent in mapping joints.
 
-    Angles are continuous from frame to frame, without jumps by a full turn; an undefined angle keeps its value.
+    Angles are continuous from frame to frame, without jumps by 360 degrees; an undefined angle keeps its value.
 
     Args:
         arm: the robot's arm.
@@ -61,7 +61,7 @@ class JointMapping:
         self.start(arm.home)
 
     def start(self, q: Array) -> None:
-        """Forget the person; the robot is at ``q``, shape (7,) [rad]."""
+        """Start anew with the robot at ``q``, shape (7,) [rad]."""
         self._q = np.array(q, dtype=float)
         self._person: Array | None = None  # angles of the last frame
         self._origin: tuple[Array, Array] | None = None  # robot's joints and person's angles when engaged
@@ -88,7 +88,7 @@ class JointMapping:
 
     @property
     def _from(self) -> tuple[Array, Array]:
-        """The robot's joints and the person's angles that correspond to each other."""
+        """The last joints of the robot and the person's angles that correspond to them."""
         if self.relative and self._origin is not None:
             return self._origin
         return self.zero, np.zeros(7)
@@ -122,7 +122,7 @@ class JointMapping:
         q0, theta0 = self._from
         q = q0 + self.sense * (theta - theta0)
         q[:4] = continued(q[:4], self._q[:4])
-        if begins:  # a whole turn may bring a joint within its limits; later it would be a jump
+        if begins:  # a full rotation may bring a joint within its limits; later it would be a jump
             q[:4] = _whole_turn_inside(q[:4], self.arm.lower[:4], self.arm.upper[:4])
         chain = self.sense * (q - self.zero)
         _, _, forearm = human_arm_pose(np.concatenate([chain[:4], np.zeros(3)]), _ANY)
@@ -135,10 +135,10 @@ class JointMapping:
 
 
 class Approach:
-    """Moves to a distant first goal at limited speed, then follows it: the mapping may begin anywhere.
+    """Moves to a distant first goal at limited speed, then follows the mapping.
 
     Args:
-        arm: whose velocity limits.
+        arm: gives the velocity limits.
         dt: control period [s].
         fraction: of the velocity limits, while approaching.
     """
@@ -157,12 +157,12 @@ class Approach:
 
 
 def continued(angles: Array, before: Array) -> Array:
-    """Return angles plus whole turns so that each is closest to the one before, shape (n,) [rad]."""
+    """Return angles plus multiples of 360 degrees so that each is closest to the one before, shape (n,) [rad]."""
     return np.asarray(before + (angles - before + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def _whole_turn_inside(angles: Array, lower: Array, upper: Array) -> Array:
-    """Add a whole turn to angles beyond their limits where that brings them inside, shape (n,) [rad]."""
+    """Add 360 degrees to angles beyond their limits where that brings them inside, shape (n,) [rad]."""
     turned = angles - 2.0 * np.pi * np.sign(angles)
     helps = ((angles < lower) | (angles > upper)) & (turned >= lower) & (turned <= upper)
     return np.where(helps, turned, angles)

@@ -18,7 +18,7 @@ Indices = NDArray[np.intp]
 Smoothing = float | str
 
 SMOOTHINGS = ("gcv", "morozov")
-"""How the smoothing may be chosen, besides a number."""
+"""Names of the rules that choose the smoothing."""
 
 _MU = (-6.0, 6.0)  # decades to search
 _HUBER, _PASSES = 2.5, 3  # an outlier is farther than 2.5 sigma; number of reweightings
@@ -115,7 +115,7 @@ class NURBS:
         return float(self.knots[0]), float(self.knots[-1])
 
     def evaluate(self, u: ArrayLike) -> Array:
-        """Return the points of the curve at ``u`` (k,), shape (k, d); beyond its ends the end points.
+        """Return the points of the curve at ``u`` (k,), shape (k, d); beyond the ends the curve is constant.
 
         A single number gives one point, shape (d,).
         """
@@ -133,7 +133,7 @@ class NURBS:
         :math:`C^{(r)} = \frac1W \bigl(A^{(r)} - \sum_{j=1}^r \binom rj W^{(j)} C^{(r-j)}\bigr)`.
 
         Args:
-            u: where; a single number gives shape (d,). Beyond the ends: the derivative at the end.
+            u: where; a single number gives shape (d,). Beyond the ends it is the derivative at the end.
             order: 0 (the point itself) to ``degree``.
 
         Raises:
@@ -245,7 +245,8 @@ def fit_nurbs(
             ``"morozov"``: such that the residual equals ``sigma``.
         sigma: standard deviation of a sample on each axis, in the points' unit; None: from the residuals.
         robust: reduce the weight of samples farther than 2.5 sigma from the curve (Huber), in three passes.
-        rational: also fit the weights w, between 0.2 and 5, mean 1; otherwise all are 1. Needed only for exact arcs.
+        rational: also fit the weights w, between 0.2 and 5, mean 1; otherwise all are 1. This is needed only for exact
+            arcs.
 
     Raises:
         InputError: when shapes do not match, times do not increase, fewer than p + 1 samples have confidence, or an
@@ -395,7 +396,7 @@ def _cross_validated(problem: _Problem, confidence: Array) -> float:
 
 
 def _least(score: Callable[[float], float]) -> float:
-    """Return 10 to the power of the decade of the lowest score: among whole decades, then between neighbours."""
+    """Return the argument with the lowest score, searched among powers of ten, then next to the best."""
     decades = np.arange(_MU[0], _MU[1] + 0.5)
     best = float(decades[int(np.argmin([score(float(d)) for d in decades]))])
     finer = minimize_scalar(score, bounds=(best - 1.0, best + 1.0), method="bounded", options={"xatol": 0.1})
@@ -406,7 +407,7 @@ def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
     r"""Return weights w (n,), mean 1, by least squares, reweighted by the last denominator.
 
     :math:`\sum_k \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is quadratic in
-    both. X is eliminated, and among equally good w the one closest to ones is taken.
+    both. X is eliminated; among equally good w, the one closest to all ones is taken.
     """
     n = problem.n_control
     basis = np.zeros((len(problem.first), n))

@@ -88,7 +88,7 @@ class HumanArmTracker:
         self._time = -math.inf
 
     def follow(self, estimate: ArmEstimate, lengths: LimbLengths) -> tuple[Array, Array]:
-        """Process a frame; return wrist (3,) [m] and hand quaternion (4,) of the tracked arm in the base frame.
+        """Process a frame; return the tracked arm's wrist (3,) [m] and hand quaternion (4,) in the base frame.
 
         Args:
             estimate: of the arm, with true bone lengths.
@@ -140,8 +140,8 @@ class HumanArmTracker:
 def roll_pitch_yaw(rotation: Array) -> Array:
     """Return roll, pitch and yaw of a rotation Rz(yaw) Ry(pitch) Rx(roll), shape (3,) [rad].
 
-    The thesis uses their differences as the error of orientation: they wrap at half a turn, are singular at a pitch of
-    a quarter turn, and are not a rotation vector.
+    The thesis uses their differences as the error of orientation: they wrap at 180 degrees, are singular at a pitch of
+        90 degrees, and are not a rotation vector.
     """
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
     return np.array(
@@ -180,8 +180,9 @@ class ThesisRetargeter(Retargeter):
        :class:`~imitarm.retarget.baselines.hand_curve.DelayedCurve`).
 
     At each control step the tool moves towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
-    3.9). Every step is limited in length, since otherwise the arm freezes. Joint positions and velocities stay within
-    their limits. Accelerations, the elbow, obstacles and the loss of the person are not treated, because the thesis
+    3.9). The length of every step is limited, because otherwise the damping stops the arm. Joint positions and
+    velocities stay within their limits. Accelerations, the elbow, obstacles and the loss of the person are not treated,
+    because the thesis
     does not: when the person is lost, the target stays, and it jumps when the person returns.
 
     Args:
@@ -190,8 +191,8 @@ class ThesisRetargeter(Retargeter):
         dt: control period [s].
         scene: ignored.
         small_angle: ``"thesis"``: with the term printed after Eq 3.9.
-        as_printed: True: reproduce all misprints of :data:`PRINTED`; or the names of some. Limits are kept all the
-            same.
+        as_printed: True: reproduce all misprints of :data:`PRINTED`; or the names of some. Limits are kept
+            nevertheless.
         smoothing: ``"live"``; ``"global"``: :meth:`run` fits one curve to the whole recording, without lag
             (:meth:`step` is live); None: no curve.
         lag: of the live curve [s].
@@ -247,7 +248,7 @@ class ThesisRetargeter(Retargeter):
         return ArmEstimator(self.correspondence, smoothing=False, limbs="direction")
 
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
-        """Retarget a whole recording; with ``smoothing="global"`` through one curve for all of it.
+        """Retarget a whole recording; ``smoothing="global"`` fits one curve to all of it.
 
         Args:
             skeletons: in order of time.
@@ -283,7 +284,7 @@ class ThesisRetargeter(Retargeter):
         return HandSample(estimate.time, wrist, hand, (known, max(rotated, _UNSEEN)))
 
     def _hand(self) -> tuple[Array, Array]:
-        """Return wrist and hand on the smoothed curve: there the clutch engages, so that the tool does not jump."""
+        """Return wrist and hand on the smoothed curve, where the clutch engages, so that the tool does not jump."""
         hand = self._curve.now()
         assert hand is not None
         return hand
