@@ -19,7 +19,7 @@ _TICKS = 20  # timed ticks in each of our measurements, and calls of the yardsti
 def skeleton_to_command() -> Row:
     """One control tick of the modern method with a new skeleton; ticks without one are not timed.
 
-    A simulated person reaches about before a camera of 30 frames per second, as in use: a robot that is asked for more
+    A simulated person reaches about before a camera of 30 frames per second, as in use: a robot that is commanded more
     than it can do takes longer.
     """
     arm, person = ArmModel.load("sawyer", tool="gripper"), Person.from_seed(0)

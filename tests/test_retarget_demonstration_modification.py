@@ -104,7 +104,7 @@ def test_what_can_not_be_mended_is_counted_and_cut_at_the_limits():
 
 def test_teaching_takes_each_segment_and_five_seconds():
     frames = shown(swing(0, 1.2, over=0.6), 4.0)
-    short, long = (M1(SAWYER, FIXED, advice_time=t).run(frames).notes for t in (5.0, 20.0))
+    short, long = (M1(SAWYER, FIXED, annotation_time=t).run(frames).notes for t in (5.0, 20.0))
     assert long["teaching_time"] - short["teaching_time"] == pytest.approx(15.0 * short["segments"])
     assert 5.4 < short["teaching_time"] < 7.0  # one segment, 0.2 s longer on both sides than what is too fast
 
@@ -147,5 +147,5 @@ def test_seeds_tell_repairs_apart():
 
 
 def test_a_time_that_can_not_be_is_refused():
-    with pytest.raises(InputError, match="advice_time"):
-        M1(SAWYER, advice_time=-1.0)
+    with pytest.raises(InputError, match="annotation_time"):
+        M1(SAWYER, annotation_time=-1.0)

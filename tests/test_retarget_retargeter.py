@@ -139,7 +139,7 @@ WRONG = [np.nan, np.inf, -1.0, "x", [1, 2], np.zeros(3), np.full(7, np.nan), obj
         ),
         *(
             lambda v, name=name: RETARGETERS["m1"](ARM, **{name: v})
-            for name in ("advice_time", "seed", "constraints", "velocity_scaling", "relative")
+            for name in ("annotation_time", "seed", "constraints", "velocity_scaling", "relative")
         ),
         lambda v: RETARGETERS["m3"](ARM, gain=v),
         lambda v: Damped(ARM).start(v),

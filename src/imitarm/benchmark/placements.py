@@ -62,7 +62,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class PlacementResult:
-    """What came of one policy in one placement.
+    """Result of one policy in one placement.
 
     Attributes:
         policy: its name.
@@ -200,7 +200,7 @@ def run_placements(
         progress: called with the number of placements that are done, and of all.
 
     Raises:
-        InputError: when a skill or an arm can't be loaded, or several processes are asked for without joblib.
+        InputError: when a skill or an arm can't be loaded, or several processes are requested without joblib.
     """
     work = [(policy, setup, seed) for setup in setups for seed in seeds for policy in policies]
     done: list[PlacementResult] = []

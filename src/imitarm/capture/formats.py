@@ -96,7 +96,7 @@ def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[Recordi
         content: of the file.
 
     Returns:
-        the skeletons, and what is worth knowing about the file.
+        the skeletons, and notes about the file.
 
     Raises:
         FileFormatError: when the file was cut off after it was closed, has another version, or a line is not a
@@ -161,7 +161,7 @@ def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[R
         content: of the file.
 
     Returns:
-        the skeletons, and what is worth knowing about the file.
+        the skeletons, and notes about the file.
 
     Raises:
         FileFormatError: when the file is another table, was cut off, or a field is not a number; the message names

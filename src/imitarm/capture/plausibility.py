@@ -48,7 +48,8 @@ def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
         rate: frame rate when the stamps are read in ``unit`` [Hz].
         unit: the unit in which the stamps were read [s].
 
-    Returns: the name of the unit, and the factor by which the times must be multiplied. None when no other unit fits.
+    Returns:
+        the name of the unit, and the factor by which the times must be multiplied. None when no other unit fits.
     """
     low, high = PLAUSIBLE_RATE
     fits = [

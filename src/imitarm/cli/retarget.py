@@ -71,17 +71,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     person = parser.add_argument_group("the person")
     person.add_argument("--side", choices=SIDES, help="the arm; default: as calibrated, else right")
     person.add_argument(
-        "--person", type=int, metavar="N", help="of several people; default: the one seen most, or first"
+        "--person",
+        type=int,
+        metavar="N",
+        help="number of the person, of several; default: in a recording the one seen most, else the first",
     )
-    person.add_argument("--calibration", type=Path, metavar="FILE", help="as 'imitarm calibrate' writes it")
-    person.add_argument("--seconds", type=float, metavar="S", help="how long; default: to the end, or till Ctrl-C")
-    person.add_argument("--trim", type=float, nargs=2, metavar=("A", "B"), help="use only the time from A to B seconds")
+    person.add_argument("--calibration", type=Path, metavar="FILE", help="file written by 'imitarm calibrate'")
+    person.add_argument(
+        "--seconds", type=float, metavar="S", help="duration; default: to the end of the source, or until Ctrl-C"
+    )
+    person.add_argument("--trim", type=float, nargs=2, metavar=("A", "B"), help="use only the part from A to B seconds")
     person.add_argument(
         "--pace", type=float, default=1.0, metavar="FACTOR", help="slow the motion down, e.g. 0.5: half as fast"
     )
     follow = parser.add_argument_group("correspondence")
     follow.add_argument(
-        "--scale", type=float, metavar="FACTOR", help="robot's motion over person's; default: as calibrated, else 1"
+        "--scale",
+        type=float,
+        metavar="FACTOR",
+        help="motion of the robot over motion of the person; default: as calibrated, else 1",
     )
     follow.add_argument(
         "--orientation",
@@ -151,7 +159,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _output_files(arguments: argparse.Namespace, names: Sequence[str]) -> dict[str, Path]:
-    """Return the demonstration's file for each method; check now whatever would otherwise fail after the work."""
+    """Return the demonstration's file for each method.
+
+    Check everything now that would otherwise fail only after the run.
+    """
     slowed((), arguments.pace)
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
@@ -224,7 +235,7 @@ def _retargeted(
 
 
 def _result(name: str, evaluation: RunEvaluation, execution: Execution | None) -> MethodResult:
-    """Return what the report shows of one method."""
+    """Return the content of the report for one method."""
     run = evaluation.run
     measures, notes = _measures(evaluation), list(evaluation.warnings)
     if execution is not None:
@@ -260,7 +271,7 @@ _DEGREES = 180.0 / np.pi
 
 
 def _measures(evaluation: RunEvaluation) -> list[Measure]:
-    """Return the figures of merit in the units that people use."""
+    """Return the measures in the units of the report."""
     run, m, tracking = evaluation.run, evaluation.metrics, evaluation.tracking
     hand = "true hand" if evaluation.truth_known else "hand as seen"
     return [
@@ -271,7 +282,7 @@ def _measures(evaluation: RunEvaluation) -> list[Measure]:
         Measure(TARGET_FAR, 1e2 * tracking.far_fraction, "% of the time", 1, "less"),
         Measure(TARGET_LAG, 1e3 * evaluation.target_lag, "ms", 0, "less"),
         Measure(f"tool to the {hand}, RMS", 1e3 * m.tool_rms, "mm", 1, "less"),
-        Measure("the same without its lag", 1e3 * m.tool_rms_without_lag, "mm", 1, "less"),
+        Measure("the same after removing the lag", 1e3 * m.tool_rms_without_lag, "mm", 1, "less"),
         Measure(f"lag behind the {hand}", 1e3 * evaluation.hand_lag, "ms", 0),
         Measure("upper arm's direction, RMS error", _DEGREES * m.elbow_direction_rms, "°", 1, "less"),
         Measure("beyond a limit of position", m.position_violations, "frames", 0, "less", fault=True),
@@ -299,15 +310,16 @@ def _torques(evaluation: RunEvaluation) -> PlainTable:
         "Torques [N m]",
         ("Joint", "Mean", "Weight", "Motion", "RMS", "Rated"),
         tuple(rows),
-        "By inverse dynamics, without friction. Weight: the part that holds the arm's weight; motion: the rest. Means "
+        "Torques are computed by inverse dynamics, without friction. Weight: the part that holds the arm's weight; "
+        "motion: the rest. Means "
         "are of absolute values, so the two parts need not add up to the whole.",
     )
 
 
 def _execution_measures(execution: Execution) -> list[Measure]:
-    """Return what was measured on the simulated robot."""
+    """Return the measurements on the simulated robot."""
     return [
-        Measure("simulated: error of the worst joint, RMS", 1e3 * execution.error_rms, "mrad", 1, "less"),
+        Measure("simulated: RMS error of the worst joint", 1e3 * execution.error_rms, "mrad", 1, "less"),
         Measure("simulated: largest error of a joint", 1e3 * execution.error_max, "mrad", 0, "less"),
         Measure("simulated: highest torque", 100.0 * execution.peak_torque_ratio, "% of the rated", 0, "less"),
         Measure("simulated: commands reduced by the robot's limits", execution.limited, "frames", 0, "less"),
@@ -315,7 +327,7 @@ def _execution_measures(execution: Execution) -> list[Measure]:
 
 
 def _execution_notes(execution: Execution) -> list[str]:
-    """Return what the user should know of the simulated execution, a sentence each."""
+    """Return warnings about the simulated execution, one sentence each."""
     notes = []
     if np.isfinite(execution.clearance):
         notes.append(f"simulated: smallest distance of the arm to an obstacle {1e3 * execution.clearance:.0f} mm")
@@ -342,7 +354,7 @@ def suggestion(
     Args:
         tracking: of the run.
         skeletons: of the person.
-        correspondence: that the method was given.
+        correspondence: between person and robot, the input of the method.
         fitted: whether ``--fit`` was given.
         pace: value of ``--pace``.
     """
@@ -374,7 +386,7 @@ def _wrist_motion(skeletons: Sequence[Skeleton], side: str) -> float:
 
 
 def _show(results: Sequence[MethodResult]) -> None:
-    """Print the figures of merit, a column for each method."""
+    """Print a table of the measures, with a column for each method."""
     rows = []
     for measures in zip(*(result.measures for result in results), strict=True):
         one: Measure = measures[0]
@@ -392,7 +404,7 @@ def _written_report(
     done: Sequence[tuple[MethodResult, TargetTracking]],
     hint: str,
 ) -> Path:
-    """Write the report and return where."""
+    """Write the report and return its path."""
     (result, tracking), arm, correspondence = done[0], setting.arm, setting.correspondence
     with working("drawing the report"):
         return write_retarget_report(

@@ -63,7 +63,8 @@ def run_scene(
         caption: a sentence about what the scene shows.
         progress: called with the fraction of the motion that is done, 0 to 1.
 
-    Returns: The result; when the policy refuses, it has no rollout, but the reason.
+    Returns:
+        The result; when the policy refuses, it has no rollout, but the reason.
     """
     scene = robot.scene_at_start
     frames = FrameRecorder(robot.model)

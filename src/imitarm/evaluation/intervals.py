@@ -224,7 +224,8 @@ def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
         differences: one per person, shape (n,).
         seed: of the random sign flips, when there are more differences.
 
-    Returns: The probability; 1 without differences.
+    Returns:
+        The probability; 1 without differences.
     """
     d = np.asarray(differences, dtype=float)
     n = len(d)

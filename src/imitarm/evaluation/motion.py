@@ -156,7 +156,8 @@ def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
         speed: of a point, shape (n,) [m/s].
         dt: sampling period [s].
 
-    Returns: A number without unit; nan for a point that does not move.
+    Returns:
+        A number without unit; nan for a point that does not move.
     """
     v = np.asarray(speed, dtype=float)
     n = 2 ** (int(np.ceil(np.log2(len(v)))) + _PADDING)

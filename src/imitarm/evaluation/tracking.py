@@ -56,7 +56,7 @@ class TrueArm:
         Args:
             truth: the person's skeleton over time; called in the order of the times.
             times: of a run, shape (n,) [s].
-            correspondence: which arm, and the pose of the sensor.
+            correspondence: gives the side of the arm and the pose of the sensor.
             start: the person's time at the run's time 0, which is that of its first skeleton [s].
         """
         t = np.asarray(times, dtype=float)
@@ -95,7 +95,7 @@ def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Co
     Args:
         skeletons: in order of time.
         times: since the first skeleton, shape (n,) [s].
-        correspondence: which arm, and the pose of the sensor.
+        correspondence: gives the side of the arm and the pose of the sensor.
 
     Raises:
         TaskFailedError: when shoulder, elbow and wrist are never seen together.

@@ -16,7 +16,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file to a temporary file, which is then renamed; an existing file stays intact until then.
 
     Args:
-        path: of the file; an existing file is replaced.
+        path: file to write; an existing file is replaced.
         text: its content, written as UTF-8.
 
     Raises:

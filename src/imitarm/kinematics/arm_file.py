@@ -318,7 +318,8 @@ def _name_all(spec: mujoco.MjSpec) -> None:
 def _replace_unusable_masses(spec: mujoco.MjSpec, path: Path, root: XmlElement) -> tuple[str, ...]:
     """Give links without a usable mass and inertia placeholders, so that the kinematics can be built.
 
-    Returns: A description of the fault for each such link.
+    Returns:
+        A description of the fault for each such link.
     """
     faults: list[str] = []
     for _ in range(len(spec.bodies)):

@@ -400,7 +400,7 @@ def _rms(k: Array, b: Array, c: Array) -> float:
 
 
 def _suspect(k: Array, b: Array, c: Array, rms: float) -> int | None:
-    """Return the index of the pair without which the others fit far better; None when there is none."""
+    """Return the index of the pair without which the others fit far better; None when no pair is an outlier."""
     if len(k) < LEAST_PAIRS + 1 or rms < _WORTH:
         return None
     every = np.arange(len(k))

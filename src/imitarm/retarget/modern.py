@@ -267,10 +267,10 @@ class JerkLimiter:
 
     .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a D'}, \qquad D' = D - \tfrac12 v\,dt,
 
-    and :math:`2 D'/dt` where that is negative.
+    and :math:`2 D'/dt` where D' is negative.
 
-    A joint that keeps this bound once can always keep it by braking with a. Near a limit the last clipping may exceed
-    the jerk limit; position, velocity and acceleration are always kept.
+    A joint that keeps this bound once can always keep it by braking with a_max. Near a limit the last clipping may
+    exceed the jerk limit; position, velocity and acceleration are always kept.
 
     A blocked arm falls behind its commands, and its drives press harder the further it falls behind. So a command that
     is ahead of the measured joint by more than half of ``max_lead`` brakes: ``max_lead`` acts as one more position
@@ -282,7 +282,7 @@ class JerkLimiter:
         frequency: omega [rad/s]; must be well below 1/dt.
         rise_time: time to full acceleration [s]: j = a_max / rise_time.
         max_lead: of a command over the measured position [rad]; half of it must exceed the distance that the joints
-            move at full speed within the robot's delay, or it slows them down.
+            move at full speed within the robot's delay, or the limit slows the joints down.
 
     Raises:
         InputError: when a number is out of range.
@@ -319,7 +319,7 @@ class JerkLimiter:
         self.start(arm.home)
 
     def start(self, q: ArrayLike) -> None:
-        """Be at rest at ``q``, shape (n_joints,) [rad]."""
+        """Reset to rest at ``q``, shape (n_joints,) [rad]."""
         self.q: Array = np.array(q, dtype=float)
         self.velocity: Array = np.zeros_like(self.q)
         self._acceleration = [0.0] * len(self.q)
@@ -375,8 +375,8 @@ class JerkLimiter:
             x: its position [rad].
             v: its velocity [rad/s].
             measured: its measured position [rad].
-            low: lowest velocity by the other limits [rad/s].
-            high: highest velocity by the other limits [rad/s].
+            low: lowest velocity that the other limits allow [rad/s].
+            high: highest velocity that the other limits allow [rad/s].
             joint: its limits.
         """
         _, a_max, step, _, bottom, top, _, _ = joint

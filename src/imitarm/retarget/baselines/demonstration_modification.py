@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 ROUNDS = 5
-ADVICE_TIME = 5.0  # [s] that a teacher needs for one segment, in addition to watching it
+ANNOTATION_TIME = 5.0  # [s] that a teacher needs for one segment, in addition to watching it
 
 SLOWED_TO = 0.9  # of the velocity limits: highest speed of a slowed segment
 PULLED_TO = 0.78 / 0.80  # of the reach: largest distance of the wrist after the correction
@@ -61,7 +61,7 @@ COUNTED = (
     "shown_time",
     "corrected_time",
 )
-"""What is counted and summed over the engagements of a recording."""
+"""Names of the counts that are summed over the engagements of a recording."""
 
 _STRIDE = 10  # every tenth sample is checked first
 _SLOWEST = 10.0  # largest factor of slowing down
@@ -104,7 +104,7 @@ class DemonstrationModification(BaselineRetargeter):
             themselves, approached at limited speed. See
             :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
         constraints: additional conditions, by name, for example ``{"table": above(0.02)}``.
-        advice_time: time that a teacher needs for each segment in addition to watching it [s].
+        annotation_time: time that a teacher needs for each segment in addition to watching it [s].
         seed: of the samples that repair key frames.
 
     Attributes:
@@ -130,13 +130,14 @@ class DemonstrationModification(BaselineRetargeter):
         velocity_scaling: bool = False,
         relative: bool = True,
         constraints: Mapping[str, Constraint] | None = None,
-        advice_time: float = ADVICE_TIME,
+        annotation_time: float = ANNOTATION_TIME,
         seed: int = 0,
     ) -> None:
         super().__init__(arm, correspondence, dt=dt, scene=scene, velocity_scaling=velocity_scaling)
         self._mapping = JointMapping(arm, relative=relative)
         self.check = FeasibilityCheck(arm, dt, constraints)
-        self._advice_time = finite_number(advice_time, "DemonstrationModification: advice_time", "s", at_least=0.0)
+        what = "DemonstrationModification: annotation_time"
+        self._annotation_time = finite_number(annotation_time, what, "s", at_least=0.0)
         self._seed = whole_number(seed, "DemonstrationModification: seed", at_least=0)
         self._shown_times = np.empty(0)
 
@@ -204,7 +205,7 @@ class DemonstrationModification(BaselineRetargeter):
             "rounds": float(max((corrector.rounds for corrector in correctors), default=0)),
             **counts,
             "execution_time": self.dt * performed,
-            "teaching_time": watched + self._advice_time * counts["segments"],
+            "teaching_time": watched + self._annotation_time * counts["segments"],
         }
 
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
@@ -272,7 +273,7 @@ def pull(points: Array, joints: Array) -> Array:
     r"""Return the factor :math:`\kappa` of the distance shoulder to wrist for a stretch of 78/80 at most, shape (n,).
 
     Where the robot's elbow angle equals the person's, this is :math:`\kappa = 0.78/(\rho |W - S|)`; where it differs
-    (relative mapping), the person's elbow must bend by as much as the robot's lacks.
+    (relative mapping), the person's elbow must bend by the amount that is missing at the robot's elbow.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
@@ -409,7 +410,7 @@ class SegmentCorrector:
         rng: for the samples of a repair.
 
     Attributes:
-        rounds: that were needed.
+        rounds: number of rounds so far.
         counts: by the names of :data:`COUNTED`; times in s.
     """
 
