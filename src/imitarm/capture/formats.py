@@ -252,7 +252,7 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
 
 
 def is_motion_capture(head: bytes) -> bool:
-    """Return whether a file begins as an export of motion capture by QTM does: a table of markers with tabs."""
+    """Return whether a file begins like an export of motion capture by QTM: a table of markers with tabs."""
     return head.startswith(b"NO_OF_FRAMES\t") and b"\nMARKER_NAMES\t" in head
 
 
@@ -266,7 +266,7 @@ def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]
         path: of the file.
 
     Returns:
-        the skeletons, and what is worth knowing about the file.
+        the skeletons, and notes about the file.
 
     Raises:
         FileFormatError: when the file is damaged or lacks a marker of the right arm; the message names the line.
@@ -344,10 +344,10 @@ class MotionCapture:
         return cls(table[:, 0], np.stack([s, e, 0.5 * (left + right), tip, thumb], axis=1), path.name)
 
     def truth(self, person: Person) -> Truth:
-        """Return the motion as done by ``person`` in front of a sensor; the arm keeps its captured bones.
+        """Return the motion as if ``person`` did it in front of a sensor; the arm keeps its captured bone lengths.
 
-        It is interpolated linearly between frames, and still before the first and after the last one. The rest of the
-        body stands upright where the person stands.
+        The arm is interpolated linearly between frames, and at rest before the first and after the last one. The rest
+        of the body stands upright at the person's place.
         """
         to_sensor = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
         points = self.points @ to_sensor.T
@@ -376,7 +376,9 @@ def _row(path: Path, number: int, line: str, columns: list[int]) -> list[float]:
     try:
         values = [float(fields[1])] + [float(fields[c + k]) for c in columns for k in range(3)]
     except (ValueError, IndexError) as error:
-        raise FileFormatError(f"{path}, line {number}: not a frame of numbers ({error}); is the file whole?") from error
+        raise FileFormatError(
+            f"{path}, line {number}: not a frame of numbers ({error}); is the file complete?"
+        ) from error
     if not np.isfinite(values).all():
         raise FileFormatError(f"{path}, line {number}: a marker of the arm has a gap; fill it before exporting")
     return values

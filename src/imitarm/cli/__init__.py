@@ -1,6 +1,6 @@
 """The ``imitarm`` command: one file a subcommand, each with ``add_arguments(parser)`` and ``run(arguments)``.
 
-A module is imported only when its command is asked for, so ``imitarm --help`` answers at once. A new command is a
+A module is imported only when its command is used, so ``imitarm --help`` answers at once. A new command is a
 file in this folder and a line in ``COMMANDS``.
 """
 
@@ -16,16 +16,16 @@ from imitarm import __version__
 from imitarm.errors import ImitarmError
 
 COMMANDS = {
-    "capture": "take a person's motion from a camera or a file, record it and check it",
-    "calibrate": "measure a person's arm, find where the sensor is, choose how the robot follows",
+    "capture": "record a person's motion from a camera or a file, and check it",
+    "calibrate": "measure a person's arm, locate the sensor, choose how the robot follows",
     "retarget": "turn a person's motion into a robot's, ready to learn from",
     "teleoperate": "let a person move a robot in real time",
     "serve": "make a simulated robot available to other processes over UDP",
     "lint": "check demonstrations and say what is wrong with them",
     "learn": "learn a skill from demonstrations",
     "reproduce": "let a simulated arm do what a skill has learnt, around obstacles",
-    "demo": "learn a sweep, do it around obstacles, write a report",
-    "benchmark": "measure how good the methods are, beside what the thesis says",
+    "demo": "learn a sweep, reproduce it around obstacles, write a report",
+    "benchmark": "compare the methods with each other and with the thesis",
     "robots": "list the known arms and tools, or inspect one",
 }
 

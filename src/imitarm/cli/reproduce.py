@@ -39,7 +39,7 @@ FORBIDDEN = {"keep_height": HORIZONTAL_ONLY, "not_down": NOT_DOWN}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes."""
+    """Add the arguments of the command."""
     parser.add_argument("skill", metavar="SKILL", type=Path, help="a skill file, as 'imitarm learn' writes it")
     add_robot_options(parser)
     parser.add_argument(
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--control", choices=("position", "torque"), default="position", help="of the simulated drives")
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=Path, metavar="FILE", help="the measured motion, as a demonstration (CSV)")
-    output.add_argument("--force", action="store_true", help="replace files that are there")
+    output.add_argument("--force", action="store_true", help="replace existing files")
     output.add_argument("--report", type=Path, metavar="FILE", help="a page with 3-D playback and figures (HTML)")
 
 

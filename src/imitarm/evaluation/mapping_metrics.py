@@ -137,7 +137,7 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
 
     Args:
         run: of the method.
-        correspondence: that the method was given.
+        correspondence: between person and robot, the input of the method.
         true: the person's arm at the times of the run, or, for a method that slows the motion down, at its shown times;
             None when it is unknown, as with a real camera: the measures that need it are nan.
 

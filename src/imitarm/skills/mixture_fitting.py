@@ -306,7 +306,7 @@ def choose(candidates: Sequence[Candidate]) -> int:
       the larger differences.
 
     If no K meets both, it is the smallest K that generalises and whose bias is within a tenth of the smallest bias
-    among those. BIC alone keeps growing with K on data over time, because neighbouring samples are not independent. It
+    among those. BIC alone keeps growing with K on data over time, because neighbouring samples are not independent. BIC
     decides only when there is one demonstration, because then none can be left out.
     """
     ordered = sorted(candidates, key=lambda c: c.n_components)

@@ -131,7 +131,7 @@ class Constraint(Protocol):
     """A condition on the tool, as annotated by a teacher."""
 
     def __call__(self, positions: Array, rotations: Array, /) -> Mask:
-        """Return where it holds, shape (n,), for positions (n, 3) [m] and rotations (n, 3, 3) in the base frame."""
+        """Return whether it holds, shape (n,), for positions (n, 3) [m] and rotations (n, 3, 3) in the base frame."""
         ...
 
 
@@ -180,7 +180,7 @@ class FeasibilityCheck:
             )
 
     def reasons(self, joints: Array) -> dict[str, Mask]:
-        """Return for each condition where it is violated, shape (n,), for joints (n, n_joints) [rad]."""
+        """Return the violated samples of each condition, shape (n,) bool, for joints (n, n_joints) [rad]."""
         return {"speed": self.too_fast(joints), **self.postures(joints)}
 
     def anywhere(self, joints: Array) -> Mask:
@@ -200,7 +200,7 @@ class FeasibilityCheck:
         return np.asarray(np.abs(np.diff(joints, axis=0)) / (self.dt * self.arm.max_velocity))
 
     def postures(self, joints: Array) -> dict[str, Mask]:
-        """Return, for each condition on single postures, where it is violated, shape (n,)."""
+        """Return the violated samples of each condition on single postures, shape (n,) bool."""
         jacobians = np.array([self.arm.tool_jacobian(q) for q in joints]).reshape(-1, 6, self.arm.n_joints)
         found: dict[str, Mask] = {
             "limits": self.outside(joints),
