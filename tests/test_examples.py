@@ -25,7 +25,7 @@ SAYS = {
     "02_avoid_obstacles": [
         r"mapf +refused",
         r"certified can be executed: 2\d\.\d mm proven",
-        r"samples of the path are exactly where they were learnt",
+        r"samples of the path are exactly where they were learned",
         r"no way round box \"low wall\"",
         r"sphere \"jar\" covers the goal",
         r"path ends at \[0\.699 0\.399 0\.003\]",
@@ -44,7 +44,7 @@ SAYS = {
     "05_your_own_policy": [r"  acfra: clearance \d+ mm, .*finished", r"repelled: .*(touched|not finished)"],
     "06_retarget_a_person": [
         r"take 4: 5\.\d s, \d{1,2} mm from the true hand on average, (\d\d|100) % of the velocity and (\d\d|100) % of",
-        r"learnt \d+ components from 5 takes of a person",
+        r"learned \d+ components from 5 takes of a person",
         r"nothing in the way: finished",
         r"a ball on the path: finished, .*, \d\d mm from the ball",
     ],

@@ -23,7 +23,7 @@ COMMANDS = {
     "serve": "make a simulated robot available to other processes over UDP",
     "lint": "check demonstrations and say what is wrong with them",
     "learn": "learn a skill from demonstrations",
-    "reproduce": "let a simulated arm do what a skill has learnt, around obstacles",
+    "reproduce": "let a simulated arm reproduce a skill around obstacles",
     "demo": "learn a sweep, reproduce it around obstacles, write a report",
     "benchmark": "compare the methods with each other and with the thesis",
     "robots": "list the known arms and tools, or inspect one",
