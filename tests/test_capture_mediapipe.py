@@ -78,7 +78,7 @@ def test_the_worker_is_told_what_to_read_and_may_not_import_what_lies_around(wor
     [
         (said("error is not a video that can be read"), InputError, r"film\.mp4: is not a video that can be read$"),
         ("sys.exit('no module named cv2')", InputError, "does not start.*no module named cv2.*rebuild its environment"),
-        (said("hello world"), InputError, "does not send what MediaPipe's process should: 'hello world'"),
+        (said("hello world"), InputError, "does not send the lines of MediaPipe's process: 'hello world'"),
         (said("imitarm-mediapipe 2 1280 720"), InputError, "does not send the lines"),
         (said("imitarm-mediapipe 1 wide high"), InputError, "no image size"),
         (said("imitarm-mediapipe 1 0 720"), InputError, "needs an image size"),

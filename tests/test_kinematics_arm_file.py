@@ -230,7 +230,7 @@ def test_binary_files_are_refused(tmp_path):
 
 def test_a_name_that_is_not_known_is_answered_with_the_known_ones(tmp_path):
     with pytest.raises(
-        UnknownNameError, match=r"unknown robot 'baxter'; known: panda, sawyer; the path of an MJCF or URDF"
+        UnknownNameError, match=r"unknown robot 'baxter'; known: panda, sawyer; or give the path of an MJCF or URDF"
     ):
         ArmModel.load("baxter")
     with pytest.raises(UnknownNameError, match="unknown tool 'saw'; known: brush, gripper"):

@@ -445,7 +445,7 @@ def test_a_shape_that_is_in_no_registry_is_not_written(tmp_path):
     class Plate(Box):
         pass
 
-    with pytest.raises(InputError, match="no scene file can hold a Plate; known types: sphere, box"):
+    with pytest.raises(InputError, match="a scene file can't hold a Plate; known types: sphere, box"):
         save_scene(Scene(None, [Plate(Pose.identity(), [1, 1, 0.01])]), tmp_path / "scene.yaml")
     assert list(tmp_path.iterdir()) == []
 
