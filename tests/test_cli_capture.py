@@ -203,7 +203,7 @@ def with_spikes(frames):
         ),
         (z_up, "axes", "take x, z, -y of the file as x, y, z"),
         (frozen, "frozen", "repaired: dropped 89 frames that repeat the one before, for up to 2.97 s on end"),
-        (with_spikes, "spike", "repaired: took joints as lost in 6 frames with a spike"),
+        (with_spikes, "spike", "repaired: marked joints as lost in 6 frames with a spike"),
     ],
 )
 def test_an_implausible_recording_is_reported_by_capture_and_by_retarget(spoil, code, retargeted, tmp_path, capsys):

@@ -43,8 +43,8 @@ class IKStep:
 
     Attributes:
         velocity: of the joints, shape (n_joints,) [rad/s].
-        missing: of each task, what it asked for less what it gets, in the task's own weighted units.
-        limited: joints that stand at a bound of their box, shape (n_joints,) bool.
+        missing: target minus result of each task, in the task's own weighted units.
+        limited: whether each joint velocity is at a bound of the box, shape (n_joints,) bool.
         slack: by how much each row is violated, shape (m,); 0 where it holds.
     """
 
@@ -55,7 +55,7 @@ class IKStep:
 
 
 class IKSolver:
-    r"""Inverse kinematics of one arm for a control loop: what does not change is checked once.
+    r"""Inverse kinematics of one arm for a control loop; arguments that do not change are checked once.
 
     ``"qp"`` minimises, over the joint velocity v inside every :class:`~imitarm.kinematics.limits.Box`,
 
@@ -63,23 +63,23 @@ class IKSolver:
               + \sum_j \tfrac{c_j}2 \max(0, b_j - A_j v)^2 / |A_j|^2
 
     with a Jacobian :math:`J_i` and a target :math:`t_i` for each task, the previous velocity :math:`v_p`, and the
-    rows :math:`A_j v \ge b_j` with their prices :math:`c_j`. Rows without a finite price are kept wherever the boxes
-    allow it; where they don't, the violations, in rad/s along each row, are as small as they can be (least sum of
-    squares), and the tasks come after that. The other methods take one
-    :class:`~imitarm.kinematics.tasks.TwistTask`, perhaps a :class:`~imitarm.kinematics.tasks.PostureTask`, and boxes:
+    rows :math:`A_j v \ge b_j` with their prices :math:`c_j`. Rows without a finite price are kept whenever the boxes
+    allow it. When they do not, the sum of the squared violations, in rad/s along each row, is minimised first, and the
+    tasks come second. The other methods take one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one
+    :class:`~imitarm.kinematics.tasks.PostureTask`, and boxes:
 
     * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9): in joints scaled by their velocity limits
       :math:`v = J^T (J J^T+\lambda^2)^{-1} t`, with :math:`\lambda=0` for :math:`s_{min}\ge d`,
       :math:`\lambda^2=s_{min}(d-s_{min})` for :math:`d/2\le s_{min}<d` and :math:`\lambda=d/2` below, :math:`d=|t|`.
       This keeps the norm of the scaled velocity at most 1.
     * ``"dls_small_angle"``: the same with half the least singular value subtracted from d, as the thesis prints
-      after Eq 3.9; that weakens the damping, and is there to compare with.
+      after Eq 3.9; this weakens the damping; it is kept for comparison.
     * ``"svd"``, numerical filtering (Maciejewski and Klein 1988):
       :math:`v=\sum_i s_i/(s_i^2+\lambda_i^2)\, v_i u_i^T t` with :math:`\lambda_i^2=0.06^2(1-(s_i/0.06)^2)` where
       :math:`s_i<0.06`.
 
-    These three are scaled down as a whole when a joint would be too fast, then clipped to the box. A solver holds
-    nothing of the previous step and can be used by several threads.
+    These three are scaled down as a whole when a joint would be too fast, then clipped to the box. A solver keeps no
+    state between steps and can be used by several threads.
 
     Args:
         arm: the arm.
@@ -139,7 +139,7 @@ class IKSolver:
         velocity: ArrayLike | None = None,
         rows: Rows | Sequence[Rows] | None = None,
     ) -> IKStep:
-        """Do what :meth:`solve` does, and report what could not be done; same arguments and errors."""
+        """Solve like :meth:`solve`, and also report unmet tasks and limits; same arguments and errors."""
         problem = self.problem(q, tasks, velocity=velocity, rows=rows)
         result = self._solve(problem)
         counted = result / self.arm.max_velocity if self._scaled else result
@@ -156,7 +156,7 @@ class IKSolver:
         velocity: ArrayLike | None = None,
         rows: Rows | Sequence[Rows] | None = None,
     ) -> IKProblem:
-        """Return what the methods solve; same arguments and errors as :meth:`solve`."""
+        """Return the problem that the methods solve; same arguments and errors as :meth:`solve`."""
         arm = self.arm
         memory = arm.at(q)
         position = np.asarray(q, dtype=float)
@@ -193,7 +193,7 @@ class IKSolver:
         return problem
 
     def _add_tasks(self, problem: IKProblem, tasks: Sequence[Task]) -> None:
-        """Add what more tasks ask for."""
+        """Add the rows of further tasks."""
         for task in tasks:
             if not hasattr(task, "rows"):
                 raise InputError(f"solve_ik: tasks must be tasks such as TwistTask(twist), got {task!r}")
@@ -248,7 +248,7 @@ def solve_ik(
     velocity: ArrayLike | None = None,
     rows: Rows | Sequence[Rows] | None = None,
 ) -> Array:
-    """Return the joint velocity that does the tasks as far as the limits allow.
+    """Return the joint velocity that fulfils the tasks as far as the limits allow.
 
     ``solve_ik(arm, q, TwistTask([0.1, 0, 0, 0, 0, 0]))`` moves the tool at 0.1 m/s along x. :class:`IKSolver`
     explains the methods, and does the same in a loop.
@@ -321,7 +321,7 @@ def _stacked(tasks: list[TaskRows]) -> tuple[Array, Array]:
 
 
 def _sorted_rows(rows: list[Rows]) -> tuple[Array | None, Array | None, Sequence[Rows]]:
-    """Return all stiff rows together, and the others."""
+    """Return the rows without a finite price, stacked, and the other rows."""
     if len(rows) == 1 and rows[0].price == math.inf:
         return rows[0].matrix, rows[0].lower, ()
     stiff = [part for part in rows if part.price == math.inf]
@@ -379,7 +379,7 @@ def _least_violation(box: Box, matrix: Array, least: Array) -> tuple[Array, Arra
 
 
 def _unconstrained(box: Box, matrix: Array | None, least: Array | None, hessian: Array, linear: Array) -> Array | None:
-    """Return the minimum without limits when it keeps them all: most steps need no more, in half of the time."""
+    """Return the unconstrained minimum if it keeps all limits; this is so in most steps, and takes half the time."""
     factor, velocity = hessian.copy(), np.empty(len(linear))
     if mujoco.mju_cholFactor(factor, _NULL) < len(linear):
         return None
@@ -398,12 +398,12 @@ def _scaled_eye(n: int, factor: float) -> Array:
 
 
 def _plain(n: int) -> NDArray[np.intc]:
-    """Return daqp's mark of plain inequalities; it writes into it."""
+    """Return daqp's flags for plain inequalities; daqp writes into this array."""
     return np.zeros(n, dtype=np.intc)
 
 
 def damped_least_squares(problem: IKProblem) -> Array:
-    """Solve thesis Eq 3.8 and 3.9: one damping for all directions, as little as keeps the joints' speed in bounds."""
+    """Solve thesis Eq 3.8 and 3.9: the least isotropic damping that keeps the joint speeds in bounds."""
     scaled, target, _ = problem.tasks[0]
     length = math.hypot(*target.tolist())
     gram = scaled.dot(scaled.T)
@@ -414,7 +414,7 @@ def damped_least_squares(problem: IKProblem) -> Array:
 
 
 def damped_with_small_angle(problem: IKProblem) -> Array:
-    """Do the same with the small-angle term that the thesis prints after Eq 3.9."""
+    """Solve thesis Eq 3.8 and 3.9 with the small-angle term that is printed after Eq 3.9."""
     scaled, target, _ = problem.tasks[0]
     squares, basis, _ = lapack.dsyev(scaled.dot(scaled.T))
     small = 0.5 * math.sqrt(max(float(squares[0]), 0.0))
@@ -439,7 +439,7 @@ def _damped(problem: IKProblem, squares: Array, basis: Array, threshold: float) 
 
 
 def _is_above(gram: Array, bound: float) -> bool:
-    """Return whether all eigenvalues are above ``bound``: then, and only then, a Cholesky factor of the rest exists."""
+    """Return whether all eigenvalues exceed ``bound``, by trying a Cholesky factorisation."""
     rest = gram - bound * _EYE
     return mujoco.mju_cholFactor(rest, _NULL) == 6
 
@@ -470,7 +470,7 @@ def filtered_svd(problem: IKProblem) -> Array:
 
 
 def _within_box(problem: IKProblem, result: Array, scale: Array | float, squares: Array, basis: Array) -> Array:
-    """Add the drift to the posture in the null space, then keep the limits: direction first, then each joint."""
+    """Add the null-space drift to the posture, then scale the whole velocity, then clip each joint to its limits."""
     if problem.posture is not None:
         jacobian = problem.tasks[0].jacobian
         drift = problem.posture / scale

@@ -1,4 +1,4 @@
-"""Keeping the arm off itself: which links can touch, their distances, and rows for the inverse kinematics."""
+"""Self-clearance of the arm: which links can touch, their distances, and rows for the inverse kinematics."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MOST_KNOWN = 64
 
 
 class SelfClearance:
-    r"""Keeps links that are not neighbours, and the tool, off each other.
+    r"""Keeps links that are not neighbours, and the tool, apart from each other.
 
     The arm is covered by spheres (``ArmModel.collision_spheres``). For the spheres i and j of two links, with centres
     c and radii r, the distance and its gradient are
@@ -41,18 +41,18 @@ class SelfClearance:
     .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
 
     and a row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets it shrink no faster than exponentially. Where the
-    distance is below the clearance it must grow, at 25/s in place of :math:`\xi`. Every two spheres within 6 cm of the
-    clearance have a row, at most the 64 nearest; so have the nearest spheres of each of the ``n_rows`` nearest pairs of
-    links within 15 cm.
+    distance is below the clearance it must grow, at 25/s in place of :math:`\xi`. Every pair of spheres within 6 cm of
+    the clearance has a row (at most the 64 nearest pairs). So has the nearest pair of spheres of each of the ``n_rows``
+    nearest pairs of links within 15 cm.
 
-    Not watched are links that are joined by a joint, links that their joints' limits keep apart
-    (:func:`meeting_links`), and spheres that are nearer than the clearance in the
-    arm's home posture. The base is watched; what it stands on is no part of the arm: put it into the scene.
+    These pairs are not checked: links that share a joint, links that can't touch within their joint limits
+        (:func:`meeting_links`), and spheres that are nearer than the clearance in the arm's home posture. The base is
+        checked. What it stands on is not part of the arm: put it into the scene.
 
     Args:
         arm: the arm with its tool.
         clearance: least distance [m].
-        n_rows: how many pairs of links at most have a row.
+        n_rows: largest number of pairs of links that have a row.
         gain: xi [1/s].
 
     Raises:
@@ -86,16 +86,16 @@ class SelfClearance:
         self._near, self._close = np.float32(clearance + _INFLUENCE), np.float32(clearance + _NEAR)
 
     def _centers(self, q: ArrayLike) -> Array:
-        """Return where all spheres are, those of the base last, shape (m, 3) [m]."""
+        """Return the centres of all spheres, those of the base last, shape (m, 3) [m]."""
         return np.concatenate([self.arm.collision_spheres(q)[0], self.arm.cover.base_centers])
 
     @property
     def n_pairs(self) -> int:
-        """How many pairs of spheres are watched."""
+        """Number of pairs of spheres that are checked."""
         return len(self._sums)
 
     def distance(self, q: ArrayLike) -> float:
-        """Return the least distance between any two watched spheres [m]; negative where they overlap.
+        """Return the smallest distance of all checked pairs of spheres [m]; negative when two overlap.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
@@ -109,7 +109,7 @@ class SelfClearance:
         return float((np.linalg.norm(centers[self._outer] - centers[self._inner], axis=1) - self._sums).min())
 
     def nearest(self, q: ArrayLike) -> tuple[Indices, Array]:
-        """Return the spheres that have a row, two by two, the nearest first.
+        """Return the pairs of spheres that have a row, the nearest first.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
@@ -133,7 +133,7 @@ class SelfClearance:
         return None if found is None else Rows(found[0], self.lower(found[1]))
 
     def near(self, q: ArrayLike) -> tuple[Array, Array] | None:
-        """Return the gradients of the near distances (k, n_joints) [m/rad], and the room beyond the clearance (k,) [m].
+        """Return gradients of the near distances (k, n_joints) [m/rad], and distance minus clearance (k,) [m].
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
@@ -148,13 +148,13 @@ class SelfClearance:
         return gradients, distances - self.clearance
 
     def lower(self, room: Array) -> Array:
-        """Return the least rate (k,) [m/s] at which each distance may change, for the room (k,) [m] that it has."""
+        """Return the lower bound of each distance's rate (k,) [m/s], from distance minus clearance (k,) [m]."""
         if min(room.tolist(), default=0.0) >= 0.0:  # nearly always
             return -self._gain * room
         return np.where(room < 0.0, -_RETREAT_RATE, -self._gain) * room
 
     def periodic(self, dt: float = 0.01) -> PeriodicSelfClearance:
-        """Return the same for a control loop with period ``dt`` [s], at a fifth of the cost."""
+        """Return a faster version of this check, for a control loop with period ``dt`` [s], at a fifth of the cost."""
         return PeriodicSelfClearance(self, dt)
 
     def _found(self, q: ArrayLike) -> tuple[Indices, Indices, Array, Array, Array]:
@@ -181,7 +181,7 @@ class SelfClearance:
         return outer, inner, outer_centers, between / lengths[:, None], lengths - self._sums.take(chosen)
 
     def _coarse_distances(self, centers: Array) -> NDArray[np.float32]:
-        """Return the distances of all watched pairs, in single precision: good to some um, which tells who is near."""
+        """Return the distances of all checked pairs in single precision, enough to find the near ones."""
         points = centers.astype(np.float32)
         squares = (points * points).sum(axis=1)
         products = points @ (-2.0 * points).T
@@ -195,13 +195,14 @@ class SelfClearance:
 
 
 class PeriodicSelfClearance:
-    r"""Rows of a :class:`SelfClearance` for a control loop that has little time: searched for every 30 to 50 ms.
+    r"""Rows of a :class:`SelfClearance` for a fast control loop: near pairs are searched for only every 30 to 50 ms.
 
-    In between the distances follow from the joints' motion, :math:`d(q) \approx d_0 + \nabla d\,(q - q_0)`. The
-    error of that within 50 ms is less than 8 mm with every joint at 1 rad/s, and grows with the square of the speed.
+    In between the distances follow from the joints' motion, :math:`d(q) \approx d_0 + \nabla d\,(q - q_0)`. Within 50
+    ms the error of this approximation is less than 8 mm with every joint at 1 rad/s; it grows with the square of the
+    speed.
 
     Args:
-        own: what is watched.
+        own: the self-clearance whose rows are approximated.
         dt: control period [s].
     """
 
@@ -221,7 +222,7 @@ class PeriodicSelfClearance:
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
-            may_search: whether this step has time for a search; one that is overdue takes place all the same.
+            may_search: whether this step has time for a search; an overdue search takes place anyway.
         """
         self._age += 1
         if self._age > self._latest or (may_search and self._age > self._every):

@@ -1,10 +1,10 @@
 r"""The shoulder-elbow-wrist angle: where the elbow is on its circle about the line from shoulder to wrist.
 
-With seven joints the elbow of an arm can swing while the hand stands still; one angle says where it is, for a person
-and a robot alike. It is measured from a reference direction, and no choice of it is without a singularity
-(Elias and Wen 2024): the ``"conventional"`` angle, from a fixed vector v, is lost when the wrist is anywhere on the
-line through the shoulder along v; the ``"stereographic"`` one only on one half of that line, which can be made to point
-where no wrist goes. Here it points behind the base (METHODS A.9).
+The elbow of an arm with seven joints can move while the hand is at rest; one angle describes its position, for a person
+and for a robot. It is measured from a reference direction, and every choice of that direction has a singularity (Elias
+and Wen 2024). The ``"conventional"`` angle, from a fixed vector v, is undefined when the wrist is on the line through
+the shoulder along v. The ``"stereographic"`` angle is undefined only on one half of such a line, which can be chosen
+where no wrist goes. Here it points behind the base.
 """
 
 from __future__ import annotations
@@ -23,20 +23,22 @@ Array = NDArray[np.float64]
 Vector = tuple[Any, Any, Any]
 
 UP = (0.0, 0.0, 1.0)
-"""With the wrist ahead of the shoulder an elbow that is lifted straight up has the angle 0, one that hangs has pi."""
+"""With the wrist ahead of the shoulder, the angle is 0 for an elbow straight above and pi for an elbow straight
+below."""
 _LOST = 1e-12  # squared sine below which an angle is only rounding
 
 
 class SewAngle(NamedTuple):
-    """The angle of one or many arms and how it changes.
+    """The angle of one or many arms, and its derivatives.
 
     Attributes:
         angle: in (-pi, pi], shape (...) [rad].
         shoulder: derivative by the shoulder's position, shape (..., 3) [rad/m].
         elbow: derivative by the elbow's, shape (..., 3) [rad/m].
         wrist: derivative by the wrist's, shape (..., 3) [rad/m].
-        bend: squared sine of the angle at the elbow, shape (...); 0 where the arm is straight and the angle is lost.
-        reference: squared length of the reference direction, shape (...); 0 where that is lost.
+        bend: squared sine of the angle at the elbow, shape (...); 0 where the arm is straight and the angle is
+            undefined.
+        reference: squared length of the reference direction, shape (...); 0 where the reference is undefined.
     """
 
     angle: Any
@@ -59,8 +61,8 @@ def sew_angle(
         k_r = (\hat w - e_t) \times e_r, \quad k_x = k_r \times (W - S), \quad e_x = k_x / |k_x|, \quad
         \psi = \mathrm{atan2}(\hat w \cdot (e_x \times e),\; e_x \cdot e)
 
-    The conventional one is measured from the part of :math:`e_r` that is at right angles to :math:`\hat w`. Both are
-    positive when the elbow turns right-handed about the direction to the wrist.
+    The conventional one is measured from the part of :math:`e_r` that is at right angles to :math:`\hat w`. Both angles
+    increase when the elbow rotates right-handed about the direction to the wrist.
 
     Args:
         shoulder: shape (..., 3) [m], in a frame with x ahead and z up.
@@ -69,7 +71,7 @@ def sew_angle(
         convention: ``"stereographic"`` or ``"conventional"``.
 
     Returns:
-        shape (...) [rad], in [-pi, pi]; nan where the angle is lost (a straight arm) or a point is nan.
+        shape (...) [rad], in [-pi, pi]; nan where the angle is undefined (a straight arm) or a point is nan.
 
     Raises:
         UnknownNameError: when the convention is not known.
@@ -81,7 +83,7 @@ def sew_angle(
 def sew_derivatives(
     shoulder: ArrayLike, elbow: ArrayLike, wrist: ArrayLike, *, convention: str = "stereographic"
 ) -> SewAngle:
-    """Return what :func:`sew_angle` does, and its derivatives by the three points; same arguments."""
+    """Return the angle of :func:`sew_angle` and its derivatives by the three points; same arguments."""
     formula = _formula(convention)
     points = [np.asarray(point, dtype=float) for point in (shoulder, elbow, wrist)]
     if any(point.shape[-1:] != (3,) for point in points):
@@ -100,11 +102,11 @@ def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereogr
 
     Args:
         points: of shoulder, elbow and wrist, shape (3, 3) [m], as from ``ArmModel.sew_points``.
-        jacobians: theirs, shape (3, 3, n), as from ``ArmModel.sew_jacobians``.
+        jacobians: of these points, shape (3, 3, n), as from ``ArmModel.sew_jacobians``.
         convention: as for :func:`sew_angle`.
 
     Returns:
-        angle [rad] and its Jacobian, shape (n,); nan where the angle is lost.
+        angle [rad] and its Jacobian, shape (n,); nan where the angle is undefined.
     """
     shoulder, elbow, wrist = points.tolist()
     found = one_angle(shoulder, elbow, wrist, convention)
@@ -125,8 +127,7 @@ def one_angle(
         wrist: three floats [m].
         convention: as for :func:`sew_angle`.
 
-    Returns:
-        None where the angle is lost.
+    Returns: None where the angle is undefined.
     """
     (sx, sy, sz), (ex, ey, ez), (wx, wy, wz) = shoulder, elbow, wrist
     try:
@@ -137,7 +138,7 @@ def one_angle(
 
 
 def _stereographic(m: Any, e: Vector, w: Vector) -> SewAngle:
-    """Value and derivatives (METHODS A.9); with e_t = -x and e_r = z many of the products are single terms."""
+    """Value and derivatives; with e_t = -x and e_r = z many of the products are single terms."""
     # written out without _dot and _cross, whose calls would take a third of the time
     (e0, e1, e2), (w0, w1, w2) = e, w
     length = m.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
@@ -167,7 +168,7 @@ def _stereographic(m: Any, e: Vector, w: Vector) -> SewAngle:
 
 
 def _conventional(m: Any, e: Vector, w: Vector) -> SewAngle:
-    """The same from a fixed direction."""
+    """Value and derivatives of the conventional angle, which is measured from a fixed direction."""
     length = m.sqrt(_dot(w, w))
     along = _times(1.0 / length, w)
     to_wrist, to_up = _dot(along, e), _dot(along, UP)
@@ -194,7 +195,7 @@ CONVENTIONS: dict[str, Callable[[Any, Vector, Vector], SewAngle]] = {
     "conventional": _conventional,
     "stereographic": _stereographic,
 }
-"""Ways to choose the direction from which the angle is measured."""
+"""Choices of the direction from which the angle is measured."""
 
 
 def _formula(convention: str) -> Callable[[Any, Vector, Vector], SewAngle]:

@@ -54,7 +54,7 @@ class _Members(NamedTuple):
 
 
 class _Frames(NamedTuple):
-    """The own frames of obstacles, family by family, in the order of ``PackedObstacles._sorted``."""
+    """The own frames of the obstacles, grouped by family, in the order of ``PackedObstacles._sorted``."""
 
     to_own: Array  # rotation of base vectors into each own frame, shape (n, 3, 3)
     rows: Array  # the same, axis first, for one product with many points, shape (3 n, 3)
@@ -128,12 +128,12 @@ class PackedObstacles:
         if self.rotating:
             turned = quaternion_multiply(quaternion_exp(dt * self.angular_velocities), self.quaternions)
             return self._copy(positions=self.positions + dt * self.velocities, quaternions=turned)
-        return self._copy(_ahead=(self, dt))  # positions and frames are computed when they are asked for
+        return self._copy(_ahead=(self, dt))  # positions and frames are computed when they are first used
 
     def placed(
         self, positions: Array, quaternions: Array, velocities: Array, angular_velocities: Array, stamp: float
     ) -> PackedObstacles:
-        """Return the same shapes elsewhere and seen at ``stamp`` [s]; the other arguments are the attributes."""
+        """Return the same shapes with other poses, seen at ``stamp`` [s]; the other arguments are the attributes."""
         moved = self._copy(
             positions=positions,
             quaternions=quaternions,
@@ -146,7 +146,7 @@ class PackedObstacles:
         return moved
 
     def _copy(self, **changes: object) -> PackedObstacles:
-        """Return a copy with other poses, which keeps what was worked out for the shapes."""
+        """Return a copy with other poses that shares the values computed for the shapes."""
         moved = object.__new__(PackedObstacles)
         moved.__dict__.update(self._shapes, **changes)
         return moved
@@ -179,13 +179,13 @@ class PackedObstacles:
 
     @cached_property
     def radii(self) -> Array:
-        """Of the sphere around ``positions`` that holds each solid, shape (n,) [m]; inf for a half-space."""
+        """Radius of the sphere around ``positions`` that contains each solid, shape (n,) [m]; inf for a half-space."""
         rows = zip(self.kinds.tolist(), self.sizes.tolist(), self.polytopes, strict=True)
         return np.array([_bounding_radius(KINDS[kind], size, polytope) for kind, size, polytope in rows])
 
     @cached_property
     def _sorted(self) -> tuple[Indices, list[_Members]]:
-        """The order of the obstacles, family by family, and the families; every hull is a family of its own."""
+        """The order of the obstacles, grouped by family, and the families; every hull is a family of its own."""
         names = [KINDS[kind] for kind in self.kinds.tolist()]
         merged = any(name in SLABS.kinds for name in names)  # then spheres and capsules are taken as rounded boxes
         order: list[int] = []
@@ -220,11 +220,11 @@ class PackedObstacles:
 
     @cached_property
     def _kept(self) -> list[tuple[Array, Array]]:
-        """The last answer of :meth:`_limits`; all copies share it."""
+        """The last result of :meth:`_limits`; all copies share it."""
         return []
 
     def _limits(self, reach: Array) -> Array:
-        """Return the squared distance from each obstacle's origin (n, m) within which a point may be in ``reach``."""
+        """Return the squared distance (n, m) from each origin beyond which a point is out of ``reach``."""
         if not self._kept or self._kept[0][0] is not reach:
             limit = reach + self.radii[self._sorted[0], None]
             self._kept[:] = [(reach, limit * limit)]
@@ -236,8 +236,8 @@ def distances(packed: PackedObstacles, points: ArrayLike, times: ArrayLike | Non
 
     Args:
         packed: n obstacles, at their time 0.
-        points: in the base frame, shape (..., 3) [m]. With ``times``, shape (k, ..., 3): the points of each time,
-            or (1, ..., 3) for points that stand.
+        points: in the base frame, shape (..., 3) [m]. With ``times``: the points at each time, shape (k, ..., 3), or
+            (1, ..., 3) for points that do not move.
         times: seconds after the obstacles' time, shape (k,) [s]; None for that time itself.
 
     Returns:
@@ -265,7 +265,7 @@ def distances_and_gradients(
 
 
 class NearPairs(NamedTuple):
-    """Points that are near obstacles.
+    """Pairs of a point and an obstacle that are near each other.
 
     Attributes:
         obstacle: index of the obstacle, shape (k,).
@@ -281,9 +281,9 @@ class NearPairs(NamedTuple):
 
 
 def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPairs | None:
-    """Return all pairs of a point and an obstacle that are at most ``reach`` apart, for control loops; None if none.
+    """Return all pairs of a point and an obstacle that are at most ``reach`` apart; None if there is no such pair.
 
-    Bounding spheres come first; the exact distance is computed only for the pairs that they leave.
+    Pairs are first sorted out by bounding spheres; the exact distance is computed only for the remaining pairs.
 
     Args:
         packed: n obstacles.

@@ -65,7 +65,7 @@ def checked_lengths(value: object, what: str) -> Array:
 
 
 class _Single(NamedTuple):
-    """One obstacle, ready for distances."""
+    """One obstacle, prepared for distance queries."""
 
     formula: Formula
     to_own: Array | None  # rotation of base vectors into the own frame, shape (3, 3); None when there is none
@@ -115,7 +115,7 @@ class Obstacle(ABC):
     and its gradient, a unit vector: outside it points from the nearest surface point to ``x``, inside from ``x`` to
     the nearest surface point, on the surface along the outward normal. Because the solids are convex, ``sd`` is convex,
     and it changes by at most one metre per metre. Where the nearest surface point is not unique (the centre of a
-    sphere, the medial axis of a box), one of them is used, always the same for the same input. To keep a distance
+    sphere, the medial axis of a box), one of them is used; it is always the same for the same input. To keep a distance
     ``r`` from an obstacle, require ``sd(x) >= r``: no inflated copy is needed.
 
     Attributes:
@@ -123,11 +123,10 @@ class Obstacle(ABC):
         name: used in messages; a :class:`~imitarm.scene.Scene` falls back on ``"box 1"``.
         angular_velocity: about the shape's centre, in the base frame, shape (3,) [rad/s].
         covariance: of the position, shape (3, 3) [m^2]; None when it is exact or unknown.
-        track_id: number of the track that a tracker keeps of it; None without one.
+        track_id: number of the obstacle's track in a tracker; None without a tracker.
 
     Raises:
-        InputError: when a number is not finite, a size is not positive, or a number is so large that it can't be
-            in SI units.
+        InputError: when a number is not finite, a size is not positive, or a number is too large to be in SI units.
     """
 
     kind: ClassVar[str]  # the shape's name in scene files and messages
@@ -164,7 +163,7 @@ class Obstacle(ABC):
         return f'{type(self).__name__} "{self.name}"' if self.name else type(self).__name__
 
     def _forget(self) -> None:
-        """Drop what was worked out for the present pose; for a fresh copy."""
+        """Drop the values that were computed for the present pose, in a fresh copy."""
         for key in ("packed", "_single"):
             self.__dict__.pop(key, None)
 
@@ -176,7 +175,7 @@ class Obstacle(ABC):
 
     @cached_property
     def packed(self) -> PackedObstacles:
-        """The obstacle as a :class:`~imitarm.scene.distances.PackedObstacles` of one, at time 0."""
+        """The obstacle alone as :class:`~imitarm.scene.distances.PackedObstacles`, at time 0."""
         return pack((self,), 0.0)
 
     @cached_property
@@ -225,7 +224,7 @@ class Obstacle(ABC):
         return distance, gradient
 
     def support(self, directions: ArrayLike) -> Array:
-        """Return the farthest point of the solid in each direction, the one query that GJK needs.
+        """Return the farthest point of the solid in each direction (its support mapping, as used by GJK).
 
         Args:
             directions: of any length but zero, in the base frame, shape (..., 3).
@@ -246,7 +245,7 @@ class Obstacle(ABC):
 
     @property
     def moves(self) -> bool:
-        """Whether it has a velocity or an angular velocity."""
+        """Whether the obstacle has a velocity or an angular velocity."""
         return bool(self.velocity.any() or self.angular_velocity.any())
 
     def after(self, dt: float) -> Self:
@@ -270,7 +269,9 @@ class Obstacle(ABC):
         return moved
 
     def placed(self, position: Array, quaternion: Array, velocity: Array, angular_velocity: Array) -> Self:
-        """Return the obstacle elsewhere; itself when it is there already. The arguments must be valid.
+        """Return a copy of the obstacle with another pose; the obstacle itself when the pose is the same.
+
+        The arguments must be valid.
 
         Args:
             position: of the own frame's origin, see :class:`~imitarm.scene.distances.PackedObstacles`, shape (3,) [m].
@@ -304,7 +305,7 @@ class Obstacle(ABC):
 
 
 def pack(obstacles: tuple[Obstacle, ...], stamp: float) -> PackedObstacles:
-    """Return obstacles as arrays; ``stamp`` [s] is the time for which they hold."""
+    """Return obstacles as arrays; ``stamp`` [s] is the time at which they have these poses."""
     zero = np.zeros((3, 3))
     return PackedObstacles.of(
         [obstacle.solid() for obstacle in obstacles],
@@ -318,7 +319,7 @@ def pack(obstacles: tuple[Obstacle, ...], stamp: float) -> PackedObstacles:
 
 @dataclass(frozen=True, eq=False)
 class PosedObstacle(Obstacle):
-    """An obstacle that is described in its own frame, at its centre.
+    """An obstacle whose shape is described in a frame of its own, at its centre.
 
     Attributes:
         pose: obstacle_to_base: the centre and the rotation.
