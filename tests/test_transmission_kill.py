@@ -89,7 +89,7 @@ class Stage:
 
     def questions(self):
         """How often the retargeting process has asked whether the robot may move."""
-        return self.log("retargeting").count("press Enter to let it move again")
+        return self.log("retargeting").count("press Enter")
 
     def press_enter(self):
         self.answered = self.questions()
