@@ -1,4 +1,4 @@
-"""How often a method keeps its clearance, over hundreds of seeded scenes: ``imitarm benchmark avoidance``.
+"""Rate at which a method keeps its clearance in hundreds of seeded scenes: ``imitarm benchmark avoidance``.
 
 Success is evaluated on 4000 points of the path that would be executed, not on the samples of the plan.
 """
@@ -42,10 +42,10 @@ class Outcome:
     """The result of a method in one scene.
 
     Attributes:
-        accepted: whether the method offers its path for execution.
-        kept: whether the path keeps the required clearance (less 0.5 mm) on the dense geometry.
-        collision_free: whether the path touches nothing on the dense geometry.
-        clearance: smallest distance on the dense geometry [m].
+        accepted: whether the method accepts the scene and returns a path to execute.
+        kept: whether the path keeps the required clearance (minus 0.5 mm) at all dense points.
+        collision_free: whether the path touches no obstacle at any dense point.
+        clearance: smallest distance at the dense points [m].
         rmse: root mean square distance to the nominal path [m].
         unmoved: fraction of the components that did not move.
         seconds: compute time [s].
@@ -69,7 +69,7 @@ def learn(*, planar: bool) -> tuple[Skill, Array]:
 
 
 def evaluate(case: Case, adaptation: Adaptation) -> Outcome:
-    """Measure an adaptation on the dense geometry of its scene."""
+    """Measure an adaptation at dense points of its path."""
     times = adaptation.trajectory.times
     points, _ = adaptation.trajectory.at(np.linspace(times[0], times[-1], _DENSE))
     clearance = float(np.min(case.scene.clearance(points))) - TOOL_RADIUS
@@ -96,7 +96,7 @@ def run_family(skill: Skill, cases: Iterable[Case], method: str = "certified") -
 
 
 def _families(path: Array, planar: bool) -> list[tuple[str, bool, Callable[[int], Case]]]:
-    """Return the name of each family, whether it can be solved, and what makes its scenes."""
+    """Return the name of each family, whether it can be solved, and the function that makes its scenes."""
     rows: list[tuple[str, bool, Callable[[int], Case]]] = [
         (f"{k} on the path", True, lambda s, k=k: sparse_clutter(s, path, n_obstacles=k, planar=planar))  # type: ignore[misc]
         for k in (1, 2, 3)
@@ -137,7 +137,7 @@ def success_table(
         seeds: scenes in each family.
         first: first seed; 2000 and on are the test seeds.
         methods: of :data:`imitarm.policies.adaptation.ADAPTERS`.
-        on_done: called with the number of rows that are done, and the number of all.
+        on_done: called with the number of finished rows and the total number.
     """
     rows: list[tuple[str, ...]] = []
     planned = [(planar, *learn(planar=planar)) for planar in (True, False)]
@@ -152,7 +152,8 @@ def success_table(
                 if on_done is not None:
                     on_done(len(rows), total)
     return Table(
-        f"{seeds} scenes per row, {1e3 * CLEARANCE:.0f} mm required of a {2e3 * TOOL_RADIUS:.0f} mm tool",
+        f"{seeds} scenes per row, {1e3 * CLEARANCE:.0f} mm required clearance, tool of {2e3 * TOOL_RADIUS:.0f} mm "
+        f"radius",
         _COLUMNS,
         tuple(rows),
         "Right answer: solved with the required clearance (less 0.5 mm), or refused where it can't be solved.",

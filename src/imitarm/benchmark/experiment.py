@@ -73,7 +73,7 @@ VARIANTS: Mapping[str, Method] = {
     "m1-scaled": Method("m1", "M1, scaled", {"velocity_scaling": True}),
     "m3-scaled": Method("m3", "M3, scaled", {"velocity_scaling": True}),
 }
-"""The same methods with one option changed, to show its effect. Me-thesis fits one NURBS to the whole recording and
+"""Methods with one changed option, to show its effect. Me-thesis fits one NURBS to the whole recording and
 uses the small-angle term; "as printed" keeps every misprint that can be run; "scaled" slows all joints together where
 one would be too fast."""
 
@@ -85,7 +85,7 @@ def method(name: str) -> Method:
     """Return a method by name.
 
     Raises:
-        UnknownNameError: when there is none; the message lists those that exist.
+        UnknownNameError: when there is no such method; the message lists all methods.
     """
     if name not in METHODS:
         raise UnknownNameError.among("method", name, METHODS)
@@ -134,20 +134,21 @@ class Experiment:
 
     @property
     def plan(self) -> Plan:
-        """The recording that the method follows; for the live task the one of the same seeds."""
+        """The recording that the method follows; for the live task, the recording with the same seeds."""
         kind = "stacking" if self.task == LIVE else self.task
         return Plan(kind, self.seed, self.repeat, self.seconds, self.sigma, self.data)
 
     @property
     def name(self) -> str:
-        """A short name, unique among experiments that differ in nothing else."""
+        """A short name for the experiment."""
         return f"{self.task.replace(' ', '-')}-{self.method}-{self.robot}-{self.seed:02d}-{self.repeat}"
 
     def run(self, folder: str | Path | None = None) -> Result:
         """Run the method, and measure.
 
         Args:
-            folder: where recordings are kept, so that the next method can use the same file; None: nowhere.
+            folder: folder for recordings, so that the next method can use the same file; None: recordings are not
+                saved.
 
         Returns:
             The result; when the method fails, one without values and with the reason in ``failure``.
@@ -161,7 +162,7 @@ class Experiment:
         return Result(self, code_version(), values, failure, clock.perf_counter() - began)
 
     def recording(self, folder: Path | None = None) -> MappingRecording:
-        """Return the recording: read from ``folder`` when it is there, else made and saved there."""
+        """Return the recording: read from ``folder`` if it exists there, otherwise made and saved there."""
         if folder is None:
             return make_recording(self.plan, _arm(self.robot))
         facts = json.dumps([asdict(self.plan), self.robot, code_version()])
@@ -206,9 +207,9 @@ class StackingOutcome:
         mean_torque: mean of the absolute torque of each joint [N m].
         rms_torque: root mean square of each joint's torque [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
-        peak_torque_ratio: largest torque over the rated one.
-        velocity_ratio: largest measured joint velocity over the one allowed.
-        clamped: control ticks in which the robot's own limits changed the command.
+        peak_torque_ratio: largest torque relative to the rated torque.
+        velocity_ratio: largest measured joint velocity relative to its limit.
+        clamped: control steps in which the robot's limits changed the command.
     """
 
     success: bool
@@ -228,7 +229,7 @@ class StackingOutcome:
 def run_stacking(
     method_name: str, person: int, repeat: int = 0, sigma: float | None = None, arm: ArmModel | None = None
 ) -> StackingOutcome:
-    """Let a simulated person stack cubes by a method before a noisy camera, with real contact, and measure.
+    """Let a simulated person stack cubes with a method, a noisy camera and contact physics; measure.
 
     Args:
         method_name: one of :data:`METHODS`.
@@ -256,7 +257,7 @@ def run_stacking(
 
 
 def camera_maker(sigma: float | None) -> Callable[[int], SkeletonCamera]:
-    """Return what makes a camera with all the faults of a real one from a seed; ``sigma`` [m] as in Experiment."""
+    """Return a function from a seed to a camera with realistic errors; ``sigma`` [m] as in Experiment."""
     return SkeletonCamera.from_seed if sigma is None else partial(SkeletonCamera, sigma=sigma)
 
 
@@ -272,11 +273,11 @@ class Result:
 
     Attributes:
         experiment: which one.
-        code: which code ran, see :func:`imitarm.benchmark.provenance.code_version`.
+        code: version of the code that ran, see :func:`imitarm.benchmark.provenance.code_version`.
         values: the measures by name: those of :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics` with
             ``recorded`` [s], ``beyond_reach`` (fraction of the time) and the method's own ``notes``; or those of
             :class:`StackingOutcome`; empty after a failure.
-        failure: why there is nothing to measure; empty when there is.
+        failure: reason why there are no measures; empty if there are.
         seconds: computing time [s].
     """
 
@@ -288,7 +289,7 @@ class Result:
 
     @property
     def without_recording(self) -> bool:
-        """Whether there was no recording to follow, which is no failure of the method."""
+        """Whether the recording is missing, which is not a failure of the method."""
         return f": {_NO_RECORDING}: " in self.failure
 
     def value(self, name: str) -> float:
@@ -298,12 +299,12 @@ class Result:
 
     @staticmethod
     def path(folder: Path, experiment: Experiment) -> Path:
-        """Return where the result of an experiment is kept: a digest of its configuration is in the name."""
+        """Return the path of an experiment's result; its name contains a digest of the configuration."""
         facts = json.dumps(asdict(experiment), sort_keys=True)
         return folder / f"{experiment.name}-{hashlib.sha256(facts.encode()).hexdigest()[:12]}.json"
 
     def save(self, folder: Path) -> Path:
-        """Write it atomically, and return where it is."""
+        """Write the result atomically, and return its path."""
         folder.mkdir(parents=True, exist_ok=True)
         path = self.path(folder, self.experiment)
         content = {

@@ -1,7 +1,7 @@
-"""Seeded families of scenes around one seeded skill: the same number gives the same scene everywhere.
+"""Seeded families of scenes around one seeded skill; the same seed gives the same scene on every machine.
 
-Every scene is a :class:`Case`: what is in the way, in which directions nothing may move, and whether it can be solved
-at all, known from how the scene was made and not from a method under test.
+Every scene is a :class:`Case`: obstacles, forbidden directions, and whether a solution exists. The latter follows from
+the construction of the scene, not from a tested method.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Case:
     """One scene to be solved or refused.
 
     Attributes:
-        scene: what is in the way.
+        scene: the obstacles.
         forbidden: directions in which nothing may move, shape (m, 3).
         solvable: whether a path with the required clearance exists.
     """
@@ -49,7 +49,7 @@ def s_shaped_demonstrations(*, planar: bool, n_demonstrations: int = 8, seed: in
     Args:
         planar: keep the height constant, as in a task on a table.
         n_demonstrations: how many.
-        seed: of the habits that tell one demonstration from another.
+        seed: of the differences between the demonstrations.
     """
     rng = np.random.default_rng([1, seed])
     times = np.linspace(0.0, _DURATION, 200)
@@ -98,10 +98,10 @@ def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, ki
 
     Args:
         seed: number of the scene.
-        path: nominal path that they are put on, shape (n, 3) [m].
+        path: nominal path on which the obstacles are placed, shape (n, 3) [m].
         n_obstacles: how many.
         planar: whether the path must stay in its plane.
-        kinds: which shapes to choose from.
+        kinds: the shapes from which to choose.
     """
     rng = np.random.default_rng([11, n_obstacles, planar, seed])
     ends = path[[0, -1]]
@@ -123,7 +123,7 @@ def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, ki
 
 
 def narrow_gap(seed: int, path: Array, *, solvable: bool) -> Case:
-    """Family S4: a wall square across a planar path with one gap, wide enough by 5 to 30 mm or too narrow by as much.
+    """Family S4: a wall across a planar path with one gap, 5 to 30 mm wider or narrower than necessary.
 
     Args:
         seed: number of the scene.
@@ -198,7 +198,7 @@ RANDOM_FAMILIES = ("on the path", "cluster", "gap", "near an end", "huge", "thin
 
 
 def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> RandomScene:
-    """Make a random scene that is as hard as it comes: nothing guarantees that it can be solved.
+    """Make a random scene, which need not have a solution.
 
     Args:
         seed: number of the scene.
@@ -303,7 +303,7 @@ def _gap(rng: np.random.Generator, path: Array, duration: float, planar: bool, r
 def _near_an_end(
     rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float
 ) -> tuple[Obstacle, ...]:
-    """An obstacle just ahead of the start or the goal, which it leaves barely clear."""
+    """An obstacle close to the start or the goal, with little more than the required clearance."""
     forward = bool(rng.random() < 0.5)
     end, inward = (path[0], path[len(path) // 9] - path[0]) if forward else (path[-1], path[-len(path) // 9] - path[-1])
     direction = inward / np.linalg.norm(inward) + rng.choice([0.1, 0.5]) * rng.normal(size=3)
@@ -333,7 +333,7 @@ def _thin(rng: np.random.Generator, path: Array, duration: float, planar: bool, 
 def _enclosing(
     rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float
 ) -> tuple[Obstacle, ...]:
-    """Walls on several sides of a point of the path, as in a shelf or a box: some have no exit."""
+    """Walls on several sides of a point of the path, as in a shelf or a box; some leave no opening."""
     at, ahead = _heading(rng, path)
     at = int(rng.choice([0, at, len(path) - 1]))
     yaw = np.array([0.0, 0.0, np.arctan2(ahead[1], ahead[0])])
@@ -349,7 +349,7 @@ def _enclosing(
 
 
 def _moving(rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float) -> tuple[Obstacle, ...]:
-    """Obstacles that cross the path at the time when the tool is there, or nearly, at 0.1 to 0.6 m/s."""
+    """Obstacles that cross the path at 0.1 to 0.6 m/s, about when the tool is there."""
     made = []
     for _ in range(int(rng.integers(1, 4))):
         at = int(rng.uniform(0.15, 0.85) * (len(path) - 1))

@@ -1,4 +1,4 @@
-"""What is better than what: ``modern`` against each other method, and the thesis's claims against what held here."""
+"""Comparisons: ``modern`` with each other method, and the thesis's claims with the results."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ COMPARED = (
 and smoothness, and the frames that break a limit."""
 STACKED = Figure("success", "stacked [%]", 100.0, 0, more=True)
 LIVE_COMPARED = (STACKED, *LOOP, TORQUES[1], EFFORT[4], EFFORT[6])
-"""The same in closed loop; all but the rate are of the trials in which both methods succeeded."""
+"""The measures that are compared in closed loop; all but the rate are of the trials in which both methods succeeded."""
 
 
 def _compared(results: Results, tasks: Sequence[str]) -> Iterator[tuple[Figure, str, Comparison, float]]:
@@ -52,7 +52,7 @@ def _compared(results: Results, tasks: Sequence[str]) -> Iterator[tuple[Figure, 
 
 
 def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return ``modern`` against each other method, paired over the same recordings or trials."""
+    """Return the comparisons of ``modern`` with each other method, paired over the same recordings or trials."""
     rows = [
         (_titled(figure), METHODS[name].title, *_difference(comparison, figure), f"{p:.3f}")
         for figure, name, comparison, p in _compared(results, tasks)
@@ -60,13 +60,13 @@ def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
     columns = ("measure", f"{OURS} minus", "difference (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
     note = (
         "↑: a larger value is better; else a smaller one. Persons are resampled; p by sign flips of the persons' "
-        "differences, corrected within each measure. Pairs: where both methods have a value."
+        "differences, corrected within each measure. Pairs: recordings for which both methods have a value."
     )
     return Table(f"Paired comparison: {', '.join(tasks)}", columns, tuple(rows), note)
 
 
 def better_methods_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return where another method is better than ``modern``: in each kind of recording, and in closed loop."""
+    """Return the measures in which another method is better than ``modern``."""
     rows = []
     for task in [*tasks, LIVE]:
         for figure, name, comparison, p in _compared(results, [task]):
@@ -121,14 +121,14 @@ PRINTED_TIME = np.array([22.23, 18.43, 17.72, 19.2, 15.82, 14.21, 13.03, 9.01, 9
 """Execution time of Table 3.1 [s]."""
 
 ME = ("thesis", "modern")
-"""What stands for the thesis's own method, Me: its corrected equations, and this library's method."""
+"""The two methods that represent the thesis's own method, Me: its corrected equations, and this library's method."""
 BASELINES = ("m1", "m2", "m3")
 _TORQUE_FIGURE = Figure("mean_torque", "mean torque [N m]", digits=2)
 _PATH_FIGURE = Figure("path_length", "path [m]", digits=2)
 
 
 def printed_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return Table 3.1 beside ours: means over its ten experiments, and over our persons."""
+    """Return Table 3.1 beside our results: means over its ten experiments, and over our persons."""
     arm = ArmModel.load("sawyer", tool="gripper")
     rows = [
         (
@@ -181,18 +181,18 @@ def claims_table(results: Results, tasks: Sequence[str]) -> Table:
         "corrected p is below 0.05; no: for one of them it is on the other side; not shown: neither. Times are "
         "compared where both succeeded."
     )
-    return Table("What the thesis claims, and what held", columns, tuple(rows), note)
+    return Table("Claims of the thesis, and results", columns, tuple(rows), note)
 
 
 Verdict = tuple[str, str]
-"""What was measured, in words, and whether the claim held."""
+"""The measurement as text, and whether the claim held."""
 
 
 def verdict(comparisons: Sequence[Comparison], sign: float) -> str:
     """Return whether a claim held against all baselines.
 
     A difference counts when its interval excludes zero and p, corrected for the number of baselines, is below 0.05; so
-    two persons alone can't show anything.
+    with only two persons no claim can be confirmed.
 
     Args:
         comparisons: Me minus each baseline.
@@ -282,4 +282,4 @@ CLAIMS: Sequence[tuple[str, Callable[[Results, str, Sequence[str]], Verdict]]] =
     (f"mean torques of {min(_MEANS):.0f} to {max(_MEANS):.0f} N m at every joint (Table 3.1)", _rated),
     (f"four cubes stacked in {PRINTED_TIME.mean():.1f} s (Table 3.1)", _like_printed_time),
 )
-"""The claims, and what evaluates them."""
+"""The claims, and the functions that evaluate them."""

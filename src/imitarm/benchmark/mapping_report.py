@@ -39,20 +39,20 @@ _WORDS: Final = {
 def write_mapping_report(
     results: Results, tables: Sequence[Table], path: str | Path, *, provenance: Mapping[str, Any], folder: Path | None
 ) -> Path:
-    """Write the page by :func:`~imitarm.viewer.page.draw_page` and return where it is.
+    """Write the page with :func:`~imitarm.viewer.page.draw_page` and return its path.
 
     Args:
         results: of the benchmark.
         tables: as the command printed them.
         path: the file to write; its folder must exist.
-        provenance: what is needed to repeat it.
-        folder: where recordings are kept; None: nowhere.
+        provenance: the facts that are needed to repeat the benchmark.
+        folder: folder of the recordings; None: they were not saved.
 
     Returns:
         Where it was written, absolute.
 
     Raises:
-        InputError: when the place can't be written, or the libraries that draw are not installed.
+        InputError: when the file can't be written, or the drawing libraries are not installed.
         TaskFailedError: when the disk is full.
     """
     return draw_page(lambda: mapping_report_html(results, tables, provenance=provenance, folder=folder), path)
@@ -86,7 +86,7 @@ def _verdict(results: Results) -> tuple[str, bool]:
     if not runs:
         return f"{OURS} was not run", False
     broken = sum(_breaks(r) for r in runs)
-    text = f"{OURS} breaks a limit in {broken} of {len(runs)} recordings"
+    text = f"{OURS} exceeds a limit in {broken} of {len(runs)} recordings"
     return text, broken == 0
 
 
@@ -198,8 +198,8 @@ def accuracy(results: Results, tasks: Sequence[str], *, name: str = "accuracy") 
 
 
 def limit_violations(results: Results, tasks: Sequence[str], *, name: str = "limits") -> str:
-    """Draw the number of frames that break a limit, for each method and kind of recording."""
-    text = "Frames that break a limit of position, velocity or acceleration"
+    """Draw the number of frames that exceed a limit, for each method and kind of recording."""
+    text = "Frames that exceed a limit of position, velocity or acceleration"
     return _by_task(results, tasks, "limit_violations", 1.0, "frames per recording", text, name)
 
 
@@ -209,7 +209,9 @@ def times(results: Results, *, name: str = "times") -> str:
     def values(method: str) -> Values:
         return results.values(method, [LIVE], "time")
 
-    return _live(results, lambda m: interval(values(m)), "time of the successes [s]", "Time to stack four cubes", name)
+    return _live(
+        results, lambda m: interval(values(m)), "time of successful trials [s]", "Time to stack four cubes", name
+    )
 
 
 def successes(results: Results, *, name: str = "successes") -> str:
@@ -244,7 +246,7 @@ def _scaled(found: Interval, factor: float) -> Interval:
 def _grouped(
     name: str, description: str, unit: str, groups: Sequence[str], series: Sequence[tuple[str, Sequence[Interval]]]
 ) -> str:
-    """Draw bars in groups, one of each series in a group, with their intervals; nothing when there is no number."""
+    """Draw bars in groups, one bar of each series in a group, with intervals; return an empty text without values."""
     if not any(math.isfinite(found.mean) for _, bars in series for found in bars):
         return ""
     rows = -(-len(series) // 2)

@@ -1,4 +1,4 @@
-"""The mapping benchmark's tables, from results that were saved: texts in rows, for a terminal or a page."""
+"""The tables of the mapping benchmark, built from saved results, for a terminal or a page."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Figure:
         name: in ``Result.values``.
         title: with its unit.
         factor: from SI.
-        digits: after the point.
+        digits: number of decimals.
         more: whether a larger value is better.
     """
 
@@ -68,13 +68,13 @@ TORQUES = (
     Figure("rms_torque", "RMS torque [N m]", digits=2),
     Figure("mean_motion_torque", "mean torque without gravity [N m]", digits=2),
 )
-"""Means over the joints of what the tables of torques have for each."""
+"""Titles of the means over the joints, by the titles of the torque tables."""
 LOOP = (Figure("time", "time [s]", digits=0), Figure("path_length", "path [m]", digits=2), TORQUES[0])
 
 _RECORDED = (Figure("recorded", "length [s]"), Figure("beyond_reach", "beyond reach [%]", 100.0))
 _MEANS_NOTE = "Mean over persons (95 % interval)"
 _ACCURACY_NOTE = (
-    "root mean squares. Executed: by an arm that keeps its limits, as a real one does. Engaged: fraction of the time "
+    "root mean squares. Executed: by an arm that keeps its limits, as a real arm does. Engaged: fraction of the time "
     "in which the robot was led."
 )
 _CAPTURED_NOTE = "One person's motion, so without an interval: mean (least … greatest over the cameras)"
@@ -82,14 +82,14 @@ _ONE = -1  # person of the captured arm: it is the same whichever simulated body
 
 
 class Results:
-    """Results by method, task and name of what was measured."""
+    """Results by method, task and measure."""
 
     def __init__(self, results: Iterable[Result]) -> None:
         self.all = list(results)
         self.methods = [name for name in METHODS if any(r.experiment.method == name for r in self.all)]
 
     def of(self, method: str, tasks: Sequence[str]) -> list[Result]:
-        """Return the results of a method at some tasks."""
+        """Return the results of a method for some tasks."""
         return [r for r in self.all if r.experiment.method == method and r.experiment.task in tasks]
 
     def tasks(self, among: Sequence[str] = KINDS) -> list[str]:
@@ -102,9 +102,9 @@ class Results:
         Args:
             method: whose.
             tasks: at which.
-            name: what was measured; ``"limit_violations"`` is the sum of the three counts. With the loop closed
+            name: of the measure; ``"limit_violations"`` is the sum of the three counts. With the loop closed
                 ``"success"`` is 1 or 0, and the rest is known only of the trials that succeeded.
-            joint: of what is measured for each joint, which; None: the mean over the joints.
+            joint: index of the joint, for measures of each joint; None: the mean over the joints.
         """
         return {
             (_person(r), (r.experiment.task, r.experiment.repeat)): number(r, name, joint)
@@ -131,7 +131,7 @@ def number(result: Result, name: str, joint: int | None = None) -> float:
 
 
 def written(found: Interval, figure: Figure) -> str:
-    """Return mean, interval and, when some recordings have no number, how many have one."""
+    """Return mean, interval and, when some recordings have no value, the number of recordings with a value."""
     if not math.isfinite(found.mean):
         return f"– (0 of {found.of})" if found.of else "–"
     values = [figure.factor * v for v in (found.mean, found.low, found.high)]
@@ -142,7 +142,7 @@ def written(found: Interval, figure: Figure) -> str:
 
 
 def written_each(values: Values, figure: Figure) -> str:
-    """Return a mean and, in brackets, the smallest and largest value: for what has no interval."""
+    """Return a mean and, in brackets, the smallest and largest value, for measures without an interval."""
     known = [figure.factor * value for _, value in sorted(values.items()) if math.isfinite(value)]
     if not known:
         return f"– (0 of {len(values)})" if values else "–"
@@ -161,7 +161,7 @@ def _cells(results: Results, name: str, task: str, figures: Sequence[Figure]) ->
 
 
 def recordings_table(results: Results) -> Table:
-    """Return how many recordings there are, how long, and how often the target is beyond the robot's reach."""
+    """Return the number and duration of the recordings, and how often the target is beyond the robot's reach."""
     rows = []
     for task in results.tasks(REPLAYS):
         runs = [r for r in results.all if r.experiment.task == task]
@@ -184,7 +184,7 @@ def recordings_table(results: Results) -> Table:
 
 
 def persons_note(results: Results) -> str:
-    """Return which simulated persons the figures are of, and whether methods were developed with them."""
+    """Return a sentence about the simulated persons of the tables, and whether methods were developed with them."""
     seen = sorted({r.experiment.seed for r in results.all if r.experiment.task != CAPTURED})
     if not seen:
         return ""
@@ -235,7 +235,7 @@ def torque_table(results: Results, tasks: Sequence[str], name: str, title: str) 
 
 
 def limits_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return what breaks limits, by finite differences of the joint positions alone."""
+    """Return the frames that exceed limits, by finite differences of the joint positions alone."""
     rows = []
     for name in results.methods:
         made = [r for r in results.of(name, tasks) if not r.without_recording]
@@ -252,12 +252,13 @@ def limits_table(results: Results, tasks: Sequence[str]) -> Table:
         rows.append((*row, *(f"{ratio:.2f}" for ratio in ratios), str(own)))
     heads = ("method", "recordings without any>", "position>", "velocity>", "acceleration>")
     columns = (*heads, "worst velocity>", "worst acceleration>", "found by the method>")
-    note = "Frames that break a limit; the worst value over the limit; faults that the method found itself and left."
+    note = "Frames that exceed a limit; largest value relative to the limit; faults that the method itself found and "
+    "did not fix."
     return Table(f"Limit violations: {', '.join(tasks)}", columns, tuple(rows), note)
 
 
 def success_table(results: Results) -> Table:
-    """Return how often four cubes were stacked with the loop closed; time and path only of what succeeded."""
+    """Return how often four cubes were stacked in closed loop, with time and path of the successful trials."""
     rows = []
     for name in results.methods:
         runs = results.of(name, [LIVE])

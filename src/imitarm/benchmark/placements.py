@@ -1,4 +1,4 @@
-"""Policies on a simulated arm, among seeded obstacles on the path: who arrives, who waits, who touches.
+"""Policies on a simulated arm, with seeded obstacles on the path: rates of arrival, refusal and contact.
 
 Each placement puts one to three obstacles on the learned path of a skill. Every policy reproduces the skill there,
 behind the same safety filter, and the simulator's own geometry measures what happens.
@@ -34,7 +34,7 @@ from imitarm.skills import Skill
 Array = NDArray[np.float64]
 
 OUTCOMES = ("arrived", "refused", "waited", "too near", "touched", "stopped")
-"""What can come of a placement: arrived with the clearance kept; refused before any motion; not finished in time;
+"""Possible outcomes of a placement: arrived with the clearance kept; refused before any motion; not finished in time;
 finished, but nearer than required; contact, also of the arm with itself; a protective stop or a failure."""
 
 CLEARANCE = 0.02  # [m] required
@@ -47,7 +47,7 @@ _TRIES = 200
 
 @dataclass(frozen=True)
 class Setup:
-    """What is reproduced, by what arm.
+    """A skill and the arm that reproduces it.
 
     Attributes:
         skill: path of a skill file.
@@ -66,7 +66,7 @@ class PlacementResult:
 
     Attributes:
         policy: its name.
-        setup: what was reproduced.
+        setup: the skill and the arm.
         seed: of the placement.
         outcome: one of :data:`OUTCOMES`.
         clearance: smallest measured distance of arm and tool to an obstacle [m]; nan without a motion.
@@ -197,7 +197,7 @@ def run_placements(
         setups: skills with their arms.
         seeds: of the placements.
         jobs: processes.
-        progress: called with the number of placements that are done, and of all.
+        progress: called with the number of finished placements and the total number.
 
     Raises:
         InputError: when a skill or an arm can't be loaded, or several processes are requested without joblib.
@@ -228,7 +228,7 @@ def _joblib() -> Any:
 
 
 def placement_table(results: Sequence[PlacementResult]) -> Table:
-    """Return one row for each policy: how often each outcome came, and how near the arm was."""
+    """Return one row for each policy: the frequency of each outcome, and the smallest clearance."""
     rows = []
     for policy in dict.fromkeys(result.policy for result in results):
         own = [result for result in results if result.policy == policy]

@@ -1,4 +1,4 @@
-"""Which code made a result: the commit of the checkout that it ran from, or the version that is installed."""
+"""Version of the code that made a result: the commit of its checkout, or the installed version."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _PACKAGE = Path(imitarm.__file__).parent
 
 @lru_cache(maxsize=1)
 def code_version() -> str:
-    """Return which code is running, as a phrase; read once per process.
+    """Return the version of the running code as text; it is determined once per process.
 
-    In a checkout this is the last commit that changed the package, so commits of documentation or tests leave it as it
-    is. Uncommitted changes of the package are named by a hash of their text: results of two different states of a
-    working tree are never taken for each other.
+    In a checkout this is the last commit that changed the package; commits of documentation or tests do not change it.
+    Uncommitted changes of the package are identified by a hash of their text, so that results of two different states
+    of a working tree are never confused.
 
     Returns:
         ``"commit 0123456789"``, ``"commit 0123456789 with uncommitted changes 01234567"``, or ``"version 0.1.0"`` when
@@ -29,7 +29,7 @@ def code_version() -> str:
 
 
 def version_of(package: Path, installed: str) -> str:
-    """Return which code is in a folder: see :func:`code_version`.
+    """Return the version of the code in a folder, see :func:`code_version`.
 
     Args:
         package: the folder, with an ``__init__.py``.
@@ -49,7 +49,7 @@ def version_of(package: Path, installed: str) -> str:
 
 
 def origin(versions: Iterable[str]) -> str:
-    """Return a sentence that says which code made the results, and whether it is other code than this.
+    """Return a sentence that says which code made the results, and whether it differs from the running code.
 
     Args:
         versions: of the code of each result, see :func:`code_version`.

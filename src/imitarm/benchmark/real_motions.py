@@ -104,7 +104,7 @@ def tables(motions: Sequence[Motion]) -> list[Table]:
 
 
 class Start(NamedTuple):
-    """How an arm starts to follow a motion: where all of it is within reach.
+    """The start of an arm that follows a motion, from which the whole motion is within reach.
 
     The fields are the arm, the skeletons at the playback speed, the correspondence, the first posture (n_joints,)
     [rad], and the largest speed of the target [m/s].

@@ -50,7 +50,7 @@ _TRIES = 5  # trials of a person, until one stacks the tower with the ideal foll
 
 @dataclass(frozen=True)
 class Plan:
-    """What defines a recording, as plain values.
+    """The definition of a recording, as plain values.
 
     Attributes:
         kind: one of :data:`KINDS`, or :data:`CAPTURED`.
@@ -85,20 +85,20 @@ class Plan:
 
     @property
     def number(self) -> int:
-        """A seed that no other recording has."""
+        """The unique seed of this recording."""
         return 10 * (REPEATS * self.person + self.repeat) + (*KINDS, CAPTURED).index(self.kind)
 
     def camera(self, number: int) -> SkeletonCamera:
-        """Return a camera with all the faults of a real one."""
+        """Return a camera with realistic errors."""
         return SkeletonCamera.from_seed(number) if self.sigma is None else SkeletonCamera(number, sigma=self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class MappingRecording:
-    """A recording with everything a method is given, and with the truth, which no method is given.
+    """A recording with the input of the methods, and the true motion, which the methods do not get.
 
     Attributes:
-        plan: what defines it.
+        plan: the definition of the recording.
         skeletons: as the camera saw them.
         correspondence: the same for all methods.
         start: first posture of the robot, shape (n_joints,) [rad].
@@ -121,7 +121,7 @@ class MappingRecording:
         return TrueArm.from_points(times, points.reshape(-1, 6, 3), self.correspondence)
 
     def save(self, path: Path) -> None:
-        """Write it atomically; the file holds arrays only, nothing that could be executed."""
+        """Write the recording atomically; the file contains only arrays and nothing executable."""
         c, lengths = self.correspondence, self.correspondence.lengths
         assert lengths is not None
         aside = path.with_name(f".{path.name}.{np.random.default_rng().integers(1 << 62):x}.part")
@@ -146,7 +146,7 @@ class MappingRecording:
 
     @classmethod
     def load(cls, path: Path, plan: Plan) -> MappingRecording:
-        """Read what :meth:`save` wrote."""
+        """Read a file that :meth:`save` wrote."""
         with np.load(path, allow_pickle=False) as file:
             seen = zip(file["times"], file["positions"], file["tracking"], file["hands"], strict=True)
             skeletons = tuple(Skeleton(t, p, k, (HandState(left), HandState(right))) for t, p, k, (left, right) in seen)
@@ -163,7 +163,7 @@ def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
     """Make a recording; the same plan always gives the same recording.
 
     Args:
-        plan: what defines it.
+        plan: the definition of the recording.
         arm: the robot that will follow it.
 
     Raises:
@@ -200,7 +200,7 @@ def _scale(plan: Plan, person: Person) -> float:
 
 
 def _start(plan: Plan, arm: ArmModel, points: Array) -> Array:
-    """Return the first posture: that of the stacking task, else one with the wrist where the person's maps to."""
+    """Return the first posture: that of the stacking task, else one that corresponds to the person's wrist."""
     if plan.kind == "stacking":
         return StackTask().start_posture(arm)
     s, e, w = FACING.apply(points[:3])
@@ -242,7 +242,7 @@ def _drawing(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
 
 
 def _stacking(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
-    """Return a person who stacks with a gripper that moves exactly with the hand: no method shapes the motion."""
+    """Return a person who stacks with a gripper that moves exactly with the hand, independent of all methods."""
     for k in range(_TRIES):
         done = run_stack(plan.person, plan.repeat + REPEATS * k, IdealFollower, camera=ideal_camera)
         if done.success:

@@ -1,17 +1,18 @@
-"""Is there a path at all? An oracle for refusals, which shares nothing with the search of the product.
+"""An oracle that decides whether a path exists, to check refusals. It shares no code with the search of the library.
 
 It looks at displacements of the nominal path, one grid of them for each of many times (layers), and gives one of three
 answers:
 
-* **impossible**: a proof. A box of the grid counts as free when any point of it might be, at any time of an interval.
-  If even so no chain of boxes leads from the start to the goal, no continuous displacement does.
-* **possible**: a path was found and verified. Cells count as free when their centre is; moves between neighbours and
-  between layers are bounded from below by tangents. The cheapest chain is then fitted by sums of the skill's
-  components or, where these are too wide, of hat functions in time.
-* **undecided**: neither, at the finest grid.
+* **impossible**: a proof. A box of the grid counts as free if any of its points may be free at any time of an interval.
+  If no chain of such boxes leads from the start to the goal, then no continuous displacement does either.
+* **possible**: a path was found and verified. A cell counts as free if its centre is free; the distance during moves
+  between neighbours and between layers is bounded from below by tangents. The cheapest chain is then fitted by sums of
+  the skill's components or, where these are too wide, of hat functions in time.
+* **undecided**: neither was shown with the finest grid.
 
-The limits are those that the product states: no sample is displaced by more than 0.5 m, no step is longer than 8 times
-the longest step of the nominal path, fixed times do not move, and nothing moves in forbidden directions.
+The limits are those of the library: no sample is displaced by more than 0.5 m, no step is longer than 8 times
+the longest step of the nominal path, fixed times do not move, and no displacement has a component in forbidden
+directions.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _FIT_ROUNDS = 12
 
 
 class Answer(Enum):
-    """What the oracle found."""
+    """Answer of the oracle."""
 
     IMPOSSIBLE = "impossible"
     POSSIBLE = "possible"
@@ -75,7 +76,7 @@ def answer(question: Question) -> Answer:
 def is_solved(
     question: Question, axes: Array | None = None, grids_to_search: Sequence[tuple[float, float]] | None = None
 ) -> bool:
-    """Tell whether a path is found and verified, on all grids or on some, given by reach and size of a cell [m]."""
+    """Return whether a path is found and verified, on all grids or on given ones (reach and cell size [m])."""
     axes = question.axes() if axes is None else axes
     if separation(question, question.nominal.times, question.nominal.positions) >= -1e-9:
         return True
@@ -154,7 +155,7 @@ def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Arr
 def _advanced(
     cost: Array, middle: tuple[int, ...], away: Array, longest: float, from_fixed: bool, to_fixed: bool
 ) -> Array:
-    """Return the costs at the next layer: cells stay, except straight from and to a point that must not move."""
+    """Return the costs at the next layer: displacements stay in their cell, except next to a fixed point."""
     if from_fixed and not to_fixed:
         return np.where(away <= longest, cost[middle] + _CHANGE_COST * away, np.inf)
     if to_fixed and not from_fixed:
@@ -163,7 +164,7 @@ def _advanced(
 
 
 def _layer_times(question: Question) -> Array:
-    """Return the times of the layers: evenly, and the first few samples from each fixed time."""
+    """Return the times of the layers: evenly spaced, plus the first few samples around each fixed time."""
     moving = any(obstacle.velocity.any() for obstacle in question.obstacles)
     samples = question.nominal.times
     even = np.linspace(samples[0], samples[-1], _SEARCH_LAYERS_MOVING if moving else _SEARCH_LAYERS)
@@ -251,7 +252,7 @@ def _tangent_bound(f0: Array, a: Array, f1: Array, b: Array) -> Array:
 
 
 def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
-    """Return the costs after one more move to a neighbour along each axis, where it is free."""
+    """Return the costs after one more free move to a neighbour along each axis."""
     d = cost.ndim
     result = cost.copy()
     for axis in range(d):
@@ -267,7 +268,7 @@ def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
 def _backtracked(
     costs: list[Array], sides: list[list[Bools]], arrivals: list[Any], away: Array, middle: tuple[int, ...], h: float
 ) -> Array:
-    """Return the cell coordinates (k, d) [m] of the cheapest chain, one at each layer: where it leaves the layer."""
+    """Return the coordinates (k, d) [m] of the last cell of the cheapest chain in each layer."""
     chain = np.zeros((len(costs), len(middle)))
     cell = middle
     for k in range(len(costs) - 1, 0, -1):
@@ -300,7 +301,7 @@ def _neighbours(
 
 
 def _fits(question: Question, axes: Array, chain: tuple[Array, Array]) -> bool:
-    """Tell whether sums of components, or of hat functions in time, follow a chain and keep the clearance."""
+    """Return whether sums of components, or of hat functions in time, can follow a chain and keep the clearance."""
     times = question.nominal.times
     wanted = np.stack([np.interp(times, chain[0], column) for column in chain[1].T], axis=1)
     return any(
@@ -309,7 +310,7 @@ def _fits(question: Question, axes: Array, chain: tuple[Array, Array]) -> bool:
 
 
 def _hats(question: Question, every: int) -> Array:
-    """Return hat functions in time (n, m): a peak every few samples, and more near fixed times."""
+    """Return hat functions in time (n, m), with a peak every few samples, and more of them near fixed times."""
     times, n = question.nominal.times, len(question.nominal)
     fixed = [int(np.argmin(np.abs(times - time))) for time in question.fixed_times]
     peaks = set(range(0, n, every)) | {n - 1}

@@ -1,7 +1,7 @@
-"""Proof that no path exists, by flooding boxes of space over time, and what it is asked about.
+"""Proof that no path exists, by flooding boxes of space over time.
 
-A box counts as free when any point of it might be, at any time of an interval. If even so no chain of boxes leads from
-the start to the goal, no continuous displacement of the path does.
+A box counts as free if any of its points may be free at any time of an interval. If no chain of such boxes leads from
+the start to the goal, then no continuous displacement of the path does either.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Question:
     Attributes:
         nominal: the nominal path, n samples.
         basis: influence of the skill's components on the samples, shape (n, n_components).
-        obstacles: where they are at time 0; they keep their velocity.
+        obstacles: at time 0; they keep their velocity.
         spheres: of the tool, rows x y z r, shape (m, 4) [m].
         clearance: required [m].
         forbidden: directions in which nothing may move, shape (k, 3).
@@ -59,7 +59,7 @@ class Question:
         return tip, np.stack([rotate(rotations, np.broadcast_to(s[:3], (len(times), 3))) for s in self.spheres])
 
     def axes(self) -> Array:
-        """Return an orthonormal basis (d, 3) of the displacements that are not ruled out altogether."""
+        """Return an orthonormal basis (d, 3) of the permitted displacements."""
         if not len(self.forbidden):
             return np.eye(3)
         unit = self.forbidden / np.linalg.norm(self.forbidden, axis=1, keepdims=True)
@@ -71,11 +71,11 @@ class Question:
 
 
 def separation(question: Question, times: Array, positions: Array) -> float:
-    """Return the smallest proven distance [m] along a path, less the required clearance.
+    """Return the smallest proven distance along a path, minus the required clearance [m].
 
     A point is at least ``u . p - max_x u . x`` away from a convex obstacle, for any unit vector u; the maximum over the
-    points x of the obstacle is its support function. Nothing else of the product's geometry is trusted: its gradient
-    only proposes u.
+    points x of the obstacle is its support function. The proof relies on no other geometry of the library; the gradient
+    of its distance is only used to propose u.
 
     Args:
         question: obstacles, spheres and clearance.
@@ -113,7 +113,7 @@ class _Cells:
     counts: tuple[int, ...]
 
     def window(self, centre: Array) -> tuple[tuple[int, int], ...]:
-        """Return first and last-but-one index along each edge of the boxes within the largest displacement."""
+        """Return the first and the past-the-last index, along each edge, of the boxes in reach."""
         low = np.floor((self.frame @ centre - MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         high = np.ceil((self.frame @ centre + MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         return tuple((max(a, 0), min(b, n)) for a, b, n in zip(low, high, self.counts, strict=True))
@@ -176,11 +176,11 @@ def _cells(question: Question, frame: Array, size: Array) -> _Cells:
 
 
 def is_impossible(question: Question, cells: _Cells) -> bool:
-    """Prove that there is no path: flood, interval after interval, every box that might be free during some of it.
+    """Prove that there is no path: flood, interval after interval, every box that may be free during a part of it.
 
-    A box is blocked when all of its corners are inside one and the same inflated obstacle, for it is convex. Boxes are
-    fixed in space, so the motion of the tip does not matter; what remains of the motion (out of the permitted plane,
-    of spheres beside the tip, of the obstacles) is subtracted.
+    A box is blocked when all of its corners are inside the same inflated obstacle, because the obstacle is convex.
+    Boxes are fixed in space, so the motion of the tip does not matter. All other motion (out of the permitted plane, of
+    spheres beside the tip, of the obstacles) is subtracted from the distance.
     """
     d = len(cells.frame)
     moving = any(obstacle.velocity.any() for obstacle in question.obstacles)
@@ -230,7 +230,7 @@ def is_impossible(question: Question, cells: _Cells) -> bool:
 
 
 def _touching(cells: _Cells, window: tuple[tuple[int, int], ...], point: Array) -> Bools:
-    """Return which boxes of a window touch a point."""
+    """Return whether each box of a window touches a point."""
     at = (cells.frame @ point - cells.lowest) / cells.size
     lines = [
         (np.arange(a, b) - 1e-9 <= x) & (x <= np.arange(a, b) + 1.0 + 1e-9)
@@ -261,7 +261,7 @@ def _inside(question: Question, start: float, end: float) -> Array:
 def _leftover_motion(
     question: Question, cells: _Cells, times: Array, tip: Array, relative: Array, middle: int
 ) -> Array:
-    """Return how far spheres get, relative to obstacles, from where they are at ``middle``, (n_obstacles, m) [m]."""
+    """Return the largest displacement of spheres relative to obstacles since ``middle``, (n_obstacles, m) [m]."""
     out_of_plane = tip - tip @ cells.frame.T @ cells.frame
     bow = np.linalg.norm(question.spheres[:, :3], axis=1) * 1e-3 * bool(np.abs(np.diff(relative, axis=1)).max() > 0.0)
     answer = np.empty((len(question.obstacles), len(question.spheres)))
@@ -280,7 +280,7 @@ def _maybe_free(
     relative: Array,
     slack: Array,
 ) -> Bools:
-    """Return which boxes are not surely blocked."""
+    """Return whether each box may be free."""
     d = len(cells.frame)
     corners = cells.corners(window, tip)
     blocked = np.zeros([b - a for a, b in window], dtype=bool)
@@ -298,7 +298,7 @@ def _maybe_free(
 def _permitted(
     question: Question, cells: _Cells, window: tuple[tuple[int, int], ...], times: Array, tip: Array
 ) -> Bools:
-    """Return which boxes a one-sided forbidden direction does not rule out at some time of an interval."""
+    """Return whether one-sided forbidden directions permit each box at some time of an interval."""
     answer = np.ones([b - a for a, b in window], dtype=bool)
     corners: Array | None = None
     for f in question.forbidden:
@@ -315,7 +315,7 @@ def _permitted(
 
 
 def halves(axis: int, d: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Return what selects all but the last, and all but the first entry along an axis of a d-dimensional array."""
+    """Return two indices: all but the last, and all but the first entry along an axis of a d-dimensional array."""
     first, last = [slice(None)] * d, [slice(None)] * d
     first[axis], last[axis] = slice(None, -1), slice(1, None)
     return tuple(first), tuple(last)

@@ -1,4 +1,4 @@
-"""Are accepted paths clear, and refusals right? Random scenes and an oracle: ``imitarm benchmark refusals``."""
+"""Checks of accepted paths and of refusals. Random scenes and an oracle: ``imitarm benchmark refusals``."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _COLUMNS = ("scenes", "accepted>", "violations>", "oracle solves>", "refused>", 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What happened in one scene.
+    """Result of one scene.
 
     Attributes:
         seed: number of the scene.
         family: how its obstacles were placed.
         accepted: whether the adaptation is feasible.
-        margin: smallest proven distance less the required clearance along an accepted path [m]; nan when refused.
-        oracle: what the oracle says of the scene; for an accepted one, possible or undecided.
+        margin: smallest proven distance minus required clearance along an accepted path [m]; nan when refused.
+        oracle: the oracle's answer for the scene; for an accepted one, possible or undecided.
         seconds: compute time of the adaptation [s].
     """
 
@@ -66,7 +66,7 @@ def scene_for(skill: Skill, seed: int) -> RandomScene:
 
 
 def question_of(skill: Skill, case: RandomScene) -> Question:
-    """Return a scene as the oracle sees it."""
+    """Return a scene in the form that the oracle takes."""
     path = ComponentPath.of_skill(skill, n_samples=case.n_samples, pinned=case.pinned)
     forbidden = np.array(case.forbidden, dtype=float).reshape(-1, 3)
     return Question(
@@ -147,7 +147,7 @@ def _note(verdicts: Sequence[Verdict]) -> str:
     parts = []
     if accepted:
         solved = sum(v.oracle is Answer.POSSIBLE for v in accepted)
-        parts.append(f"least margin of an accepted path: {1e6 * min(v.margin for v in accepted):.2f} um")
+        parts.append(f"smallest margin of an accepted path: {1e6 * min(v.margin for v in accepted):.2f} um")
         parts.append(f"the oracle solves {100 * solved / len(accepted):.1f} % of the accepted scenes")
     if refused:
         right = sum(v.oracle is Answer.IMPOSSIBLE for v in refused)

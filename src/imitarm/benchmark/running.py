@@ -21,7 +21,7 @@ LOCAL = "loky"
 _RUNS, _RECORDINGS = "runs", "recordings"
 
 OnDone = Callable[[int, int], None]
-"""Called with the number of experiments that are done, and the number of all."""
+"""Called with the number of finished experiments and the total number."""
 
 
 def run_all(
@@ -40,11 +40,11 @@ def run_all(
     the same configuration and the same code is read instead of run again. The values do not depend on ``jobs``.
 
     Args:
-        experiments: what to run.
-        folder: where results and recordings are kept; made when it is not there.
-        jobs: processes; None: one for each processor; 1: none but this one.
-        fresh: run again what has been run.
-        reuse: read saved results of the same configuration whatever code made them; each says which.
+        experiments: the experiments to run.
+        folder: folder for results and recordings; created if missing.
+        jobs: number of processes; None: one for each processor; 1: only this process.
+        fresh: ignore saved results and run all experiments again.
+        reuse: use saved results of the same configuration even if other code made them; each result names its code.
         backend: a backend of joblib: ``"loky"`` (local processes), or one whose workers see the same folder, such as
             ``"dask"`` or ``"ray"``.
         on_done: called with the progress.
@@ -83,7 +83,7 @@ def _prepared(folder: str | Path) -> Path:
 
 
 def _kept(place: Path, experiment: Experiment, reuse: bool) -> Result | None:
-    """Return the saved result; None when there is none, it can't be read, or other code made it and that counts."""
+    """Return the saved result; None when it is missing, can't be read, or was made by other code."""
     path = Result.path(place / _RUNS, experiment)
     try:
         found = Result.load(path) if path.exists() else None
@@ -93,11 +93,11 @@ def _kept(place: Path, experiment: Experiment, reuse: bool) -> Result | None:
 
 
 Job = tuple[Experiment, str, str, int]
-"""The experiment, the folder, the version of the code, and the process that has asked for it."""
+"""The experiment, the folder, the version of the code, and the parent process."""
 
 
 def _make(job: Job) -> Experiment:
-    """Make the recording of an experiment; when that fails, the experiment will fail later and say why."""
+    """Make the recording of an experiment; if that fails, the experiment fails later with the reason."""
     experiment, folder, _, parent = job
     _end_with(parent)
     with contextlib.suppress(ImitarmError):
@@ -117,7 +117,7 @@ def _run(job: Job) -> Experiment:
 def _parallel(
     function: Callable[[Job], Experiment], jobs: Sequence[Job], backend: str, workers: int
 ) -> Iterator[Experiment]:
-    """Call a function for each job, in parallel, and give what it returns as soon as it does."""
+    """Call a function for each job, in parallel, and yield each result as soon as it is there."""
     import joblib  # noqa: PLC0415  (takes long to import)
 
     try:
@@ -131,7 +131,7 @@ def _parallel(
 
 @lru_cache(maxsize=1)
 def _end_with(parent: int) -> None:
-    """End this worker when its parent is gone: workers outlive a parent that was killed."""
+    """End this worker when its parent is gone, because workers outlive a parent that was killed."""
     if os.getppid() == parent:
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 

@@ -1,4 +1,4 @@
-"""Table: what a benchmark found, as texts in rows, for a terminal, a page or a document."""
+"""Table: results of a benchmark as rows of text, for a terminal, a page or a document."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ END = "<!-- end -->"
 
 @dataclass(frozen=True)
 class Table:
-    """Texts in rows: ``title``, ``columns`` (one that ends in ``>`` is a number), ``rows``, a ``note`` below."""
+    """Rows of text: ``title``, ``columns`` (one that ends in ``>`` holds numbers), ``rows``, ``note``."""
 
     title: str
     columns: tuple[str, ...]
@@ -23,7 +23,7 @@ class Table:
     note: str = ""
 
     def markdown(self) -> str:
-        """Return it as Markdown."""
+        """Return the table as Markdown."""
         lines = [f"**{self.title}**", "", f"| {' | '.join(c.removesuffix('>') for c in self.columns)} |"]
         lines.append(f"|{'|'.join('--:' if c.endswith('>') else '---' for c in self.columns)}|")
         lines += [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in self.rows]
@@ -32,7 +32,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the tables of a benchmark stand in a document.
+    """The place of a benchmark's tables in a document.
 
     Attributes:
         document: the file, Markdown.
@@ -55,12 +55,12 @@ class Place:
         return f"<!-- imitarm benchmark {self.benchmark} -->"
 
     def fill(self, found: Sequence[Table], command: str, versions: Iterable[str]) -> None:
-        """Put tables into the document; the rest of it stays as it is.
+        """Put tables into the document, without any other change.
 
         Args:
             found: the tables.
-            command: which printed them.
-            versions: which code made each result; the document says when it is not the code that is running.
+            command: the command that printed the tables.
+            versions: of the code that made each result; the document says if it differs from the running code.
         """
         head, tail = self._parts()
         body = "\n".join(table.markdown() for table in found)

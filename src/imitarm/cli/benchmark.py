@@ -45,9 +45,7 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parsers = parser.add_subparsers(metavar="BENCHMARK", required=True, title="benchmarks")
-    mapping = parsers.add_parser(
-        "mapping", help="from a person's arm to a robot's: every method on the same recordings (thesis Table 3.1)"
-    )
+    mapping = parsers.add_parser("mapping", help="retargeting: every method on the same recordings (thesis Table 3.1)")
     mapping.add_argument("--people", type=int, metavar="N", help="simulated people; default: 10, with --quick 2")
     mapping.add_argument(
         "--first",
@@ -74,22 +72,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument("--out", type=Path, metavar="DIR", help="folder of the results; default: benchmark-mapping")
     mapping.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
     _add_fill(mapping)
-    mapping.add_argument("--fresh", action="store_true", help="run again what has been run")
+    mapping.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
     mapping.add_argument(
-        "--reuse", action="store_true", help="take saved results of the same configuration, whatever code made them"
+        "--reuse", action="store_true", help="use saved results of the same configuration even if other code made them"
     )
     mapping.add_argument("--jobs", type=int, metavar="N", help="processes; default: one for each processor")
     mapping.add_argument("--backend", default=LOCAL, metavar="NAME", help="of joblib: loky (local), dask, ray")
     mapping.set_defaults(benchmark=_mapping)
-    other = parsers.add_parser("avoidance", help="how often a method keeps its clearance, over seeded scenes")
+    other = parsers.add_parser("avoidance", help="rate at which a method keeps its clearance in seeded scenes")
     other.add_argument("--seeds", type=int, default=200, metavar="N", help="scenes in each family; default: 200")
     other.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000, the test seeds")
     other.add_argument("--methods", nargs="+", choices=ADAPTERS, default=list(ADAPTERS))
     _add_fill(other)
     other.set_defaults(benchmark=_avoidance)
-    third = parsers.add_parser(
-        "refusals", help="whether accepted paths are clear and refusals right, over random scenes, by an oracle"
-    )
+    third = parsers.add_parser("refusals", help="check accepted paths and refusals in random scenes by an oracle")
     third.add_argument("--scenes", type=int, default=1000, metavar="N", help="how many; default: 1000")
     third.add_argument("--first", type=int, default=0, metavar="N", help="first seed; default: 0")
     third.add_argument("--skills", type=Path, nargs="+", default=[], metavar="FILE", help="skills to adapt as well")
@@ -239,7 +235,7 @@ def _people(arguments: argparse.Namespace) -> int:
 
 
 def _place(arguments: argparse.Namespace, benchmark: str) -> Place | None:
-    """Return where the tables go besides the terminal; checks the document before the work."""
+    """Return the document for the tables, which is checked before the run; None without one."""
     return None if arguments.fill is None else Place(arguments.fill, benchmark)
 
 
@@ -284,7 +280,7 @@ def _command() -> str:
 
 
 def _not_done(results: Sequence[Result]) -> list[str]:
-    """Return what could not be done and why: a recording that can't be made is reported once, not for every method."""
+    """Return the failures and their reasons; a recording that can't be made is reported once, not for every method."""
     found: dict[tuple[str, int, int, str], list[str]] = {}
     for result in results:
         if result.failure:
@@ -301,7 +297,7 @@ def _given(value: int | None, otherwise: int) -> int:
 
 
 def _check(arguments: argparse.Namespace, folder: Path) -> None:
-    """Find out before the work what would fail after it."""
+    """Check options that would otherwise fail only after the run."""
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {arguments.jobs}")
     if arguments.data is not None and not arguments.data.is_dir():
@@ -309,7 +305,7 @@ def _check(arguments: argparse.Namespace, folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}: is not a folder; name another one")
     if arguments.data is not None and same_place(folder, arguments.data):
-        raise InputError(f"--out {folder}: is the folder of --data, too; name another one")
+        raise InputError(f"--out {folder}: is also the folder of --data; name another one")
     written = [("--out", folder / name) for name in ("mapping.md", "mapping.json")]
     check_outputs([("--report", arguments.report)], [("--fill", arguments.fill), *written], new_folders=True)
     if arguments.report is None:

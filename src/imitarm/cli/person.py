@@ -1,4 +1,4 @@
-"""Shared by all commands that read a person from a source: arguments, reading, and printing what is wrong."""
+"""Shared by all commands that read a person from a source: arguments, reading, and printing of issues."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def gather(
     total: float | None = None,
     on_skeleton: Callable[[Skeleton], None] | None = None,
 ) -> tuple[list[Skeleton], bool]:
-    """Read skeletons until the source is over, the time is up, or the user stops it; show the progress.
+    """Read skeletons until the source ends, the time is up, or the user stops; show the progress.
 
     Args:
         source: to read from.
@@ -123,9 +123,9 @@ def gather(
 
 
 def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton], list[str], Truth | None]:
-    """Read the person from the source, as the options ``person``, ``seconds``, ``trim`` and ``pace`` say.
+    """Read the person from the source, according to the options ``person``, ``seconds``, ``trim`` and ``pace``.
 
-    A recording is repaired first. What was changed and what is wrong is printed.
+    A recording is repaired first. Changes and issues are printed.
 
     Args:
         arguments: of the command.
@@ -176,7 +176,7 @@ def _slow(truth: Truth, begin: float, pace: float) -> Truth:
 
 
 def _repaired_person(recording: SkeletonRecording, person: int | None) -> tuple[SkeletonRecording, list[str]]:
-    """Return a repaired recording of one person, and what was changed and found while reading."""
+    """Return a repaired recording of one person, with the changes and the issues found while reading."""
     one = recording if person is None else recording.person(person)
     fixed, notes = repaired(one)
     return fixed, [*(f"repaired: {note}" for note in notes), *(str(issue) for issue in recording.issues)]

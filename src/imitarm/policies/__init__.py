@@ -1,4 +1,4 @@
-"""How a skill is reproduced around obstacles, one method a file.
+"""Policies: methods of reproducing a skill around obstacles, one file for each.
 
 ``POLICIES`` is the registry: a new method is one file and one line here.
 """

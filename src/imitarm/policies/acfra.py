@@ -28,36 +28,39 @@ _DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
 class ACFRA(Policy):
     r"""Adapt the whole path once, then follow it (thesis Chapter 4).
 
-    ``reset`` adapts the skill to the observed scene and refuses when it can't keep the clearance. ``step`` follows the
-    adapted path with its own velocity plus feedback::
+    ``reset`` adapts the skill to the observed scene, and raises an error when the clearance can't be kept. ``step``
+    follows the adapted path with its own velocity plus feedback::
 
         twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
-    so the phase ``s`` waits for a robot that lags (its speed limits, a hand that holds it). With ``e_0`` the required
+    so the phase ``s`` waits for a robot that lags, for example at its speed limits or when a hand holds it. With
+    ``e_0`` the required
     clearance, no corner is cut by more than half of it: each point of the straight line back is within ``e_0 / 2`` of
     the tool or of its target, and both are clear.
 
-    Among moving obstacles the plan holds only on schedule: the phase follows the clock and waits for nothing. When the
-    tool is farther than ``e_0 / 2`` from where the plan has it, the plan is void: the arm brakes to rest and stays.
+    Among moving obstacles the plan is valid only at the planned times, so the phase follows the clock and does not
+    wait. When the tool is farther than ``e_0 / 2`` from its planned position, the plan is no longer valid: the arm
+    brakes and stays at rest.
 
-    Only ``"certified"`` knows beforehand that it can't keep the clearance, and refuses; the thesis's potential fields
-    (``"mapf"``, ``"literal"``) are followed wherever they lead, so that they can be compared.
+    Only ``"certified"`` refuses in advance when it can't keep the clearance. The paths of the thesis's potential fields
+    (``"mapf"``, ``"literal"``) are followed in any case, for comparison.
 
     Args:
         skill: what to reproduce.
         method: name in :data:`~imitarm.policies.ADAPTERS`.
         tool_radius: in place of ``tool_spheres``, radius of one sphere about the tool's tip [m].
-        tool_spheres: spheres that hold the tool, rows x y z r in the tool's frame, shape (m, 4) [m].
+        tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m].
         clearance: required distance of the tool to every obstacle [m].
         forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
         pinned: times at which the path must not move [s].
         gain: K [1/s].
         patience: e_0 [m]; None: the clearance, at least 5 mm.
-        arrival: distance to the end of the path at which the motion has arrived [m].
-        allowance: planned for beyond the clearance, where that is possible, since no robot follows exactly [m].
+        arrival: distance to the end of the path at which the motion counts as arrived [m].
+        allowance: distance that is planned in addition to the clearance, if possible, because no robot follows exactly
+            [m].
 
     Attributes:
-        adaptation: what the last ``reset`` found.
+        adaptation: result of the last ``reset``.
     """
 
     def __init__(
@@ -94,7 +97,7 @@ class ACFRA(Policy):
         self._phase, self._void = 0.0, ""
 
     def reset(self, observation: Observation) -> None:
-        """Adapt the path to the scene, beginning where the tool is.
+        """Adapt the path to the scene, starting at the measured pose of the tool.
 
         Raises:
             InfeasibleError: when the clearance can't be kept, with the obstacle and the reason.
@@ -119,7 +122,7 @@ class ACFRA(Policy):
         self._phase, self._void = 0.0, ""
 
     def _adapted(self, scene: Scene, start: Pose | None) -> Adaptation:
-        """Plan with the allowance where there is room for it, else without."""
+        """Plan with the allowance if that is feasible, otherwise without it."""
         plan = None
         for allowance in sorted({self._allowance if self._refuses else 0.0, 0.0}, reverse=True):
             clearance = self.clearance + allowance
@@ -131,12 +134,12 @@ class ACFRA(Policy):
 
     @property
     def plan(self) -> Adaptation | None:
-        """What a report draws of the plan: the adaptation."""
+        """The adaptation, which a report draws."""
         return self.adaptation
 
     @property
     def phase(self) -> float:
-        """How far along the demonstrated time the motion is [s]."""
+        """The phase of the motion, in demonstrated time [s]."""
         return self._phase
 
     def step(self, observation: Observation, dt: float) -> Command:
@@ -157,8 +160,8 @@ class ACFRA(Policy):
         lag = float(np.linalg.norm(error[:3]))
         if on_schedule and lag > 0.5 * self._patience:
             self._void = self._void or (
-                f"the plan holds only on schedule, and the tool is {1e3 * lag:.0f} mm from where it should be at "
-                f"{observation.time:.2f} s: the arm brakes; plan again from here"
+                f"the plan is valid only at the planned times, but the tool is {1e3 * lag:.0f} mm from its planned "
+                f"position at {observation.time:.2f} s: the arm brakes; plan again from here"
             )
         if self._void:
             return Command(np.zeros(6), progress=self._phase / end, status=Status.BRAKING, reason=self._void)

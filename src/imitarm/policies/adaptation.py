@@ -39,11 +39,11 @@ NOT_DOWN = ((0.0, 0.0, -1.0),)  # never into the table
 
 @dataclass(frozen=True, eq=False)
 class AvoidanceProblem:
-    """What a method of adaptation has to solve.
+    """The problem that a method of adaptation solves.
 
     Attributes:
         path: the nominal path and its components.
-        nominal: clearance of the tool along it, to every obstacle.
+        nominal: clearance of the tool along the nominal path, to every obstacle.
         clearance: required [m].
         allowed: directions in which components may move.
     """
@@ -54,24 +54,24 @@ class AvoidanceProblem:
     allowed: AllowedDirections
 
     def evaluated(self, displacement: Array) -> Detour:
-        """Return what is proven of the path when the components move by ``displacement`` (n_components, 3) [m]."""
+        """Return the path with its certificate when the components move by ``displacement`` (n_components, 3) [m]."""
         there = self.nominal.tool.clearance_of(self.path.displaced(displacement))
         return LeastDetour(self.path, self.nominal.tool, self.clearance, self.allowed).evaluate(displacement, there)
 
 
 class PathAdapter(ABC):
-    """One method of adapting a path. A new one is one file, and one line in ``ADAPTERS`` or an entry point.
+    """One method of adapting a path. A new method is one file, and one line in ``ADAPTERS`` or an entry point.
 
     Attributes:
-        refuses: whether the method itself knows that it can't keep the clearance. ``ACFRA`` then refuses to move;
-            the paths of other methods are followed wherever they lead, so that they can be compared.
+        refuses: whether the method detects that it can't keep the clearance. ``ACFRA`` then refuses to move. The
+            paths of other methods are followed in any case, for comparison.
     """
 
     refuses: ClassVar[bool] = False
 
     @abstractmethod
     def detour(self, problem: AvoidanceProblem) -> Detour:
-        """Return a displaced path with what is proven of it; :meth:`AvoidanceProblem.evaluated` makes one."""
+        """Return a displaced path with its certificate, as :meth:`AvoidanceProblem.evaluated` makes it."""
 
 
 ADAPTERS: Registry[PathAdapter] = Registry(
@@ -91,29 +91,29 @@ class Adaptation:
 
     Attributes:
         nominal: the path without obstacles.
-        trajectory: the adapted path, at the same times; where it is not ``feasible``, the best attempt, not to be
+        trajectory: the adapted path, at the same times; if not ``feasible``, it is the best attempt, which must not be
             executed.
         displacement: of each component's mean, shape (n_components, 3) [m].
-        moved: which components moved, shape (n_components,).
+        moved: whether each component moved, shape (n_components,).
         means: centres of the components before they moved, shape (n_components, 3) [m].
         covariances: position covariances of the components, shape (n_components, 3, 3) [m^2].
         responsibilities: of each component for each sample, shape (n, n_components).
-        divided: whether the learned components were too wide for this scene, so that the arrays above are of more,
-            narrower ones.
+        divided: whether the learned components were too wide for this scene; then the arrays above describe more and
+            narrower components.
         tolerance: covariance of the demonstrations along the path, shape (n, 3, 3) [m^2].
         min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without any.
-        certified_clearance: guaranteed lower bound of it on the whole polyline through the samples [m].
-        only_on_schedule: whether an obstacle moves. The guarantee then holds only while the motion is on time: the
-            tool is at ``trajectory`` at the time of each sample, counted from when the scene was seen. It ends with the
-            last sample.
-        validity: in words, what the guarantee assumes and what it does not cover.
-        deviation: how many demonstrated sigmas the farthest mean moved (Mahalanobis).
+        certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m].
+        only_on_schedule: whether the guarantee depends on the schedule, because an obstacle moves. The guarantee then
+            holds only while the motion is on time: the tool is at ``trajectory`` at the time of each sample, counted
+            from when the scene was seen. The guarantee ends with the last sample.
+        validity: text that says what the guarantee assumes and what it does not cover.
+        deviation: largest displacement of a mean, in standard deviations of the demonstrations (Mahalanobis distance).
         jerk_ratio: largest jerk of the adapted path, divided by the largest jerk of the nominal path.
         jerk_reason: empty while ``jerk_ratio`` is at most 10, else why it is not.
         feasible: whether ``certified_clearance`` reaches the required clearance, within the stated limits.
         reason: empty when feasible, else which obstacle is in the way and why it can't be avoided.
-        method: which method was used.
-        compute_time: of the whole adaptation [s].
+        method: name of the method.
+        compute_time: computing time of the whole adaptation [s].
         joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned.
     """
 
@@ -191,22 +191,22 @@ def adapt(
 ) -> Adaptation:
     """Adapt the whole path of a skill to the obstacles of a scene.
 
-    ``certified`` moves the affected components by the least that keeps the clearance on the whole path, or refuses and
-    says why. ``mapf`` and ``literal`` are the thesis's potential fields (see ``potential_components``), which may fail.
-    Start, goal and ``pinned`` times do not move. The tool must be given in exactly one of three ways.
+    ``certified`` moves the affected components by the smallest displacement that keeps the clearance on the whole path,
+    or refuses and says why. ``mapf`` and ``literal`` are the thesis's potential fields (see ``potential_components``),
+    which may fail. Start, goal and ``pinned`` times do not move. The tool must be given in exactly one of three ways.
 
-    Obstacles are where the scene says at time 0, and move on at their velocities: the motion begins at time 0.
+    The motion begins at time 0, when the obstacles have the poses of the scene; then they move with their velocities.
 
     Args:
         skill: a fitted skill.
         scene: goal (None: the learned one) and obstacles.
         method: a name in ``ADAPTERS``: ``"certified"``, ``"mapf"``, ``"literal"`` or one that was added.
         tool_radius: the tool as one sphere of this radius about its tip [m]; 0 for a point.
-        tool_spheres: the tool as spheres that contain it: rows x y z r in the tool's frame, shape (m, 4) [m]. They
-            rotate as the skill rotates the tool.
-        arm: the tool as the spheres of this arm (``ArmModel.tool_spheres``). Its links are not planned for.
+        tool_spheres: the tool as spheres that contain it: rows x y z r in the tool's frame, shape (m, 4) [m]. The
+            spheres rotate with the tool as in the skill.
+        arm: the tool as the spheres of this arm (``ArmModel.tool_spheres``). The links of the arm are not considered.
         clearance: required distance from the tool to every obstacle [m].
-        forbidden: directions in which nothing may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
+        forbidden: directions in which no component may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
         pinned: times [s] at which the path must not move, for example where the dirt lies.
         start: where the motion begins; None: where it was learned.
         n_samples: samples along the path.
@@ -299,7 +299,10 @@ def _unit_rows(directions: ArrayLike) -> Array:
 
 
 def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
-    """Return the detour of the method; nothing is searched when nothing is in the way or a fixed point is covered."""
+    """Return the detour of the method.
+
+    There is no search when no obstacle is in the way or a fixed point is covered.
+    """
     path, clearance, lowest = problem.path, problem.clearance, problem.nominal.lowest
     still = np.zeros((path.n_components, 3))
     covered = bool(problem.nominal.distance[:, path.fixed].min(initial=np.inf) < clearance)
@@ -338,7 +341,7 @@ def _jerk_reason(scene: Scene, detour: Detour, ratio: float, clearance: float) -
 
 
 def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str, adapter: PathAdapter) -> str:
-    """Say which obstacle can't be avoided and why, in words that tell what to change."""
+    """Return a message that says which obstacle can't be avoided, why, and what to change."""
     path, k = problem.path, problem.nominal.tool.n_spheres
     required = f"{1e3 * problem.clearance:.0f} mm required"
     fixed = path.fixed
@@ -351,8 +354,8 @@ def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str
     left = f"{1e3 * float(detour.bounds[worst]) + 0.0:.1f} mm"
     if not adapter.refuses:
         return (
-            f"the path passes {name} at {left} ({required}): method {method!r} pushes components and does "
-            "not look at the path between them; try method 'certified'"
+            f"the path passes {name} at {left} ({required}): method {method!r} pushes components and ignores the path "
+            f"between them; try method 'certified'"
         )
     if not problem.allowed.dimension:
         return f"{name} is in the way ({left} left, {required}), and every direction is forbidden: allow one"
@@ -377,7 +380,7 @@ def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str
 
 
 def _at_fixed(path: ComponentPath, name: str, sample: int, left: float, required: str) -> str:
-    """Say that an obstacle is too near to a point that must not move."""
+    """Return a message that an obstacle is too near to a point that must not move."""
     at, end = path.nominal.times[sample], path.nominal.times[-1]
     where = "start" if at < 0.02 * end else "goal" if at > 0.98 * end else f"pinned point at {at:.2f} s"
     lies = f"covers the {where}" if left <= 0.0 else f"leaves {1e3 * left:.0f} mm at the {where} ({required})"

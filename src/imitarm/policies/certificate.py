@@ -32,10 +32,10 @@ _MAX_PROBES = 12  # points measured on a segment whose bound is too low; the bra
 
 @dataclass(frozen=True, eq=False)
 class ClosePoints:
-    """Points between two samples that are closer to an obstacle than required, although both samples are not.
+    """Points between two samples that are closer to an obstacle than required, although the samples themselves are not.
 
     Attributes:
-        pair: which sphere and obstacle, shape (m,).
+        pair: index of the pair of a sphere and an obstacle, shape (m,).
         segment: index of the sample before the point, shape (m,).
         fraction: position of the point between that sample (0) and the next (1), shape (m,).
     """
@@ -68,10 +68,10 @@ class ToolAmongObstacles:
     Attributes:
         obstacles: convex obstacles; spheres in place of those that rotate.
         radii: of the spheres, shape (n_spheres,) [m].
-        offsets: for each obstacle, from the tip to the centres of the spheres at each sample, less the motion of the
-            obstacle until then, in the base frame, shape (n_spheres, n, 3) [m]; None when all of them are zero.
+        offsets: for each obstacle, from the tip to the centres of the spheres at each sample, minus the displacement of
+            the obstacle until then, in the base frame, shape (n_spheres, n, 3) [m]; None when all of them are zero.
         reach: radius of the sphere about the tip that contains all spheres [m].
-        bows: how far a centre leaves the straight line between two samples while the tool rotates, shape
+        bows: largest distance of a centre from the straight line between two samples while the tool rotates, shape
             (n_spheres, n - 1) [m].
     """
 
@@ -88,8 +88,8 @@ class ToolAmongObstacles:
         Args:
             nominal: times and rotations of the tool, n samples.
             spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
-            obstacles: where they are at time 0; one with a velocity moves from there. One that rotates is replaced by
-                a sphere about its centre that contains it.
+            obstacles: at time 0; those with a velocity move from there. A rotating obstacle is replaced
+                by a sphere about its centre that contains it.
 
         Raises:
             InputError: when a half-space rotates.
@@ -125,7 +125,7 @@ class ToolAmongObstacles:
         return len(self.radii) * len(self.obstacles)
 
     def centres(self, pair: int, positions: Array, samples: Index | slice = slice(None)) -> Array:
-        """Return the centre of a pair's sphere, relative to where its obstacle is at that time.
+        """Return the centre of a pair's sphere, relative to the position of its obstacle at that time.
 
         Args:
             pair: index of the pair.
@@ -146,7 +146,7 @@ class ToolAmongObstacles:
         return distance - self.radii[sphere], normal
 
     def exits(self, pair: int, points: Array, directions: Array, target: float, tolerance: float) -> Array:
-        """Return how far points have to go along directions until they are clear of the obstacle for good.
+        """Return how far points must move along directions to leave the inflated obstacle.
 
         Newton's method from outside: the signed distance along a ray is convex, so the lift decreases to the largest
         root without passing it.
@@ -156,7 +156,7 @@ class ToolAmongObstacles:
             points: centres of its sphere, shape (p, 3) [m].
             directions: unit rows, shape (m, 3).
             target: distance to reach [m].
-            tolerance: the most by which the distance may be larger than that [m].
+            tolerance: largest accepted excess of the distance over ``target`` [m].
 
         Returns:
             Lifts, shape (m, p) [m]; inf where the obstacle has no end.
@@ -217,7 +217,7 @@ class ToolAmongObstacles:
 
 @dataclass(frozen=True, eq=False)
 class PathClearance:
-    """Distances from the tool to the obstacles along one path of the tip, and what follows from them.
+    """Distances from the tool to the obstacles along one path of the tip, and bounds that follow from them.
 
     Attributes:
         tool: the spheres and the obstacles.
@@ -240,9 +240,10 @@ class PathClearance:
         """Bound the distance from below on each segment of the path.
 
         For a convex function ``f`` on a segment of length L, with slope a at its start and b at its end,
-        ``f(s) >= max(f0 + a s, f1 - b (L - s))``. The minimum of the right side over s is at an end or where the two
-        lines cross. The tip moves straight between two samples. A sphere beside it leaves the straight line by at most
-        ``|offset| (1 - cos(angle / 2))`` while the tool rotates by ``angle``; this is subtracted.
+        ``f(s) >= max(f0 + a s, f1 - b (L - s))``. The minimum of the right side over s is at an end of the segment or
+        at the crossing of the two lines. The tip moves straight between two samples. The centre of a sphere beside the
+        tip leaves the straight line by at most ``|offset| (1 - cos(angle / 2))`` while the tool rotates by ``angle``;
+        this is subtracted.
 
         Returns:
             Shape (n_pairs, n - 1) [m].
@@ -261,12 +262,13 @@ class PathClearance:
         return low - (np.tile(tool.bows, (len(tool.obstacles), 1)) if tool.bows.any() else 0.0)
 
     def certified(self, clearance: float) -> tuple[Array, ClosePoints]:
-        """Bound the distance on each segment, and look more closely where the bound is below a clearance.
+        """Bound the distance on each segment, and refine the bound where it is below a clearance.
 
-        Round a corner, two tangents cross at twice the depth of the chord or deeper. The distance is therefore measured
-        where they cross. If it is too small there, the path really is too close. If not, the tangent at that point
-        replaces one of the two, namely the one on whose side the distance falls towards the point. So the minimum stays
-        between two tangents that close in on it.
+        Around a corner, two tangents cross at twice the depth of the chord or deeper. The distance is therefore
+        measured where they cross. If the distance is too small there, the path really is too close. Otherwise the
+        tangent at
+        that point replaces one of the two tangents: the one from whose side the distance decreases towards the point.
+        So the minimum stays between two tangents that converge to it.
 
         Args:
             clearance: that the path must keep [m].
@@ -286,7 +288,7 @@ class PathClearance:
         return bounds, found
 
     def _closer_look(self, pair: int, j: Index, bounds: Array, clearance: float) -> tuple[Array, Array]:
-        """Return better bounds (m,) of segments ``j`` (m,) of a pair, and the fraction where each is lowest (m,)."""
+        """Return refined bounds (m,) of segments ``j`` (m,) of a pair, and where each is lowest (m,)."""
         start = self.tool.centres(pair, self.positions[j], j)
         step = self.tool.centres(pair, self.positions[j + 1], j + 1) - start
         bow = self.tool.bows[pair % self.tool.n_spheres, j]
@@ -323,7 +325,7 @@ class PathClearance:
 
 
 def _around(obstacle: Obstacle) -> Sphere:
-    """Return a sphere about an obstacle's centre that contains it however it rotates."""
+    """Return a sphere about an obstacle's centre that contains the obstacle in every orientation."""
     if isinstance(obstacle, HalfSpace):
         raise InputError(
             f"adapt: half-space {obstacle.name!r} rotates; a path among rotating half-spaces can't be certified"
@@ -334,7 +336,7 @@ def _around(obstacle: Obstacle) -> Sphere:
 
 
 def crossing_of_tangents(f0: Array, a: Array, f1: Array, b: Array, length: Array | float) -> tuple[Array, Array]:
-    """Return the least value of ``max(f0 + a s, f1 - b (length - s))`` over s in [0, length], and the s of it.
+    """Return the minimum of ``max(f0 + a s, f1 - b (length - s))`` over s in [0, length], and the s at the minimum.
 
     Args:
         f0: values at the start, of any shape.

@@ -1,12 +1,13 @@
-"""Move the fewest components by the least so that the whole path keeps its clearance, or say why it can't be done.
+"""Displace as few components as little as possible so that the whole path keeps its clearance, or refuse and say why.
 
 The algorithm of :func:`find_detour`:
 
-1. **Side.** Take the obstacle that is violated worst. Try directions across the path. Along each, the lift that a
-   violated sample needs is the exit from the inflated convex obstacle, found by Newton's method from outside, which
-   never overshoots on a convex function. The smallest amplitudes of the components that give this lift are a small
-   quadratic program. The direction of least cost (demonstrated variance used up, and clearance still violated) is
-   followed first, until nothing is violated; the others are kept and come up again if it leads nowhere.
+1. **Side.** Take the obstacle with the largest violation. Try directions across the path. Along each direction, the
+   lift of a violated sample is its distance to the exit from the inflated convex obstacle, found by Newton's method
+   from outside, which never overshoots on a convex function. A small quadratic program computes the smallest amplitudes
+   of the components that give this lift. The direction of least cost (displacement relative to the demonstrated
+   variance, plus the remaining violation) is followed first, until nothing is violated; the other directions are kept
+   and tried later if this one fails.
 2. **Least detour** (:mod:`~imitarm.policies.least_detour`): on that side, the smallest displacement that keeps the
    clearance.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
@@ -62,7 +63,7 @@ _THINNED = 3  # sides are rated on every third sample
 
 
 class CertifiedAdapter(PathAdapter):
-    """The default method: the least detour that is proven to keep the clearance, or a refusal."""
+    """The default method: the least detour with a certified clearance, or a refusal."""
 
     refuses = True
 
@@ -117,7 +118,7 @@ class _Node:
 
 
 class _SideSearch:
-    """One call's arrays: the state of the best-first search over sides."""
+    """The state of one best-first search over sides."""
 
     def __init__(
         self, path: ComponentPath, nominal: PathClearance, clearance: float, allowed: AllowedDirections
@@ -128,7 +129,7 @@ class _SideSearch:
         self.target = self.least.target
 
     def run(self, max_choices: int) -> Detour:
-        """Follow the cheapest choice of sides until one is feasible; begin at the nominal path."""
+        """Follow the cheapest choice of sides until a path is feasible, starting at the nominal path."""
         heap = [_Node(0.0, 0, np.zeros((self.path.n_components, 3)))]
         tried: list[Array] = []
         best: Detour | None = None
@@ -156,7 +157,7 @@ class _SideSearch:
         return best_of((best, self.least.evaluate(nothing, self.nominal))) or best  # type: ignore[return-value]
 
     def _children(self, displacement: Array, here: PathClearance) -> list[tuple[float, Array]]:
-        """Return what each direction round the worst obstacle leads to: (cost, displacement), affordable ones only."""
+        """Return (cost, displacement) for each direction around the obstacle with the largest violation."""
         distance = here.distance
         worst = int(np.argmin(distance.min(axis=1)))
         rows = np.flatnonzero((distance[worst] < self.target - _ROUNDING) & self.least.movable)
@@ -192,7 +193,8 @@ class _SideSearch:
         """Turn lifts (m, p) along directions (m, 3) into displacements with their costs.
 
         All directions are first rated with one amplitude for all affected components; the best few then get the
-        smallest sufficient amplitudes. Also returns whether the cheapest one comes nearer to another obstacle.
+        smallest sufficient amplitudes. The function also returns whether the cheapest displacement comes nearer to
+        another obstacle.
         """
         uniform = (lifts / np.maximum(lever.sum(axis=1), NEGLIGIBLE_LEVER)).max(axis=1, initial=0.0)
         affordable = uniform <= 2.0 * MAX_LIFT
@@ -218,7 +220,7 @@ class _SideSearch:
         return list(children), costs.tolist(), bool(nearer.any())
 
     def _costs(self, displacements: Array) -> tuple[Array, Array]:
-        """Rate displacements (c, n_components, 3): demonstrated variance they use up, and clearance still violated.
+        """Rate displacements (c, n_components, 3) by their size and the remaining violation.
 
         Returns:
             costs (c,) and, by pair, the violation summed over every third sample (n_pairs, c) [m].
@@ -242,7 +244,7 @@ class _SideSearch:
         return self.allowed.unit_directions(candidates)
 
     def _exits(self, pair: int, positions: Array, rows: Index, directions: Array) -> Array:
-        """Return how far samples (p,) have to go along directions (m, 3) to be clear for good, shape (m, p) [m].
+        """Return how far samples (p,) must move along directions (m, 3) to leave the obstacles, shape (m, p) [m].
 
         A lift above ``MAX_LIFT`` becomes inf.
         """
@@ -251,9 +253,9 @@ class _SideSearch:
         return np.where(lift > MAX_LIFT, np.inf, lift)
 
     def _affected(self, rows: Index, worst: int, here: PathClearance) -> Index:
-        """Return the indices of the components near the obstacle or in charge of a violated sample.
+        """Return the indices of the components near the obstacle, or with influence on a violated sample.
 
-        A component's centre is taken to be where the path is at its time; there the distances are known.
+        A component's centre is approximated by the path at its time, where the distances are known.
         """
         centre, n = here.distance[worst, self.path.centres], here.normal[worst, self.path.centres]
         spread = np.sqrt(np.einsum("kd,kde,ke->k", n, self.path.covariances, n))
@@ -262,11 +264,11 @@ class _SideSearch:
         return np.flatnonzero((near | in_charge) & (self.path.basis[rows].max(axis=0) > NEGLIGIBLE_LEVER))
 
     def _amplitudes(self, lever: Array, lift: Array, u: Array, affected: Index) -> Array | None:
-        """Return amplitudes a >= 0 of least ``sum a_k^2 / (u^T Y_k u)`` with ``lever @ a >= lift``, or None.
+        """Return amplitudes a >= 0 with the smallest ``sum a_k^2 / (u^T Y_k u)`` and ``lever @ a >= lift``, or None.
 
         Args:
             lever: basis of the violated samples and affected components, shape (p, k).
-            lift: what each sample needs, shape (p,) [m].
+            lift: required displacement of each sample, shape (p,) [m].
             u: unit direction (3,).
             affected: indices of the components, shape (k,).
 

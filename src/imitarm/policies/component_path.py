@@ -50,7 +50,7 @@ class ComponentPath:
         x(t) = x0(t) + w(t) sum_k h_k(t) Delta_k  =  x0(t) + basis(t) @ Delta
 
     The window ``w`` is a quintic step. It is 0 at every fixed time (start, goal, contact points) and 1 elsewhere.
-    Components with ``Delta_k = 0`` change nothing at all.
+    Components with ``Delta_k = 0`` have no effect.
 
     Attributes:
         nominal: the path without obstacles, n samples.
@@ -58,10 +58,11 @@ class ComponentPath:
         responsibilities: h, shape (n, n_components).
         basis: w h, shape (n, n_components); never negative.
         means: centres of the components on the nominal path, shape (n_components, 3) [m].
-        covariances: position covariances of the components, floored at (5 mm)^2, (n_components, 3, 3) [m^2]. They
+        covariances: position covariances of the components, with the lower bound (5 mm)^2, (n_components, 3, 3) [m^2].
+            They
             contain the motion itself too: a component is long along the path.
-        yields: how much the teacher varied at the time of each component's centre, floored as well: GMR's covariance
-            there, (n_components, 3, 3) [m^2]. A displacement is measured against it.
+        yields: GMR's covariance at the time of each component's centre, with the same lower bound, (n_components, 3, 3)
+            [m^2]. A displacement is measured against it.
         centres: sample at which each component has its centre, (n_components,).
         precisions: inverses of the yields, (n_components, 3, 3) [1/m^2].
         tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
@@ -93,8 +94,8 @@ class ComponentPath:
         Args:
             skill: a fitted skill.
             n_samples: samples along the path.
-            start: where the motion begins; None: where it was learned.
-            goal: where the motion ends; None: where it was learned. A moved start or goal bends the nominal path
+            start: start of the motion; None: the learned start.
+            goal: end of the motion; None: the learned goal. Another start or goal changes the nominal path
                 (``Skill.nominal``), and the components move with it.
             pinned: further times [s] at which the path must not move, for example a contact; each becomes a sample.
 
@@ -142,7 +143,7 @@ class ComponentPath:
         return self.nominal.positions + self.basis @ displacement
 
     def deviation(self, displacement: Array) -> float:
-        """Return the largest Mahalanobis length of a mean's displacement: how many demonstrated sigmas it moved."""
+        """Return the largest displacement of a mean, in standard deviations of the demonstrations (Mahalanobis)."""
         squares = np.einsum("kd,kde,ke->k", displacement, self.precisions, displacement)
         return float(np.sqrt(squares.max(initial=0.0)))
 
@@ -163,7 +164,7 @@ class ComponentPath:
 
     @cached_property
     def basis_jerk(self) -> Array:
-        """What a unit displacement of each component adds to the jerk, shape (n - 3, n_components) [1/s^3]."""
+        """Change of the jerk by a unit displacement of each component, shape (n - 3, n_components) [1/s^3]."""
         return self.jerk(self.basis)
 
     @cached_property
@@ -215,7 +216,10 @@ _PATHS: WeakKeyDictionary[GMR, tuple[Array, tuple[int, tuple[float, ...]], Compo
 
 
 def _learned(gmr: GMR, n_samples: int, fixed_times: tuple[float, ...]) -> ComponentPath:
-    """Decompose the learned path; the last answer for each regression is kept, since no scene changes it."""
+    """Decompose the learned path.
+
+    The last result for each regression is kept, because it does not depend on the scene.
+    """
     key = (n_samples, fixed_times)
     if gmr in _PATHS and _PATHS[gmr][0] is gmr.means_ and _PATHS[gmr][1] == key:  # fitting again makes new means
         return _PATHS[gmr][2]
@@ -242,7 +246,7 @@ def _learned(gmr: GMR, n_samples: int, fixed_times: tuple[float, ...]) -> Compon
 
 
 def _sample_times(n_samples: int, fixed_times: tuple[float, ...]) -> Array:
-    """Return equally spaced times with every fixed time among them: what must not move has to be a sample."""
+    """Return nearly equally spaced times that include every fixed time, because fixed points must be samples."""
     even = np.linspace(0.0, fixed_times[-1], n_samples)
     apart = np.abs(even[:, None] - np.asarray(fixed_times)).min(axis=1) > 0.01 * even[1]
     return np.unique(np.concatenate([even[apart], fixed_times]))

@@ -1,9 +1,9 @@
-"""The smallest displacement of components that keeps the clearance, once it is known on which side to pass.
+"""The smallest displacement of components that keeps the clearance, for a given choice of sides.
 
 With one tangent plane for each sample and obstacle, "keep the clearance" is a set of linear inequalities in the
 displacements. Because the planes under-estimate the distance, each solution truly keeps the clearance at the samples
-(an inner convex approximation). Minimising ``sum_k Delta_k^T Y_k^-1 Delta_k`` under them and renewing the planes never
-leaves the feasible set and never gets worse.
+(an inner convex approximation). Repeatedly minimising ``sum_k Delta_k^T Y_k^-1 Delta_k`` under these inequalities and
+renewing the planes stays in the feasible set, and never increases the cost.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class AllowedDirections:
 
     Attributes:
         forbidden: unit rows, shape (m, 3). A direction and its opposite forbid the axis.
-        axes: orthonormal basis of what is left without the forbidden axes, columns, shape (3, d).
+        axes: orthonormal basis of the space without the forbidden axes, as columns, shape (3, d).
         one_sided: the other forbidden directions in that basis, unit rows, shape (m', d).
     """
 
@@ -74,7 +74,7 @@ class AllowedDirections:
 
     @classmethod
     def without(cls, forbidden: Array) -> AllowedDirections:
-        """Leave out forbidden directions, given as unit rows (m, 3)."""
+        """Build from forbidden directions, unit rows (m, 3)."""
         if not len(forbidden):
             return cls(forbidden, np.eye(3), np.empty((0, 3)))
         opposite = (forbidden @ forbidden.T).min(axis=1) < -1.0 + 1e-12
@@ -85,11 +85,11 @@ class AllowedDirections:
 
     @property
     def dimension(self) -> int:
-        """Number of dimensions in which components can move at all."""
+        """Number of dimensions in which components can move."""
         return self.axes.shape[1]
 
     def enforced(self, reduced: Array) -> Array:
-        """Return displacements (..., 3) for coordinates (..., d), with what rounding left in forbidden directions."""
+        """Return displacements (..., 3) for coordinates (..., d); rounding may leave a rest in forbidden directions."""
         for _ in range(100 if len(self.one_sided) else 0):  # taking out one part may bring back a little of another
             for f in self.one_sided:
                 reduced = reduced - np.maximum(reduced @ f, 0.0)[..., None] * f
@@ -98,7 +98,10 @@ class AllowedDirections:
         return np.asarray(reduced @ self.axes.T)
 
     def unit_directions(self, candidates: Array) -> Array:
-        """Return the allowed parts of directions (m, 3) as unit rows, without those of which little is left."""
+        """Return the allowed parts of directions (m, 3) as unit rows.
+
+        Directions with a small allowed part are dropped.
+        """
         allowed = self.enforced(candidates @ self.axes) if len(self.forbidden) else candidates
         length = np.sqrt(np.einsum("md,md->m", allowed, allowed))
         allowed = allowed[length > 0.25] / length[length > 0.25, None]
@@ -106,7 +109,7 @@ class AllowedDirections:
 
 
 def _complement(axes: Array) -> Array:
-    """Return an orthonormal basis (3, d), as columns, of the directions that are square to all rows of ``axes``."""
+    """Return an orthonormal basis, as columns (3, d), of the directions perpendicular to all rows of ``axes``."""
     if not len(axes):
         return np.eye(3)
     first = axes[0]
@@ -127,16 +130,16 @@ def _complement(axes: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Detour:
-    """A displaced path and what is proven of it.
+    """A displaced path and its certificate.
 
     Attributes:
         path: the path and the components that were moved.
         displacement: of each component's mean, shape (n_components, 3) [m].
         clearance: distances along the displaced path.
-        bounds: proven lower bound of the clearance of each pair over the whole path, shape (n_pairs,) [m].
+        bounds: guaranteed lower bound of the clearance of each pair over the whole path, shape (n_pairs,) [m].
         feasible: whether every bound reaches the required clearance and the path is within the stated limits.
         out_of_limits: whether the path leads farther away, or makes longer steps, than the stated limits.
-        close: where it is too close between two samples that are not.
+        close: points that are too close, between two samples that are not.
     """
 
     path: ComponentPath
@@ -185,8 +188,8 @@ class LeastDetour:
     """Finds the least detours of one path among one set of obstacles, for all spheres of the tool.
 
     Attributes:
-        target: distance that is planned for at the samples: the clearance, and a little for the segments between [m].
-        movable: which samples some component can move, shape (n,).
+        target: planned distance at the samples: the clearance plus a small amount for the segments between them [m].
+        movable: whether any component can move each sample, shape (n,).
     """
 
     def __init__(
@@ -209,7 +212,7 @@ class LeastDetour:
         self.movable = path.lever > (1e-3 if exact else NEGLIGIBLE_LEVER)
 
     def _beyond_limits(self, positions: Array) -> _Cuts:
-        """Return half-spaces that hold for every path within the stated limits, and not for this one."""
+        """Return half-spaces that contain every path within the stated limits, but not this one."""
         nominal, basis = self.path.nominal.positions, self.path.basis
         away, step = positions - nominal, np.diff(positions, axis=0)
         far, long = np.linalg.norm(away, axis=1), np.linalg.norm(step, axis=1)
@@ -221,7 +224,7 @@ class LeastDetour:
         return _Cuts(np.concatenate([basis[j], basis[k + 1] - basis[k]]), direction, bound)
 
     def evaluate(self, displacement: Array, clearance: PathClearance) -> Detour:
-        """Return what is proven of a displaced path, and whether it is within the stated limits."""
+        """Return the certificate of a displaced path, and whether the path is within the stated limits."""
         bounds, close = clearance.certified(self.clearance)
         away = clearance.positions - self.path.nominal.positions
         out = bool(np.sqrt(np.einsum("nd,nd->n", away, away).max()) > MAX_DISPLACEMENT) or (
@@ -236,14 +239,15 @@ class LeastDetour:
     ) -> Detour | None:
         """Return the least detour that the tangents along a path allow, or the best attempt; None: no attempt.
 
-        Where a segment is too close although its samples are not, that point gets a row of its own. Requiring more at
-        the samples instead does not work: with longer steps round the edge the path can have them farther out and yet
-        cut the edge as before, and next to a fixed time a little more takes a huge displacement.
+        Where a segment is too close although its samples are not, the closest point gets a row of its own. Requiring
+        more at
+        the samples instead does not work: with longer steps around the edge, the samples can be farther out while the
+            path still cuts the edge; and next to a fixed time, a small additional distance needs a huge displacement.
 
         Args:
             start: clearance along a path from which the tangents are taken; it need not be a sum of the components.
             moved: indices of the components that may move; None: all.
-            smoothness: weight of the squared jerk; None: the usual one of this path.
+            smoothness: weight of the squared jerk; None: the default weight of this path.
         """
         moved = np.arange(self.path.n_components) if moved is None else moved
         scale = self._scale(moved, smoothness)
@@ -333,7 +337,7 @@ class LeastDetour:
     ) -> tuple[Array, PathClearance, float] | None:
         """Return the displacement of least cost under the tangents, its clearance and cost; None: no solution.
 
-        At first only samples near an obstacle get a row. Where that lets another one in, all of them do.
+        At first only samples near an obstacle get a row; if the solution violates another sample, all samples get one.
         """
         answer = None
         for influence in (_INFLUENCE, np.inf):
@@ -352,8 +356,8 @@ class LeastDetour:
     ) -> tuple[Array, float] | None:
         """Minimise the cost under the tangents along a path; None: no solution.
 
-        Where there is none, one more unknown lets all tangents be missed by the same, smallest length; from the path
-        that results, the renewed tangents may have one.
+        If there is no solution, one more unknown relaxes all tangents by the same smallest distance; the tangents of
+        the resulting path may then have a solution.
         """
         basis, away = self.path.basis, here.positions - self.path.nominal.positions
         pair, j = np.nonzero((here.distance < self.target + influence) & self.movable)
@@ -390,6 +394,6 @@ class LeastDetour:
 
 
 def best_of(detours: Iterable[Detour | None]) -> Detour | None:
-    """Return the feasible detour, or the one that comes nearest to the clearance; None when there is none."""
+    """Return the feasible detour, or the one that comes nearest to the clearance; None when the list is empty."""
     found = [detour for detour in detours if detour is not None]
     return max(found, key=lambda x: (x.feasible, not x.out_of_limits, x.lowest), default=None)

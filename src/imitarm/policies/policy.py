@@ -1,4 +1,4 @@
-"""What every policy has in common: it looks at an arm and its scene, and answers with a command."""
+"""The interface of every policy: it observes an arm and its scene, and returns a command."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What a policy knows at one control step.
+    """The input of a policy at one control step.
 
     Attributes:
         time: since the reproduction began [s].
         state: measured state of the arm.
         tool_to_base: measured pose of the tool in the base frame.
-        scene: goal and obstacles as last seen; ``scene.stamp`` says when that was, and ``scene.at(time)`` predicts
-            where the obstacles are now.
+        scene: goal and obstacles as last seen, at the time ``scene.stamp``; ``scene.at(time)`` predicts the present
+            obstacles.
     """
 
     time: float
@@ -45,21 +45,22 @@ class Observation:
 
 
 class Policy(ABC):
-    """Decides the next command from what is observed now.
+    """Decides the next command from the present observation.
 
     A policy of your own is one subclass with the three methods below. Registered under the entry point group
     ``imitarm.policies``, or by ``POLICIES.register(name, policy)``, it appears in ``imitarm reproduce --policy``, in
-    ``imitarm benchmark placements`` and in their reports, which build it with the arguments below. It holds state
-    between :meth:`reset` and the end of one reproduction: the same observations give the same commands.
+    ``imitarm benchmark placements`` and in their reports, which build it with the arguments below. Its state lasts from
+    :meth:`reset` to the end of one reproduction; the same observations give the same commands.
 
     Args:
-        skill: what to reproduce.
-        tool_spheres: spheres that hold the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: its tip.
+        skill: the skill to reproduce.
+        tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: its tip.
         clearance: required distance of the tool to every obstacle [m].
         forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
 
     Attributes:
-        plan: what is drawn of the policy's plan in a report, an :class:`~imitarm.policies.Adaptation`; None: nothing.
+        plan: the policy's plan for drawing in a report, an :class:`~imitarm.policies.Adaptation`; None: there is no
+            plan.
     """
 
     plan: Any = None
@@ -84,22 +85,22 @@ class Policy(ABC):
         """Return a policy for the command line and the benchmark, with the constructor's common arguments.
 
         Raises:
-            InputError: when the constructor does not take them.
+            InputError: when the constructor does not take these arguments.
         """
         try:
             return cls(skill, **options)
         except TypeError as error:
             raise InputError(
-                f"{cls.__name__}: can't be built with the arguments {', '.join(options)}: {error}; let its constructor "
-                "take what Policy's takes"
+                f"{cls.__name__}: can't be built with the arguments {', '.join(options)}: {error}; let its "
+                f"constructor take the arguments of Policy's constructor"
             ) from error
 
     @abstractmethod
     def reset(self, observation: Observation) -> None:
-        """Begin a reproduction in the observed scene.
+        """Start a reproduction in the observed scene.
 
         Raises:
-            InfeasibleError: when the policy knows beforehand that it can't be done; the message says why.
+            InfeasibleError: when the policy knows in advance that the reproduction is impossible; the message says why.
         """
 
     @abstractmethod

@@ -1,10 +1,10 @@
-"""A roadmap of displacements over time: where can the tool be at each time, and how does it get from one to the next?
+"""A roadmap of displacements over time: possible positions of the tool at each time, and connections between them.
 
 At some times along the nominal path (layers), rays leave the nominal position. On each ray, the points just outside the
 inflated obstacles are the nodes. Edges lead from each node to the nodes of the next layer on the same and on
-neighbouring rays. An edge costs what the displacement changes, and much more where the two tangents at its ends do not
-prove the clearance. Dynamic programming from both ends gives the cheapest route through every node at once; a route is
-only a proposal, from which the least detour takes its tangents.
+neighbouring rays. The cost of an edge is the change of the displacement, plus a large amount where the two tangents at
+its ends do not prove the clearance. Dynamic programming from both ends gives the cheapest route through every node at
+once; a route is only a proposal, at which the tangents of the least detour are taken.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Roadmap:
     def routes(self, n: int) -> Iterator[Array]:
         """Yield up to ``n`` routes as displacements of the tip at all samples (n_samples, 3) [m], cheapest first.
 
-        After the first, each passes elsewhere at the layer where the ones before came closest to an obstacle.
+        Each further route takes another node at the layer at which the previous routes came closest to an obstacle.
         """
         through = self._forward[0] + self._backward[0]
         used: list[Array] = []
@@ -178,7 +178,7 @@ class Roadmap:
         return cost, via
 
     def _through(self, at: int, node: int) -> Index:
-        """Return the node at each layer of the cheapest route through one of them."""
+        """Return the node at each layer of the cheapest route through a given node."""
         chosen = np.zeros(len(self.layers), dtype=np.intp)
         chosen[at] = node
         for layer in range(at, 0, -1):
@@ -196,7 +196,7 @@ class Roadmap:
         return self._sweep(forward=False)
 
     def violation(self) -> float:
-        """Return the most that an edge of the cheapest route lacks of the clearance [m]; inf when there is no route."""
+        """Return the largest missing clearance of an edge of the cheapest route [m]; inf when there is no route."""
         if not self._forward[0][-1, 0] < _BLOCKED:
             return np.inf
         edges = self._edges_of(self._through(len(self.layers) - 1, 0))
@@ -209,7 +209,7 @@ class Roadmap:
         return np.asarray(np.searchsorted(keys, chosen[:-1] * n + chosen[1:]), dtype=np.intp)
 
     def _worst_layer(self, chosen: Index) -> int:
-        """Return the layer where a route costs most, or is displaced most when all of its edges are free."""
+        """Return the layer at which a route costs most, or, when all of its edges are free, is displaced most."""
         edges = self._edges_of(chosen)
         costs = self.edge_costs[np.arange(len(edges)), edges]
         if costs.max() > 1.0:

@@ -1,1 +1,1 @@
-"""Avoidance methods to compare with."""
+"""Avoidance methods for comparison."""

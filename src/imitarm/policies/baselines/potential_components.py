@@ -1,16 +1,16 @@
 r"""ACFRA as printed in the thesis: push the components' means by a repulsive potential (thesis Eqs 4.2-4.8).
 
-Two readings share one descent. With ``d`` the distance from an obstacle to the component's ellipse, ``n`` the outward
-normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the obstacle:
+Two potentials share the same descent. With ``d`` the distance from an obstacle to the component's ellipse, ``n`` the
+outward normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the obstacle:
 
 * ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The last term does not depend on the
   position, so it drops out of the force: the spread has no effect.
-* ``mapf``: the dimensionless form that does what the text says,
+* ``mapf``: a dimensionless form with the effect that the text describes,
   ``U = 1/2 eta s d_th^2 (1/rho - 1)^2`` with ``rho = d / d_th`` and a gain ``s = exp((sigma(n)^2 - mean) / max)`` that
-  lets loosely demonstrated components yield more.
+  moves components with a large spread more.
 
-Neither knows whether the path *between* two pushed means is clear, and two components on both sides of an obstacle are
-pushed apart, so that the path goes through it. They are kept to be compared with; ``certified`` is the default.
+Neither checks whether the path *between* two pushed means is clear. Two components on both sides of an obstacle are
+pushed apart, so that the path goes through the obstacle. They are kept for comparison; ``certified`` is the default.
 """
 
 from __future__ import annotations
@@ -37,10 +37,11 @@ _GAIN_RANGE = (0.25, 4.0)
 def component_distances(
     path: ComponentPath, displacement: Array, obstacles: Sequence[Obstacle], margin: float
 ) -> tuple[Array, Array, Array]:
-    """Return how far the components' one-sigma ellipses are from the inflated obstacles.
+    """Return the distances of the components' one-sigma ellipses from the inflated obstacles.
 
-    ``d = sd(mu) - sqrt(n^T Sigma n) - margin``: the ellipse's support towards the obstacle is taken off the centre's
-    distance. Exact for spheres, a lower bound for every convex obstacle that the centre is outside of.
+    ``d = sd(mu) - sqrt(n^T Sigma n) - margin``: the ellipse's extent towards the obstacle is subtracted from the
+    distance of its centre. The result is exact for spheres, and a lower bound for every convex obstacle that does not
+    contain the centre.
 
     Returns:
         distances (n_obstacles, n_components) [m], normals (n_obstacles, n_components, 3) and spreads
@@ -85,7 +86,7 @@ FORCES = {"literal": literal_force, "mapf": modified_force}
 def push_components(
     path: ComponentPath, obstacles: Sequence[Obstacle], margin: float, *, method: str, forbidden: Array
 ) -> Array:
-    """Let the potential push the means until nothing is within its influence, or 200 steps are done.
+    """Let the potential push the means until none is within its influence, or for 200 steps.
 
     Args:
         path: the nominal path and its components.
@@ -112,8 +113,8 @@ def push_components(
 class PotentialField(PathAdapter):
     """The thesis's method: push components away from obstacles; the result is evaluated by the same certificate.
 
-    The tool counts as one sphere about its tip that contains all of its spheres. Obstacles count as standing where
-    they are at time 0.
+    The tool counts as one sphere about its tip that contains all of its spheres. Obstacles are assumed to stay at their
+    poses at time 0.
 
     Args:
         force: a name in ``FORCES``.
@@ -123,7 +124,7 @@ class PotentialField(PathAdapter):
         self.force = force
 
     def detour(self, problem: AvoidanceProblem) -> Detour:
-        """Return the path after the push, whether it keeps the clearance or not."""
+        """Return the path after the push; it need not keep the clearance."""
         tool = problem.nominal.tool
         pushed = push_components(
             problem.path,
