@@ -22,10 +22,10 @@ def test_one_command_prints_tables_and_leaves_files(tmp_path, capsys):
     words = [*SMALL, "--methods", "modern", "m3", "--out", str(out), "--report", str(page), "--fill", str(document)]
     assert cli.main(words) == 0
     printed = capsys.readouterr()
-    for said in ("What the thesis claims", "Table 3.1", "Accuracy, inside", "Limit violations", "held?"):
+    for said in ("Claims of the thesis", "Table 3.1", "Accuracy, inside", "Limit violations", "held?"):
         assert said in printed.out
     assert "--data" in printed.err  # what was left out is said
-    assert (out / "mapping.md").read_text().startswith("**What the thesis claims")
+    assert (out / "mapping.md").read_text().startswith("**Claims of the thesis")
     assert len(json.loads((out / "mapping.json").read_text())["results"]) == 2
     assert "<svg" in page.read_text()
     assert "Accuracy, inside" in document.read_text()

@@ -153,7 +153,7 @@ def success_table(
                     on_done(len(rows), total)
     return Table(
         f"{seeds} scenes per row, {1e3 * CLEARANCE:.0f} mm required clearance, tool of {2e3 * TOOL_RADIUS:.0f} mm "
-        f"radius",
+        "diameter",
         _COLUMNS,
         tuple(rows),
         "Right answer: solved with the required clearance (less 0.5 mm), or refused where it can't be solved.",

@@ -83,7 +83,7 @@ def _prepared(folder: str | Path) -> Path:
 
 
 def _kept(place: Path, experiment: Experiment, reuse: bool) -> Result | None:
-    """Return the saved result; None when it is missing, can't be read, or was made by other code."""
+    """Return the saved result; None when it is missing, can't be read, or (unless ``reuse``) other code made it."""
     path = Result.path(place / _RUNS, experiment)
     try:
         found = Result.load(path) if path.exists() else None

@@ -396,7 +396,7 @@ def _cross_validated(problem: _Problem, confidence: Array) -> float:
 
 
 def _least(score: Callable[[float], float]) -> float:
-    """Return the argument with the lowest score, searched among powers of ten, then next to the best."""
+    """Return ``10**d`` with the lowest ``score(d)``; d is searched among whole numbers, then near the best."""
     decades = np.arange(_MU[0], _MU[1] + 0.5)
     best = float(decades[int(np.argmin([score(float(d)) for d in decades]))])
     finer = minimize_scalar(score, bounds=(best - 1.0, best + 1.0), method="bounded", options={"xatol": 0.1})
