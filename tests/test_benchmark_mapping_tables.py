@@ -43,7 +43,7 @@ def test_the_captured_arm_is_one_person_and_has_no_interval():
     ((kind, n, who, *facts),) = recordings_table(Results(results)).rows
     assert (kind, n, who, facts[0]) == (CAPTURED, "2", "1 person, 2 cameras", "43.0 (43.0 … 43.0)")
     titles = [t.title for t in tables(Results(results))]
-    assert not any(title.startswith(("Paired", "Where another", "What the thesis")) for title in titles)
+    assert not any(title.startswith(("Paired", "Where another", "Claims of the thesis")) for title in titles)
     other = [captured("modern", 0, 0.04, seed=0), captured("modern", 1, 0.04, seed=1)]
     assert {person for person, _ in Results(other).values("modern", [CAPTURED], "lag")} == {-1}
     assert written_each({(-1, 0): 1.0, (-1, 1): math.nan}, Figure("x", "")) == "1.0, 1 of 2"

@@ -45,7 +45,7 @@ def test_one_command_prints_tables_and_leaves_files(tmp_path, capsys):
         (["--data", "nowhere"], "no such folder"),
         (["--first", "-1"], "first person"),
         (["--report", "."], "is a folder"),
-        (["--data", ".", "--out", "."], "is the folder of --data, too"),
+        (["--data", ".", "--out", "."], "is also the folder of --data"),
         (["--fill", "nowhere.md"], "can't be read"),
         (["--methods", "magic"], "modern"),
         (["--kinds", "dance"], "edge"),

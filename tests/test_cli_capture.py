@@ -199,7 +199,7 @@ def with_spikes(frames):
         (
             microseconds,
             "frame-rate",
-            "units of 100 ns and fit in us (30.0 frames a second): multiply them by 10",
+            "units of 100 ns, but are plausible in us (30.0 frames a second): multiply them by 10",
         ),
         (z_up, "axes", "take x, z, -y of the file as x, y, z"),
         (frozen, "frozen", "repaired: dropped 89 frames that repeat the one before, for up to 2.97 s on end"),

@@ -111,7 +111,7 @@ def test_a_moving_obstacle_is_passed_on_schedule_and_a_late_arm_brakes_and_says_
     late = ACFRA(skill, tool_radius=0.03)
     fly(late, scene, skill.start_.position, held=range(100, 200), steps=400)
     command = late.step(last, DT)
-    assert command.status is Status.BRAKING and "only on schedule" in command.reason
+    assert command.status is Status.BRAKING and "only at the planned times" in command.reason
     assert not command.twist.any() and not late.finished(last)
     np.testing.assert_array_equal(held[-1], held[-100])  # and stays
 

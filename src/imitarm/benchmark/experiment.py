@@ -349,7 +349,7 @@ def plain(value: Any) -> Any:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically: beside its name, then renamed, so that no reader finds half of it."""
+    """Write a text file under a temporary name and rename it, so that no reader finds half of it."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         aside.write_text(text, encoding="utf-8")

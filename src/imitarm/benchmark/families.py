@@ -204,7 +204,7 @@ def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> R
         seed: number of the scene.
         path: nominal path, shape (n, 3) [m].
         duration: of the path [s].
-        rotates: whether the skill rotates the tool, so that spheres beside the tip can be planned for.
+        rotates: whether the skill rotates the tool, so that the tool may have spheres beside the tip.
     """
     rng = np.random.default_rng([31, seed])
     family = RANDOM_FAMILIES[int(rng.choice(len(RANDOM_FAMILIES), p=[0.1, 0.1, 0.3, 0.12, 0.06, 0.06, 0.16, 0.1]))]

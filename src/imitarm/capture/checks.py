@@ -187,7 +187,7 @@ class _View:
             return "look at the spikes and jumps; if there are none, check the units of time and length"
         name, factor = fit
         return (
-            f"the times were read in units of {time_unit_name(self.time_unit)} and fit in {name} "
+            f"the times were read in units of {time_unit_name(self.time_unit)}, but are plausible in {name} "
             f"({1.0 / (factor * self.period):.1f} frames a second): multiply them by {factor:.10g}"
         )
 
@@ -368,7 +368,7 @@ def _limbs(view: _View) -> Iterator[RecordingIssue]:
         deviation = _MAD_TO_SIGMA * float(np.median(np.abs(seen - length)))
         if not _LIMB[0] <= length <= _LIMB[1]:
             unit = length_unit_that_fits(length)
-            remedy = "is this an arm?" if unit is None else f"these fit in {unit}: convert them"
+            remedy = "is this an arm?" if unit is None else f"these are plausible in {unit}: convert them"
             message = f"the {name} is {length:.2f} m long"
             yield view.issue("error", "limb-length", message, f"positions must be in metres; {remedy}")
         elif deviation > _SPREAD * length and len(tracked) >= _FEW:

@@ -180,7 +180,7 @@ def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[R
     period = abs(float(times[-1])) / max(n - 1, 1)
     if n > 1 and period < 1.0 / _FASTEST_RATE:
         fit = time_unit_that_fits(1.0 / period, TICK) if period > 0.0 else None
-        unit = "" if fit is None else f"they fit in {fit[0]}: multiply them by {fit[1]:.10g}; or "
+        unit = "" if fit is None else f"they are plausible in {fit[0]}: multiply them by {fit[1]:.10g}; or "
         raise FileFormatError(
             f"{path}: {n} frames within {abs(float(times[-1])):.3g} s; its times are not in units of 100 ns as the "
             f"Kinect SDK writes them; {unit}multiply seconds by 10 000 000"
@@ -244,7 +244,7 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
         finite = np.concatenate(lengths)[np.isfinite(np.concatenate(lengths))]
         unit = length_unit_that_fits(float(np.median(finite))) if len(finite) else None
         if unit is not None:
-            remedy = f"positions must be in metres; these fit in {unit}: convert them"
+            remedy = f"positions must be in metres; these are plausible in {unit}: convert them"
     return [RecordingIssue("warning", "far-joint", message, frame, float(times[frame] - times[0]), remedy)]
 
 

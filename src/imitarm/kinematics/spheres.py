@@ -210,7 +210,7 @@ def _cylinder(half_length: float, radius: float) -> tuple[Array, float]:
 
 
 def _grid(half_size: Array) -> tuple[Array, float]:
-    """Cover a box by a limited number of cells that are about as long as the box is thin."""
+    """Cover a box by a limited number of cells, with edges about as long as the shortest edge of the box."""
     cell = max(2.0 * float(np.min(half_size)), _SMALLEST_CELL, 2.0 * float(np.max(half_size)) / _LONGEST_ROW)
     counts = np.maximum(1, np.ceil(2.0 * half_size / cell - 1e-9)).astype(int)
     axes = [h * (2.0 * np.arange(n) + 1.0 - n) / n for h, n in zip(half_size, counts, strict=True)]

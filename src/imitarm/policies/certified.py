@@ -12,7 +12,7 @@ The algorithm of :func:`find_detour`:
    clearance.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
    samples.
-4. Where a few choices of a side find nothing, the displacements of all times are searched together
+4. If the search over sides finds no path, the displacements of all times are searched together
    (:mod:`~imitarm.policies.roadmap`), first with the learned components, then with more and narrower ones.
 """
 

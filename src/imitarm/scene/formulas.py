@@ -172,7 +172,7 @@ def _prepare_ellipsoids(_kinds: Sequence[str], sizes: Array) -> Parameters:
 def cones(
     q: Array, gradient: bool, radius: Array, height: Array, slant: Array, side: Array
 ) -> tuple[Array, Array | None]:
-    """Cones: in the half-plane ``(rho, z)`` a triangle with the base at ``-height/2`` and the tip at ``+height/2``.
+    """Cones, which are triangles in the half-plane ``(rho, z)``: base at ``-height/2``, tip at ``+height/2``.
 
     The distance outside is that to the nearer one of two segments, the slant side and the base; inside it is the larger
     one of the signed distances to their lines.

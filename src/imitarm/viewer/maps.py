@@ -45,7 +45,7 @@ class View:
 
     @property
     def title(self) -> str:
-        """The view in words."""
+        """Description of the view, as text."""
         return {2: "seen from above", 1: "seen from the side", 0: "seen from the front"}[self.depth]
 
     @property
