@@ -77,8 +77,8 @@ def better_methods_table(results: Results, tasks: Sequence[str]) -> Table:
                 rows.append((task, _titled(figure), METHODS[name].title, *cells, f"{p:.3f}"))
     columns = ("recordings", "measure", "better", f"{OURS} minus it (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
     note = (
-        f"Of all measures that are compared, those whose interval says that {OURS} is worse, whatever p is, and every "
-        "method that stacked more often. ↑: a larger value is better; else a smaller one."
+        f"All compared measures whose interval shows that {OURS} is worse (for any p), and all methods that stacked "
+        f"more often. ↑: a larger value is better; else a smaller one."
     )
     return Table(f"Where another method is better than {OURS}", columns, tuple(rows), note)
 

@@ -1,4 +1,4 @@
-"""``imitarm serve``: makes a robot available to other processes over UDP."""
+"""``imitarm serve``: make a robot available to other processes over UDP."""
 
 from __future__ import annotations
 

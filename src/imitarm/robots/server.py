@@ -261,8 +261,8 @@ class RobotServer:
 
     It sends nothing unless asked, and a :class:`~imitarm.robots.server.Supervisor` checks everything it receives.
     If the machine was too busy and periods were missed, the next step is longer by their time, up to 20 ms in total,
-    so that the robot keeps up with the commands. The limits still hold, because they depend on the length of the
-    step. Time missed beyond that is skipped.
+    so that the robot keeps up with the commands. The limits still hold, because they are computed from the length of
+    the step. Time missed beyond that is skipped.
 
     Args:
         robot: robot to serve.

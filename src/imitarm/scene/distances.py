@@ -354,7 +354,7 @@ def _evaluate(
 
 
 def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradient: bool) -> tuple[Array, Array | None]:
-    """Return distances (n, m) and gradients (n, m, 3) of points (m, 3); with ``times`` (k,) m is k times as many."""
+    """Return distances (n, m) and gradients (n, m, 3) of points (m, 3), or (n, k m) with ``times`` (k,)."""
     frames, n, m = packed._frames, len(packed), len(points)
     q = np.dot(frames.rows, points.T).reshape(3, n, m)
     if times is None:

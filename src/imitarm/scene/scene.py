@@ -68,7 +68,7 @@ class Scene:
         return pack(self.obstacles, self.stamp)
 
     def at(self, time: float) -> Scene:
-        """Return the scene as predicted for another time: the one place where obstacles are moved ahead.
+        """Return the scene as predicted for another time; no other code predicts the motion of obstacles.
 
         Each obstacle keeps its velocity and its angular velocity; the goal stays. The result has ``stamp = time``;
         ``packed.stamps`` keep when each obstacle was seen. It takes microseconds: only the packed arrays are moved, and

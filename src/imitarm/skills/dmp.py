@@ -53,8 +53,8 @@ class DMPState(NamedTuple):
         target: start, goal and duration of the motion.
         rotation: state of the rotation; None when none was learned.
         steps: length of the steps so far, as a fraction of the duration, and their number; None when they differed.
-        checked: ``motion`` itself when it is known to be finite. A step checks only states that were changed by the
-            caller, and not those returned by the previous step.
+        checked: the ``motion`` array that was checked to be finite; None before a check. A step checks only states that
+            were changed by the caller, and not those returned by the previous step.
     """
 
     motion: Array

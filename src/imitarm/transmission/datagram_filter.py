@@ -72,7 +72,7 @@ class ClockOffsetEstimator:
     * when two later datagrams have an earlier time stamp, since a sender's clock never goes back; or
     * when, over ``max_age``, three later datagrams are fresh by the confirmed minimum, and this minimum was supported
       by three datagrams before the sample arrived. This rule applies only while at most four samples are
-      unconfirmed: more of them are a queue that empties.
+      unconfirmed, because a larger number comes from a queue of delayed datagrams.
 
     Args:
         max_age: longest accepted delay [ns].
