@@ -20,7 +20,10 @@ SOURCES = sorted((ROOT / "src" / "imitarm").rglob("*.py"))
 EXAMPLES = sorted((ROOT / "examples").rglob("*.py"))
 
 _BLOCK = re.compile(r"^[ \t]*```.*?^[ \t]*```|^[ \t]*\$\$.*?\$\$[ \t]*$|<!--.*?-->", re.MULTILINE | re.DOTALL)
-_START = re.compile(r"^\s*(?:[-*]\s|\d+\.\s|#+\s|\||>|[\w*, ().]+:$|\w[\w, *]*(?: \([^)]*\))?: |!\[)")
+# a list item, a heading, a table row, a quotation or a picture; in a docstring also a section or an argument
+_ITEM = r"\s*(?:[-*]\s|\d+\.\s|#+\s|\||>|!\["
+_START = re.compile(_ITEM + ")")
+_ARGUMENT = re.compile(_ITEM + r"|[\w*, ().]+:$|\w[\w, *]*(?: \([^)]*\))?: )")
 _END = re.compile(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*`$\[]*[A-Z0-9])")
 _ABBREVIATION = re.compile(r"\b(?:Eq|Eqs|Fig|Figs|e\.g|i\.e|et al|vs|cf|Trans|No|[A-Z])\.$")
 _WORD = re.compile(r"[A-Za-z]{2,}")
@@ -45,11 +48,11 @@ def _sentences(paragraph: str) -> Iterator[str]:
     yield from parts
 
 
-def _paragraphs(lines: list[str], first: int) -> Iterator[tuple[int, str]]:
-    """Yield (line number, paragraph): blank lines, list items, headings and table rows each start a new one."""
+def _paragraphs(lines: list[str], first: int, begins: re.Pattern[str]) -> Iterator[tuple[int, str]]:
+    """Yield (line number, paragraph); a blank line, and a line that ``begins`` matches, start a new one."""
     start, held = first, ""
     for number, line in enumerate([*lines, ""], first):
-        if not line.strip() or _START.match(line):
+        if not line.strip() or begins.match(line):
             if held.strip():
                 yield start, held
             start, held = number, ""
@@ -62,7 +65,7 @@ def _prose(path: Path) -> Iterator[Sentence]:
     """Yield the sentences of a page; a table row gives one for each cell."""
     text = _BLOCK.sub(lambda match: "\n" * match[0].count("\n"), path.read_text(encoding="utf-8"))
     name = str(path.relative_to(ROOT))
-    for line, paragraph in _paragraphs(text.splitlines(), 1):
+    for line, paragraph in _paragraphs(text.splitlines(), 1, _START):
         row = paragraph.strip().startswith("|")
         cells = re.split(r"(?<!\\)\|", paragraph.strip().strip("|")) if row else [paragraph]
         for cell in cells:
@@ -95,7 +98,7 @@ def _code(path: Path) -> Iterator[Sentence]:
     docstrings = {id(held): held for node in ast.walk(tree) if (held := _docstring(node))}
     for held in docstrings.values():
         plain = _BLOCK.sub(lambda match: "\n" * match[0].count("\n"), str(held.value))
-        for line, paragraph in _paragraphs(plain.splitlines(), held.lineno):
+        for line, paragraph in _paragraphs(plain.splitlines(), held.lineno, _ARGUMENT):
             if not paragraph.lstrip().startswith((">>>", "...")):
                 for sentence in _sentences(paragraph):
                     yield Sentence(f"{name}:{line}", sentence)

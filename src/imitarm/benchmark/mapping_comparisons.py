@@ -246,7 +246,7 @@ def _two_leads(results: Results, me: str, tasks: Sequence[str]) -> Verdict:
 
 
 def _farther_from_singular(results: Results, me: str, _: Sequence[str]) -> Verdict:
-    """The smallest singular value at the edge of reach is larger than without treatment of singularities, M3."""
+    """The smallest singular value at the edge of reach is larger than that of M3, which treats no singularity."""
     if not results.tasks(["edge"]) or "m3" not in results.methods:
         return "–", "not run"
     ours, theirs = (results.values(name, ["edge"], "least_singular") for name in (me, "m3"))
