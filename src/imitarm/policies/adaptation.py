@@ -384,4 +384,5 @@ def _at_fixed(path: ComponentPath, name: str, sample: int, left: float, required
     at, end = path.nominal.times[sample], path.nominal.times[-1]
     where = "start" if at < 0.02 * end else "goal" if at > 0.98 * end else f"pinned point at {at:.2f} s"
     lies = f"covers the {where}" if left <= 0.0 else f"leaves {1e3 * left:.0f} mm at the {where} ({required})"
-    return f"{name} {lies}, which must not move: move the obstacle, or ask for another {where.split(maxsplit=1)[0]}"
+    other = where if where in {"start", "goal"} else "pinned time"
+    return f"{name} {lies}, which must not move: move the obstacle, or choose another {other}"
