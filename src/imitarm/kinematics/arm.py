@@ -128,7 +128,7 @@ class ArmModel(ArmKinematics):
 
         ``home`` is the keyframe of that name, else the first keyframe. A file without keyframes gets the middle of the
         joints' ranges if that is a usable posture: not singular, with 20 mm between the links. Otherwise it gets the
-        posture, of 1024, that is farthest from singularities and limits.
+        best of 1024 postures by these criteria.
 
         Args:
             name_or_path: ``"sawyer"``, ``"panda"`` or a path.
