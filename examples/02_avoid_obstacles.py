@@ -17,7 +17,7 @@ UPRIGHT = [1.0, 0.0, 0.0, 0.0]  # quaternions are w, x, y, z everywhere
 def show(adaptation: Adaptation) -> None:
     verdict = "can be executed" if adaptation.feasible else "refused"
     print(
-        f"  {adaptation.method:9s} {verdict}: {1e3 * adaptation.certified_clearance:.1f} mm certified on the whole path, "
+        f"  {adaptation.method:9s} {verdict}: {1e3 * adaptation.certified_clearance:.1f} mm certified on the path, "
         f"{int(adaptation.moved.sum())} of {len(adaptation.moved)} components moved, "
         f"{1e3 * adaptation.rmse_to_nominal:.0f} mm from the learned path"
     )
