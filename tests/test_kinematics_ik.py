@@ -325,7 +325,7 @@ def test_rows_with_a_price_have_the_documented_cost(seed):
 @settings(deadline=None, max_examples=150)
 @given(seeds, st.integers(1, 12), st.sampled_from([0.01, 0.05, 0.2]))
 def test_rows_are_kept_wherever_the_box_allows_it_and_violated_least_where_not(seed, n, shift):
-    """A known QP solver's own soft constraints fail this in a third of all cases: rows that can be kept are broken."""
+    """A known QP solver's own soft constraints fail this: they break rows that can be kept."""
     problem = random_rows_problem(seed, [(n, shift, np.inf)])
     bounds, rows = list(zip(*problem.box, strict=True)), problem.rows[0]
 

@@ -365,7 +365,7 @@ def _least_violation(box: Box, matrix: Array, least: Array) -> tuple[Array, Arra
     """Return a velocity that violates contradictory rows least (sum of squares), and the bounds that it keeps.
 
     Each row gets a slack variable. daqp's own soft constraints would need none, but where they meet active bounds
-    its answers violate rows that can be kept (version 0.11, in a third of random problems).
+    its answers violate rows that can be kept (seen with version 0.11).
     """
     m, n = matrix.shape
     lengths = np.sqrt(np.einsum("ij,ij->i", matrix, matrix))
