@@ -8,7 +8,7 @@ both, and compares them in pairs. The table prints the median ratio and its 95 %
 evaluate the results: speed at the expense of accuracy does not count. Numerical libraries run with one thread.
 
 With ``--against``, both checkouts run in processes of their own, also in turns. The rows of the other checkout are its
-own, in ``benchmarks/``, so that they call what it has.
+own, in ``benchmarks/``, so that they call what it has. CPU time is compared, except where a row starts processes.
 """
 
 from __future__ import annotations
@@ -72,7 +72,9 @@ def show_changes(changes: Sequence[Change], console: Console) -> None:
     for c in changes:
         verdict = {True: "", False: "SLOWER", None: "not measured"}[c.passed]
         before, after = ("" if np.isnan(seconds) else duration(seconds) for seconds in (c.before, c.after))
-        table.add_row(c.name, before, after, "" if c.ratio is None else str(c.ratio), verdict, c.note)
+        r = c.ratio
+        ratio = "" if r is None else f"{r.median:.3f} ({r.low:.3f} to {r.high:.3f})"
+        table.add_row(c.name, before, after, ratio, verdict, c.note)
     console.print(table)
 
 
