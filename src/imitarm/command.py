@@ -33,9 +33,9 @@ class Command:
     """The motion that a policy requests for the next control period.
 
     Attributes:
-        twist: of the tool in the base frame, linear velocity first, shape (6,) [m/s, rad/s].
-        joint_velocity: of the joints, shape (n_joints,) [rad/s]; it replaces the twist where it is given, for example
-            along a planned joint path. None: the inverse kinematics chooses it.
+        twist: twist of the tool in the base frame, linear velocity first, shape (6,) [m/s, rad/s].
+        joint_velocity: velocity of the joints, shape (n_joints,) [rad/s]; it replaces the twist where it is given, for
+            example along a planned joint path. None: the inverse kinematics chooses it.
         posture: joint positions to drift towards, as far as the twist leaves freedom, shape (n_joints,) [rad]; None:
             any.
         elbow: SEW angle to rotate the elbow to, as far as the twist leaves freedom [rad]; None: any.

@@ -24,7 +24,8 @@ class Registry(Mapping[str, Item], Generic[Item]):
     Args:
         kind: what a member is, for messages, for example ``"policy"``.
         group: the entry-point group, for example ``"imitarm.policies"``.
-        built_in: of this package, ``"module:attribute"`` by name, in the order in which they are listed.
+        built_in: built-in members of this package, ``"module:attribute"`` by name, in the order in which they are
+            listed.
     """
 
     def __init__(self, kind: str, group: str, built_in: Mapping[str, str]) -> None:

@@ -30,7 +30,7 @@ class SafetyStep:
     """The filter's answer to one command.
 
     Attributes:
-        velocity: of the joints, to be sent, shape (n_joints,) [rad/s].
+        velocity: velocity of the joints, to be sent, shape (n_joints,) [rad/s].
         changed: norm of the difference between ``velocity`` and the velocity that the command would give within the
             joint limits alone [rad/s]; 0 when no clearance row was active.
         slack: largest violation of a clearance row [m/s]; 0 when all rows are kept.
@@ -66,8 +66,8 @@ class SafetyFilter:
         allowance: distance kept in addition to the clearance, because no robot moves exactly as commanded [m].
         self_clearance: required distance between links that are not neighbours [m]; None: not checked.
         limits: limits of the inverse kinematics; None: position, velocity and acceleration of each joint.
-        method: of the inverse kinematics; only ``"qp"`` keeps clearances, so with another method both clearances must
-            be None.
+        method: method of the inverse kinematics; only ``"qp"`` keeps clearances, so with another method both clearances
+            must be None.
 
     Raises:
         InputError: when a number can't be used, or the method can't keep what is required.
@@ -97,7 +97,7 @@ class SafetyFilter:
         """Return the joint velocity for one control period.
 
         Args:
-            command: of the policy.
+            command: command of the policy.
             q: joint positions, shape (n_joints,) [rad].
             velocity: joint velocity that was sent last, shape (n_joints,) [rad/s]; None: unknown, accelerations are
                 not limited.

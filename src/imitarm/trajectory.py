@@ -221,7 +221,7 @@ class Demonstration:
         Columns: ``t`` [s], ``x y z`` [m], ``qw qx qy qz`` when the rotation is known, then the joints by name [rad].
 
         Args:
-            path: of the file.
+            path: path of the file.
 
         Raises:
             InputError: when a joint's name can't be a column name, or the file can't be written.
@@ -252,7 +252,7 @@ class Demonstration:
         The ``source`` of the result is the path.
 
         Args:
-            path: of the file.
+            path: path of the file.
 
         Raises:
             InputError: when the file can't be opened.
@@ -275,7 +275,7 @@ def read_demonstration_table(path: str | os.PathLike[str]) -> Table:
     """Read the file of a demonstration as a table. The header is checked, the numbers are not.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
         InputError: when the file can't be opened.

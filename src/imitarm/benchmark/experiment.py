@@ -102,7 +102,7 @@ class Experiment:
         task: one of :data:`REPLAYS`, or :data:`LIVE`.
         method: one of :data:`METHODS`.
         robot: one of :data:`ROBOTS`; stacking needs the Sawyer.
-        seed: of the person.
+        seed: seed of the person.
         repeat: number of the recording or trial among those of this person.
         seconds: approximate duration of reaches and drawings [s].
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
@@ -200,10 +200,10 @@ class StackingOutcome:
     Attributes:
         success: whether four cubes stand in order.
         failure: one of :data:`imitarm.tasks.stack.FAILURES`; empty on success.
-        reason: in words.
+        reason: reason in words.
         stacked: cubes in the tower at the end.
         time: until the person had finished, or the time limit [s].
-        path_length: of the tool [m].
+        path_length: path length of the tool [m].
         mean_torque: mean of the absolute torque of each joint [N m].
         rms_torque: root mean square of each joint's torque [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].

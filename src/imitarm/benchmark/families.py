@@ -49,7 +49,7 @@ def s_shaped_demonstrations(*, planar: bool, n_demonstrations: int = 8, seed: in
     Args:
         planar: keep the height constant, as in a task on a table.
         n_demonstrations: how many.
-        seed: of the differences between the demonstrations.
+        seed: seed of the differences between the demonstrations.
     """
     rng = np.random.default_rng([1, seed])
     times = np.linspace(0.0, _DURATION, 200)
@@ -203,7 +203,7 @@ def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> R
     Args:
         seed: number of the scene.
         path: nominal path, shape (n, 3) [m].
-        duration: of the path [s].
+        duration: duration of the path [s].
         rotates: whether the skill rotates the tool, so that the tool may have spheres beside the tip.
     """
     rng = np.random.default_rng([31, seed])

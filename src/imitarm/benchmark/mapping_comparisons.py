@@ -196,7 +196,7 @@ def verdict(comparisons: Sequence[Comparison], sign: float) -> str:
 
     Args:
         comparisons: Me minus each baseline.
-        sign: of the differences according to the claim, -1 or 1.
+        sign: sign of the differences according to the claim, -1 or 1.
     """
     corrected = holm([c.p for c in comparisons])
     shown = [

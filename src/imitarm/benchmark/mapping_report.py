@@ -42,7 +42,7 @@ def write_mapping_report(
     """Write the page with :func:`~imitarm.viewer.page.draw_page` and return its path.
 
     Args:
-        results: of the benchmark.
+        results: results of the benchmark.
         tables: as the command printed them.
         path: the file to write; its folder must exist.
         provenance: the facts that are needed to repeat the benchmark.

@@ -102,7 +102,7 @@ class Results:
         Args:
             method: whose.
             tasks: at which.
-            name: of the measure; ``"limit_violations"`` is the sum of the three counts. With the loop closed
+            name: name of the measure; ``"limit_violations"`` is the sum of the three counts. With the loop closed
                 ``"success"`` is 1 or 0, and the rest is known only of the trials that succeeded.
             joint: index of the joint, for measures of each joint; None: the mean over the joints.
         """

@@ -67,12 +67,12 @@ class PlacementResult:
     Attributes:
         policy: its name.
         setup: the skill and the arm.
-        seed: of the placement.
+        seed: seed of the placement.
         outcome: one of :data:`OUTCOMES`.
         clearance: smallest measured distance of arm and tool to an obstacle [m]; nan without a motion.
-        duration: of the motion over that of the skill; nan without a motion.
+        duration: duration of the motion over that of the skill; nan without a motion.
         planning: wall time until the policy answered or refused [s].
-        reason: in words.
+        reason: reason in words.
     """
 
     policy: str
@@ -91,7 +91,7 @@ def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
     Args:
         skill: whose path.
         arm: whose tool must be clear at start and goal.
-        seed: of the scene; every third has one obstacle.
+        seed: seed of the scene; every third has one obstacle.
         start: joint positions at the start, shape (n_joints,) [rad].
 
     Raises:
@@ -195,7 +195,7 @@ def run_placements(
     Args:
         policies: names in :data:`~imitarm.policies.POLICIES`.
         setups: skills with their arms.
-        seeds: of the placements.
+        seeds: seeds of the placements.
         jobs: processes.
         progress: called with the number of finished placements and the total number.
 

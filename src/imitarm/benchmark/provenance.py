@@ -52,7 +52,7 @@ def origin(versions: Iterable[str]) -> str:
     """Return a sentence that says which code made the results, and whether it differs from the running code.
 
     Args:
-        versions: of the code of each result, see :func:`code_version`.
+        versions: versions of the code of each result, see :func:`code_version`.
     """
     found, now = sorted(set(versions)), code_version()
     if found == [now]:

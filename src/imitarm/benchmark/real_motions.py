@@ -86,7 +86,7 @@ def tables(motions: Sequence[Motion]) -> list[Table]:
     """Return two tables: ``modern`` on every motion and arm at each speed, and all methods on the first motion.
 
     Args:
-        motions: at least one.
+        motions: at least one motion.
     """
     arms = {name: ArmModel.load(name, tool="gripper") for name in _ARMS}
     modern, starts = [], {}

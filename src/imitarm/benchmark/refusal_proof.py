@@ -35,8 +35,8 @@ class Question:
     Attributes:
         nominal: the nominal path, n samples.
         basis: influence of the skill's components on the samples, shape (n, n_components).
-        obstacles: at time 0; they keep their velocity.
-        spheres: of the tool, rows x y z r, shape (m, 4) [m].
+        obstacles: obstacles at time 0; they keep their velocity.
+        spheres: spheres of the tool, rows x y z r, shape (m, 4) [m].
         clearance: required [m].
         forbidden: directions in which nothing may move, shape (k, 3).
         fixed_times: at which the path must not move [s].
@@ -79,8 +79,8 @@ def separation(question: Question, times: Array, positions: Array) -> float:
 
     Args:
         question: obstacles, spheres and clearance.
-        times: of the path [s], shape (n,).
-        positions: of the tip, a polyline, shape (n, 3) [m].
+        times: times of the path [s], shape (n,).
+        positions: positions of the tip, a polyline, shape (n, 3) [m].
     """
     dense = np.unique(np.concatenate([np.linspace(times[0], times[-1], _DENSE), times]))
     tip = np.stack([np.interp(dense, times, column) for column in positions.T], axis=1)
@@ -102,7 +102,7 @@ class _Cells:
 
     Attributes:
         frame: rows are the directions of the edges, an orthonormal basis of the permitted plane, line or space, (d, 3).
-        size: of a box along each edge, shape (d,) [m].
+        size: size of a box along each edge, shape (d,) [m].
         lowest: coordinates of the lowest corner of all, shape (d,) [m].
         counts: boxes along each edge, shape (d,).
     """

@@ -60,7 +60,7 @@ class Place:
         Args:
             found: the tables.
             command: the command that printed the tables.
-            versions: of the code that made each result; the document says if it differs from the running code.
+            versions: versions of the code that made each result; the document says if it differs from the running code.
         """
         head, tail = self._parts()
         body = "\n".join(table.markdown() for table in found)

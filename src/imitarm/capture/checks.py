@@ -57,7 +57,7 @@ def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIs
 
     Args:
         recording: as read or captured.
-        side: of the arm that a robot is to follow.
+        side: side of the arm that a robot is to follow.
 
     Raises:
         UnknownNameError: when ``side`` is neither left nor right.

@@ -92,8 +92,8 @@ def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[Recordi
     line; an issue reports the loss.
 
     Args:
-        path: for messages.
-        content: of the file.
+        path: path for messages.
+        content: content of the file.
 
     Returns:
         the skeletons, and notes about the file.
@@ -157,8 +157,8 @@ def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[R
     a line is accepted.
 
     Args:
-        path: for messages.
-        content: of the file.
+        path: path for messages.
+        content: content of the file.
 
     Returns:
         the skeletons, and notes about the file.
@@ -263,7 +263,7 @@ def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]
     that of an average person who stands upright in front of a sensor, and is given as inferred.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Returns:
         the skeletons, and notes about the file.

@@ -30,7 +30,7 @@ class BodyCamera(SkeletonSource):
     """A camera whose driver delivers frames of all bodies in view.
 
     Attributes:
-        name: for messages.
+        name: name for messages.
     """
 
     live = True

@@ -68,11 +68,11 @@ class PoseLandmarks:
     """The landmarks that MediaPipe found in one image.
 
     Attributes:
-        time: of the image [s].
+        time: time of the image [s].
         world: relative to the middle of the hips, x to the image's right, y down, z away, shape (33, 3) [m].
         image: place in the image, 0 to 1 from the left and from the top, shape (33, 2); beyond this range when not in
             view.
-        visibility: of each landmark, 0 to 1, shape (33,).
+        visibility: visibility of each landmark, 0 to 1, shape (33,).
 
     Raises:
         InputError: when a shape is wrong or a value is not finite.
@@ -110,7 +110,7 @@ class LandmarkConverter:
 
     Args:
         size: width and height of the image [pixels]; only their ratio matters.
-        field_of_view: of the longer side [deg].
+        field_of_view: field of view of the longer side [deg].
 
     Raises:
         InputError: when the size is not positive, or the field of view is not between 10 and 150 degrees.
@@ -217,7 +217,7 @@ class MediaPipeSource(SkeletonSource):
         film: a video file, or the number of a webcam.
         realtime: return a video's skeletons no earlier than the video would show them; else as fast as they are
             tracked.
-        field_of_view: of the longer side of the image [deg].
+        field_of_view: field of view of the longer side of the image [deg].
         python: interpreter that has MediaPipe; None: :func:`~imitarm.capture.mediapipe_environment.find_python`.
 
     Attributes:

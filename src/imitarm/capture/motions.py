@@ -42,7 +42,7 @@ def reaching(person: Person, seed: int, *, duration: float = 12.0, kind: str = "
 
     Args:
         person: who moves.
-        seed: of the places and the speeds.
+        seed: seed of the places and the speeds.
         duration: [s]; the hand is still during the first second.
         kind: ``"inside"``: well within reach. ``"edge"``: every second reach stretches the arm fully and stays there
             for a while, at and beyond the reach of a robot of the same proportions.

@@ -61,7 +61,7 @@ class Person:
         upper_arm: shoulder to elbow [m].
         forearm: elbow to wrist [m].
         hand: wrist to finger tip [m].
-        position: of the point on the floor between the feet, x and z in the sensor's frame, shape (2,) [m].
+        position: position of the point on the floor between the feet, x and z in the sensor's frame, shape (2,) [m].
         swivel: psi, the angle of the elbow outwards from straight down, while the hand is low [rad].
         lift: increase of psi with the height of the hand [rad/m].
         tremor: amplitude [m], frequency [rad/s] and phase [rad] of the hand's tremor, for each of n waves and each
@@ -144,7 +144,7 @@ class Person:
             hand: rotation of the hand in the sensor's frame, shape (3, 3), its x along the hand, its y towards the
                 thumb; None: in line with the forearm, with the thumb up as far as possible.
             closed: whether the hand is a fist.
-            side: of the arm that moves.
+            side: side of the arm that moves.
 
         Raises:
             InputError: when the wrist is not three finite numbers, the swivel is not finite, or the hand is not a

@@ -40,8 +40,8 @@ class SkeletonRecording(SkeletonSource):
     :func:`~imitarm.capture.checks.check` says what is wrong.
 
     Args:
-        skeletons: in the order they came.
-        name: for messages, for example the file's name.
+        skeletons: skeletons in the order they came.
+        name: name for messages, for example the file's name.
         realtime: replay at the recorded speed; else as fast as skeletons are read.
         issues: found while reading.
         time_unit: unit of the file's time stamps [s], for messages about times that are not plausible.
@@ -225,12 +225,12 @@ class SkeletonRecorder:
     the new one is complete.
 
     Args:
-        path: of the file.
+        path: path of the file.
         source: origin of the skeletons, written into the file.
         replace: an existing file may be replaced.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         n_frames: written so far.
 
     Raises:
@@ -282,7 +282,7 @@ def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
         longer.
 
     Args:
-        skeletons: in the order of their times.
+        skeletons: skeletons in the order of their times.
         pace: fraction of the recorded speed, 0.05 to 1.
 
     Raises:

@@ -88,7 +88,7 @@ def measure_noise(skeletons: Iterable[Skeleton]) -> SensorNoise:
     """Estimate the noise of a skeleton camera.
 
     Args:
-        skeletons: of one person, in the order of their times; at least 20, some of them at rest.
+        skeletons: skeletons of one person, in the order of their times; at least 20, some of them at rest.
 
     Raises:
         InputError: when there are too few, or their times don't increase.

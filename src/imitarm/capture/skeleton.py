@@ -84,7 +84,7 @@ class Arm:
     Attributes:
         time: [s].
         points: shoulder, elbow, wrist, hand, hand tip, thumb, shape (6, 3) [m]; nan where lost.
-        confidence: of each point, 0 (lost) to 1 (tracked), shape (6,).
+        confidence: confidence of each point, 0 (lost) to 1 (tracked), shape (6,).
         hand_state: open, closed, or unknown.
     """
 
@@ -125,10 +125,10 @@ class Skeleton:
     is nan, so that it can't be used by mistake.
 
     Attributes:
-        time: of the exposure, on the source's clock [s].
-        positions: of the joints :data:`JOINTS`, shape (25, 3) [m]; nan where lost.
+        time: time of the exposure, on the source's clock [s].
+        positions: positions of the joints :data:`JOINTS`, shape (25, 3) [m]; nan where lost.
         tracking: :class:`Tracking` of each joint, shape (25,).
-        hand_states: of the left and the right hand.
+        hand_states: states of the left and the right hand.
         person: number of the person, given by the source.
 
     Raises:
@@ -224,7 +224,7 @@ class SkeletonSource(ABC):
         glove = "my_package.glove:GloveSource"
 
     Attributes:
-        name: for messages and for recordings, for example the file's name.
+        name: name for messages and for recordings, for example the file's name.
         argument: what a user writes after the colon, for example ``"SEED"``; empty: there is no colon.
         description: one line for ``--help``.
         live: whether the source goes on until it is stopped.

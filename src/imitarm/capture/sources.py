@@ -86,7 +86,7 @@ def is_live(word: str | Path) -> bool:
     """Return whether the source that a word names runs until it is stopped, without opening it.
 
     Raises:
-        InputError: as :func:`find_source`.
+        InputError: for the same reasons as :func:`find_source`.
     """
     return find_source(word)[0].live
 

@@ -44,7 +44,7 @@ class SkeletonSender:
         """Send a skeleton; return whether it was sent.
 
         Args:
-            skeleton: to send.
+            skeleton: skeleton to send.
             exposed_ns: time of exposure, on the sender's clock [ns]; None: now.
         """
         now = self._clock_ns()
@@ -69,7 +69,7 @@ def frame_of(skeleton: Skeleton, waited_ns: int = 0) -> SkeletonFrame:
     """Return a skeleton as it is sent: lost positions are 0, because a datagram must not hold nan.
 
     Args:
-        skeleton: to send.
+        skeleton: skeleton to send.
         waited_ns: time between exposure and sending [ns].
     """
     seen = skeleton.tracking != Tracking.LOST

@@ -34,10 +34,10 @@ class SyntheticSource(SkeletonSource):
         camera: the simulated camera.
         duration: [s].
         realtime: return each skeleton at its time, as a camera does; else as fast as skeletons are read.
-        name: for messages.
+        name: name for messages.
 
     Attributes:
-        truth: as given.
+        truth: true positions, as given.
 
     Raises:
         InputError: when the duration is not positive, or longer than a day.

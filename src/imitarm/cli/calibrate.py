@@ -311,8 +311,8 @@ def touched_points(
     Args:
         source: observes the hand, live or replayed in real time.
         points: in the robot's base frame, shape (n, 3) [m].
-        side: of the hand.
-        seconds: of each measurement.
+        side: side of the hand.
+        seconds: duration of each measurement.
         only: index of the single point to touch, from 0; None: all points.
 
     Returns:

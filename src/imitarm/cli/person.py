@@ -49,7 +49,7 @@ def add_source(parser: argparse.ArgumentParser, name: str = "source", purpose: s
     """Add the argument that names a source of skeletons.
 
     Args:
-        parser: of the command.
+        parser: parser of the command.
         name: ``"source"``, or ``"--source"`` for an option.
         purpose: what the source is for, at the beginning of the help.
     """
@@ -128,8 +128,8 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
     A recording is repaired first. Changes and issues are printed.
 
     Args:
-        arguments: of the command.
-        side: of the arm that the robot follows.
+        arguments: arguments of the command.
+        side: side of the arm that the robot follows.
 
     Returns:
         the skeletons; what was changed and what is wrong, a sentence each; and the person's true motion, when the

@@ -352,9 +352,9 @@ def suggestion(
     """Return which options to try when the tool did not follow, the most promising first; empty when it did.
 
     Args:
-        tracking: of the run.
-        skeletons: of the person.
-        correspondence: between person and robot, the input of the method.
+        tracking: tracking of the run.
+        skeletons: skeletons of the person.
+        correspondence: correspondence between person and robot, the input of the method.
         fitted: whether ``--fit`` was given.
         pace: value of ``--pace``.
     """

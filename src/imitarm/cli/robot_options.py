@@ -16,7 +16,7 @@ def add_robot_options(parser: argparse.ArgumentParser, *, default: str | None = 
     """Add ``--robot``, ``--tool``, ``--flange``, ``--package-path`` and ``--discard-meshes``.
 
     Args:
-        parser: of the command.
+        parser: parser of the command.
         default: the robot that is taken when none is named; None for a command that can do without a robot.
     """
     group = parser.add_argument_group("the robot arm")

@@ -52,7 +52,7 @@ def run_scene(
     Args:
         name: short and unique.
         title: for tables and the report.
-        robot: at its start posture, in its scene.
+        robot: robot at its start posture, in its scene.
         policy: not yet reset.
         clearance: required clearance [m].
         link_clearance: required clearance of every link [m]; None: only the tool keeps a clearance.

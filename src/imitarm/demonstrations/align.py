@@ -67,7 +67,7 @@ class Alignment:
         demonstrations: all with the same times, from 0 to ``duration``.
         duration: the median of the trimmed demonstrations' durations [s].
         kept_rows: first and last row of each demonstration that were kept, shape (n_demonstrations, 2).
-        durations: of each trimmed demonstration, before [s], shape (n_demonstrations,).
+        durations: duration of each trimmed demonstration, before [s], shape (n_demonstrations,).
         warps: for each sample of the common motion, the fraction of its own trimmed duration that each demonstration
             has passed, 0 to 1, strictly increasing, shape (n_demonstrations, n).
         method: ``"dtw"`` or ``"resample"``.
@@ -102,7 +102,7 @@ def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Meth
     Positions, rotations and joints all follow the same warp.
 
     Args:
-        demonstrations: of one motion, at least one.
+        demonstrations: demonstrations of one motion, at least one.
         n: number of samples of each result.
         method: ``"dtw"`` or ``"resample"``.
 
@@ -293,7 +293,7 @@ def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, In
         a: shape (pairs, n, d).
         b: shape (pairs, n, d), same n.
         band: largest allowed |i - j|, in samples.
-        price: of a step that is not diagonal, in units of the cost.
+        price: cost of a step that is not diagonal, in units of the cost.
 
     Returns:
         cost: D(n-1, n-1) of each pair, shape (pairs,).

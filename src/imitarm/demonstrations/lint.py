@@ -78,8 +78,8 @@ def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: Arm
     """Check each demonstration by itself and against the arm, and compare all with each other.
 
     Args:
-        demonstrations: of one motion. Raw demonstrations (``read_raw``) may contain invalid numbers, which are
-            reported; a Demonstration can't contain any.
+        demonstrations: demonstrations of one motion. Raw demonstrations (``read_raw``) may contain invalid numbers,
+            which are reported; a Demonstration can't contain any.
         arm: the arm that was recorded, with its tool; None: joint limits and reach are not checked.
 
     Returns:

@@ -83,7 +83,7 @@ class RawDemonstration:
     Attributes:
         source: the file, and the part of it.
         times: shape (n,) [s], in any order.
-        positions: of the tool in the base frame, shape (n, 3) [m]; None when only joints were recorded.
+        positions: positions of the tool in the base frame, shape (n, 3) [m]; None when only joints were recorded.
         quaternions: wxyz of any length, shape (n, 4); None when not recorded.
         joints: shape (n, n_joints) [rad]; None when not recorded.
         joint_names: one name for each column of ``joints``.

@@ -45,7 +45,7 @@ class ReadOptions:
     Attributes:
         units: unit of lengths, a key of ``LENGTH_UNITS``; None: as the file says, else m.
         time_units: unit of time stamps, a key of ``TIME_UNITS``; None: as the file says, else s.
-        duration: of the motion [s], for files without time stamps.
+        duration: duration of the motion [s], for files without time stamps.
         rate: samples per second [Hz], for files without time stamps.
         quaternion_order: ``"wxyz"`` or ``"xyzw"``, for quaternion columns without names; None: as the file says, else
             wxyz.

@@ -79,7 +79,7 @@ def execute_on_robot(
     The robot's own limits are active: a command beyond them is reduced, and the arm falls behind.
 
     Args:
-        run: of a method.
+        run: run of a method.
         scene: obstacles, as solid bodies.
         progress: called with the fraction that is done, 0 to 1.
     """

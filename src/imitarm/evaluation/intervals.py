@@ -66,9 +66,9 @@ def interval(values: Values, *, confidence: float = 0.95, seed: int = 0) -> Inte
     """Return the mean over persons and its bootstrap interval.
 
     Args:
-        values: of each recording.
-        confidence: of the interval.
-        seed: of the resampling.
+        values: values of each recording.
+        confidence: confidence level of the interval.
+        seed: seed of the resampling.
     """
     means = person_means(values)
     used = sum(math.isfinite(value) for value in values.values())
@@ -86,8 +86,8 @@ def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) ->
 
     Args:
         samples: shape (n,).
-        confidence: of the interval.
-        seed: of the resampling.
+        confidence: confidence level of the interval.
+        seed: seed of the resampling.
 
     Returns:
         low and high; nan with fewer than two samples.
@@ -150,7 +150,7 @@ def rate_interval(outcomes: Values) -> Interval:
     as good in every trial, and the upper end the highest of all that are at least as bad.
 
     Args:
-        outcomes: of each trial, 1 for success, 0 for failure.
+        outcomes: outcome of each trial, 1 for success, 0 for failure.
     """
     rates = person_means(outcomes)
     n, used = len(rates), sum(math.isfinite(value) for value in outcomes.values())
@@ -171,7 +171,7 @@ def _lower_end(rates: Array, each: float, step: int) -> float:
     before another improves (that result majorises all others). So only these need to be examined.
 
     Args:
-        rates: of the persons, shape (n,).
+        rates: rates of the persons, shape (n,).
         each: trials per person, on average.
         step: rates are examined in steps of ``1 / step``.
     """
@@ -222,7 +222,7 @@ def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
 
     Args:
         differences: one per person, shape (n,).
-        seed: of the random sign flips, when there are more differences.
+        seed: seed of the random sign flips, when there are more differences.
 
     Returns:
         The probability; 1 without differences.

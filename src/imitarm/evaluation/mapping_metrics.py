@@ -46,7 +46,7 @@ class MappingMetrics:
     ``engaged_fraction``; ``tool_rms_from_first`` includes everything.
 
     Attributes:
-        duration: of the robot's motion [s].
+        duration: duration of the robot's motion [s].
         following_fraction: fraction of the frames with state "following".
         engaged_fraction: fraction of the frames in which the person led: following, coasting, holding.
         engagements: how often the person began to lead.
@@ -64,7 +64,7 @@ class MappingMetrics:
         elbow_direction_rms: angle between the actual and the correct direction of the robot's upper arm, see
             :func:`~imitarm.evaluation.tracking.elbow_direction_errors` [rad].
         elbow_angle_rms: difference between the changes of the robot's and the person's SEW angle [rad].
-        path_length: of the tool [m].
+        path_length: path length of the tool [m].
         settling_time: from the end of the true hand's motion until the tool stays within 1 cm of the method's last
             target for 0.5 s [s]; nan when it never does.
         mean_torque: mean absolute torque of each joint [N m].
@@ -81,9 +81,9 @@ class MappingMetrics:
         position_excess: largest distance of a joint from its range [rad].
         velocity_ratio: largest velocity relative to its limit.
         acceleration_ratio: largest acceleration relative to its limit.
-        jerk_rms: of the tool's position [m/s^3].
-        joint_jerk_rms: of all joints together [rad/s^3].
-        spectral_arc_length: of the tool's speed; 0 is smoothest.
+        jerk_rms: RMS jerk of the tool's position [m/s^3].
+        joint_jerk_rms: RMS jerk of all joints together [rad/s^3].
+        spectral_arc_length: spectral arc length of the tool's speed; 0 is smoothest.
         least_singular: smallest singular value of the tool's Jacobian during the motion, 1 rad counted as 0.3 m
             [m/rad].
         teaching_time: time of a teacher that the method's corrections took [s]; 0 for methods without a teacher.
@@ -136,8 +136,8 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
     """Measure a retargeting.
 
     Args:
-        run: of the method.
-        correspondence: between person and robot, the input of the method.
+        run: run of the method.
+        correspondence: correspondence between person and robot, the input of the method.
         true: the person's arm at the times of the run, or, for a method that slows the motion down, at its shown times;
             None when it is unknown, as with a real camera: the measures that need it are nan.
 

@@ -153,7 +153,7 @@ def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
     motions of the same recording.
 
     Args:
-        speed: of a point, shape (n,) [m/s].
+        speed: speed of a point, shape (n,) [m/s].
         dt: sampling period [s].
 
     Returns:

@@ -37,7 +37,7 @@ class TargetTracking:
     limit.
 
     Attributes:
-        title: of the method.
+        title: title of the method.
         rms: root mean square distance to the target [m]; nan when there was none.
         far_fraction: fraction of the time with a target in which the tool was farther than :data:`FAR`, 0 to 1; or nan.
         far_time: time in which the tool was farther than :data:`FAR` [s].
@@ -61,8 +61,8 @@ class TargetTracking:
         """Return how a run tracked its target.
 
         Args:
-            run: of a method.
-            metrics: of this run.
+            run: run of a method.
+            metrics: metrics of this run.
         """
         away = np.linalg.norm(run.arm.tool_path(run.joints)[0] - run.targets[0], axis=1)
         away = away[np.isfinite(away)]
@@ -118,8 +118,8 @@ class RunEvaluation:
         run: the evaluated run.
         metrics: comparison with the person's arm.
         tracking: how well the tool tracked its own target.
-        target_lag: of the tool behind its own target [s]; nan when it does not follow.
-        hand_lag: of the tool behind the hand [s]; nan when it does not follow.
+        target_lag: lag of the tool behind its own target [s]; nan when it does not follow.
+        hand_lag: lag of the tool behind the hand [s]; nan when it does not follow.
         link_distance: smallest distance between links that are not neighbours [m], between the spheres that cover them.
         truth_known: whether measures compare with the true hand; otherwise with the hand as the camera saw it.
         warnings: remarks for the user about this run, one sentence each.
@@ -144,9 +144,9 @@ def evaluate_run(
     """Measure the quality of a retargeting.
 
     Args:
-        run: of a method.
-        skeletons: of the person, the input of the method.
-        correspondence: between person and robot, the input of the method.
+        run: run of a method.
+        skeletons: skeletons of the person, the input of the method.
+        correspondence: correspondence between person and robot, the input of the method.
         truth: the true positions of the person over time; None: what the camera saw is used instead.
 
     Raises:
@@ -182,9 +182,9 @@ def warnings_of(
     """Return remarks for the user about a run, one sentence each.
 
     Args:
-        run: of a method.
-        metrics: of the run.
-        tracking: of the run.
+        run: run of a method.
+        metrics: metrics of the run.
+        tracking: tracking of the run.
         link_distance: smallest distance between links that are not neighbours [m].
     """
     dt = float(run.times[1] - run.times[0])

@@ -36,7 +36,7 @@ class TrueArm:
     """Positions of a person's arm, in the axes of the robot's base.
 
     Attributes:
-        times: of the samples of the run with which it is compared, shape (n,) [s]; non-decreasing.
+        times: times of the samples of the run with which it is compared, shape (n,) [s]; non-decreasing.
         shoulder: shape (n, 3) [m].
         elbow: shape (n, 3) [m].
         wrist: shape (n, 3) [m].
@@ -55,7 +55,7 @@ class TrueArm:
 
         Args:
             truth: the person's skeleton over time; called in the order of the times.
-            times: of a run, shape (n,) [s].
+            times: times of a run, shape (n,) [s].
             correspondence: gives the side of the arm and the pose of the sensor.
             start: the person's time at the run's time 0, which is that of its first skeleton [s].
         """
@@ -93,7 +93,7 @@ def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Co
     worse than it is.
 
     Args:
-        skeletons: in order of time.
+        skeletons: skeletons in order of time.
         times: since the first skeleton, shape (n,) [s].
         correspondence: gives the side of the arm and the pose of the sensor.
 
@@ -169,7 +169,7 @@ def reference_positions(
         tool: positions of the tool, shape (n, 3) [m].
         periods: when the person led.
         scale: rho.
-        lag: by which the tool may be late [s].
+        lag: largest time by which the tool may be late [s].
 
     Returns:
         shape (n, 3) [m]; undefined where nobody led.
@@ -182,7 +182,7 @@ def reference_rotations(true: TrueArm, quaternions: Array, periods: EngagementPe
 
     Args:
         true: the person's arm, in the axes of the base.
-        quaternions: of the tool, wxyz, shape (n, 4).
+        quaternions: quaternions of the tool, wxyz, shape (n, 4).
         periods: when the person led.
         orientation: ``"hand"``, ``"upright"`` or ``"fixed"``, see
             :class:`~imitarm.retarget.correspondence.Correspondence`.

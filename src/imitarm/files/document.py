@@ -53,7 +53,7 @@ def as_document(content: Any, kind: type[Document], path: str | os.PathLike[str]
     Args:
         content: what a JSON or YAML reader returned.
         kind: the Struct that describes the fields and their types.
-        path: of the file, for messages.
+        path: path of the file, for messages.
         remedy: what to do about a wrong field, for messages.
 
     Raises:

@@ -182,7 +182,7 @@ def parse_table(path: str | Path, content: bytes) -> Table:
         content: the file's bytes, or the part of them to read.
 
     Raises:
-        FileFormatError: as :func:`read_table`.
+        FileFormatError: for the same reasons as :func:`read_table`.
     """
     text = _text_of(path, content)
     stripped = [(number, line.strip(" \f\v")) for number, line in enumerate(text.split("\n"), start=1)]

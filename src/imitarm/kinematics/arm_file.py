@@ -62,7 +62,7 @@ class ArmFile:
     """What was read: a spec with the tool attached, and the figures that MuJoCo has no place for.
 
     Attributes:
-        name: of the arm.
+        name: name of the arm.
         spec: with sites ``flange`` and, with a tool, ``tool``.
         joints: names of the joints from base to flange, in order.
         max_velocity: largest speed of each joint [rad/s] or [m/s].

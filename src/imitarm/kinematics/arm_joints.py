@@ -253,7 +253,7 @@ def read_limits(
         spec: the file as MuJoCo has read it.
         model: the compiled ``spec``.
         joints: names of the arm's joints.
-        path: of the file, for messages.
+        path: path of the file, for messages.
         root: the file's own elements, which hold what MuJoCo drops from a URDF.
 
     Raises:

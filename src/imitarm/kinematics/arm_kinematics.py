@@ -134,7 +134,7 @@ class ArmKinematics:
         """Prepare the kinematics of a compiled model.
 
         Args:
-            name: of the arm.
+            name: name of the arm.
             joint_names: the joints from base to flange, in order.
             model: a model with a site ``flange`` and, with a tool, a site ``tool``.
             posture: positions of all joints of the model, fingers too, shape (nq,).

@@ -42,7 +42,7 @@ class IKStep:
     """One step of inverse kinematics and how well it could be done.
 
     Attributes:
-        velocity: of the joints, shape (n_joints,) [rad/s].
+        velocity: velocity of the joints, shape (n_joints,) [rad/s].
         missing: target minus result of each task, in the task's own weighted units.
         limited: whether each joint velocity is at a bound of the box, shape (n_joints,) bool.
         slack: by how much each row is violated, shape (m,); 0 where it holds.

@@ -40,7 +40,7 @@ class Rows(NamedTuple):
     Attributes:
         matrix: shape (m, n_joints).
         lower: shape (m,).
-        price: of a violation.
+        price: penalty of a violation.
     """
 
     matrix: Array

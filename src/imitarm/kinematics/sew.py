@@ -103,7 +103,7 @@ def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereogr
     Args:
         points: of shoulder, elbow and wrist, shape (3, 3) [m], as from ``ArmModel.sew_points``.
         jacobians: of these points, shape (3, 3, n), as from ``ArmModel.sew_jacobians``.
-        convention: as for :func:`sew_angle`.
+        convention: see :func:`sew_angle`.
 
     Returns:
         angle [rad] and its Jacobian, shape (n,); nan where the angle is undefined.
@@ -125,7 +125,7 @@ def one_angle(
         shoulder: three floats [m].
         elbow: three floats [m].
         wrist: three floats [m].
-        convention: as for :func:`sew_angle`.
+        convention: see :func:`sew_angle`.
 
     Returns: None where the angle is undefined.
     """

@@ -87,7 +87,7 @@ class JointVelocityTask(NamedTuple):
 
     Attributes:
         velocity: desired joint velocity, shape (n_joints,) [rad/s].
-        weight: of this task; that of a twist is 1 [m^2].
+        weight: weight of this task; that of a twist is 1 [m^2].
     """
 
     velocity: ArrayLike
@@ -106,7 +106,7 @@ class PostureTask(NamedTuple):
     Attributes:
         q: joint positions to drift to, shape (n_joints,) [rad].
         gain: k [1/s].
-        weight: of this task; that of a twist is 1 [m^2].
+        weight: weight of this task; that of a twist is 1 [m^2].
     """
 
     q: ArrayLike
@@ -145,7 +145,7 @@ class ElbowTask(NamedTuple):
         confidence: c, 0 to 1: certainty of the desired angle; 0: the elbow is not moved.
         gain: k [1/s].
         max_rate: limit of the desired rate of the angle [rad/s].
-        convention: of the angle.
+        convention: convention of the angle.
     """
 
     angle: float
@@ -198,8 +198,8 @@ def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] 
     e of the tool changes the quantity by :math:`g^T J^+ e`.
 
     Args:
-        jacobian: of the tool, shape (m, n_joints).
-        gradient: of the quantity by the joints, shape (n_joints,).
+        jacobian: jacobian of the tool, shape (m, n_joints).
+        gradient: gradient of the quantity by the joints, shape (n_joints,).
 
     Returns:
         the motion as a unit vector (n_joints,), how fast it changes the quantity, and :math:`g^T J^+`, shape (m,);

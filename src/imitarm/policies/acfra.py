@@ -33,9 +33,9 @@ class ACFRA(Policy):
 
         twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
-    so the phase ``s`` waits for a robot that lags, for example at its speed limits or when a hand holds it. With
-    ``e_0`` the required
-    clearance, no corner is cut by more than half of it: each point of the straight line back is within ``e_0 / 2`` of
+    so the phase ``s`` waits for a robot that lags, for example at its speed limits or when a hand holds it. If ``e_0``
+    is the required clearance, the tool cuts no corner by more than half of it: each point of the straight line back is
+    within ``e_0 / 2`` of
     the tool or of its target, and both are clear.
 
     Among moving obstacles the plan is valid only at the planned times, so the phase follows the clock and does not
@@ -43,12 +43,12 @@ class ACFRA(Policy):
     brakes and stays at rest.
 
     Only ``"certified"`` refuses in advance when it can't keep the clearance. The paths of the thesis's potential fields
-    (``"mapf"``, ``"literal"``) are followed in any case, for comparison.
+    (``"mapf"``, ``"literal"``) are always followed, for comparison.
 
     Args:
-        skill: what to reproduce.
+        skill: skill to reproduce.
         method: name in :data:`~imitarm.policies.ADAPTERS`.
-        tool_radius: in place of ``tool_spheres``, radius of one sphere about the tool's tip [m].
+        tool_radius: radius of one sphere about the tool's tip [m]; use it instead of ``tool_spheres``.
         tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m].
         clearance: required distance of the tool to every obstacle [m].
         forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
@@ -56,8 +56,7 @@ class ACFRA(Policy):
         gain: K [1/s].
         patience: e_0 [m]; None: the clearance, at least 5 mm.
         arrival: distance to the end of the path at which the motion counts as arrived [m].
-        allowance: distance that is planned in addition to the clearance, if possible, because no robot follows exactly
-            [m].
+        allowance: margin added to the clearance in planning, if possible, because a robot has tracking errors [m].
 
     Attributes:
         adaptation: result of the last ``reset``.
@@ -134,12 +133,12 @@ class ACFRA(Policy):
 
     @property
     def plan(self) -> Adaptation | None:
-        """The adaptation, which a report draws."""
+        """The result of the last adaptation, for drawing in a report."""
         return self.adaptation
 
     @property
     def phase(self) -> float:
-        """The phase of the motion, in demonstrated time [s]."""
+        """The phase of the motion, as a time in the demonstrated motion [s]."""
         return self._phase
 
     def step(self, observation: Observation, dt: float) -> Command:
@@ -187,7 +186,7 @@ class ACFRA(Policy):
         return Command(twist, progress=progress)
 
     def _target(self, path: Trajectory) -> Pose:
-        """Return the desired pose at the present phase; a skill without orientation keeps the tool's rotation."""
+        """Return the desired pose at the current phase; without a learned orientation, the tool's rotation is kept."""
         positions, quaternions = path.at([self._phase])
         return Pose(positions[0], self._hold.quaternion if quaternions is None else quaternions[0])
 

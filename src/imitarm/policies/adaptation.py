@@ -60,18 +60,20 @@ class AvoidanceProblem:
 
 
 class PathAdapter(ABC):
-    """One method of adapting a path. A new method is one file, and one line in ``ADAPTERS`` or an entry point.
+    """One method of adapting a path.
+
+    To add a method, write one file and register it in ``ADAPTERS`` or by an entry point.
 
     Attributes:
         refuses: whether the method detects that it can't keep the clearance. ``ACFRA`` then refuses to move. The
-            paths of other methods are followed in any case, for comparison.
+            paths of other methods are always followed, for comparison.
     """
 
     refuses: ClassVar[bool] = False
 
     @abstractmethod
     def detour(self, problem: AvoidanceProblem) -> Detour:
-        """Return a displaced path with its certificate, as :meth:`AvoidanceProblem.evaluated` makes it."""
+        """Return a displaced path with its certificate; :meth:`AvoidanceProblem.evaluated` computes both."""
 
 
 ADAPTERS: Registry[PathAdapter] = Registry(
@@ -93,15 +95,16 @@ class Adaptation:
         nominal: the path without obstacles.
         trajectory: the adapted path, at the same times; if not ``feasible``, it is the best attempt, which must not be
             executed.
-        displacement: of each component's mean, shape (n_components, 3) [m].
+        displacement: displacement of each component's mean, shape (n_components, 3) [m].
         moved: whether each component moved, shape (n_components,).
         means: centres of the components before they moved, shape (n_components, 3) [m].
         covariances: position covariances of the components, shape (n_components, 3, 3) [m^2].
-        responsibilities: of each component for each sample, shape (n, n_components).
-        divided: whether the learned components were too wide for this scene; then the arrays above describe more and
+        responsibilities: responsibilities of each component for each sample, shape (n, n_components).
+        divided: whether the learned components were too wide for this scene; if so, the arrays above describe more,
             narrower components.
         tolerance: covariance of the demonstrations along the path, shape (n, 3, 3) [m^2].
-        min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without any.
+        min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without
+            obstacles.
         certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m].
         only_on_schedule: whether the guarantee depends on the schedule, because an obstacle moves. The guarantee then
             holds only while the motion is on time: the tool is at ``trajectory`` at the time of each sample, counted
@@ -109,9 +112,9 @@ class Adaptation:
         validity: text that says what the guarantee assumes and what it does not cover.
         deviation: largest displacement of a mean, in standard deviations of the demonstrations (Mahalanobis distance).
         jerk_ratio: largest jerk of the adapted path, divided by the largest jerk of the nominal path.
-        jerk_reason: empty while ``jerk_ratio`` is at most 10, else why it is not.
+        jerk_reason: why ``jerk_ratio`` exceeds 10; empty if it does not.
         feasible: whether ``certified_clearance`` reaches the required clearance, within the stated limits.
-        reason: empty when feasible, else which obstacle is in the way and why it can't be avoided.
+        reason: which obstacle blocks the path and why it can't be avoided; empty when feasible.
         method: name of the method.
         compute_time: computing time of the whole adaptation [s].
         joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned.
@@ -146,7 +149,7 @@ class Adaptation:
 
     @property
     def rmse_to_nominal(self) -> float:
-        """Root mean square distance between adapted and nominal path (thesis Eq 4.9 with its root) [m]."""
+        """Root mean square distance between adapted and nominal path (thesis Eq 4.9, with the square root) [m]."""
         return float(np.sqrt(np.mean(np.sum((self.trajectory.positions - self.nominal.positions) ** 2, axis=1))))
 
     def __repr__(self) -> str:
@@ -193,22 +196,23 @@ def adapt(
 
     ``certified`` moves the affected components by the smallest displacement that keeps the clearance on the whole path,
     or refuses and says why. ``mapf`` and ``literal`` are the thesis's potential fields (see ``potential_components``),
-    which may fail. Start, goal and ``pinned`` times do not move. The tool must be given in exactly one of three ways.
+    which may fail. Start, goal and ``pinned`` times do not move. Specify the tool by exactly one of ``tool_radius``,
+    ``tool_spheres`` and ``arm``.
 
     The motion begins at time 0, when the obstacles have the poses of the scene; then they move with their velocities.
 
     Args:
         skill: a fitted skill.
         scene: goal (None: the learned one) and obstacles.
-        method: a name in ``ADAPTERS``: ``"certified"``, ``"mapf"``, ``"literal"`` or one that was added.
+        method: a name in ``ADAPTERS``: ``"certified"``, ``"mapf"``, ``"literal"`` or a registered method.
         tool_radius: the tool as one sphere of this radius about its tip [m]; 0 for a point.
         tool_spheres: the tool as spheres that contain it: rows x y z r in the tool's frame, shape (m, 4) [m]. The
             spheres rotate with the tool as in the skill.
         arm: the tool as the spheres of this arm (``ArmModel.tool_spheres``). The links of the arm are not considered.
         clearance: required distance from the tool to every obstacle [m].
         forbidden: directions in which no component may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
-        pinned: times [s] at which the path must not move, for example where the dirt lies.
-        start: where the motion begins; None: where it was learned.
+        pinned: times [s] at which the path must not move, for example contact points.
+        start: start of the motion; None: the learned start.
         n_samples: samples along the path.
 
     Returns:
@@ -216,7 +220,7 @@ def adapt(
 
     Raises:
         UnknownNameError: when there is no such method.
-        InputError: when the tool is not given in exactly one way, or an argument is not valid.
+        InputError: when not exactly one of the three tool arguments is given, or an argument is not valid.
     """
     began = time.perf_counter()
     adapter = ADAPTERS[text(method, "method")]
@@ -281,7 +285,7 @@ def _spheres(skill: Skill, radius: float | None, spheres: ArrayLike | None, arm:
             raise InputError("tool_spheres: give at least one row x y z r with r >= 0 m")
     if not skill.gmr_.has_orientation_ and rows[:, :3].any():
         raise InputError(
-            "tool spheres beside the tip need the tool's orientation, which was not learned: "
+            "tool spheres away from the tip need the tool's orientation, which was not learned: "
             "record quaternions, or give tool_radius"
         )
     return rows
@@ -299,9 +303,9 @@ def _unit_rows(directions: ArrayLike) -> Array:
 
 
 def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
-    """Return the detour of the method.
+    """Return the detour that the method finds.
 
-    There is no search when no obstacle is in the way or a fixed point is covered.
+    It does not search when no obstacle blocks the path or when an obstacle covers a fixed point.
     """
     path, clearance, lowest = problem.path, problem.clearance, problem.nominal.lowest
     still = np.zeros((path.n_components, 3))
@@ -358,7 +362,7 @@ def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str
             f"between them; try method 'certified'"
         )
     if not problem.allowed.dimension:
-        return f"{name} is in the way ({left} left, {required}), and every direction is forbidden: allow one"
+        return f"{name} blocks the path ({left} left, {required}), and every direction is forbidden: allow one"
     if detour.out_of_limits:
         far = np.linalg.norm(detour.clearance.positions - path.nominal.positions, axis=1).max()
         return (

@@ -59,17 +59,18 @@ class ClosePoints:
 
 @dataclass(frozen=True, eq=False)
 class ToolAmongObstacles:
-    """The spheres that contain the tool, and the obstacles that each of them must stay clear of.
+    """The spheres that contain the tool, and the obstacles that these spheres must not approach too closely.
 
-    Every sphere with every obstacle is a *pair*; pair ``i`` is obstacle ``i // n_spheres`` with sphere
+    One sphere and one obstacle form a *pair*: pair ``i`` is obstacle ``i // n_spheres`` with sphere
     ``i % n_spheres``. The tool rotates as on the nominal path, so the centre of a sphere is the position of the tip
     plus a known offset at each sample.
 
     Attributes:
-        obstacles: convex obstacles; spheres in place of those that rotate.
-        radii: of the spheres, shape (n_spheres,) [m].
-        offsets: for each obstacle, from the tip to the centres of the spheres at each sample, minus the displacement of
-            the obstacle until then, in the base frame, shape (n_spheres, n, 3) [m]; None when all of them are zero.
+        obstacles: convex obstacles; a rotating obstacle is replaced by a sphere that contains it.
+        radii: radii of the spheres, shape (n_spheres,) [m].
+        offsets: for each obstacle and sample, the vectors from the tip to the centres of the spheres, minus the
+            displacement of the obstacle since time 0, in the base frame, shape (n_spheres, n, 3) [m]; None when all of
+            them are zero.
         reach: radius of the sphere about the tip that contains all spheres [m].
         bows: largest distance of a centre from the straight line between two samples while the tool rotates, shape
             (n_spheres, n - 1) [m].
@@ -88,7 +89,7 @@ class ToolAmongObstacles:
         Args:
             nominal: times and rotations of the tool, n samples.
             spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
-            obstacles: at time 0; those with a velocity move from there. A rotating obstacle is replaced
+            obstacles: obstacles at time 0; those with a velocity move from there. A rotating obstacle is replaced
                 by a sphere about its centre that contains it.
 
         Raises:
@@ -129,7 +130,7 @@ class ToolAmongObstacles:
 
         Args:
             pair: index of the pair.
-            positions: of the tip, shape (..., m, 3) [m].
+            positions: positions of the tip, shape (..., m, 3) [m].
             samples: the m samples of the path to which the positions belong.
 
         Returns:
@@ -159,7 +160,7 @@ class ToolAmongObstacles:
             tolerance: largest accepted excess of the distance over ``target`` [m].
 
         Returns:
-            Lifts, shape (m, p) [m]; inf where the obstacle has no end.
+            Lifts, shape (m, p) [m]; inf where the ray never leaves the obstacle.
         """
         obstacle, sphere = divmod(pair, self.n_spheres)
         solid = self.obstacles[obstacle]
@@ -185,11 +186,11 @@ class ToolAmongObstacles:
         """Return the distance of every pair.
 
         Args:
-            positions: of the tip, shape (..., m, 3) [m].
+            positions: positions of the tip, shape (..., m, 3) [m].
             samples: the m samples of the path to which the positions belong.
 
         Returns:
-            From the spheres' surfaces to the obstacles, shape (n_pairs, ..., m) [m].
+            Distances from the surfaces of the spheres to the obstacles, shape (n_pairs, ..., m) [m].
         """
         answer = np.empty((self.n_pairs, *positions.shape[:-1]))
         for o, obstacle in enumerate(self.obstacles):
@@ -221,8 +222,8 @@ class PathClearance:
 
     Attributes:
         tool: the spheres and the obstacles.
-        positions: of the tip, shape (n, 3) [m].
-        distance: of each pair at each sample, shape (n_pairs, n) [m].
+        positions: positions of the tip, shape (n, 3) [m].
+        distance: distance of each pair at each sample, shape (n_pairs, n) [m].
         normal: gradients of these distances, shape (n_pairs, n, 3).
     """
 
@@ -264,14 +265,15 @@ class PathClearance:
     def certified(self, clearance: float) -> tuple[Array, ClosePoints]:
         """Bound the distance on each segment, and refine the bound where it is below a clearance.
 
-        Around a corner, two tangents cross at twice the depth of the chord or deeper. The distance is therefore
+        Near a corner of an obstacle, the two tangents cross at least twice as deep as the chord. The distance is
+        therefore
         measured where they cross. If the distance is too small there, the path really is too close. Otherwise the
         tangent at
         that point replaces one of the two tangents: the one from whose side the distance decreases towards the point.
         So the minimum stays between two tangents that converge to it.
 
         Args:
-            clearance: that the path must keep [m].
+            clearance: required clearance [m].
 
         Returns:
             Lower bounds, shape (n_pairs, n - 1) [m], and the points that are closer than ``clearance``.
@@ -339,11 +341,11 @@ def crossing_of_tangents(f0: Array, a: Array, f1: Array, b: Array, length: Array
     """Return the minimum of ``max(f0 + a s, f1 - b (length - s))`` over s in [0, length], and the s at the minimum.
 
     Args:
-        f0: values at the start, of any shape.
+        f0: values at the start, any shape.
         a: slopes at the start.
         f1: values at the end.
         b: slopes at the end.
-        length: of the interval.
+        length: length of the interval.
     """
     inside = (a < 0.0) & (b > 0.0)
     s = np.clip((f1 - f0 - b * length) / np.where(inside, a - b, -1.0), 0.0, length)

@@ -12,7 +12,7 @@ The algorithm of :func:`find_detour`:
    clearance.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
    samples.
-4. If the search over sides finds no path, the displacements of all times are searched together
+4. If the search over sides finds no path, a second search treats all samples together
    (:mod:`~imitarm.policies.roadmap`), first with the learned components, then with more and narrower ones.
 """
 
@@ -190,11 +190,11 @@ class _SideSearch:
         worst: int,
         distance: Array,
     ) -> tuple[list[Array], list[float], bool]:
-        """Turn lifts (m, p) along directions (m, 3) into displacements with their costs.
+        """Convert lifts (m, p) along directions (m, 3) to displacements with their costs.
 
-        All directions are first rated with one amplitude for all affected components; the best few then get the
-        smallest sufficient amplitudes. The function also returns whether the cheapest displacement comes nearer to
-        another obstacle.
+        First, every direction is rated with one common amplitude for all affected components. Then the smallest
+        sufficient amplitudes are computed for the best few directions. The function also returns whether the cheapest
+        displacement brings the path closer to another obstacle.
         """
         uniform = (lifts / np.maximum(lever.sum(axis=1), NEGLIGIBLE_LEVER)).max(axis=1, initial=0.0)
         affordable = uniform <= 2.0 * MAX_LIFT
@@ -223,7 +223,7 @@ class _SideSearch:
         """Rate displacements (c, n_components, 3) by their size and the remaining violation.
 
         Returns:
-            costs (c,) and, by pair, the violation summed over every third sample (n_pairs, c) [m].
+            Costs (c,), and for each pair the violation summed over every third sample (n_pairs, c) [m].
         """
         style = np.einsum("ckd,kde,cke->c", displacements, self.path.precisions, displacements)
         sampled = self.path.nominal.positions[::_THINNED] + self.path.basis[::_THINNED] @ displacements
@@ -253,9 +253,9 @@ class _SideSearch:
         return np.where(lift > MAX_LIFT, np.inf, lift)
 
     def _affected(self, rows: Index, worst: int, here: PathClearance) -> Index:
-        """Return the indices of the components near the obstacle, or with influence on a violated sample.
+        """Return the indices of the components that are near the obstacle or influence a violated sample.
 
-        A component's centre is approximated by the path at its time, where the distances are known.
+        The centre of a component is approximated by the path position at the same time, where the distances are known.
         """
         centre, n = here.distance[worst, self.path.centres], here.normal[worst, self.path.centres]
         spread = np.sqrt(np.einsum("kd,kde,ke->k", n, self.path.covariances, n))

@@ -1,4 +1,4 @@
-"""A learned path as the sum of its Gaussian components, so that only some of them need to move."""
+"""A learned path as a sum of Gaussian components, so that an adaptation moves only some of them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ class ComponentPath:
     r"""The nominal path, and the effect of moving its components.
 
     Time-driven GMR gives ``x0(t) = sum_k h_k(t) m_k(t)`` (thesis Eq 2.6 with its responsibilities). The
-    responsibilities ``h_k(t)`` depend on time alone. So moving the mean of component ``k`` by ``Delta_k`` changes the
+    responsibilities ``h_k(t)`` depend only on time. Therefore, moving the mean of component ``k`` by ``Delta_k``
+    changes the
     path by an affine, smooth amount::
 
         x(t) = x0(t) + w(t) sum_k h_k(t) Delta_k  =  x0(t) + basis(t) @ Delta
@@ -62,9 +63,9 @@ class ComponentPath:
             They
             contain the motion itself too: a component is long along the path.
         yields: GMR's covariance at the time of each component's centre, with the same lower bound, (n_components, 3, 3)
-            [m^2]. A displacement is measured against it.
-        centres: sample at which each component has its centre, (n_components,).
-        precisions: inverses of the yields, (n_components, 3, 3) [1/m^2].
+            [m^2]. The size of a displacement is measured relative to it.
+        centres: index of the sample at the centre of each component, (n_components,).
+        precisions: inverses of ``yields``, (n_components, 3, 3) [1/m^2].
         tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
     """
 
@@ -97,7 +98,8 @@ class ComponentPath:
             start: start of the motion; None: the learned start.
             goal: end of the motion; None: the learned goal. Another start or goal changes the nominal path
                 (``Skill.nominal``), and the components move with it.
-            pinned: further times [s] at which the path must not move, for example a contact; each becomes a sample.
+            pinned: further times [s] at which the path must not move, for example a contact; a sample is placed at
+                each of them.
 
         Raises:
             InputError: when there are fewer than 10 or more than 100 000 samples, or a pinned time is outside.
@@ -125,17 +127,17 @@ class ComponentPath:
 
     @cached_property
     def factors(self) -> Array:
-        """Lower Cholesky factors of the yields, (n_components, 3, 3) [m]."""
+        """Lower Cholesky factors of ``yields``, (n_components, 3, 3) [m]."""
         return np.asarray(np.linalg.cholesky(self.yields), dtype=np.float64)
 
     @cached_property
     def lever(self) -> Array:
-        """The largest influence that a component has on each sample, shape (n,)."""
+        """The largest influence of any component on each sample, shape (n,)."""
         return np.asarray(self.basis.max(axis=1))
 
     @cached_property
     def fixed(self) -> Index:
-        """The samples that no displacement can move."""
+        """The samples that no displacement of the components can move."""
         return np.flatnonzero(self.lever == 0.0)
 
     def displaced(self, displacement: Array) -> Array:
@@ -164,7 +166,7 @@ class ComponentPath:
 
     @cached_property
     def basis_jerk(self) -> Array:
-        """Change of the jerk by a unit displacement of each component, shape (n - 3, n_components) [1/s^3]."""
+        """Change of the jerk caused by a unit displacement of each component, shape (n - 3, n_components) [1/s^3]."""
         return self.jerk(self.basis)
 
     @cached_property
@@ -181,10 +183,12 @@ class ComponentPath:
     def divided(self) -> ComponentPath:
         """Return the same path with more, narrower components.
 
-        The Gaussians' influence is too wide for some scenes: next to the start or the goal, or in tight places. A
-        divided path has cubic B-splines in time instead of the responsibilities. They sum to 1 as well, and the first
-        and the last of them, which would move the start and the goal, are left out. Their knots lie closer together
-        towards the fixed times.
+        For some scenes, the influence of the Gaussians extends too far: near the start or the goal, or in narrow
+            spaces. A
+        divided path has cubic B-splines in time instead of the responsibilities. The B-splines also sum to 1. The first
+        and the last one are left out, because they would move the start and the goal. The knots are closer together
+        near
+        the fixed times.
         """
         times, fixed = self.nominal.times, self.fixed_times
         knots = np.concatenate([[times[0]] * 3, _knots(times, fixed), [times[-1]] * 3])
@@ -218,7 +222,7 @@ _PATHS: WeakKeyDictionary[GMR, tuple[Array, tuple[int, tuple[float, ...]], Compo
 def _learned(gmr: GMR, n_samples: int, fixed_times: tuple[float, ...]) -> ComponentPath:
     """Decompose the learned path.
 
-    The last result for each regression is kept, because it does not depend on the scene.
+    The last result for each regression is cached, because it does not depend on the scene.
     """
     key = (n_samples, fixed_times)
     if gmr in _PATHS and _PATHS[gmr][0] is gmr.means_ and _PATHS[gmr][1] == key:  # fitting again makes new means
@@ -253,13 +257,16 @@ def _sample_times(n_samples: int, fixed_times: tuple[float, ...]) -> Array:
 
 
 def _window(times: Array, fixed_times: Sequence[float], width: float) -> Array:
-    """Return w (n,): 0 at each fixed time, 1 beyond ``width`` (a fraction of the duration) from all of them."""
+    """Return w (n,): 0 at each fixed time, 1 more than ``width`` (fraction of the duration) away from all of them."""
     distance = np.min(np.abs(times[:, None] - np.asarray(fixed_times)[None, :]), axis=1)
     return quintic_step(distance / (width * (times[-1] - times[0])))
 
 
 def _knots(times: Array, fixed_times: Sequence[float]) -> Array:
-    """Return knots at samples: about ``_PIECES`` evenly, and 1, 2, 4, ... samples from each fixed time."""
+    """Return knots at samples: about ``_PIECES`` evenly spaced ones, and more at 1, 2, 4, ...
+
+    Samples from each fixed time.
+    """
     last = len(times) - 1
     widest = max(last / _PIECES, 1.0)
     fixed = np.unique(np.searchsorted(times, fixed_times)).tolist()

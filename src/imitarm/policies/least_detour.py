@@ -1,4 +1,4 @@
-"""The smallest displacement of components that keeps the clearance, for a given choice of sides.
+"""The smallest displacement of components that keeps the clearance, when the side of each obstacle is given.
 
 With one tangent plane for each sample and obstacle, "keep the clearance" is a set of linear inequalities in the
 displacements. Because the planes under-estimate the distance, each solution truly keeps the clearance at the samples
@@ -47,8 +47,8 @@ def least_norm(rows: Array, lower: Array, upper: Array) -> Array | None:
 
     Args:
         rows: shape (m, n).
-        lower: shape (m,) or, to bound y itself as well, (n + m,).
-        upper: as ``lower``.
+        lower: lower bounds, shape (m,), or (n + m,) when the first n bound y itself.
+        upper: upper bounds, of the same shape as ``lower``.
 
     Returns:
         y, shape (n,); None when there is no solution.
@@ -63,9 +63,9 @@ class AllowedDirections:
     """The directions in which components may move: all ``u`` with ``u . f <= 0`` for every forbidden direction ``f``.
 
     Attributes:
-        forbidden: unit rows, shape (m, 3). A direction and its opposite forbid the axis.
+        forbidden: unit rows, shape (m, 3). Forbidding a direction and its opposite forbids the whole axis.
         axes: orthonormal basis of the space without the forbidden axes, as columns, shape (3, d).
-        one_sided: the other forbidden directions in that basis, unit rows, shape (m', d).
+        one_sided: the remaining forbidden directions in the basis ``axes``, unit rows, shape (m', d).
     """
 
     forbidden: Array
@@ -89,7 +89,10 @@ class AllowedDirections:
         return self.axes.shape[1]
 
     def enforced(self, reduced: Array) -> Array:
-        """Return displacements (..., 3) for coordinates (..., d); rounding may leave a rest in forbidden directions."""
+        """Return displacements (..., 3) for coordinates (..., d).
+
+        Rounding errors may leave a small part in forbidden directions.
+        """
         for _ in range(100 if len(self.one_sided) else 0):  # taking out one part may bring back a little of another
             for f in self.one_sided:
                 reduced = reduced - np.maximum(reduced @ f, 0.0)[..., None] * f
@@ -98,7 +101,7 @@ class AllowedDirections:
         return np.asarray(reduced @ self.axes.T)
 
     def unit_directions(self, candidates: Array) -> Array:
-        """Return the allowed parts of directions (m, 3) as unit rows.
+        """Return the directions (m, 3) without their forbidden parts, as unit rows.
 
         Directions with a small allowed part are dropped.
         """
@@ -134,12 +137,12 @@ class Detour:
 
     Attributes:
         path: the path and the components that were moved.
-        displacement: of each component's mean, shape (n_components, 3) [m].
+        displacement: displacement of each component's mean, shape (n_components, 3) [m].
         clearance: distances along the displaced path.
         bounds: guaranteed lower bound of the clearance of each pair over the whole path, shape (n_pairs,) [m].
         feasible: whether every bound reaches the required clearance and the path is within the stated limits.
-        out_of_limits: whether the path leads farther away, or makes longer steps, than the stated limits.
-        close: points that are too close, between two samples that are not.
+        out_of_limits: whether the path's displacement or its steps exceed the stated limits.
+        close: points that are too close although the samples before and after them are not.
     """
 
     path: ComponentPath
@@ -189,7 +192,7 @@ class LeastDetour:
 
     Attributes:
         target: planned distance at the samples: the clearance plus a small amount for the segments between them [m].
-        movable: whether any component can move each sample, shape (n,).
+        movable: whether a component can move the sample, for each sample, shape (n,).
     """
 
     def __init__(
@@ -212,7 +215,7 @@ class LeastDetour:
         self.movable = path.lever > (1e-3 if exact else NEGLIGIBLE_LEVER)
 
     def _beyond_limits(self, positions: Array) -> _Cuts:
-        """Return half-spaces that contain every path within the stated limits, but not this one."""
+        """Return half-spaces that contain every path within the stated limits and exclude this path."""
         nominal, basis = self.path.nominal.positions, self.path.basis
         away, step = positions - nominal, np.diff(positions, axis=0)
         far, long = np.linalg.norm(away, axis=1), np.linalg.norm(step, axis=1)
@@ -237,15 +240,16 @@ class LeastDetour:
     def shrink(
         self, start: PathClearance, moved: Index | None = None, *, smoothness: float | None = None
     ) -> Detour | None:
-        """Return the least detour that the tangents along a path allow, or the best attempt; None: no attempt.
+        """Return the least detour that the tangents along a path allow, or the best attempt; None without an attempt.
 
-        Where a segment is too close although its samples are not, the closest point gets a row of its own. Requiring
+        Where a segment is too close although its samples are not, the closest point adds a row. Requiring
         more at
         the samples instead does not work: with longer steps around the edge, the samples can be farther out while the
             path still cuts the edge; and next to a fixed time, a small additional distance needs a huge displacement.
 
         Args:
-            start: clearance along a path from which the tangents are taken; it need not be a sum of the components.
+            start: clearance along the path at which the tangents are taken; this path need not be a sum of the
+                components.
             moved: indices of the components that may move; None: all.
             smoothness: weight of the squared jerk; None: the default weight of this path.
         """
@@ -289,7 +293,7 @@ class LeastDetour:
         return best
 
     def smoothed(self, detour: Detour) -> tuple[Detour, float]:
-        """Return a feasible detour with a jerk within the limit, if there is one near it, and its jerk ratio."""
+        """Return a feasible detour near this one with a jerk within the limit, if there is one, and its jerk ratio."""
         ratio = self.path.jerk_ratio(detour.clearance.positions)
         best, limit = detour, max(MAX_JERK_RATIO, 1.0)
         moved = np.flatnonzero(detour.displacement.any(axis=1)) if not self.exact else None
@@ -356,8 +360,8 @@ class LeastDetour:
     ) -> tuple[Array, float] | None:
         """Minimise the cost under the tangents along a path; None: no solution.
 
-        If there is no solution, one more unknown relaxes all tangents by the same smallest distance; the tangents of
-        the resulting path may then have a solution.
+        If there is no solution, all tangents are relaxed by one common distance, as small as possible; the tangents
+        along the resulting path may then have a solution.
         """
         basis, away = self.path.basis, here.positions - self.path.nominal.positions
         pair, j = np.nonzero((here.distance < self.target + influence) & self.movable)
@@ -394,6 +398,6 @@ class LeastDetour:
 
 
 def best_of(detours: Iterable[Detour | None]) -> Detour | None:
-    """Return the feasible detour, or the one that comes nearest to the clearance; None when the list is empty."""
+    """Return the feasible detour, or the one with the largest clearance; None when the list is empty."""
     found = [detour for detour in detours if detour is not None]
     return max(found, key=lambda x: (x.feasible, not x.out_of_limits, x.lowest), default=None)

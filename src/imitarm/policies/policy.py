@@ -25,11 +25,11 @@ class Observation:
     """The input of a policy at one control step.
 
     Attributes:
-        time: since the reproduction began [s].
+        time: time since the reproduction began [s].
         state: measured state of the arm.
         tool_to_base: measured pose of the tool in the base frame.
-        scene: goal and obstacles as last seen, at the time ``scene.stamp``; ``scene.at(time)`` predicts the present
-            obstacles.
+        scene: goal and obstacles as last seen, at the time ``scene.stamp``; ``scene.at(time)`` predicts the
+            obstacles at the current time.
     """
 
     time: float
@@ -45,9 +45,9 @@ class Observation:
 
 
 class Policy(ABC):
-    """Decides the next command from the present observation.
+    """Decides the next command from the current observation.
 
-    A policy of your own is one subclass with the three methods below. Registered under the entry point group
+    To write your own policy, implement the three methods below in one subclass. Registered under the entry point group
     ``imitarm.policies``, or by ``POLICIES.register(name, policy)``, it appears in ``imitarm reproduce --policy``, in
     ``imitarm benchmark placements`` and in their reports, which build it with the arguments below. Its state lasts from
     :meth:`reset` to the end of one reproduction; the same observations give the same commands.
@@ -59,8 +59,7 @@ class Policy(ABC):
         forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
 
     Attributes:
-        plan: the policy's plan for drawing in a report, an :class:`~imitarm.policies.Adaptation`; None: there is no
-            plan.
+        plan: plan to draw in a report, an :class:`~imitarm.policies.Adaptation`; None if the policy has no plan.
     """
 
     plan: Any = None

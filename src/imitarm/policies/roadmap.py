@@ -1,10 +1,11 @@
 """A roadmap of displacements over time: possible positions of the tool at each time, and connections between them.
 
-At some times along the nominal path (layers), rays leave the nominal position. On each ray, the points just outside the
+At some times along the nominal path (layers), rays start at the nominal position. On each ray, the points just outside
+the
 inflated obstacles are the nodes. Edges lead from each node to the nodes of the next layer on the same and on
 neighbouring rays. The cost of an edge is the change of the displacement, plus a large amount where the two tangents at
 its ends do not prove the clearance. Dynamic programming from both ends gives the cheapest route through every node at
-once; a route is only a proposal, at which the tangents of the least detour are taken.
+once. A route is only a proposal: the least detour takes its tangents along it.
 """
 
 from __future__ import annotations
@@ -64,7 +65,8 @@ class Roadmap:
     def routes(self, n: int) -> Iterator[Array]:
         """Yield up to ``n`` routes as displacements of the tip at all samples (n_samples, 3) [m], cheapest first.
 
-        Each further route takes another node at the layer at which the previous routes came closest to an obstacle.
+        Each further route goes through another node of the layer in which the previous routes came closest to an
+        obstacle.
         """
         through = self._forward[0] + self._backward[0]
         used: list[Array] = []
@@ -125,7 +127,7 @@ class Roadmap:
         return answer
 
     def _edges_between_layers(self) -> tuple[Array, Array]:
-        """Return cost and unproven clearance [m] of every edge, shapes (n_layers - 1, n_edges)."""
+        """Return the cost and the missing (unproven) clearance [m] of every edge, shapes (n_layers - 1, n_edges)."""
         start, end = self.pairs_of_nodes
         positions = self.path.nominal.positions[self.layers][:, None, :] + self.nodes
         spread = np.swapaxes(positions, 0, 1)  # (n_nodes, n_layers, 3)
@@ -150,7 +152,7 @@ class Roadmap:
         return np.where(too_fast | missing, _BLOCKED, cost), violation
 
     def _sweep(self, *, forward: bool) -> tuple[Array, Index]:
-        """Return the cheapest cost of every node from the start (or to the goal), and the node before (or after) it."""
+        """Return the lowest cost from the start to each node (or from it to the goal), and the adjacent node."""
         precisions = np.linalg.inv(self.path.tolerance[self.layers] + 0.005**2 * np.eye(3))
         style = np.einsum("lkd,lde,lke->lk", self.nodes, precisions, self.nodes) * (
             self.path.n_components / len(self.layers)
@@ -209,7 +211,10 @@ class Roadmap:
         return np.asarray(np.searchsorted(keys, chosen[:-1] * n + chosen[1:]), dtype=np.intp)
 
     def _worst_layer(self, chosen: Index) -> int:
-        """Return the layer at which a route costs most, or, when all of its edges are free, is displaced most."""
+        """Return the layer at which a route costs most.
+
+        When all of its edges are free, the layer with the largest displacement.
+        """
         edges = self._edges_of(chosen)
         costs = self.edge_costs[np.arange(len(edges)), edges]
         if costs.max() > 1.0:
@@ -237,7 +242,10 @@ def _spread_directions(allowed: AllowedDirections) -> Array:
 
 
 def _edges(rays: Array, n_neighbours: int) -> tuple[Index, Index]:
-    """Return the start and end node of every edge between two layers: nominal to all, ray to neighbouring rays."""
+    """Return the start and end node of every edge between two layers.
+
+    From the nominal node to all nodes, and from each ray to its neighbours.
+    """
     n = 1 + len(rays) * _SLOTS
     ray_of = np.concatenate([[-1], np.repeat(np.arange(len(rays)), _SLOTS)])
     near = np.zeros((len(rays), len(rays)), dtype=bool)

@@ -1,4 +1,4 @@
-"""Retargeting: from the motion of a human arm to that of a robot arm.
+"""Retargeting: convert the motion of a human arm to the motion of a robot arm.
 
 The built-in methods, and those of other packages, are in :data:`RETARGETERS`.
 """

@@ -1,4 +1,4 @@
-"""ArmEstimator: one steady estimate of a person's arm from noisy skeletons; shared by all methods."""
+"""ArmEstimator: estimates a person's arm from noisy skeletons; all methods use the same estimate."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class ArmEstimate:
     """A person's arm, smoothed, with the true lengths of its bones, in the robot's base frame.
 
     Attributes:
-        time: of the frame, on the source's clock [s].
+        time: time of the frame, on the source's clock [s].
         shoulder: position, shape (3,) [m].
         elbow: position, shape (3,) [m].
         wrist: position, shape (3,) [m].
-        velocities: of these three, shape (3, 3) [m/s].
+        velocities: velocities of these three points, shape (3, 3) [m/s].
         hand: rotation of the hand, quaternion wxyz, shape (4,): x along the hand, z out of the back of the hand.
-        angular_velocity: of the hand, shape (3,) [rad/s].
-        confidence: of elbow, wrist and hand rotation, each 0 to 1.
+        angular_velocity: angular velocity of the hand, shape (3,) [rad/s].
+        confidence: confidences of elbow, wrist and hand rotation, each 0 to 1.
         closed: whether the hand is closed; None while that is unknown.
     """
 
@@ -66,14 +66,15 @@ class ArmEstimate:
 
 
 class ArmEstimator:
-    """Turns skeletons into an :class:`ArmEstimate`: outliers removed, bone lengths corrected, smoothed.
+    """Converts skeletons to an :class:`ArmEstimate`: removes outliers, corrects bone lengths, and smooths.
 
-    All methods share it, so that they differ only in the method.
+    All retargeting methods use this estimator, so a comparison of methods does not depend on the filter.
 
     Args:
-        correspondence: gives the side of the arm and the pose of the sensor.
-        smoothing: filter by One-Euro, and remove jumps that come with a change of tracking
-            (:class:`~imitarm.retarget.smoothing.TrackingOffsets`); off: return the corrected points unfiltered.
+        correspondence: provides the side of the arm and the pose of the sensor.
+        smoothing: whether to apply the One-Euro filter and remove jumps due to a change of tracking
+            (:class:`~imitarm.retarget.smoothing.TrackingOffsets`); otherwise the corrected points are returned
+            unfiltered.
         limbs: how bone lengths are corrected: ``"fit"`` by the smallest change of all three points, ``"direction"`` as
             in the thesis, from the shoulder outwards.
     """
@@ -148,7 +149,7 @@ class ArmEstimator:
         return np.array([points[0], *correct_limbs(points[0], points[1], points[2], lengths)])
 
     def _weights(self, confidence: Array) -> Array:
-        """Return the weights of the three points; that of the elbow decreases with the error of its inferred position.
+        """Return the weights of the three points; the elbow's weight decreases with the error of its inferred position.
 
         Otherwise an error of the elbow would move the wrist, because the forearm has a fixed length, and the tool
         follows the wrist.
@@ -161,7 +162,7 @@ class ArmEstimator:
         return weights
 
     def _learn(self, skeleton: Skeleton) -> None:
-        """Measure the arm over the first frames in which it is seen."""
+        """Measure the arm in the first frames that show it."""
         self._learning.append(skeleton)
         try:
             self.lengths = measure_limbs(self._learning, self.correspondence.side)
@@ -174,7 +175,7 @@ class ArmEstimator:
     def _hand_rotation(self, points: Array, confidence: list[float], forearm: Array) -> tuple[Array, float]:
         """Return the hand's rotation in the base frame and its confidence.
 
-        A hand that is not seen rotates with the forearm.
+        A hand that is not visible is assumed to rotate with the forearm.
         """
         length = math.sqrt(float(forearm.dot(forearm)))
         fore = forearm / length if length > 0.0 else np.array([1.0, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""Calibration: measurements of a person, a sensor and a robot that are made once and kept in a file."""
+"""Calibration: measurements of a person, a sensor and a robot, made once and saved in a file."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ _WORTH = 0.005  # [m] RMS residual below which no pair is suspect
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Measurements that are valid until the person changes or the sensor is moved; None: not measured.
+    """Measurements that remain valid until the person changes or the sensor moves; None: not measured.
 
     Attributes:
         side: arm of the person, ``"left"`` or ``"right"``.
-        lengths: of that arm.
+        lengths: lengths of that arm.
         sensor_to_base: pose of the sensor in the robot's base frame.
-        sensor_rms: RMS residual of that pose [m].
-        scale: motion of the robot over motion of the person; None: 1.
-        orientation: how the tool rotates with the hand; None: exactly as the hand does.
+        sensor_rms: RMS residual of the sensor's pose [m].
+        scale: robot motion divided by the person's motion; None: 1.
+        orientation: how the tool rotates with the hand; None: exactly like the hand.
 
     Raises:
         InputError: when a value is not usable.
@@ -162,7 +162,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 class _Fields:
-    """A group of fields; every value has the requested type, or an error names the field."""
+    """A group of fields with checked types; an error names the field."""
 
     def __init__(self, values: object, place: str) -> None:
         if not isinstance(values, Mapping):
@@ -175,7 +175,7 @@ class _Fields:
         return self._values[name]
 
     def refuse_others(self, known: set[str]) -> None:
-        """Refuse fields that are not ``known``, so that a misspelt name is not ignored."""
+        """Reject fields that are not ``known``, so that a misspelt name is not ignored."""
         for name in self._values:
             if name not in known:
                 raise InputError(f"{self._place}: unknown field {name!r:.60}; known: {', '.join(sorted(known))}")
@@ -271,8 +271,8 @@ class SensorFit:
     Attributes:
         sensor_to_base: pose of the sensor in the robot's base frame.
         residuals: remaining distance of each pair of points, shape (n,) [m].
-        condition: first over second singular value of the points' cross-covariance H: 1 for points spread equally in
-            all directions, large for points almost on a line.
+        condition: ratio of the first to the second singular value of the points' cross-covariance H: 1 for points
+            spread equally in all directions, large for points almost on a line.
         angle_error: standard error of the rotation about its least certain axis [rad].
         flat: whether the points lie in a plane; a mirrored axis is then not detected.
         suspect: index of the pair that does not fit the others, from 0; None: all fit.
@@ -292,7 +292,10 @@ class SensorFit:
 
     @property
     def accepted(self) -> bool:
-        """Whether the fit is good enough for teleoperation: 2 cm, and every pair fits."""
+        """Whether the fit is good enough for teleoperation.
+
+        An RMS residual of at most 2 cm and no pair that does not fit.
+        """
         return self.rms <= GOOD and self.suspect is None
 
     def notes(self) -> list[str]:
@@ -326,9 +329,9 @@ def fit_sensor_to_base(sensor: ArrayLike, base: ArrayLike, weights: ArrayLike | 
     No scale is fitted: both frames are in metres, and a scale would only hide a wrong unit.
 
     Args:
-        sensor: the points as the sensor saw them, shape (n, 3) [m].
+        sensor: points measured by the sensor, shape (n, 3) [m].
         base: the same points in the robot's base frame, shape (n, 3) [m].
-        weights: of the pairs, shape (n,); None: equal.
+        weights: weights of the pairs, shape (n,); None: equal.
 
     Raises:
         InputError: when there are fewer than four pairs, they are not finite, lie on a line or too close together, or
@@ -356,7 +359,7 @@ def fit_sensor_to_base(sensor: ArrayLike, base: ArrayLike, weights: ArrayLike | 
 def _checked(sensor: ArrayLike, base: ArrayLike, weights: ArrayLike | None) -> tuple[Array, Array, Array]:
     k, b = np.asarray(sensor, dtype=float), np.asarray(base, dtype=float)
     if k.ndim != 2 or k.shape[1:] != (3,) or k.shape != b.shape:
-        raise InputError(f"sensor calibration: needs two sets of n points (n, 3), got shapes {k.shape} and {b.shape}")
+        raise InputError(f"sensor calibration: needs two arrays of shape (n, 3), got shapes {k.shape} and {b.shape}")
     if len(k) < LEAST_PAIRS:
         raise InputError(f"sensor calibration: {len(k)} pairs of points, at least {LEAST_PAIRS} are needed; touch more")
     bad = ~np.isfinite(k).all(axis=1) | ~np.isfinite(b).all(axis=1)
@@ -400,7 +403,7 @@ def _rms(k: Array, b: Array, c: Array) -> float:
 
 
 def _suspect(k: Array, b: Array, c: Array, rms: float) -> int | None:
-    """Return the index of the pair without which the others fit far better; None when no pair is an outlier."""
+    """Return the index of the pair whose removal improves the fit most; None when no pair is an outlier."""
     if len(k) < LEAST_PAIRS + 1 or rms < _WORTH:
         return None
     every = np.arange(len(k))

@@ -1,4 +1,4 @@
-"""Correspondence: the leading arm of the person, the pose of the sensor, the scale, and how the tool rotates."""
+"""Correspondence: which arm of the person leads, the pose of the sensor, the scale, and how the tool rotates."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ forward is the robot's x, the person's left is its y, up is its z."""
 class Correspondence:
     r"""How the person's arm motion is mapped to the robot's tool.
 
-    While the person leads, the tool follows the hand relative to where both were when the person began to lead
+    While the person leads, the tool repeats the displacement of the hand since the person began to lead
     (docs/retargeting.md):
 
     .. math:: p_d = p_{home} + \rho\, R\,(W - W_0), \qquad R_d = R\,(R_H R_{H,0}^T)\,R^T R_{home}
 
-    with :math:`R` the rotation from sensor to base, :math:`\rho` the scale, W the wrist and :math:`R_H` the hand's
+    where :math:`R` is the rotation from sensor to base, :math:`\rho` the scale, W the wrist and :math:`R_H` the hand's
     rotation.
 
     Attributes:
         side: arm of the person, ``"left"`` or ``"right"``.
         sensor_to_base: pose of the sensor in the robot's base frame; only its rotation matters for relative motion.
-        lengths: of the person's arm; None: they are measured in the first frames.
-        scale: rho, motion of the robot over motion of the person.
+        lengths: lengths of the person's arm; None: they are measured in the first frames.
+        scale: rho, robot motion divided by the person's motion.
         orientation: how the tool rotates: ``"hand"`` as the hand does; ``"upright"`` only about the vertical, so that a
             tool that points down keeps pointing down; ``"fixed"`` not at all.
 
@@ -62,11 +62,11 @@ class Correspondence:
         object.__setattr__(self, "scale", scale)
 
     def engage(self, wrist: ArrayLike, hand: Array, tool_to_base: Pose) -> Clutch:
-        """Return the clutch that begins here.
+        """Return the clutch of an engagement that begins at these poses.
 
         Args:
-            wrist: position in the base frame, shape (3,) [m].
-            hand: rotation in the base frame, quaternion wxyz, shape (4,).
+            wrist: wrist position in the base frame, shape (3,) [m].
+            hand: hand rotation in the base frame, quaternion wxyz, shape (4,).
             tool_to_base: pose of the tool: its position as measured, its rotation as last commanded.
         """
         return Clutch(self, np.array(wrist, dtype=float), np.array(hand, dtype=float), tool_to_base)
@@ -77,9 +77,9 @@ class Clutch:
     """The poses of hand and tool when the person began to lead; see :class:`Correspondence`.
 
     Attributes:
-        correspondence: between the person's arm and the robot's.
-        wrist: position in the base frame at that time, shape (3,) [m].
-        hand: rotation in the base frame at that time, quaternion wxyz, shape (4,).
+        correspondence: correspondence between the person's arm and the robot's.
+        wrist: wrist position in the base frame at that time, shape (3,) [m].
+        hand: hand rotation in the base frame at that time, quaternion wxyz, shape (4,).
         home: pose of the tool in the base frame at that time.
     """
 

@@ -20,7 +20,7 @@ LONGEST_GAP = 0.1  # [s] between two estimates; a longer gap restarts that count
 
 
 class EngagementState(StrEnum):
-    """State of the engagement at a time. A member equals its value, so ``state == "following"`` works.
+    """State of the engagement. A member equals its value, so ``state == "following"`` works.
 
     * ``WAITING``: the arm is at rest until a person has been seen for half a second.
     * ``FOLLOWING``: the person is seen and leads the tool.
@@ -38,7 +38,7 @@ class EngagementState(StrEnum):
 
     @property
     def engaged(self) -> bool:
-        """Whether the person leads the tool, or was lost only a short time ago."""
+        """Whether the person leads the tool, including short losses of tracking."""
         return self in _ENGAGED
 
 
@@ -49,18 +49,19 @@ def engaged_samples(states: ArrayLike) -> NDArray[np.bool_]:
     """Return whether the person leads the tool in each sample of a run, shape (n,).
 
     Args:
-        states: of the run, values of :class:`EngagementState`, shape (n,).
+        states: states of the run, values of :class:`EngagementState`, shape (n,).
     """
     return np.isin(np.asarray(states, dtype=str), [state.value for state in _ENGAGED])
 
 
 @dataclass(frozen=True)
 class EngagementRule:
-    """The times of the state machine, all in s.
+    """Times of the state machine, all in seconds.
 
     Attributes:
-        seen_for: how long the arm must be seen before the robot follows it.
-        follow_until: time since the arm was last seen, up to which the state is FOLLOWING (a camera drops frames).
+        seen_for: time for which the arm must be visible before the robot follows it.
+        follow_until: longest time since the arm was last seen at which the state is still FOLLOWING (cameras drop
+            frames).
         coast_until: the same for COASTING.
         hold_until: the same for HOLDING; inf: the robot never stops.
     """
@@ -81,14 +82,14 @@ class Engagement:
                                           +------(seen again)--+------------+
 
     Args:
-        correspondence: between the person's arm and the robot's.
+        correspondence: correspondence between the person's arm and the robot's.
         rule: the times of the transitions.
 
     Attributes:
         state: the current state.
         clutch: the poses of hand and tool when the person began to lead; None while nobody leads.
         ready: whether the person may begin to lead in this control period; the caller then calls :meth:`engage`.
-        time_since_seen: since the arm was last seen [s]; inf before it was ever seen.
+        time_since_seen: time since the arm was last seen [s]; inf before it was ever seen.
     """
 
     def __init__(self, correspondence: Correspondence, rule: EngagementRule | None = None) -> None:
@@ -108,10 +109,11 @@ class Engagement:
         """Advance by one control period and return the new state.
 
         Args:
-            estimate: of the person's arm from a new frame; None: there was no frame, or it does not show the arm.
-            period: since the last call [s].
+            estimate: estimate of the person's arm from a new frame; None: there was no frame, or it does not show the
+                arm.
+            period: time since the last call [s].
             at_rest: whether the robot is at rest: only then can a person begin to lead it. The time for which the
-                person has been seen is counted meanwhile.
+                person has been seen is counted in any case.
         """
         self.time_since_seen = self.time_since_seen + period if estimate is None else 0.0
         self.ready = False

@@ -1,6 +1,6 @@
-r"""Fitting: find a start posture and a scale with which a recorded motion is within the robot's reach.
+r"""Fitting: find a start posture and a scale that bring a recorded motion within the robot's reach.
 
-A live motion can't be fitted, because it is not known yet; a recording can. The tool will be at
+Only a recording can be fitted; a live motion is not known in advance. The tool will be at
 
 .. math:: p(t) = p_0 + \rho\,(W(t) - W_0)
 
@@ -55,7 +55,7 @@ class Fit:
 
 
 def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: float = 1.0) -> Fit:
-    """Find a start and a scale with which a recorded motion is within the arm's reach.
+    """Find a start and a scale that bring a recorded motion within the arm's reach.
 
     Args:
         arm: the robot's arm.
@@ -64,7 +64,7 @@ def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: floa
         scale: the largest scale to try.
 
     Returns:
-        The largest scale that was found, and a start.
+        The largest scale that was found, and the start posture for it.
 
     Raises:
         InputError: if the wrist was never seen, or an argument can't be used.
@@ -95,7 +95,7 @@ def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: floa
 
 
 class _Search:
-    """Looks for postures of an arm, with its tool oriented as at home, away from singularities and with links apart."""
+    """Finds postures with the tool oriented as at home, away from singularities and without contact between links."""
 
     def __init__(self, arm: ArmModel, links: SelfClearance) -> None:
         self.arm, self.links, self.home = arm, links, arm.tool_pose(arm.home)
@@ -109,7 +109,7 @@ class _Search:
         return float(np.linalg.norm(self._tips - self._tips.mean(axis=0), axis=1).max())
 
     def centres(self) -> Iterator[tuple[Array, Array]]:
-        """Yield places (3,) [m] for the middle of the motion, each with a posture near it, beginning near home."""
+        """Yield positions (3,) [m] for the middle of the motion, each with a posture near it, nearest to home first."""
         for shift in _NEAR_HOME:
             yield self.home.position + shift, self.arm.home
         if self._far is None:  # the same for all scales
@@ -120,7 +120,7 @@ class _Search:
         """Return a posture in which the motion can begin, shape (n_joints,); None if part of it is out of reach.
 
         Args:
-            centre: of the motion, shape (3,) [m].
+            centre: centre of the motion, shape (3,) [m].
             near: a posture near it, shape (n_joints,) [rad].
             begin: start of the motion relative to its centre, shape (3,) [m].
             outermost: the outermost points relative to the centre, shape (k, 3) [m].
@@ -132,7 +132,7 @@ class _Search:
         return first if passes else None
 
     def _reachable_centres(self) -> Iterator[tuple[Array, Array]]:
-        """Yield reachable places throughout the workspace, those nearest to home first, each with a posture."""
+        """Yield reachable positions throughout the workspace, nearest to home first, each with a posture."""
         low, high = self._tips.min(axis=0), self._tips.max(axis=0)
         step = _STEP * 0.5 * float((high - low).max())
         axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
@@ -149,7 +149,7 @@ class _Search:
     def _posture(self, position: Array, near: Array, smallest: float) -> Array | None:
         """Return a posture near another one, shape (n_joints,).
 
-        None if there is none that is far enough from singularities.
+        None if no such posture is far enough from singularities.
         """
         try:
             q = find_posture(self.arm, Pose(position, self.home.quaternion), q0=near, restarts=2)

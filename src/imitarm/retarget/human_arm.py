@@ -4,8 +4,8 @@ The chain is shoulder, upper arm, elbow, forearm, wrist. With all angles zero th
 
 .. math:: R = R_z(q_0) R_y(q_1) R_x(q_2)\;|\,L_U\,|\;R_y(q_3) R_x(q_4)\;|\,L_F\,|\;R_y(q_5) R_x(q_6)
 
-These are the axes of Sawyer's joints at zero, in the same order. So a person's angles are a Sawyer's angles, apart from
-the offsets between its links.
+These are the axes of Sawyer's joints at zero, in the same order. A person's angles therefore equal a Sawyer's angles,
+apart from the offsets between its links.
 """
 
 from __future__ import annotations
@@ -44,11 +44,12 @@ def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike,
         0 & s_\alpha & c_\alpha & d \\ 0 & 0 & 0 & 1 \end{pmatrix}
 
     Args:
-        theta: angle about the old z [rad]; all four arguments broadcast.
-        d: distance along the old z [m].
-        a: distance along the new x [m].
-        alpha: angle about the new x [rad].
-        as_printed: use the second row as printed in the thesis, with sin instead of cos: the result is not a rotation.
+        theta: angle about the previous z axis [rad]; all four arguments broadcast.
+        d: distance along the previous z axis [m].
+        a: distance along the new x axis [m].
+        alpha: angle about the new x axis [rad].
+        as_printed: whether to use the second row as printed in the thesis, with sin instead of cos; the result is
+            not a rotation.
 
     Returns:
         shape (..., 4, 4).
@@ -74,8 +75,8 @@ def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: boo
 
     Args:
         angles: shape (7,) [rad].
-        lengths: of this person.
-        as_printed: use the thesis's second row, so that the result is not a rotation.
+        lengths: lengths of this person.
+        as_printed: whether to use the second row as printed in the thesis; the result is not a rotation.
 
     Returns:
         shape (8, 4, 4), the shoulder's own frame first.
@@ -192,8 +193,8 @@ def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
     :math:`[x,\; n \times x,\; n]`.
 
     Args:
-        wrist: position, shape (3,) [m]; so are tip and thumb.
-        tip: of the hand.
+        wrist: wrist position, shape (3,) [m].
+        tip: position of the hand's tip, shape (3,) [m].
         thumb: its tip.
 
     Returns:
@@ -215,11 +216,12 @@ def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
 
 
 def carried(rotation: Array | None, before: Array | None, after: Array) -> Array:
-    """Return the hand's rotation after a rotation of the forearm, when the hand itself is not seen.
+    """Return the hand's rotation after a rotation of the forearm, when the hand itself is not visible.
 
     Args:
-        rotation: of the hand before, shape (3, 3); None: unknown, then its x is along the forearm and its z is level.
-        before: unit vector along the forearm then, shape (3,).
+        rotation: previous rotation of the hand, shape (3, 3); None if unknown: then its x is along the forearm and
+            its z is horizontal.
+        before: unit vector along the forearm at that time, shape (3,).
         after: unit vector along the forearm now, shape (3,).
 
     Returns:

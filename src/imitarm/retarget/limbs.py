@@ -1,4 +1,4 @@
-"""The bone lengths of a person's arm: measured over many frames, then imposed on every frame (thesis Eq 3.1 to 3.4)."""
+"""Bone lengths of a person's arm, measured over many frames and then enforced in every frame (thesis Eq 3.1 to 3.4)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LimbLengths:
         upper_arm: shoulder to elbow [m].
         forearm: elbow to wrist [m].
         spread: standard deviation of single measurements about the median, for the two lengths [m].
-        n_frames: number of frames measured; 0 when the lengths were given.
+        n_frames: number of frames used for the measurement; 0 when the lengths were given.
 
     Raises:
         InputError: when a length is not plausible for an arm.
@@ -77,8 +77,8 @@ def measure_limbs(skeletons: Iterable[Skeleton], side: str = "right") -> LimbLen
     """Measure the bone lengths of an arm: the medians over frames in which it is tracked and slow (docs/capture.md).
 
     Args:
-        skeletons: in order of time; two seconds are enough.
-        side: which arm.
+        skeletons: skeletons in order of time; two seconds are enough.
+        side: side of the arm, ``"left"`` or ``"right"``.
 
     Raises:
         InputError: when fewer than five frames show the whole arm, or the lengths are not plausible.
@@ -112,17 +112,17 @@ def correct_limbs(
     *,
     as_printed: bool = False,
 ) -> tuple[Array, Array]:
-    r"""Impose the true bone lengths on an arm and keep the directions of its bones (thesis Eq 3.1 to 3.4, corrected).
+    r"""Give the bones of an arm their true lengths and keep their directions (thesis Eq 3.1 to 3.4, corrected).
 
     .. math:: E_c = S + L_U \frac{E - S}{|E - S|}, \qquad W_c = E_c + L_F \frac{W - E}{|W - E|}
 
     Args:
-        shoulder: position, shape (..., 3) [m]; so are elbow and wrist.
-        elbow: as measured.
-        wrist: as measured.
-        lengths: of this person.
-        as_printed: use the signs printed in the thesis, with the forearm attached to the measured elbow; the elbow is
-            then on the opposite side of the shoulder.
+        shoulder: measured shoulder position, shape (..., 3) [m].
+        elbow: measured elbow position, same shape.
+        wrist: measured wrist position, same shape.
+        lengths: lengths of this person.
+        as_printed: whether to use the signs printed in the thesis and attach the forearm to the measured elbow; the
+            elbow is then on the wrong side of the shoulder.
 
     Returns:
         elbow and wrist, shapes (..., 3) [m].
@@ -143,13 +143,13 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
     .. math:: \min \sum_j c_j |x_j - \tilde x_j|^2 \quad\text{s.t.}\quad |E - S| = L_U,\; |W - E| = L_F
 
     It is solved by a few Gauss-Newton steps, each with a 2 x 2 system for the multipliers. :func:`correct_limbs` is the
-    special case in which the shoulder is exact and only the directions of the others count: it passes the errors of
-    shoulder and elbow on to the wrist.
+    special case in which the shoulder is exact and only the directions of the bones count: it transfers the errors
+        of shoulder and elbow to the wrist.
 
     Args:
         points: shoulder, elbow, wrist, shape (3, 3) [m].
-        confidence: of each, above 0, shape (3,).
-        lengths: of this person.
+        confidence: confidence of each point, above 0, shape (3,).
+        lengths: lengths of this person.
         rounds: number of Gauss-Newton steps.
 
     Returns:

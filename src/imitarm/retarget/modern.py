@@ -1,4 +1,4 @@
-"""ModernRetargeter: the method to use on a robot; it keeps every limit, follows the elbow and bridges short losses."""
+"""ModernRetargeter: the recommended method; keeps all limits, follows the elbow, bridges short tracking losses."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _STILL = 1e-3  # [rad/s] a slower joint is at rest
 
 
 class ModernRetargeter(Retargeter):
-    r"""Follow the hand with the tool and the person's elbow with the robot's, within every limit.
+    r"""Follow the person's hand with the tool and the person's elbow with the robot's elbow, within every limit.
 
     One step does the following (see docs/retargeting.md):
 
@@ -54,36 +54,37 @@ class ModernRetargeter(Retargeter):
     2. compute the tool's target and the twist towards it, :math:`K \log(T_d T^{-1})`, plus a fraction of the hand's
        velocity (feed-forward);
     3. solve a quadratic programme for the joint velocities. Its tasks are the twist and the elbow's SEW angle; its
-       limits are the box of position, velocity and acceleration, bounds that keep elbow and wrist away from their
-       singularities, and the distances of the links to each other and to the scene. While nobody leads, the arm does
-       not move by itself;
+       limits are the joint limits of position, velocity and acceleration, bounds that keep elbow and wrist away from
+       their
+       singularities, and the distances of the links to each other and to the scene. While nobody leads, the arm rests;
     4. limit the jerk (:class:`JerkLimiter`) and check all limits again. If something blocks the arm, it does not press
        harder, and the target does not run away from the blocked tool.
 
-    The robot's elbow angle changes as the person's does, from the angles that both had when the person began to lead:
+    The robot's elbow angle changes by as much as the person's has changed since the person began to lead:
     :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. Its weight decreases when the camera sees the person's elbow poorly
     and when either arm is nearly straight.
 
     When the person is lost, the arm coasts for 0.1 s, holds its target until 0.3 s, then stops. Once the person has
-    been seen again for half a second, it starts anew from the present poses of both, so that nothing jumps.
+    been seen again for half a second, the motion restarts from the current poses of hand and tool, so that nothing
+    jumps.
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: between the person's arm and the robot's.
+        correspondence: correspondence between the person's arm and the robot's.
         dt: control period [s].
         scene: obstacles to avoid.
         gain: K [1/s].
         lead: fraction of the hand's velocity that is fed forward, 0 to 1.
         rotation_length: length [m] that one radian of the tool's rotation counts as, when the joints can't achieve
             position and rotation both; about the base's x, y and z. None: 0.1 when the tool rotates with the hand,
-            which a camera sees poorly; 0.3 when it keeps its rotation; when it stays upright, 0.2 against tilting and
-            0.05 about z.
-        elbow: weight of the elbow's motion relative to the tool's [m^2]; 0: the elbow is free.
+            because a camera measures this rotation poorly; 0.3 when the tool keeps its rotation; when the tool stays
+            upright, 0.2 about x and y (tilt) and 0.05 about z.
+        elbow: weight of the elbow's motion relative to the tool's [m^2]; 0 leaves the elbow free.
         clearance: required distance from the scene [m].
         own_clearance: required distance between links [m]; None: not checked.
         max_speed: the twist is scaled down to this norm [m/s], with 1 rad counted as ``rotation_length``.
-        max_lead: how far a joint's command may be ahead of its measured position [rad]; a robot that responds late
-            needs more.
+        max_lead: how far a joint's command may be ahead of its measured position [rad]; a robot with a longer delay
+            needs a larger value.
 
     Raises:
         InputError: when a number is out of range.
@@ -91,7 +92,7 @@ class ModernRetargeter(Retargeter):
 
     name: ClassVar[str] = "modern"
     caption: ClassVar[str] = (
-        "The method to use on a robot: it keeps every limit, follows the elbow, and copes with a person who is lost."
+        "The recommended method: it keeps every limit, follows the elbow, and tolerates tracking losses."
     )
     rule: ClassVar[EngagementRule] = EngagementRule(follow_until=_BETWEEN)
 
@@ -164,7 +165,7 @@ class ModernRetargeter(Retargeter):
         return wrist, hand
 
     def _at_rest(self) -> bool:
-        """Return whether the arm is at rest; a remaining motion that is too slow to be seen is removed."""
+        """Return whether the arm is at rest; an imperceptibly slow remaining motion is set to zero."""
         if max(np.abs(self._velocity).max(), np.abs(self._limiter.velocity).max()) > _STILL:
             return False
         if self._velocity.any() or self._limiter.velocity.any():
@@ -219,10 +220,10 @@ class ModernRetargeter(Retargeter):
         self._drive(twist, elbow)
 
     def _slip(self, target: Pose, measured: Array) -> None:
-        """Move the clutch's origin while the hand pulls the target away from a blocked tool that stands still.
+        """Move the clutch's origin while the hand moves the target away from a tool that is blocked and at rest.
 
         Otherwise the tool would jump to the target, and against any object on its path, as soon as it is free. A robot
-        that only responds late keeps moving, and is not mistaken for a blocked one.
+        that merely responds late keeps moving, so it is not mistaken for a blocked one.
         """
         at = self.arm.tool_pose(measured).position
         moved, offset = at - self._held_at, target.position - at
@@ -233,7 +234,7 @@ class ModernRetargeter(Retargeter):
             self._engagement.shift((_SLIP / length - 1.0) * offset)
 
     def _yielding(self, twist: Array, measured: Array, fraction: float) -> Array:
-        """Return the twist without a fraction of its component in the direction in which the tool is held back."""
+        """Return the twist after reducing its component in the direction in which the tool is blocked."""
         back = self.arm.tool_pose(measured).error_to(self.arm.tool_pose(self._limiter.q)) * _METRES
         square = float(back.dot(back))
         along = float(back.dot(twist * _METRES))
@@ -242,7 +243,7 @@ class ModernRetargeter(Retargeter):
         return twist - fraction * (along / square) * back / _METRES
 
     def _drive(self, twist: Array, elbow: ElbowTask | None, *, engaged: bool = True) -> None:
-        """Move the reference by one step of inverse kinematics; an arm that nobody leads does not move by itself."""
+        """Move the reference by one step of inverse kinematics; without a leading person, the arm rests."""
         obstacles = self._obstacles.rows(self._q, self.scene)
         own = None if self._own is None else self._own.rows(self._q, may_search=not self._seeing)
         rows = ([] if obstacles is None else [obstacles]) + ([] if own is None else [own])
@@ -262,18 +263,19 @@ class JerkLimiter:
     A critically damped follower with feed-forward, :math:`a_d = \omega^2 (q_r - q) + 2\omega (v_r - v)`. Its
     acceleration is clipped to :math:`|a| \le a_{max}` and to :math:`|a - a_p| \le j\,dt`, where :math:`a_p` is the
     previous one. The resulting velocity :math:`v + a\,dt` is then clipped so that the joint can still stop before its
-    limit. With D the distance to the limit, and the position changing by the mean of two velocities, the highest such
-    velocity is
+    limit. With D the distance to the limit, and a position that changes by the mean of two successive velocities, the
+    highest such velocity is
 
     .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a D'}, \qquad D' = D - \tfrac12 v\,dt,
 
     and :math:`2 D'/dt` where D' is negative.
 
-    A joint that keeps this bound once can always keep it by braking with a_max. Near a limit the last clipping may
+    A joint that has met this bound once can meet it in all later steps by braking with a_max. Near a limit the last
+    clipping may
     exceed the jerk limit; position, velocity and acceleration are always kept.
 
-    A blocked arm falls behind its commands, and its drives press harder the further it falls behind. So a command that
-    is ahead of the measured joint by more than half of ``max_lead`` brakes: ``max_lead`` acts as one more position
+    A blocked arm falls behind its commands, and its drives push harder as the error grows. Therefore, a command that
+    leads the measured joint by more than half of ``max_lead`` brakes: ``max_lead`` acts as an additional position
     limit. The command may exceed it by the braking distance.
 
     Args:
@@ -281,8 +283,8 @@ class JerkLimiter:
         dt: control period [s].
         frequency: omega [rad/s]; must be well below 1/dt.
         rise_time: time to full acceleration [s]: j = a_max / rise_time.
-        max_lead: of a command over the measured position [rad]; half of it must exceed the distance that the joints
-            move at full speed within the robot's delay, or the limit slows the joints down.
+        max_lead: largest lead of a command over the measured position [rad]; half of it must exceed the distance that
+            the joints move at full speed within the robot's delay, otherwise this limit slows the joints down.
 
     Raises:
         InputError: when a number is out of range.
@@ -333,8 +335,8 @@ class JerkLimiter:
         """Advance by one period towards a reference and return the joint positions reached, (n_joints,) [rad].
 
         Args:
-            q: of the reference, shape (n_joints,) [rad].
-            velocity: of the reference, shape (n_joints,) [rad/s].
+            q: joint positions of the reference, shape (n_joints,) [rad].
+            velocity: velocity of the reference, shape (n_joints,) [rad/s].
             measured: measured joint positions, shape (n_joints,) [rad]; None: as commanded.
         """
         # plain floats without min and max: for so few numbers twice as fast as NumPy
@@ -374,7 +376,7 @@ class JerkLimiter:
         Args:
             x: its position [rad].
             v: its velocity [rad/s].
-            measured: its measured position [rad].
+            measured: measured position of the joint [rad].
             low: lowest velocity that the other limits allow [rad/s].
             high: highest velocity that the other limits allow [rad/s].
             joint: its limits.

@@ -32,12 +32,12 @@ class RetargetStep:
     """Result of one control step of a retargeter.
 
     Attributes:
-        time: since :meth:`Retargeter.start` [s].
+        time: time since :meth:`Retargeter.start` [s].
         q: joint positions to reach by the end of the step, shape (n_joints,) [rad].
         velocity: joint velocities at the end of the step, shape (n_joints,) [rad/s].
         closed: whether the gripper should be closed; None: leave it as it is.
-        state: of the engagement.
-        target: desired pose of the tool in the base frame, before any limit; None while nobody leads.
+        state: state of the engagement.
+        target: desired pose of the tool in the base frame, before limits are applied; None while nobody leads.
         elbow: unit vector from the person's shoulder to the elbow in the base frame, shape (3,); None when unknown.
     """
 
@@ -54,10 +54,10 @@ class Goal(NamedTuple):
     """The input of a method in one control step while the person leads.
 
     Attributes:
-        target: desired pose of the tool in the base frame, now.
-        estimate: of the person's arm, from the last frame that shows it.
-        fresh: whether that frame came in during this step.
-        age: time since that frame came in [s].
+        target: current desired pose of the tool in the base frame.
+        estimate: estimate of the person's arm, from the last frame that shows it.
+        fresh: whether that frame arrived in this step.
+        age: time since that frame arrived [s].
         state: FOLLOWING, COASTING or HOLDING.
         clutch: the poses of hand and tool when the person began to lead.
     """
@@ -74,16 +74,16 @@ class Retargeter(ABC):
     """Converts a person's arm motion, seen as skeletons, into joint positions of a robot arm.
 
     :meth:`start` puts the robot at rest at a posture. :meth:`step` is then called once per control period ``dt`` with
-    the skeleton that came in since the last call, or None: cameras give 30 frames per second and a robot takes 100
-    commands per second, so most calls get None. Every step does the same for all methods:
+    the skeleton that arrived since the last call, or None: cameras give 30 frames per second and a robot takes 100
+    commands per second, so most calls get None. Every step has the same parts for all methods:
 
     1. ``_see`` turns a new skeleton into an estimate of the person's arm;
     2. the :class:`~imitarm.retarget.engagement.Engagement` decides whether the person leads;
-    3. if so, ``_hand`` and ``_target`` say where the tool should be;
+    3. if so, ``_hand`` and ``_target`` compute the desired pose of the tool;
     4. ``_advance`` returns the joint positions of the next period: **this is the method**.
 
-    A method is a subclass that implements ``_advance``. The other functions with a leading underscore have defaults
-    that it may replace. It sets ``name``, and ``title`` and ``caption`` for tables and reports::
+    A method is a subclass that implements ``_advance``. It may also override the other functions with a leading
+    underscore, which have defaults. It sets ``name``, and ``title`` and ``caption`` for tables and reports::
 
         class Damped(Retargeter):
             name, title = "damped", "Damped least squares"
@@ -97,22 +97,22 @@ class Retargeter(ABC):
                 return q + 0.1 * J.T @ np.linalg.solve(J @ J.T + 0.01 * np.eye(6), error)
 
     Attributes:
-        name: of the method, as in :data:`imitarm.retarget.RETARGETERS`; default: the class's name.
-        title: of the method in tables and reports; default: ``name``.
+        name: name of the method, as in :data:`imitarm.retarget.RETARGETERS`; default: the class's name.
+        title: title of the method in tables and reports; default: ``name``.
         caption: one sentence about the method for reports.
         rule: times after which the robot follows, coasts, holds and stops.
         arm: the robot's arm with its tool.
-        n_joints: number of its joints.
-        correspondence: between the person's arm and the robot's.
+        n_joints: number of joints of the arm.
+        correspondence: correspondence between the person's arm and the robot's.
         dt: control period [s].
         scene: obstacles; only some methods avoid them.
         latest: result of the last step.
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: between the person's arm and the robot's; None: the default one.
+        correspondence: correspondence between the person's arm and the robot's; None: the default one.
         dt: control period [s].
-        scene: obstacles; None: none.
+        scene: obstacles; None: no obstacles.
 
     Raises:
         InputError: when an argument has the wrong type, or ``dt`` is out of range.
@@ -152,7 +152,7 @@ class Retargeter(ABC):
         self._started = False
 
     def start(self, q: ArrayLike) -> None:
-        """Forget the past and be at rest at ``q``, shape (n_joints,) [rad].
+        """Reset the state, with the robot at rest at ``q``, shape (n_joints,) [rad].
 
         Raises:
             InputError: when ``q`` has the wrong shape or is beyond the joint limits.
@@ -168,10 +168,12 @@ class Retargeter(ABC):
         self._rest_at(posture)
 
     def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
-        """Advance by one control period; see the class. The first call starts at ``arm.home`` unless already started.
+        """Advance by one control period; see the class.
+
+        The first call starts at ``arm.home`` unless :meth:`start` was called.
 
         Args:
-            skeleton: the newest one since the last step, or None.
+            skeleton: newest skeleton since the last step, or None.
             q: measured joint positions, shape (n_joints,) [rad].
 
         Returns:
@@ -210,7 +212,7 @@ class Retargeter(ABC):
         """Retarget a whole recording with a robot that reaches every commanded position.
 
         Args:
-            skeletons: in order of time.
+            skeletons: skeletons in order of time.
             q: start posture, shape (n_joints,) [rad]; None: ``arm.home``.
 
         Raises:
@@ -226,7 +228,7 @@ class Retargeter(ABC):
 
     @property
     def notes(self) -> dict[str, float]:
-        """Counts and figures that the method keeps, by name; none by default."""
+        """Counts and other figures of the method, by name; empty by default."""
         return {}
 
     # --- the method
@@ -238,25 +240,24 @@ class Retargeter(ABC):
         The last commanded positions are ``self.latest.q``.
 
         Args:
-            goal: the pose to reach, with its context; None while nobody leads: the robot must come to rest and stay
-                there.
+            goal: pose to reach, with its context; None while nobody leads: then the robot must stop and stay at rest.
             measured: measured joint positions, shape (n_joints,) [rad].
         """
 
     # --- what a method may replace
 
     def _begin(self) -> None:  # noqa: B027 (optional)
-        """Forget the past; called by :meth:`start`, before ``_rest_at``."""
+        """Reset the method's state; :meth:`start` calls this before ``_rest_at``."""
 
     def _rest_at(self, q: Array) -> None:  # noqa: B027 (optional)
-        """Note that the robot is at rest at ``q``, shape (n_joints,) [rad]: at the start, or after it was pushed."""
+        """Record that the robot is at rest at ``q``, shape (n_joints,) [rad]: at the start, or after it was moved."""
 
     def _new_estimator(self) -> ArmEstimator:
         """Return the estimator of the person's arm."""
         return ArmEstimator(self.correspondence)
 
     def _see(self, skeleton: Skeleton | None) -> ArmEstimate | None:
-        """Return the estimate of the person's arm from a new skeleton; None when there is none, or it shows no arm."""
+        """Return the estimate of the person's arm from a new skeleton; None if there is none or it shows no arm."""
         return None if skeleton is None else self._estimator.update(skeleton)
 
     def _hand(self) -> tuple[Array, Array]:
@@ -269,20 +270,20 @@ class Retargeter(ABC):
         return clutch.target(wrist, hand)
 
     def _at_rest(self) -> bool:
-        """Return whether the robot stands still: only then can a person begin to lead it."""
+        """Return whether the robot is at rest; only then can a person begin to lead it."""
         return True
 
     def _velocity_at(self, before: Array, after: Array) -> Array:
         """Return the joint velocities at the end of this period, shape (n_joints,) [rad/s].
 
-        By default the mean over the period.
+        The default is the mean velocity over the period.
         """
         return (after - before) / self.dt
 
     # --- the same for all
 
     def _start_where_pushed(self, measured: Array) -> None:
-        """Rest at the measured posture when somebody has moved the arm by hand while nobody led it."""
+        """Rest at the measured posture if the arm was moved by hand while nobody led it."""
         if float(np.abs(measured - self.latest.q).max()) > PUSHED:
             q = np.clip(measured, self.arm.lower, self.arm.upper)
             self.latest = RetargetStep(self.latest.time, q, np.zeros(self.arm.n_joints), state=self.latest.state)
@@ -306,12 +307,12 @@ class Retargeting:
         times: shape (n,) [s], from 0.
         joints: joint positions, shape (n, n_joints) [rad].
         velocities: commanded joint velocities, shape (n, n_joints) [rad/s].
-        targets: of the tool: positions (n, 3) [m] and quaternions wxyz (n, 4); nan while nobody led.
+        targets: target positions (n, 3) [m] and quaternions wxyz (n, 4) of the tool; nan while nobody led.
         elbows: unit vectors from the person's shoulder to the elbow in the base frame, (n, 3); nan where unknown.
         closed: whether the gripper should be closed, shape (n,) bool.
-        states: of the engagement, shape (n,), values of :class:`~imitarm.retarget.engagement.EngagementState`.
+        states: states of the engagement, shape (n,), values of :class:`~imitarm.retarget.engagement.EngagementState`.
         notes: counts and figures of the method, by name.
-        title: of the method for tables and reports; empty: ``method``.
+        title: title of the method for tables and reports; empty: ``method``.
         caption: one sentence about the method for reports.
         shown_times: time since the first skeleton at which the person showed each sample, shape (n,) [s]; earlier than
             ``times`` for methods that slow the motion down. None: ``times``.
@@ -339,7 +340,7 @@ class Retargeting:
         notes: dict[str, float] | None = None,
         shown_times: Array | None = None,
     ) -> Retargeting:
-        """Stack the steps of a run."""
+        """Combine the steps of a run into arrays."""
         nowhere, unknown = np.full(3, np.nan), np.full(4, np.nan)
         closed, now = np.zeros(len(steps), dtype=bool), False
         for i, step in enumerate(steps):
@@ -366,7 +367,7 @@ class Retargeting:
 
     @property
     def engaged(self) -> NDArray[np.bool_]:
-        """Whether the person led, shape (n,)."""
+        """Whether the person led the robot at each sample, shape (n,)."""
         return engaged_samples(self.states)
 
     def demonstration(self, task: str = "", source: str = "") -> Demonstration:
@@ -399,7 +400,7 @@ def ticks(frames: Sequence[Skeleton], dt: float) -> Iterable[Skeleton | None]:
     """Yield for each control period of a recording the newest skeleton of that period, or None.
 
     Args:
-        frames: in order of time, at least one.
+        frames: frames in order of time, at least one.
         dt: control period [s].
     """
     start, k = frames[0].time, 0

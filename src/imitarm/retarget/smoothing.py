@@ -41,14 +41,14 @@ class OneEuro:
 
     .. math:: \hat x \leftarrow \hat x + \alpha(f_c)\,(x - \hat x), \qquad f_c = f_{min} + \beta\,|\hat{\dot x}|
 
-    The speed is that of the whole vector, not of each axis, so the filter acts equally in all directions. It is
-    computed from the difference of two measured values. The usual difference to the previous smoothed value contains
+    The speed is the norm of the whole velocity vector, so the filter acts equally in all directions. It is computed
+    from the difference of two successive measured values. The usual difference to the previous smoothed value contains
     the filter's own lag and is too large during steady motion, which matters when the velocity is used for prediction.
     The weight of a value is multiplied by its confidence c.
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].
-        beta: its increase with speed [Hz per unit/s]; for positions in metres 8 to 15.
+        beta: increase of the cut-off frequency with speed [Hz per unit/s]; 8 to 15 for positions in metres.
         derivative_cutoff: cut-off frequency of the estimated speed [Hz].
     """
 
@@ -72,9 +72,10 @@ class OneEuro:
         """Process measured vectors and return the smoothed ones, same shape; ``velocity`` is their derivative.
 
         Args:
-            time: of the measurement [s]; if it is not later than the previous one, the previous result is returned.
+            time: time of the measurement [s]; if it is not later than the previous one, the previous result is
+                returned.
             x: a vector, shape (d,), or several, each with its own speed, shape (k, d).
-            confidence: 0 to 1; for several vectors one number or shape (k, 1).
+            confidence: confidence from 0 to 1; for several vectors one number or shape (k, 1).
         """
         period = time - self._time
         if period <= 0.0:
@@ -98,7 +99,7 @@ class OneEuro:
         self._smooth, self._speed = measured, [[0.0] * len(x) for x in measured]
 
     def _continue(self, measured: list[list[float]], trust: list[float], period: float) -> None:
-        """Filter by one period, in plain floats: for a few short vectors twice as fast as NumPy."""
+        """Filter one sample with plain floats, which is twice as fast as NumPy for a few short vectors."""
         steady = smoothing_weight(self.derivative_cutoff, period)
         smooth, speeds = [], []
         for x, last, value, velocity, c in zip(measured, self._last, self._smooth, self._speed, trust, strict=True):
@@ -126,7 +127,7 @@ class OneEuroRotation(OneEuro):
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].
-        beta: its increase with speed [Hz per rad/s].
+        beta: increase of the cut-off frequency with speed [Hz per rad/s].
         derivative_cutoff: cut-off frequency of the estimated angular velocity [Hz].
     """
 
@@ -147,7 +148,7 @@ class OneEuroRotation(OneEuro):
         return [factor * u, factor * v, factor * z]
 
     def _moved(self, value: list[float], step: list[float], fraction: float) -> list[float]:
-        """Return exp(fraction step) value, normalised."""
+        """Return ``exp(fraction step) value``, normalised."""
         (x, y, z), (w, i, j, k) = step, value
         half = 0.5 * fraction * math.sqrt(x * x + y * y + z * z)
         fraction *= 0.5 * math.sin(half) / half if half > _SMALL else 0.5
@@ -170,8 +171,8 @@ class Hampel:
 
     Args:
         window: duration [s].
-        least: r, a distance within which no value is an outlier [m]; choose more than a fast hand moves within half the
-            window.
+        least: r, distance within which no value is an outlier [m]; it should exceed the distance that a fast hand
+            moves within half the window.
     """
 
     def __init__(self, window: float = 0.3, least: float = 0.02) -> None:
@@ -198,15 +199,16 @@ class Hampel:
 
 
 class TrackingOffsets:
-    r"""Compensates the jumps that come with a change of tracking.
+    r"""Compensates for jumps due to a change of tracking.
 
     A camera infers the position of a hidden joint, with an error that is several times larger and different from the
-    error before. The step from the last tracked to the first inferred position is mostly this difference, and so is the
-    step back. So when a joint becomes inferred, its offset o is set such that the motion continues,
+    error before. The step from the last tracked to the first inferred position is mostly due to this difference, as is
+    the step back. Therefore, when a joint becomes inferred, its offset o is set so that the motion continues,
 
     .. math:: o = x_p + v\,\Delta t - \tilde x, \qquad x = \tilde x + o
 
-    with :math:`x_p` the previous position and v its velocity. While the joint is inferred, the offset is constant: the
+    where :math:`x_p` is the previous position and v its velocity. While the joint is inferred, the offset is constant:
+    the
     joint's motion is used, but not its absolute position. When the joint is tracked again, a new offset is set in the
     same way; while the joint is tracked, the offset decays with time and with the distance that the joint moves,
 
@@ -214,7 +216,8 @@ class TrackingOffsets:
 
     A person who watches the robot does not notice the decay, but would notice a robot that jumps away and back.
 
-    A joint that flickers between tracked and inferred keeps one offset for each, for up to 0.12 s. Otherwise the
+    A joint that flickers between tracked and inferred keeps one offset for each of the two, for up to 0.12 s. Otherwise
+    the
     measured position would never have an effect, and the estimate would drift away. An offset is at most 0.2 m long.
 
     Args:
@@ -251,8 +254,8 @@ class TrackingOffsets:
 
         Args:
             points: measured positions, shape (k, 3) [m].
-            confidence: of each, k numbers; 1 when it is tracked.
-            velocity: of each, from the previous estimate, shape (k, 3) [m/s].
+            confidence: confidence of each point, k numbers; 1 when it is tracked.
+            velocity: velocity of each point, from the previous estimate, shape (k, 3) [m/s].
             period: since the previous call [s].
         """
         before, self._confidence = self._confidence, confidence

@@ -114,7 +114,7 @@ class Supervisor:
         """Process a datagram and return whether to answer its sender.
 
         Args:
-            data: as received; may be anything.
+            data: data as received; may be anything.
             now: time of receiving [ns].
         """
         try:

@@ -79,7 +79,7 @@ class SimulatedRobot(Robot):
                 it is copied. None: the world is built from the scene.
             control: ``"position"`` or ``"torque"``.
             q: joint angles to start at, shape (n_joints,) [rad]; None for ``arm.home``.
-            timestep: of the physics and of the drives [s].
+            timestep: time step of the physics and of the drives [s].
 
         Raises:
             InputError: when ``control`` is unknown, ``timestep`` is not in (0, 0.002], ``q`` has a wrong shape or
@@ -413,8 +413,8 @@ class Drives:
         """Step with ``tau = h + 0.7 c sign(v) - D v``, with ``c`` the dry friction, while a hand pulls at a site.
 
         Args:
-            force: of the hand, in the base frame, shape (3,) [N].
-            torque: of the hand, shape (3,) [N m].
+            force: force of the hand, in the base frame, shape (3,) [N].
+            torque: torque of the hand, shape (3,) [N m].
             site: id of the site.
         """
         m, d = self._model, self._data

@@ -176,7 +176,7 @@ class UdpRobot(Robot):
             The newest state that has arrived.
 
         Raises:
-            InputError: as :meth:`Robot.move <imitarm.robots.robot.Robot.move>`.
+            InputError: for the same reasons as :meth:`Robot.move <imitarm.robots.robot.Robot.move>`.
         """
         self.listen()
         if not self.ready:

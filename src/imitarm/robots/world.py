@@ -51,8 +51,8 @@ def arm_world(
 
     Args:
         arm: the arm with its tool.
-        floor: as for :func:`standard_fixtures`.
-        pedestal_radius: as for :func:`standard_fixtures`.
+        floor: see :func:`standard_fixtures`.
+        pedestal_radius: see :func:`standard_fixtures`.
         fixtures: replace the standard fixtures.
 
     Returns:

@@ -74,9 +74,9 @@ class PackedObstacles:
         sizes: shape (n, 3) [m]. Sphere: radius; box: full edge lengths; capsule and cylinder: radius, length of the
             axis; cone: radius, height; ellipsoid: semi-axes; convex hull: half extents; half-space: nothing.
             Unused entries are 0.
-        velocities: of the own frame's origin, shape (n, 3) [m/s].
+        velocities: velocities of the own frame's origin, shape (n, 3) [m/s].
         angular_velocities: about that origin, in the base frame, shape (n, 3) [rad/s].
-        covariances: of the positions, shape (n, 3, 3) [m^2]; 0 when unknown.
+        covariances: covariances of the positions, shape (n, 3, 3) [m^2]; 0 when unknown.
         stamps: when each obstacle was seen, shape (n,) [s].
         track_ids: the number of its track, shape (n,); -1 without one.
         polytopes: faces and edges of each convex hull; None for other kinds.
@@ -236,8 +236,8 @@ def distances(packed: PackedObstacles, points: ArrayLike, times: ArrayLike | Non
 
     Args:
         packed: n obstacles, at their time 0.
-        points: in the base frame, shape (..., 3) [m]. With ``times``: the points at each time, shape (k, ..., 3), or
-            (1, ..., 3) for points that do not move.
+        points: points in the base frame, shape (..., 3) [m]. With ``times``: the points at each time, shape (k, ...,
+            3), or (1, ..., 3) for points that do not move.
         times: seconds after the obstacles' time, shape (k,) [s]; None for that time itself.
 
     Returns:
@@ -288,7 +288,7 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
     Args:
         packed: n obstacles.
         points: finite, in the base frame, shape (m, 3) [m].
-        reach: of each point, shape (m,) [m]; the same array in every call saves time.
+        reach: reach of each point, shape (m,) [m]; the same array in every call saves time.
     """
     frames, m = packed._frames, len(points)
     if frames.upright:

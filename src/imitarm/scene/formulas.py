@@ -180,7 +180,7 @@ def cones(
     Args:
         q: points in the own frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
-        radius: of the base, shape (...) [m].
+        radius: radius of the base, shape (...) [m].
         height: shape (...) [m].
         slant: length of the side, shape (...) [m].
         side: outward normal of the side in ``(rho, z)``, shape (2, ...).
@@ -257,7 +257,7 @@ class Polytope:
         cosines: between the faces' normals, shape (m, m).
         starts: one end of each edge between two faces, shape (3, e) [m].
         directions: unit vectors along the edges, shape (3, e).
-        lengths: of the edges, shape (e,) [m].
+        lengths: lengths of the edges, shape (e,) [m].
         starts_along: ``starts·directions`` of each edge, shape (e,) [m].
         starts_twice: ``-2 starts``, shape (3, e) [m].
         starts_squared: ``|starts|²``, shape (e,) [m²].

@@ -102,7 +102,7 @@ class MovingScene:
         """Return the poses of all obstacles' own frames.
 
         Args:
-            time: on the clock of ``scene.stamp`` [s].
+            time: time on the clock of ``scene.stamp`` [s].
 
         Returns:
             Positions (n, 3) [m] and quaternions wxyz (n, 4) in the base frame.

@@ -119,10 +119,10 @@ class Obstacle(ABC):
     ``r`` from an obstacle, require ``sd(x) >= r``: no inflated copy is needed.
 
     Attributes:
-        velocity: of the shape's centre, in the base frame, shape (3,) [m/s].
+        velocity: velocity of the shape's centre, in the base frame, shape (3,) [m/s].
         name: used in messages; a :class:`~imitarm.scene.Scene` falls back on ``"box 1"``.
         angular_velocity: about the shape's centre, in the base frame, shape (3,) [rad/s].
-        covariance: of the position, shape (3, 3) [m^2]; None when it is exact or unknown.
+        covariance: covariance of the position, shape (3, 3) [m^2]; None when it is exact or unknown.
         track_id: number of the obstacle's track in a tracker; None without a tracker.
 
     Raises:
@@ -186,7 +186,7 @@ class Obstacle(ABC):
         """Return the distance to the surface, negative inside.
 
         Args:
-            points: in the base frame, shape (..., 3) [m].
+            points: points in the base frame, shape (..., 3) [m].
 
         Returns:
             Shape (...) [m].
@@ -200,7 +200,7 @@ class Obstacle(ABC):
         """Return the gradient of :meth:`signed_distance`: unit vectors, shape (..., 3).
 
         Args:
-            points: in the base frame, shape (..., 3) [m].
+            points: points in the base frame, shape (..., 3) [m].
 
         Raises:
             InputError: when the last axis has not length 3 or a number is not finite.
@@ -211,7 +211,7 @@ class Obstacle(ABC):
         """Return :meth:`signed_distance` and :meth:`gradient` in one call.
 
         Args:
-            points: in the base frame, shape (..., 3) [m].
+            points: points in the base frame, shape (..., 3) [m].
 
         Returns:
             Distances (...) [m] and unit outward normals (..., 3).
@@ -227,7 +227,7 @@ class Obstacle(ABC):
         """Return the farthest point of the solid in each direction (its support mapping, as used by GJK).
 
         Args:
-            directions: of any length but zero, in the base frame, shape (..., 3).
+            directions: directions of any length but zero, in the base frame, shape (..., 3).
 
         Returns:
             Points of the surface in the base frame, shape (..., 3) [m].
@@ -274,7 +274,8 @@ class Obstacle(ABC):
         The arguments must be valid.
 
         Args:
-            position: of the own frame's origin, see :class:`~imitarm.scene.distances.PackedObstacles`, shape (3,) [m].
+            position: position of the own frame's origin, see :class:`~imitarm.scene.distances.PackedObstacles`, shape
+                (3,) [m].
             quaternion: own_to_base rotation wxyz, shape (4,).
             velocity: shape (3,) [m/s].
             angular_velocity: shape (3,) [rad/s].

@@ -75,7 +75,7 @@ class Scene:
         the obstacle objects are built when ``obstacles`` is read.
 
         Args:
-            time: on the clock of ``stamp`` [s].
+            time: time on the clock of ``stamp`` [s].
 
         Raises:
             InputError: when ``time`` is not a finite number.
@@ -90,7 +90,7 @@ class Scene:
         """Return :meth:`at`, or the scene itself if no obstacle moves or the scene was seen at that time.
 
         Args:
-            time: on the clock of ``stamp`` [s].
+            time: time on the clock of ``stamp`` [s].
         """
         return self if time == self.stamp or self.packed.still else self.at(time)
 
@@ -139,7 +139,7 @@ class Scene:
         """Return the signed distance of every point to every obstacle.
 
         Args:
-            points: in the base frame, shape (..., 3) [m].
+            points: points in the base frame, shape (..., 3) [m].
 
         Returns:
             Shape (n_obstacles, ...) [m], negative inside.
@@ -155,7 +155,7 @@ class Scene:
         """Return :meth:`distances` (n_obstacles, ...) [m] and their gradients, unit vectors (n_obstacles, ..., 3).
 
         Args:
-            points: in the base frame, shape (..., 3) [m].
+            points: points in the base frame, shape (..., 3) [m].
 
         Raises:
             InputError: when the last axis of ``points`` has not length 3 or a number is not finite.
@@ -169,7 +169,7 @@ class Scene:
         """Return the signed distance to the nearest obstacle, inf when there is none.
 
         Args:
-            points: in the base frame, shape (..., 3) [m].
+            points: points in the base frame, shape (..., 3) [m].
 
         Returns:
             Shape (...) [m], negative inside an obstacle.
@@ -183,7 +183,7 @@ class Scene:
         """Return the index of the nearest obstacle of every point, -1 when there is none.
 
         Args:
-            points: in the base frame, shape (..., 3) [m].
+            points: points in the base frame, shape (..., 3) [m].
 
         Returns:
             Indices into ``obstacles``, shape (...).
@@ -216,7 +216,7 @@ class Scene:
         """Refuse a goal that can't be reached without contact.
 
         Args:
-            tool_radius: of the sphere around the tool's tip that must stay free [m]; at least 0.
+            tool_radius: radius of the sphere around the tool's tip that must stay free [m]; at least 0.
 
         Raises:
             InputError: when the goal is nearer than ``tool_radius`` to an obstacle or inside it; the message names

@@ -164,7 +164,7 @@ class Cone(PosedObstacle):
     Attributes:
         pose: obstacle_to_base, on the axis at half the height (as for a cylinder): base at ``z = -height/2``, tip at
             ``z = +height/2``.
-        radius: of the base [m].
+        radius: radius of the base [m].
         height: from base to tip [m].
     """
 

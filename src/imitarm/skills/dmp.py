@@ -45,16 +45,17 @@ _SHORTEST_STEP, _LONGEST_STEP = 1e-100, 100.0  # in durations: the spring's numb
 
 
 class DMPState(NamedTuple):
-    """State of a primitive during a motion. Made by ``DMP.begin``, advanced by ``DMP.step``.
+    """State of a primitive during a motion. ``DMP.begin`` creates it and ``DMP.step`` advances it.
 
     Attributes:
         motion: [x; T x'] with T the duration, shape (2, 3) [m].
-        fraction: of the duration that is over on the primitive's own clock; the phase is ``exp(-alpha fraction)``.
+        fraction: elapsed fraction of the duration on the primitive's own clock; the phase is ``exp(-alpha
+            fraction)``.
         target: start, goal and duration of the motion.
         rotation: state of the rotation; None when none was learned.
         steps: length of the steps so far, as a fraction of the duration, and their number; None when they differed.
-        checked: the ``motion`` array that was checked to be finite; None before a check. A step checks only states that
-            were changed by the caller, and not those returned by the previous step.
+        checked: the ``motion`` array that is known to be finite; None before a check. A step checks only states
+            that the caller changed, not the state that the previous step returned.
     """
 
     motion: Array
@@ -76,12 +77,12 @@ class DMPState(NamedTuple):
 
     @property
     def phase(self) -> float:
-        """Phase s: 1 at the start, 0.01 at the end, then towards 0."""
+        """Phase s: 1 at the start, 0.01 at the end, and then decaying to 0."""
         return float(np.exp(-DECAY * self.fraction))
 
     @property
     def time(self) -> float:
-        """Time of the primitive's own clock [s]; it is behind the wall clock when the robot lagged."""
+        """Time of the primitive's own clock [s]; it falls behind the wall clock when the robot lags."""
         return self.fraction * self.target.duration
 
     @property
@@ -111,19 +112,21 @@ class DMP:
     **Another start or goal.** With ``p`` the fraction of the path that has been travelled (a primitive from 0 to 1 with
     weights w_p), ``adjustment`` selects the weights:
 
-    * ``"progress"``: w + (change of g - x_0) w_p. The change is added in proportion to the travelled path. So the
-      motion rests where the demonstration rests, it never goes backwards when the distance is halved, and an axis
-      without motion needs no special treatment.
-    * ``"hoffmann"``: w as learned, the published form. The change is added as fast as the spring allows.
+    * ``"progress"``: w + (change of g - x_0) w_p. The change of start and goal is added in proportion to the travelled
+      path. The motion therefore rests where the demonstration rests, does not reverse when the distance is halved, and
+      needs no special treatment for an axis without motion.
+    * ``"hoffmann"``: w as learned, the published form. The change of start and goal is added as fast as the spring
+      allows.
     * ``"rotodilatation"``: w rotated and stretched as g - x_0 is (Ginesi et al. 2019), for a shape that scales.
 
-    **Integration.** A step is exact for a target that is a parabola within each 1/200 of the duration, so ``step`` and
-    ``generate`` agree, and neither the path nor its end depends on the step length.
+    **Integration.** The integration is exact for a target that is a parabola within each 1/200 of the duration.
+    Therefore ``step`` and ``generate`` agree, and the path and its end do not depend on the step length.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
         n_basis: number N of basis functions.
-        regularisation: of the ridge regression, relative to the mean square response of a basis function.
+        regularisation: regularisation of the ridge regression, relative to the mean square response of a basis
+            function.
 
     Attributes:
         gains_: stiffness and damping.
@@ -131,9 +134,9 @@ class DMP:
         progress_weights_: w_p, shape (N,).
         start_: learned start x_0, shape (3,) [m].
         goal_: learned goal g, shape (3,) [m].
-        start_velocity_: learned, shape (3,) [m/s].
+        start_velocity_: learned start velocity, shape (3,) [m/s].
         duration_: learned [s].
-        path_length_: of the learned motion [m].
+        path_length_: path length of the learned motion [m].
         orientation_: primitive of the rotation; None when the demonstration had no quaternions.
 
     Raises:
@@ -160,12 +163,13 @@ class DMP:
 
         Args:
             trajectory: the motion to reproduce.
-            exact_ends: start and end exactly at the first and the last sample and rotation. Otherwise a noisy first or
+            exact_ends: whether to start and end exactly at the first and the last sample and rotation. Otherwise a
+                noisy first or
                 last sample is smoothed: if it is more than 0.1 mm from the path that fits all samples, the
                 motion starts or ends on that path.
 
         Raises:
-            InputError: when it has fewer than 3 samples.
+            InputError: when the trajectory has fewer than 3 samples.
         """
         instance(trajectory, Trajectory, "DMP.fit: trajectory")
         flag(exact_ends, "DMP.fit: exact_ends")
@@ -265,7 +269,7 @@ class DMP:
             start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
             goal: likewise.
             duration: [s]; None: as learned.
-            start_velocity: (3,) [m/s]; None: as learned, scaled with the duration.
+            start_velocity: start velocity (3,) [m/s]; None: the learned one, scaled with the duration.
             adjustment: how the motion is changed for another start and goal, see the class.
 
         Raises:
@@ -299,7 +303,7 @@ class DMP:
         """Return the state ``dt`` seconds later.
 
         Args:
-            state: from :meth:`begin` or the last step.
+            state: state returned by :meth:`begin` or by the last step.
             dt: [s], above 0.
             goal: another goal position (3,) [m] from now on, for a goal that moves.
             coupling: function from position (3,) [m] and velocity (3,) [m/s] to an acceleration (3,) [m/s^2] that is
@@ -307,7 +311,7 @@ class DMP:
                 an angular acceleration [rad/s^2].
             measured: measured position of the robot (3,) [m]. The primitive's clock slows down by
                 ``1 / (1 + |lag| / patience)`` (phase stopping), so that the primitive waits for a robot that lags.
-            patience: lag at which the clock runs at half speed [m].
+            patience: lag at which the primitive's clock runs at half speed [m].
 
         Raises:
             InputError: when an argument is not finite or of a wrong shape, ``dt`` is not above 0 or above
@@ -368,16 +372,17 @@ class DMP:
         samples are computed at once.
 
         Args:
-            start: as in :meth:`begin`.
-            goal: as in :meth:`begin`.
-            duration: as in :meth:`begin`.
+            start: see :meth:`begin`.
+            goal: see :meth:`begin`.
+            duration: see :meth:`begin`.
             dt: step [s].
-            start_velocity: as in :meth:`begin`.
-            adjustment: as in :meth:`begin`.
-            coupling: as in :meth:`step`.
+            start_velocity: see :meth:`begin`.
+            adjustment: see :meth:`begin`.
+            coupling: see :meth:`step`.
 
         Raises:
-            InputError: as :meth:`begin`, and when ``dt`` is not above 0 or longer than twice the duration.
+            InputError: for the same reasons as :meth:`begin`, and when ``dt`` is not above 0 or longer than twice the
+                duration.
         """
         state = self.begin(start, goal, duration, start_velocity=start_velocity, adjustment=adjustment)
         T = state.target.duration

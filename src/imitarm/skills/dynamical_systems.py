@@ -37,14 +37,14 @@ _NOISE = 1e-4  # [m] the repeatability of industrial arms
 
 @dataclass(frozen=True)
 class PhaseBasis:
-    r"""Basis functions over the phase s, which falls from 1 to 0.01 during the motion and then towards 0.
+    r"""Basis functions over the phase s, which decays from 1 to 0.01 during the motion and then to 0.
 
     .. math::
         \tau \dot s = -\alpha s, \qquad b_i(s) = \frac{\psi_i(s) s}{\sum_j \psi_j(s)}, \qquad
         \psi_i(s) = \exp(-h_i (s - c_i)^2)
 
-    (thesis Eqs 2.10 and 2.11.) The centres are equally spaced in time, and h_i is 2 over the squared distance to the
-    next centre.
+    (thesis Eqs 2.10 and 2.11.) The centres are equally spaced in time, and h_i is 2 divided by the squared distance to
+    the next centre.
 
     Attributes:
         n_basis: number N of functions.
@@ -108,11 +108,11 @@ class Gains(NamedTuple):
 
     @classmethod
     def of(cls, gains: str | Gains, what: str) -> Self:
-        """Return gains by name, or the given ones after a check.
+        """Return the gains of this name, or check and return the given gains.
 
         Args:
             gains: a name in ``GAINS``, or stiffness and damping.
-            what: the class that uses them, for messages.
+            what: name of the class that uses them, for messages.
 
         Raises:
             UnknownNameError: when there are no gains of that name.
@@ -134,14 +134,15 @@ GAINS = {"critical": Gains(139.26, 2.0 * float(np.sqrt(139.26))), "thesis": Gain
 class Propagator(NamedTuple):
     """One step of the spring: ``z_next = transition @ z + drive @ [y_0; ...; y_2m]``, with z = [x; tau x'].
 
-    The step is divided into m equal parts, and the target ``y`` is given at the beginning, middle and end of each. A
-    part is exact when the target is a parabola within it, so the error falls with the fourth power of its length. A
+    The step is divided into m equal parts, and the target ``y`` is given at the beginning, middle and end of each. The
+    integration over a part is exact if the target is a parabola within it, so the error falls with the fourth power of
+    the part's length. A
     part is at most 1/200 of the duration, and at most a fifth of the distance between two basis functions.
 
     Attributes:
         transition: shape (2, 2).
         drive: shape (2, 2 m + 1).
-        push: change of z by an acceleration of 1 (in units of the duration) that is held during the step, shape (2,).
+        push: change of z due to a constant acceleration of 1 (in units of the duration) during the step, shape (2,).
         instants: times at which the target is needed, as fractions of the duration since the start of the step, shape
             (2 m + 1,).
     """
@@ -162,7 +163,7 @@ def propagator(gains: Gains, step: float, n_basis: int = 0) -> Propagator:
     """Return one step of the spring.
 
     Args:
-        gains: of the spring.
+        gains: gains of the spring.
         step: fraction of the duration, above 0.
         n_basis: number of basis functions of the target.
     """
@@ -192,7 +193,7 @@ def targets_by_step(step: Propagator, target: Array) -> Array:
 
 
 def roll_out(step: Propagator, start: Array, target: Array) -> Array:
-    """Return the states after all steps at once.
+    """Return the states after all steps, computed at once.
 
     The recursion ``z_k = E z_(k-1) + q_k`` is summed by doubling: after j passes each state holds the sum of its last
     2^j terms, so n steps take log2(n) passes over whole arrays instead of a loop.
@@ -200,7 +201,7 @@ def roll_out(step: Propagator, start: Array, target: Array) -> Array:
     Args:
         step: one of n equal steps.
         start: [x; tau x'] at the beginning, shape (2, C).
-        target: y at the instants of all steps in turn, shape (2 n m + 1, C).
+        target: y at the instants of all steps, one step after the other, shape (2 n m + 1, C).
 
     Returns:
         x and tau x', shape (2, n + 1, C).
@@ -220,10 +221,10 @@ def roll_out(step: Propagator, start: Array, target: Array) -> Array:
 
 
 class PlannedSteps(NamedTuple):
-    """All steps of one length through a motion, computed in advance.
+    """All steps of a motion with one step length, computed in advance.
 
     Attributes:
-        transition: of one step, shape (2, 2).
+        transition: transition matrix of one step, shape (2, 2).
         pushes: contribution of the target to each of the n steps, arrays of shape (2, 3).
     """
 
@@ -240,7 +241,7 @@ class MovingTarget:
     Attributes:
         start: x_0, position (3,) [m].
         goal: g, position (3,) [m].
-        duration: of the motion [s].
+        duration: duration of the motion [s].
         adjustment: how the learned motion is changed for another start and goal.
         drive: w - (g - x_0), with the weights w adjusted to this start and goal, shape (N, 3) [m].
     """
@@ -263,9 +264,9 @@ class MovingTarget:
     def plan(self, gains: Gains, step: float) -> PlannedSteps | None:
         """Return all steps of length ``step`` [fraction of the duration]; None in the first call with this length.
 
-        The target does not depend on the state, so a caller that uses a fixed step needs it computed only once. A
-        moving goal gives a new target at every step. Such a target is used only once, so no plan is computed in the
-        first call.
+        The target does not depend on the state, so for a fixed step it is computed only once. A
+        moving goal gives a new target at every step. A target of this kind is used only once, so the first call
+        computes no plan.
         """
         if step not in self._plans:
             self._plans[step] = None
@@ -297,7 +298,7 @@ class FittedWeights(NamedTuple):
         weights: w, shape (N, 3) [m].
         progress_weights: w_p, shape (N,).
         start_rate: T x'(0), shape (3,) [m].
-        path_length: of the fitted motion [m].
+        path_length: path length of the fitted motion [m].
     """
 
     start: Array
@@ -310,7 +311,7 @@ class FittedWeights(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Responses:
-    """Responses of the spring on the fine grid: to a start of 1, a rate of 1, a goal of 1, and each basis function."""
+    """Responses of the spring on the fine grid to a unit start, a unit rate, a unit goal, and each basis function."""
 
     values: Array  # (n_steps + 1, 3 + N)
     rates: Array
@@ -334,25 +335,26 @@ def fit_weights(
 ) -> FittedWeights:
     r"""Return the weights with which the primitive reproduces a path.
 
-    The motion is linear in ``d_i = w_i - (g - x_0)``. With R the spring's responses to a start, a rate, a goal and each
-    basis function, ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression compares
-    forces, ``tau v' + D v`` and so on, and needs measured accelerations. Here both sides are filtered by the spring
-    itself, which turns forces into positions. So noise is not differentiated, samples may lie at any times, and the
+    The motion is linear in ``d_i = w_i - (g - x_0)``. With the responses R of the spring to a start, a rate, a goal and
+    each basis function, ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression compares
+    forces
+    (such as ``tau v' + D v``) and needs measured accelerations. Here the spring itself filters both sides,
+    which converts forces to positions. Therefore noise is not differentiated, the samples may have any times, and the
     regression minimises the error of the reproduction in metres.
 
     The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. If noise
     moves one of them more than 0.1 mm away from the path that fits all samples, the end of this path is used instead,
     because a motion forced through a noisy sample would jerk there. ``exact_ends`` turns this off. The last drive is 0,
-    so that the target is the goal when the duration is over. (The regression hardly determines it; left free, it can
-    pull the tool decimetres off the goal after the end.)
+    so that the target is the goal when the duration is over. (The regression hardly determines the last drive; without
+    this condition, it can pull the tool decimetres away from the goal after the end.)
 
     Args:
-        fraction: of the duration, from 0 to 1, shape (n,).
+        fraction: fraction of the duration, from 0 to 1, shape (n,).
         x: positions, shape (n, 3) [m].
-        gains: of the spring.
+        gains: gains of the spring.
         n_basis: number N of basis functions.
-        regularisation: of the ridge regression, relative to the mean square response.
-        exact_ends: take the first and the last sample as they are, without smoothing.
+        regularisation: regularisation of the ridge regression, relative to the mean square response.
+        exact_ends: whether to use the first and the last sample without smoothing.
     """
     responses = _responses(gains, n_basis)
     R = responses.spline(fraction)
@@ -388,7 +390,7 @@ def _without_last(R: Array, y: Array, force: Array, regularisation: float, end: 
 
 
 def _beside(R: Array, y: Array, n_basis: int, regularisation: float) -> Array:
-    """Return the distance of the best path from the first and the last sample, rows (start, 0, goal) [m]."""
+    """Return the offset of the best path from the first and the last sample, rows (start, 0, goal) [m]."""
     columns = np.concatenate([R[:, :1], R[:, 3:-1]], axis=1)
     solution = _ridge(columns, y, np.append(1.0, phase_basis(n_basis).centers[:-1]), regularisation)
     start, goal = columns[[0, -1]] @ solution - y[[0, -1]]
@@ -431,7 +433,7 @@ def start_rate(fraction: Array, x: Array, part: float = _START) -> Array:
     of the mean speed: a motion that begins at rest begins exactly at rest.
 
     Args:
-        fraction: of the duration, from 0 to 1, shape (n,).
+        fraction: fraction of the duration, from 0 to 1, shape (n,).
         x: positions, shape (n, 3) [m].
         part: fraction of the duration that the parabola covers; at least 6 samples are used.
     """

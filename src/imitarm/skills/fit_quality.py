@@ -34,8 +34,8 @@ class DemonstrationDistance:
         source: the source of the demonstration.
         rms: root mean square over its samples [m].
         largest: [m].
-        start: at its first sample [m].
-        goal: at its last sample [m].
+        start: distance at its first sample [m].
+        goal: distance at its last sample [m].
     """
 
     source: str
@@ -54,13 +54,13 @@ class FitQuality:
     above 5 % of the motion's extent is not :attr:`faithful`.
 
     Attributes:
-        distances: of the nominal path to each demonstration.
+        distances: distances of the nominal path to each demonstration.
         n_components: number of Gaussians of the skill.
         extent: diagonal of the box that contains the average motion [m].
-        bias: of the nominal path [m].
-        primitive_bias: of the movement primitive's path [m].
+        bias: bias of the nominal path [m].
+        primitive_bias: bias of the movement primitive's path [m].
         rotation_extent: largest angle between the average rotation and its start [rad]; 0 without rotations.
-        rotation_bias: of the nominal rotation [rad]; 0 without rotations.
+        rotation_bias: bias of the nominal rotation [rad]; 0 without rotations.
         period: time after which the motion repeats [s]; None when it repeats less than three times.
     """
 
@@ -88,7 +88,7 @@ class FitQuality:
 
     @property
     def problem(self) -> str:
-        """What is wrong with the fit and what to do about it; empty when the skill is faithful."""
+        """The problem of the fit and its remedy; empty when the skill is faithful."""
         texts: list[str] = []
         allowed = max(LARGEST_BIAS * self.extent, _NO_BIAS[0])
         for name, bias in (("nominal path", self.bias), ("movement primitive", self.primitive_bias)):
@@ -128,10 +128,10 @@ def evaluate_fit(gmr: GMR, dmp: DMP, trajectories: Sequence[Trajectory], sources
     """Compare a regression and a primitive with the demonstrations that they were learned from.
 
     Args:
-        gmr: fitted to the demonstrations.
-        dmp: fitted to the nominal path of ``gmr``.
+        gmr: regression fitted to the demonstrations.
+        dmp: primitive fitted to the nominal path of ``gmr``.
         trajectories: the demonstrations; their times are scaled to the duration of ``gmr``.
-        sources: one text for each of them.
+        sources: source of each demonstration, for example a file name.
     """
     T = gmr.duration_
     distances = []
@@ -170,11 +170,11 @@ def _rms(differences: Array) -> float:
 
 
 def _period(times: Array, positions: Array) -> float | None:
-    """Return the period [s] of a motion, apart from a constant drift; None when it repeats less than three times.
+    """Return the period [s] of a motion, ignoring a constant drift; None when it repeats less than three times.
 
     For each lag, the mean squared difference between the motion and the motion one lag later is compared with the value
-    for independent positions. The period is the first local minimum below 10 % of that value, after the difference has
-    been above 50 % of it.
+    for independent positions. The period is the first local minimum below 10 % of that value, provided that the
+    difference exceeded 50 % of that value at a shorter lag.
     """
     n = len(times)
     drift = np.linspace(0.0, 1.0, n)[:, None] * (positions[-1] - positions[0])

@@ -27,14 +27,15 @@ _MOST_COMPONENTS = 10_000
 
 
 class DegenerateAxisWarning(UserWarning):
-    """A column does not change, so nothing can be learned from it; it does not influence the other columns."""
+    """A column is constant, so nothing can be learned from it; it does not influence the other columns."""
 
 
 def ellipsoid_scale(probability: float, n_dims: int) -> float:
     """Return the semi-axis, in standard deviations, of the ellipsoid that contains ``probability`` of a Gaussian.
 
     The squared Mahalanobis distance of a Gaussian in ``n_dims`` dimensions has a chi-square distribution with
-    ``n_dims`` degrees of freedom. So the semi-axes are ``scale * sqrt(eigenvalue)`` with the scale 1.960, 2.448, 2.796
+    ``n_dims`` degrees of freedom. The semi-axes are therefore ``scale * sqrt(eigenvalue)`` with the scale 1.960, 2.448,
+    2.796
     for 95 % in 1, 2, 3 dimensions. The factor 1.960 for one dimension contains only 85 % in the plane and 72 % in
     space.
 
@@ -58,22 +59,22 @@ class GaussianMixture:
         N_k = \sum_n h_k(z_n), \quad \pi_k = N_k / N, \quad \mu_k = \frac{1}{N_k} \sum_n h_k z_n, \quad
         \Sigma_k = \frac{1}{N_k} \sum_n h_k z_n z_n^T - \mu_k \mu_k^T
 
-    (thesis 2.2.1). The names are those of scikit-learn. The differences:
+    (thesis 2.2.1). Names follow scikit-learn. The differences:
 
     * Columns are standardised internally, so the result does not depend on the units.
     * ``init="time"`` starts from the best division of column 0 into K segments
       (:func:`~imitarm.skills.mixture_fitting.responsibilities_by_segments`). It is deterministic and meant for samples
       [t; x].
-    * A column that does not move (a planar task has a constant z) does not influence the other columns. It is listed
+    * A constant column (such as z in a planar task) does not influence the other columns. It is listed
       in ``degenerate_axes_`` and reported by a :class:`DegenerateAxisWarning`.
 
     Args:
         n_components: number K of Gaussians.
         reg_covar: smallest eigenvalue of a covariance, relative to the variances of the columns.
         n_init: number of starts; the best fit is kept. All but the first start from k-means++ seeds.
-        init: the first start: ``"time"`` (segments of column 0) or ``"kmeans++"``.
+        init: method for the first start: ``"time"`` (segments of column 0) or ``"kmeans++"``.
         min_std: smallest standard deviation of a column [the column's unit] that counts as motion, one number or one
-            per column. A column that does not move is given this standard deviation.
+            per column. A constant column is given this standard deviation.
         random_state: seed of the k-means++ starts.
         tol: stop when the mean log-likelihood per sample changes by less.
         max_iter: largest number of iterations of one start.
@@ -85,7 +86,7 @@ class GaussianMixture:
         lower_bound_: mean log-likelihood per sample of the fitted data.
         converged_: whether the last change of ``lower_bound_`` was below ``tol``.
         n_iter_: number of iterations.
-        degenerate_axes_: indices of the columns that do not move.
+        degenerate_axes_: indices of the constant columns.
 
     Raises:
         InputError: when an option is out of range.
@@ -128,7 +129,7 @@ class GaussianMixture:
 
         Raises:
             InputError: when ``X`` is not a table of finite numbers, has fewer than 2 samples or fewer samples than
-                components, or none of its columns moves.
+                components, or all columns are constant.
         """
         X = _table(X, "GaussianMixture.fit")
         if self.min_std.ndim and len(self.min_std) != X.shape[1]:
@@ -166,7 +167,7 @@ class GaussianMixture:
         return self
 
     def _standardisation(self, X: Array) -> tuple[Array, Array, NDArray[np.bool_], Array]:
-        """Return mean and deviation of the columns, which of them move, and the deviation of those that don't."""
+        """Return mean and deviation of the columns, whether each varies, and the deviation of the constant columns."""
         center = X.mean(axis=0)
         scale = X.std(axis=0)
         largest = np.abs(X).max(axis=0)
@@ -178,7 +179,7 @@ class GaussianMixture:
         return center, scale, moves, least
 
     def _starts(self, features: Array, column: Array, Z: Array) -> Array:
-        """Return the responsibilities (n_init, K, n) to start from."""
+        """Return the initial responsibilities (n_init, K, n)."""
         rng = np.random.default_rng(self.random_state)
         starts = responsibilities_by_segments(features, column, [self.n_components]) if self.init == "time" else []
         while len(starts) < self.n_init:
@@ -186,7 +187,7 @@ class GaussianMixture:
         return np.stack(starts)
 
     def _fixed_score(self, X: Array) -> Array:
-        """Return the log-density (n,) of the columns that do not move."""
+        """Return the log-density (n,) of the constant columns."""
         offset = X[:, ~self._moves] - self._center[~self._moves]
         return -0.5 * np.sum(offset**2 / self._fixed_variance + np.log(self._fixed_variance) + LOG_2PI, axis=1)
 
@@ -225,7 +226,7 @@ class GaussianMixture:
 
     @property
     def n_parameters(self) -> int:
-        """Number of free parameters: K - 1 priors, K means, K symmetric covariances of the columns that move."""
+        """Number of free parameters: K - 1 priors, K means, K symmetric covariances, without the constant columns."""
         K, d = self.n_components, self.means_.shape[1] - len(self.degenerate_axes_)
         return K - 1 + K * d + K * d * (d + 1) // 2
 
@@ -266,7 +267,7 @@ class GaussianMixture:
 def _in_units(
     means: Array, covariances: Array, center: Array, scale: Array, moves: NDArray[np.bool_], fixed_std: Array
 ) -> tuple[Array, Array]:
-    """Return means and covariances in the units of the samples, with the columns that do not move."""
+    """Return means and covariances in the units of the samples, including the constant columns."""
     K = len(means)
     all_means = np.repeat(center[None], K, axis=0)
     all_means[:, moves] += means * scale[moves]

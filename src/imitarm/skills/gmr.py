@@ -37,7 +37,7 @@ _CLOCK_DIGITS = 6  # microseconds, the resolution of epoch times: rounded, they 
 
 
 class SingleDemonstrationWarning(UserWarning):
-    """There is only one demonstration, so the covariance shows the error of the fit, not how much a person varies."""
+    """There is only one demonstration, so the covariance shows only the error of the fit."""
 
 
 class UnalignedWarning(UserWarning):
@@ -48,7 +48,7 @@ class GMR:
     r"""Gaussian mixture regression over time, of positions and rotations.
 
     A :class:`~imitarm.skills.gmm.GaussianMixture` is fitted to all samples z = [t; x] of all demonstrations, and then
-    conditioned on t (thesis Eq 2.6, in which the responsibilities h_k are missing in print):
+    conditioned on t (thesis Eq 2.6, where the printed version lacks the responsibilities h_k):
 
     .. math::
         \beta_k = \Sigma_k^{xt} / \Sigma_k^{tt}, \quad
@@ -60,26 +60,26 @@ class GMR:
         \hat x(t) = \sum_k h_k m_k, \qquad
         \hat\Sigma(t) = \sum_k h_k \left( S_k + (m_k - \hat x)(m_k - \hat x)^T \right)
 
-    When the demonstrations have quaternions, x has six columns: the position [m] and a rotation vector [rad] from a
-    reference rotation, which moves with the motion when that rotates far
+    When the demonstrations have quaternions, x has six columns: the position [m] and a rotation vector [rad]
+        relative to a reference rotation; the reference follows the motion if the tool rotates far
     (:class:`~imitarm.skills.rotations.RotationReference`).
 
-    Times are counted from the first sample. Outside the demonstrated span the ends are held, because the linear pieces
-    would drift away.
+    Times are counted from the first sample. Outside the demonstrated time span, the values at its ends are returned,
+    because the linear pieces would drift away.
 
     Args:
-        n_components: number K of Gaussians, or ``"auto"``: the smallest K that reproduces left-out demonstrations as
-            well as any and has little bias, see :func:`~imitarm.skills.mixture_fitting.choose`.
+        n_components: number K of Gaussians, or ``"auto"``: the smallest K that reproduces held-out demonstrations as
+            well as any other and has little bias, see :func:`~imitarm.skills.mixture_fitting.choose`.
         candidates: the numbers that ``"auto"`` tries; None: 2 to 16, and more while the bias is large.
-        reg_covar: as in GaussianMixture.
-        n_init: as in GaussianMixture.
+        reg_covar: see :class:`~imitarm.skills.gmm.GaussianMixture`.
+        n_init: see :class:`~imitarm.skills.gmm.GaussianMixture`.
         min_std: smallest standard deviations that count as motion (position [m], rotation [rad]).
-        random_state: seed of further starts when ``n_init`` is above 1.
+        random_state: seed of the additional starts when ``n_init`` is above 1.
 
     Attributes:
         n_components_: number K of Gaussians.
         selection_: results of ``"auto"``, one entry per number of components; empty when the number was given.
-        duration_: demonstrated span [s]; the median when demonstrations differ.
+        duration_: demonstrated duration [s]; the median when the demonstrations differ.
         n_demonstrations_: number of demonstrations.
         has_orientation_: whether rotations were learned.
         weights_: priors, shape (K,).
@@ -87,7 +87,7 @@ class GMR:
         covariances_: of [t; x], shape (K, 1 + D, 1 + D).
         reference_: the reference of the rotation vectors; None without rotations.
         ends_: mean start and mean goal of the demonstrations, as x (position, rotation vector), shape (2, D).
-        degenerate_axes_: columns of x that do not move: 0 to 2 for x, y, z, 3 to 5 for rotations.
+        degenerate_axes_: constant columns of x: 0 to 2 for x, y, z, 3 to 5 for rotations.
         converged_: whether the fit converged.
         lower_bound_: mean log-likelihood per sample.
 
@@ -135,8 +135,8 @@ class GMR:
     def fit(self, demonstrations: Sequence[Demonstration | Trajectory]) -> Self:
         """Learn from demonstrations, aligned beforehand (``imitarm.demonstrations.align``).
 
-        Times may start anywhere: the first time of each demonstration is subtracted. Durations that differ by more than
-        1 % are scaled to their median, with an :class:`UnalignedWarning`.
+        Times may start anywhere: the first time of each demonstration is subtracted. Durations that differ by more
+            than 1 % are scaled to their median, and the method issues an :class:`UnalignedWarning`.
 
         Raises:
             InputError: when there is no demonstration, only some have quaternions, or there are fewer samples than
@@ -147,8 +147,7 @@ class GMR:
         min_std = np.array([0.0, *[self.min_std[0]] * 3, *[self.min_std[1]] * 3])[: tables[0].shape[1]]
         if len(tables) == 1:
             warnings.warn(
-                "only one demonstration: the covariance shows the error of the fit, not how much a person varies; "
-                "give 3 or more",
+                "only one demonstration: the covariance shows only the error of the fit; give 3 or more",
                 SingleDemonstrationWarning,
                 stacklevel=2,
             )
@@ -375,7 +374,7 @@ class GMR:
         return np.asarray(blend @ gaps)
 
     def _mean_ends(self, demonstrations: Sequence[Demonstration | Trajectory]) -> Array:
-        """Return the mean of the demonstrated starts and of the goals, as x, shape (2, D)."""
+        """Return the mean start and the mean goal of the demonstrations, as rows x, shape (2, D)."""
         motions = [d.trajectory if isinstance(d, Demonstration) else d for d in demonstrations]
         rows = [np.mean([m.positions[i] for m in motions], axis=0) for i in (0, -1)]
         if self.reference_ is not None:
@@ -414,7 +413,7 @@ def samples_of(
     if isinstance(demonstrations, str) or not isinstance(demonstrations, Sequence):
         raise InputError(f"GMR.fit: demonstrations must be a list, got {type(demonstrations).__name__}")
     if len(demonstrations) < 1:
-        raise InputError("GMR.fit: no demonstrations; give at least 1, better 3 or more")
+        raise InputError("GMR.fit: no demonstrations; give at least 1, preferably 3 or more")
     trajectories = [d.trajectory if isinstance(d, Demonstration) else d for d in demonstrations]
     for i, trajectory in enumerate(trajectories):
         if not isinstance(trajectory, Trajectory):

@@ -1,4 +1,4 @@
-"""Fitting Gaussian mixtures: expectation maximisation (EM), its start, and the number of components.
+"""Fitting Gaussian mixtures: initialisation, expectation maximisation (EM), and the number of components.
 
 The logarithm of a weighted Gaussian is linear in the quadratic features ``phi(z) = [1, z_i, z_i z_j (i <= j)]``::
 
@@ -179,11 +179,11 @@ def expectation_maximisation(
 
     Args:
         features: :func:`quadratic_features` of the standardised samples, shape (F, n).
-        responsibilities: of the start, shape (B, K, n).
-        sample_weights: of each sample in each fit, shape (B, n); 0 leaves it out. None: all 1.
+        responsibilities: initial responsibilities, shape (B, K, n).
+        sample_weights: weight of each sample in each fit, shape (B, n); 0 excludes the sample. None: all 1.
         floor: smallest eigenvalue of a covariance, in squared standard deviations of the columns.
         tol: stop when the mean log-likelihood per sample changes by less, in every fit.
-        max_iter: most iterations.
+        max_iter: largest number of iterations.
     """
     fraction = None if sample_weights is None else sample_weights / sample_weights.sum(axis=1, keepdims=True)
     last = np.full(len(responsibilities), -np.inf)
@@ -204,16 +204,16 @@ def expectation_maximisation(
 def responsibilities_by_segments(features: Array, column: Array, numbers: Sequence[int]) -> list[Array]:
     """Divide time into the K segments that are described best by one Gaussian each, for several K at once.
 
-    The span of ``column`` is divided into equal slots. A segment with n of the N samples and covariance Sigma
+    The range of ``column`` is divided into equal slots. A segment with n of the N samples and covariance Sigma
     costs ``n (log det Sigma / 2 - log(n / N))``, the negative log-likelihood under a Gaussian of its own, plus a small
     amount for its squared length, so that lengths are equal where the data allow it. Dynamic programming over the slots
-    finds the cheapest division for every K up to the largest. It is deterministic, and EM needs fewer iterations from
-    there than from equal bins.
+    finds the cheapest division for every K up to the largest. The result is deterministic, and EM converges in fewer
+    iterations from it than from equal bins.
 
     Args:
-        features: of the standardised samples, shape (F, n).
+        features: :func:`quadratic_features` of the standardised samples, shape (F, n).
         column: times of the samples, shape (n,).
-        numbers: the numbers K of segments.
+        numbers: numbers K of segments to compute.
 
     Returns:
         Responsibilities of 0 or 1, shape (K, n), in the order of time, for each K; equal bins for few samples or gaps.
@@ -276,7 +276,7 @@ def responsibilities_by_bins(column: Array, n_bins: int) -> Array:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One number of components, evaluated.
+    """The errors and criteria of one number of components.
 
     Attributes:
         n_components: the number K.
@@ -302,11 +302,12 @@ def choose(candidates: Sequence[Candidate]) -> int:
 
     * whose held-out error is within 2 % (or 0.1 mm) of the smallest, so it generalises as well as any, and
     * whose bias is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small beside the
-      differences between demonstrations. The held-out error alone hardly shows a bias, because it adds in squares to
-      the larger differences.
+      differences between demonstrations. The held-out error alone hardly shows a bias, because the squared bias is
+      added to much larger squared differences.
 
-    If no K meets both, it is the smallest K that generalises and whose bias is within a tenth of the smallest bias
-    among those. BIC alone keeps growing with K on data over time, because neighbouring samples are not independent. BIC
+    If no K meets both conditions, the result is the smallest K that meets the first one and whose bias is at most a
+    tenth above the smallest bias among those. BIC alone selects ever larger K for time series, because neighbouring
+    samples are not independent. BIC
     decides only when there is one demonstration, because then none can be left out.
     """
     ordered = sorted(candidates, key=lambda c: c.n_components)
@@ -332,17 +333,19 @@ def try_numbers_of_components(
 ) -> tuple[Candidate, ...]:
     """Evaluate several numbers of components.
 
-    For each, the fit to all demonstrations and the fits that leave one out run side by side, as rows of the same
-    matrix products. Only a part of the samples is used; a longer path uses more. For a motion of the rotation alone,
+    For each number, the fit to all demonstrations and the fits without one demonstration run together, as rows of the
+    same matrix products. Only a subset of the samples is used; a longer path uses more of them. For a motion of the
+    rotation
+    alone,
     errors are those of a point 100 mm from the axis. The search stops when four numbers in a row did not reduce the
     held-out error by 0.5 %, and one number meets both conditions of :func:`choose`.
 
     Args:
         tables: samples [t, x, y, z, ...] of each demonstration, over the same span of time.
-        numbers: numbers K to try.
+        numbers: numbers K of components to try.
         min_std: smallest standard deviations that count as motion, one per column.
         reg_covar: smallest eigenvalue of a covariance relative to the variances of the columns.
-        more: numbers to try, in this order, while every bias so far is above 1 % of the motion's extent.
+        more: further numbers to try, in this order, while every bias so far is above 1 % of the motion's extent.
 
     Raises:
         InputError: when there are fewer samples than the smallest number.

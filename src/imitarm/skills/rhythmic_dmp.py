@@ -24,7 +24,9 @@ _CLOSES = 0.1  # of the extent: a motion that ends a period further than this fr
 
 
 class RhythmicDMPState(NamedTuple):
-    """State of a rhythmic primitive during a motion. Made by ``RhythmicDMP.begin``, advanced by ``RhythmicDMP.step``.
+    """State of a rhythmic primitive during a motion.
+
+    ``RhythmicDMP.begin`` creates it and ``RhythmicDMP.step`` advances it.
 
     Attributes:
         motion: [x; P x'], shape (2, D): position [m], and the rotation vector [rad] where rotation was learned.
@@ -52,7 +54,7 @@ class RhythmicDMPState(NamedTuple):
 
 
 class RhythmicDMP:
-    r"""Rhythmic movement primitive, for wiping, stirring, polishing.
+    r"""Rhythmic movement primitive, for example for wiping, stirring or polishing.
 
     .. math::
         \tau \dot v = K (g - x) - D v + K r f(\phi), \quad \tau \dot x = v, \quad \tau \dot \phi = 2 \pi
@@ -63,12 +65,13 @@ class RhythmicDMP:
     tau is the period, g the centre of the motion, r its amplitude (the rhythmic form of Ijspeert et al. 2013). The
     weights come from ridge regression on the positions. The periodic response to each basis function is known exactly:
     its Fourier coefficient at the k-th harmonic is multiplied by ``K / (K - (2 pi k)^2 + 2 pi k D i)``. Rotations are
-    rotation vectors from their mean rotation; they must stay within 120 degrees of it.
+    represented by rotation vectors relative to their mean rotation; they must stay within 120 degrees of it.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
         n_basis: number N of basis functions in one period.
-        regularisation: of the ridge regression, relative to the mean square response of a basis function.
+        regularisation: regularisation of the ridge regression, relative to the mean square response of a basis
+            function.
 
     Attributes:
         gains_: stiffness and damping.
@@ -114,7 +117,7 @@ class RhythmicDMP:
 
         Args:
             trajectory: the motion; its first time need not be 0.
-            period: [s]; None: the trajectory is exactly one period.
+            period: period of the motion [s]; None: the trajectory is exactly one period.
 
         Raises:
             InputError: when the period is not above 0 or is longer than the trajectory, when positions one period apart
@@ -164,11 +167,11 @@ class RhythmicDMP:
         """Return the state at phase 0.
 
         Args:
-            start: position of the tool at rest, from which the motion approaches the rhythm. None: the motion begins in
-                the rhythm.
-            center: another centre of the positions (3,) [m]; None: as learned.
+            start: position of the tool at rest, from which the motion approaches the learned cycle. None: the motion
+                begins on the learned cycle.
+            center: another centre of the positions (3,) [m]; None: the learned one.
             amplitude: factor on the learned motion.
-            period: [s]; None: as learned.
+            period: period of the motion [s]; None: the learned one.
 
         Raises:
             InputError: when not fitted, or an argument is out of range.
@@ -208,8 +211,8 @@ class RhythmicDMP:
         """Return the state ``dt`` seconds later.
 
         Args:
-            state: from :meth:`begin` or the last step; replace ``amplitude``, ``center`` or ``period`` in it to change
-                the rhythm during the motion.
+            state: state returned by :meth:`begin` or by the last step; replace ``amplitude``, ``center`` or ``period``
+                in it to change the motion while it runs.
             dt: [s], above 0.
             coupling: function from position and velocity to an acceleration (3,) [m/s^2] that is added during this
                 step.
@@ -252,15 +255,15 @@ class RhythmicDMP:
         """Return the motion, ``round(duration / dt) + 1`` samples from 0 s to ``duration``.
 
         Args:
-            duration: [s]; None: one period.
+            duration: duration of the motion [s]; None: one period.
             dt: step [s], stretched so that a whole number of steps fills the duration.
-            start: as in :meth:`begin`.
-            center: as in :meth:`begin`.
-            amplitude: as in :meth:`begin`.
-            period: as in :meth:`begin`.
+            start: see :meth:`begin`.
+            center: see :meth:`begin`.
+            amplitude: see :meth:`begin`.
+            period: see :meth:`begin`.
 
         Raises:
-            InputError: as :meth:`begin`, and when ``duration`` or ``dt`` is out of range.
+            InputError: for the same reasons as :meth:`begin`, and when ``duration`` or ``dt`` is out of range.
         """
         state = self.begin(start, center=center, amplitude=amplitude, period=period)
         T = state.period

@@ -1,4 +1,4 @@
-"""Rotations in skills: rotation vectors from a reference rotation for mixtures, and a primitive."""
+"""Rotations in skills: rotation vectors relative to a reference (for mixtures), and a rotation primitive."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ class RotationReference:
     """A reference rotation, fixed or moving with time, in whose tangent space other rotations are vectors.
 
     A rotation ``R`` near the reference ``R_ref(t)`` has the rotation vector ``r = log(R R_ref(t)^T)`` [rad] in the base
-    frame. A fixed reference suffices while every rotation is well within 180 degrees of it. A longer rotation needs a
-    reference that moves: a cubic spline through a few key quaternions, normalised.
+    frame. A fixed reference suffices if all rotations are well within 180 degrees of it. A longer rotation needs a
+    moving reference: a cubic spline through a few key quaternions, normalised.
 
     Attributes:
-        times: of the keys [s], strictly increasing, shape (m,); a single key is a fixed reference.
+        times: times of the keys [s], strictly increasing, shape (m,); a single key is a fixed reference.
         quaternions: keys wxyz with continuous signs, shape (m, 4).
 
     Raises:
@@ -82,7 +82,7 @@ class RotationReference:
         return CubicSpline(self.times, self.quaternions)
 
     def at(self, times: ArrayLike) -> Array:
-        """Return the reference (n, 4) wxyz at ``times`` (n,) [s]; outside the keys, the nearest one is held."""
+        """Return the reference (n, 4) wxyz at ``times`` (n,) [s]; outside the keys' time span, the nearest key."""
         t = finite_numbers(times, "RotationReference: times", "s")
         if len(self.times) == 1:
             return np.repeat(self.quaternions, len(t), axis=0)
@@ -103,12 +103,12 @@ class RotationReference:
 
     @classmethod
     def among(cls, demonstrations: Sequence[tuple[Array, Array]]) -> RotationReference:
-        """Return the simplest reference that has all demonstrated rotations within 120 degrees.
+        """Return the simplest reference that is within 120 degrees of all demonstrated rotations.
 
-        That is the mean rotation, or else a spline through the mean rotations at 5, 9, 17 or 33 times.
+        This is the mean rotation if possible, otherwise a spline through the mean rotations at 5, 9, 17 or 33 times.
 
         Args:
-            demonstrations: times (n,) [s] from a common zero, and quaternions (n, 4) wxyz, of each demonstration.
+            demonstrations: times (n,) [s] on a common clock, and quaternions (n, 4) wxyz, of each demonstration.
 
         Raises:
             InputError: when demonstrations differ so much at the same time that there is no such reference.
@@ -158,7 +158,7 @@ class RotationState(NamedTuple):
         quaternion: wxyz, shape (4,).
         offset: [r; T r'] with T the duration and r the rotation vector from the target to the rotation, in the base
             frame, shape (2, 3) [rad]. It differs from 0 only because of a coupling.
-        fraction: of the duration that is over.
+        fraction: elapsed fraction of the duration.
         start_change: rotation vector (3,) [rad] from the learned start to the new one, in the base frame.
         goal_change: rotation vector (3,) [rad] from the learned goal to the new one, in the base frame.
     """
@@ -179,12 +179,13 @@ class QuaternionDMP:
     .. math::
         r = \log(R R_y(s)^T), \qquad \tau^2 \ddot r = -K r - D \tau \dot r + \tau^2 c
 
-    with c an angular acceleration from outside. Only ``r``, the distance from the target, goes through a logarithm,
-    never the distance to the goal. So a rotation by 270 degrees, or by three full revolutions, is reproduced as it was
-    shown. (Forms that use log(q_goal conj(q)) rotate in the opposite direction beyond 180 degrees.) The target is a
+    where c is an external angular acceleration. The logarithm is taken only of ``r``, the rotation from the target,
+    never of the rotation to the goal. Therefore a rotation by 270 degrees, or by three full revolutions, is reproduced
+    as demonstrated. (Forms that use log(q_goal conj(q)) rotate in the opposite direction beyond 180 degrees.) The
+    target is a
     cubic spline through quaternions with continuous signs, normalised. Another start or goal rotates the target in the
-    base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both changes are the
-    shorter of the two rotations.
+    base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both changes rotate by
+    at most 180 degrees.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
@@ -192,8 +193,8 @@ class QuaternionDMP:
 
     Attributes:
         gains_: stiffness and damping.
-        knots_: of the spline over the fraction of the duration, four at 0 and four at 1.
-        coefficients_: of the spline, shape (len(knots_) - 4, 4).
+        knots_: knots of the spline over the fraction of the duration, four at 0 and four at 1.
+        coefficients_: coefficients of the spline, shape (len(knots_) - 4, 4).
     """
 
     knots_: Array
@@ -208,11 +209,11 @@ class QuaternionDMP:
 
         Args:
             trajectory: the motion to reproduce.
-            exact_ends: start and end exactly at the first and the last rotation, instead of smoothing them.
+            exact_ends: whether to start and end exactly at the first and the last rotation instead of smoothing them.
 
         Raises:
             InputError: when it has no quaternions, or two neighbouring rotations are more than 90 degrees apart, so
-                that the path between them is not known.
+                that the rotation between them is ambiguous.
         """
         instance(trajectory, Trajectory, "QuaternionDMP.fit: trajectory")
         flag(exact_ends, "QuaternionDMP.fit: exact_ends")
@@ -227,7 +228,7 @@ class QuaternionDMP:
             row = int(np.argmax(jumps)) + 1
             raise InputError(
                 f"QuaternionDMP.fit: row {row} is rotated by {np.rad2deg(jumps.max()):.0f} degrees from the row "
-                "before, so the path between them is not known. Record at a higher rate, or repair the row"
+                "before, so the rotation between them is ambiguous. Record at a higher rate, or repair the row"
             )
         if len(fraction) <= _DEGREE + 1:  # too few for a cubic spline: interpolate along the shortest arcs
             dense = trajectory.resample(4 * (_DEGREE + 1))
@@ -332,7 +333,7 @@ class QuaternionDMP:
         """Return the state after ``step`` of the duration.
 
         Args:
-            state: from :meth:`begin` or the last step.
+            state: state returned by :meth:`begin` or by the last step.
             step: fraction of the duration, above 0.
             acceleration: T^2 times an angular acceleration (3,) [rad] in the base frame, held during the step; T is
                 the duration.
@@ -353,7 +354,7 @@ class QuaternionDMP:
 
 
 def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, goal_change: Array) -> Array:
-    """Return ``exp((1 - b) d_start) exp(b d_goal) R`` with b the minimum-jerk profile, quaternions wxyz (n, 4).
+    """Return ``exp((1 - b) d_start) exp(b d_goal) R`` as quaternions wxyz (n, 4); b is the minimum-jerk profile.
 
     Args:
         quaternions: R, the learned rotations wxyz, shape (n, 4).
@@ -368,15 +369,15 @@ def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, go
 
 
 def rotodilatation(learned: Array, asked: Array, path_length: float) -> Array:
-    """Return the smallest rotation, times a factor, that maps ``learned`` to ``asked``, shape (3, 3).
+    """Return the product of a factor and the smallest rotation that maps ``learned`` to ``asked``, shape (3, 3).
 
-    After Ginesi, Sansonetto and Fiorini (2019), "DMP++". A motion that returns to near its start defines no direction
-    and no length; the result is then the identity.
+    After Ginesi, Sansonetto and Fiorini (2019), "DMP++". If the learned motion ends near its start, its direction and
+    length are undefined, and the result is the identity.
 
     Args:
-        learned: from the learned start to the learned goal, shape (3,) [m].
-        asked: from the start to the goal of the new motion, shape (3,) [m].
-        path_length: of the learned motion [m].
+        learned: vector from the learned start to the learned goal, shape (3,) [m].
+        asked: vector from the start to the goal of the new motion, shape (3,) [m].
+        path_length: path length of the learned motion [m].
     """
     a, b = float(np.linalg.norm(learned)), float(np.linalg.norm(asked))
     if a <= _CLOSED * path_length or a == 0.0:

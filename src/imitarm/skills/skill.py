@@ -1,4 +1,4 @@
-"""A skill: a motion learned from demonstrations, and the required precision of each part of it."""
+"""A skill: a motion learned from demonstrations, and the precision that each part of it requires."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Skill:
 
     A :class:`~imitarm.skills.gmr.GMR` learns the mean motion and its covariance, which shows how much the
     demonstrations differ at each time. A :class:`~imitarm.skills.dmp.DMP` is trained on the nominal path: it can change
-    the start, the goal and the duration of the motion. The covariance is the tolerance: where the person was exact, the
-    robot must be. A skill knows nothing of obstacles; policies do.
+    the start, the goal and the duration of the motion. The covariance is the tolerance: the robot must be precise where
+    the person was precise. A skill knows nothing of obstacles; policies do.
 
     The nominal path and the primitive start and end exactly at the means of the demonstrated starts and goals.
 
@@ -51,15 +51,15 @@ class Skill:
     Attributes:
         gmr_: mean and covariance over time.
         dmp_: the primitive.
-        task_: what was shown, for example ``"sweep"``.
+        task_: name of the demonstrated task, for example ``"sweep"``.
         duration_: learned duration [s].
         start_: learned start, tool_to_base; its rotation is the identity when none was learned.
         goal_: learned goal, tool_to_base.
         n_demonstrations_: number of demonstrations.
         fit_quality_: the distance to each demonstration, and whether the skill is faithful to them; None in a skill
             from a file that does not contain it.
-        provenance_: its origin: ``"imitarm"`` (version that learned it), ``"sources"`` (one per demonstration),
-            ``"notes"`` (for example what lint found), and ``"date"`` when one was given.
+        provenance_: origin of the skill: ``"imitarm"`` (version that learned it), ``"sources"`` (one per
+            demonstration), ``"notes"`` (for example what lint found), and ``"date"`` when one was given.
 
     Raises:
         InputError: when an option is out of range.
@@ -89,12 +89,12 @@ class Skill:
     def fit(
         self, demonstrations: Sequence[Demonstration], *, notes: Sequence[str] = (), date: str | None = None
     ) -> Self:
-        """Learn from demonstrations, aligned beforehand (``imitarm.demonstrations.align``).
+        """Learn from demonstrations that were aligned before (``imitarm.demonstrations.align``).
 
         Args:
-            demonstrations: at least one; three or more show how much a person varies.
+            demonstrations: at least one demonstration; three or more show how much the demonstrations vary.
             notes: facts to keep with the skill, for example the findings of lint.
-            date: when it was learned; left out when None, so that the same input gives the same file.
+            date: date of learning; omitted when None, so that the same input gives the same file.
 
         Raises:
             InputError: as :meth:`GMR.fit` and :meth:`DMP.fit`.
@@ -195,10 +195,10 @@ class Skill:
 
         .. math:: x(t) = \bar x(t) + (1 - p(t)) \delta_{start} + p(t) \delta_{goal}
 
-        with p the fraction of the path that has been travelled. The rotation changes along a minimum-jerk profile.
+        where p is the fraction of the path that has been travelled. The rotation changes along a minimum-jerk profile.
 
         Args:
-            times: strictly increasing, from 0 to the learned duration, shape (n,) [s].
+            times: strictly increasing times from 0 to the learned duration, shape (n,) [s].
             start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
             goal: likewise.
 
@@ -231,7 +231,7 @@ class Skill:
         Args:
             start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
             goal: likewise.
-            duration: [s]; None: as learned.
+            duration: duration of the motion [s]; None: the learned one.
             dt: step [s], stretched so that a whole number of steps fills the duration.
             adjustment: how the motion is changed for another start or goal (see :class:`~imitarm.skills.dmp.DMP`).
 
@@ -244,8 +244,8 @@ class Skill:
         """Return how much the demonstrations differ at ``times`` (n,) [s]: covariances (n, 3, 3) [m^2].
 
         Args:
-            times: since the start of a motion that takes ``duration``.
-            duration: [s]; None: as learned.
+            times: times since the start of a motion of length ``duration``.
+            duration: duration of the motion [s]; None: the learned one.
 
         Raises:
             InputError: when not fitted, or an argument is not valid.
@@ -275,7 +275,7 @@ class Skill:
         """Read a skill file.
 
         Args:
-            path: of the file.
+            path: path of the file.
 
         Raises:
             InputError: when there is no such file or it can't be read.

@@ -2,7 +2,8 @@
 
 Layout: ``format``, ``version``, the meaning of the numbers (``units``, ``frames``), their origin (``task``,
 ``provenance``), the numbers (``gmr``, ``dmp``, ``fit``), and last a ``checksum``: SHA-256 of everything else in
-canonical form (sorted keys, no spaces), so that a change of any digit is detected, but not a change of layout. Floats
+canonical form (sorted keys, no spaces), so a change of any digit is detected, while a change of layout is accepted.
+Floats
 are written with all their digits and come back exactly. The classes below are the schema: they define what is written
 and what is accepted.
 """
@@ -173,7 +174,7 @@ def gmr_of(fields: GmrFields) -> GMR:
         rows = fields.selection.rows
         errors = fields.selection.held_out_rmse_mm or [np.nan] * len(rows)
         if len(errors) != len(rows) or any(len(row) != 4 for row in rows):
-            raise InputError("gmr.selection: rows of 4 numbers needed, with one error each")
+            raise InputError("gmr.selection: expected rows of 4 numbers, each with one error")
         selection = [Candidate(int(k), bic, aic, e, bias) for (k, bic, aic, bias), e in zip(rows, errors, strict=True)]
     return GMR.from_mixture(
         fields.weights,

@@ -69,7 +69,7 @@ class Encoder:
         """Return a message as a datagram.
 
         Args:
-            message: to send.
+            message: message to send.
             time_ns: time of sending, on the sender's clock [ns].
 
         Raises:
@@ -95,7 +95,7 @@ def decode(data: bytes) -> tuple[Header, Message]:
     """Return header and message of a datagram.
 
     Args:
-        data: as received; may be anything.
+        data: data as received; may be anything.
 
     Raises:
         DatagramError: when the bytes are not a valid datagram. Its ``reason`` is ``"length"``, ``"magic"``,

@@ -212,7 +212,7 @@ class DatagramFilter:
         """Return header and message of a datagram; None if it is dropped.
 
         Args:
-            data: as received.
+            data: data as received.
             now_ns: time of receiving, on the receiver's clock [ns].
             kind: expected message type.
         """
@@ -230,7 +230,7 @@ class DatagramFilter:
         """Return whether a decoded datagram is accepted, and count it.
 
         Args:
-            header: of the datagram.
+            header: header of the datagram.
             now_ns: time of receiving, on the receiver's clock [ns].
         """
         reason = self._reason_to_drop(header, now_ns)

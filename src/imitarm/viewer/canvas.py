@@ -80,7 +80,7 @@ def canvas(name: str, description: str, size: tuple[float, float]) -> Iterator[C
 
     Args:
         name: unique in the page; all ids in the SVG begin with it.
-        description: of the figure, for screen readers.
+        description: description of the figure, for screen readers.
         size: width and height [inch].
     """
     try:

@@ -212,7 +212,7 @@ def small_multiples(name: str, description: str, unit: str, times: Array, curves
 
     Args:
         name: unique in the page.
-        description: for screen readers.
+        description: description for screen readers.
         unit: label of the vertical axis.
         times: shape (n_steps,) [s].
         curves: one for each joint.

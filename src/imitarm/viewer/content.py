@@ -77,7 +77,7 @@ class SceneResult:
 
     Attributes:
         name: short and unique in the report; used in links.
-        title: as shown to the reader.
+        title: title as shown to the reader.
         scene: goal and obstacles.
         success: whether the task succeeded.
         required_clearance: distance to keep from every obstacle [m].
@@ -174,8 +174,8 @@ class LearningSummary:
 
     Attributes:
         demonstrations: checked and aligned, as they were used for learning.
-        means: of the Gaussian components' positions, shape (n_components, 3) [m].
-        covariances: of the Gaussian components' positions, shape (n_components, 3, 3) [m^2].
+        means: means of the Gaussian components' positions, shape (n_components, 3) [m].
+        covariances: covariances of the Gaussian components' positions, shape (n_components, 3, 3) [m^2].
         predicted: the learned path.
         candidates: the numbers of components that were evaluated.
         findings: what ``lint`` reported about the recordings.
@@ -203,7 +203,7 @@ class Report:
     """Everything that a page shows about one run.
 
     Attributes:
-        title: of the page.
+        title: title of the page.
         scenes: results, in the order in which they are shown; names must be unique.
         summary: one or two sentences that introduce the page.
         learning: the demonstrations and what was learned from them.

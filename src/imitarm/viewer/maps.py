@@ -160,8 +160,8 @@ def demonstrations(
 
     Args:
         shown: the demonstrations.
-        means: of the components' positions, shape (n_components, 3) [m].
-        covariances: of the components' positions, shape (n_components, 3, 3) [m^2].
+        means: means of the components' positions, shape (n_components, 3) [m].
+        covariances: covariances of the components' positions, shape (n_components, 3, 3) [m^2].
         predicted: the learned path.
         name: unique in the page.
 
@@ -280,9 +280,9 @@ def adaptation(
         clearance: distance that the tool must keep from every obstacle [m].
         tool_spheres: spheres that contain the tool, rows of x, y, z, radius in the tool frame, shape (m, 4) [m].
         tolerance: covariance of the demonstrations along the path, shape (n_steps, 3, 3) [m^2].
-        means: of the components before they were moved, shape (n_components, 3) [m].
-        covariances: of the components, shape (n_components, 3, 3) [m^2].
-        displacement: of the components, shape (n_components, 3) [m].
+        means: means of the components before they were moved, shape (n_components, 3) [m].
+        covariances: covariances of the components, shape (n_components, 3, 3) [m^2].
+        displacement: displacement of the components, shape (n_components, 3) [m].
         moved: which components were displaced, shape (n_components,).
         measured: the measured path of the robot's tool.
         name: unique in the page.

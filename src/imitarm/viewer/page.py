@@ -38,7 +38,7 @@ class Header:
     """The first part of a page.
 
     Attributes:
-        title: of the page.
+        title: title of the page.
         verdict: the result in one line.
         good: whether the result is a good one: green or red.
         summary: one or two sentences; may be empty.
@@ -75,7 +75,7 @@ class Player:
     """A 3-D player.
 
     Attributes:
-        title: for screen readers.
+        title: title for screen readers.
         own: the part of its page that no other player has, see :func:`shared_players`.
         keys: its legend.
     """

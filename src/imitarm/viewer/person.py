@@ -53,8 +53,8 @@ class PersonMark:
 
     Attributes:
         name: unique in the 3-D scene.
-        positions: of the joints :data:`imitarm.capture.skeleton.JOINTS` in the world frame, shape (n_frames, 25, 3)
-            [m]; NaN where lost.
+        positions: positions of the joints :data:`imitarm.capture.skeleton.JOINTS` in the world frame, shape (n_frames,
+            25, 3) [m]; NaN where lost.
         tracking: :class:`~imitarm.capture.skeleton.Tracking` of each joint, shape (n_frames, 25); inferred joints are
             drawn paler, lost joints are not drawn.
         side: the arm that is drawn in the colour of a demonstration.
@@ -94,14 +94,14 @@ class PersonMark:
         """Place a recorded person beside a robot, rotated so that both move in the same directions.
 
         Args:
-            skeletons: at least one, in the order of their times. After 0.25 s without a skeleton the person is not
-                drawn; after the last one the person stands still.
-            times: of the frames to draw, counted from the first skeleton, shape (n_frames,) [s].
-            sensor_to_base: of the correspondence; only its rotation is used.
-            side: of the arm that is followed.
+            skeletons: at least one skeleton, in the order of their times. After 0.25 s without a skeleton the person is
+                not drawn; after the last one the person stands still.
+            times: times of the frames to draw, counted from the first skeleton, shape (n_frames,) [s].
+            sensor_to_base: transform of the correspondence; only its rotation is used.
+            side: side of the arm that is followed.
             place: median position of the hips in the base frame: x and y [m].
             floor: height of the floor in the base frame [m].
-            name: of the person.
+            name: name of the person.
 
         Raises:
             InputError: when there is no skeleton.

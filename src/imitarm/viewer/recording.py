@@ -19,7 +19,7 @@ class Recording:
 
     Attributes:
         model: the MuJoCo model that contains the bodies.
-        times: of the frames, strictly increasing, shape (n_frames,) [s].
+        times: times of the frames, strictly increasing, shape (n_frames,) [s].
         positions: body positions in the world frame, shape (n_frames, n_bodies, 3) [m].
         quaternions: body rotations wxyz in the world frame, shape (n_frames, n_bodies, 4).
 

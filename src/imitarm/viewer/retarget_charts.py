@@ -74,7 +74,7 @@ def tool(run: Retargeting, path: Array, *, name: str = "tool") -> str:
 
     Args:
         run: the retargeted motion.
-        path: of the tool, shape (n, 3) [m].
+        path: path of the tool, shape (n, 3) [m].
         name: unique in the page.
 
     Returns:

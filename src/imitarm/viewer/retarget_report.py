@@ -61,9 +61,9 @@ class Measure:
     """One measure of a retargeting.
 
     Attributes:
-        label: as shown to the reader.
+        label: label as shown to the reader.
         value: in ``unit``; NaN when unknown.
-        unit: as shown to the reader.
+        unit: unit as shown to the reader.
         digits: number of decimals.
         better: whether ``"less"`` or ``"more"`` is better; ``""``: neither.
         fault: whether any value above 0 is a fault; it is then marked in red.
@@ -95,7 +95,7 @@ class MethodResult:
         name: short and unique in the report.
         title: the title of the tab.
         run: the retargeted motion.
-        measures: of the run; every method has the same measures in the same order.
+        measures: measures of the run; every method has the same measures in the same order.
         tables: further tables for the tab of this method.
         notes: sentences that the reader should know about this run.
         caption: one sentence that describes the method.
@@ -118,9 +118,9 @@ class RetargetReport:
     """One recording of a person and the results of one or more methods.
 
     Attributes:
-        title: of the page.
-        methods: at least one; the header is about the first one.
-        skeletons: of the person, as the methods received them.
+        title: title of the page.
+        methods: at least one method; the header is about the first one.
+        skeletons: skeletons of the person, as the methods received them.
         correspondence: which motion of the person corresponds to which motion of the robot.
         verdict: the result in one line.
         good: whether the result is a good one.

@@ -123,7 +123,7 @@ class Mover:
     """A node of viser's scene that changes from frame to frame.
 
     Args:
-        handle: of the node.
+        handle: handle of the node.
         poses: attributes of the handle in each frame: ``position``, ``wxyz``, ..., or ``visible`` (n_frames,).
     """
 

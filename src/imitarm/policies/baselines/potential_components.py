@@ -1,16 +1,18 @@
 r"""ACFRA as printed in the thesis: push the components' means by a repulsive potential (thesis Eqs 4.2-4.8).
 
-Two potentials share the same descent. With ``d`` the distance from an obstacle to the component's ellipse, ``n`` the
+The same descent is used for two potentials. With ``d`` the distance from an obstacle to the component's ellipse, ``n``
+the
 outward normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the obstacle:
 
 * ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The last term does not depend on the
   position, so it drops out of the force: the spread has no effect.
-* ``mapf``: a dimensionless form with the effect that the text describes,
+* ``mapf``: a dimensionless form with the effect that the text of the thesis describes,
   ``U = 1/2 eta s d_th^2 (1/rho - 1)^2`` with ``rho = d / d_th`` and a gain ``s = exp((sigma(n)^2 - mean) / max)`` that
   moves components with a large spread more.
 
-Neither checks whether the path *between* two pushed means is clear. Two components on both sides of an obstacle are
-pushed apart, so that the path goes through the obstacle. They are kept for comparison; ``certified`` is the default.
+Neither checks whether the path *between* two pushed means is clear. Two components on opposite sides of an obstacle are
+pushed apart, so the path between them passes through the obstacle. They are kept for comparison; ``certified`` is the
+default.
 """
 
 from __future__ import annotations
@@ -57,9 +59,9 @@ def literal_force(distance: Array, normal: Array, spread: Array) -> Array:
     """Return the force of Eq 4.7 as printed, ``k (1/d - 1/d_th) / d^2 n`` with k = 1.
 
     Args:
-        distance: ellipse to obstacle, (n_obstacles, n_components) [m].
+        distance: distance from the ellipse to the obstacle, (n_obstacles, n_components) [m].
         normal: outward normals, (n_obstacles, n_components, 3).
-        spread: not used: ``exp(sigma^2)`` is constant in the position, and its gradient is zero.
+        spread: not used, because ``exp(sigma^2)`` does not depend on the position, so its gradient is zero.
     """
     del spread
     d = np.clip(distance, _RHO_MIN * INFLUENCE_DISTANCE, INFLUENCE_DISTANCE)
@@ -70,7 +72,7 @@ def modified_force(distance: Array, normal: Array, spread: Array) -> Array:
     """Return ``s d_th (1/rho - 1) / rho^2 n``: minus the gradient of the modified potential (docs/avoidance.md, 9).
 
     Args:
-        distance: ellipse to obstacle, (n_obstacles, n_components) [m].
+        distance: distance from the ellipse to the obstacle, (n_obstacles, n_components) [m].
         normal: outward normals, (n_obstacles, n_components, 3).
         spread: sigma(n), (n_obstacles, n_components) [m]; the gain's mean and maximum are taken over it.
     """
@@ -86,7 +88,7 @@ FORCES = {"literal": literal_force, "mapf": modified_force}
 def push_components(
     path: ComponentPath, obstacles: Sequence[Obstacle], margin: float, *, method: str, forbidden: Array
 ) -> Array:
-    """Let the potential push the means until none is within its influence, or for 200 steps.
+    """Move the means along the potential's force until none is within its influence, or for 200 steps.
 
     Args:
         path: the nominal path and its components.

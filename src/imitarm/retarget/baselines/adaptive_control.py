@@ -38,8 +38,8 @@ _GRIP = 0.2  # [s] in which the closure follows a closing hand
 class JointPlant:
     """The arm on which a joint controller is simulated: in MuJoCo, with gravity, without contacts.
 
-    It includes rotor inertia, viscous damping and dry friction of the joints, which ``ArmModel`` leaves out. So a
-    controller that uses an ``ArmModel`` does not know them.
+    It includes rotor inertia, viscous damping and dry friction of the joints, which ``ArmModel`` leaves out. A
+    controller that uses an ``ArmModel`` therefore does not know these effects.
 
     Args:
         arm: whose dynamics.
@@ -103,8 +103,8 @@ class Torques:
     """Torques of one period.
 
     Attributes:
-        wanted: computed by the law, before the limits, shape (n_joints,) [N m].
-        applied: limited to the rated torques, shape (n_joints,) [N m].
+        wanted: torques computed by the law, before the limits, shape (n_joints,) [N m].
+        applied: torques limited to the rated torques, shape (n_joints,) [N m].
     """
 
     wanted: Array
@@ -127,15 +127,18 @@ class AdaptiveLaw:
         K \leftarrow [K + Q_K(\varepsilon e - \gamma K)]_{K_{min}}^{K_{max}(h)}, \quad
         D \leftarrow [D + Q_D(\varepsilon\dot e - \gamma D)]_0^{D_{max}}
 
-    with the forgetting factor :math:`\gamma = a/(1 + b|\varepsilon|^2)`. A closed hand (h = 1) raises the stiffness:
+    where the forgetting factor is :math:`\gamma = a/(1 + b|\varepsilon|^2)`. A closed hand (h = 1) raises the
+    stiffness:
     :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. M, C and G are those of the rigid arm, from ``ArmModel``; F, K and
-    D compensate for what it leaves out (rotors, friction). C is the matrix of Christoffel symbols, for which
+    D compensate for effects that the model leaves out (rotor inertia, friction). C is the matrix of Christoffel
+    symbols, for which
     :math:`C(q, a)\,b = \tfrac12\,(h(a+b) - h(a) - h(b))` with :math:`h(v) = C(q, v)\,v`.
 
-    The law is that of Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet, made discrete; the gains are ours. For
-    small errors :math:`\gamma = a` and :math:`Q_K \gamma = 1`: the stiffness forgets everything above :math:`K_{min}`
-    within one period. So that the hand still has an effect, we set :math:`K_{min} = K_{max}(h)/2`, which the sources
-    leave open.
+    The law is that of Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet, in discrete form; we chose the gains.
+    For
+    small errors :math:`\gamma = a` and :math:`Q_K \gamma = 1`: the stiffness falls back to :math:`K_{min}` within one
+    period. We set :math:`K_{min} = K_{max}(h)/2`, which the sources do not specify, so that the hand still has an
+    effect.
 
     Args:
         arm: provides M, C, G and the rated torques.
@@ -156,7 +159,7 @@ class AdaptiveLaw:
         self.start()
 
     def start(self) -> None:
-        """Forget everything that was adapted."""
+        """Reset all adapted values."""
         n = self.arm.n_joints
         self.stiffness = np.array(START_STIFFNESS)
         self.damping = 2.0 * _DAMPING_RATIO * np.sqrt(self.stiffness)
@@ -172,7 +175,7 @@ class AdaptiveLaw:
             q: joint positions, shape (n_joints,) [rad].
             velocity: joint velocities, shape (n_joints,) [rad/s].
             reference: desired joint positions, shape (n_joints,) [rad].
-            closure: of the person's hand, 0 open to 1 closed.
+            closure: closure of the person's hand, 0 open to 1 closed.
         """
         q, velocity, wanted = (np.asarray(x, dtype=float) for x in (q, velocity, reference))
         error = q - wanted
@@ -195,7 +198,7 @@ class AdaptiveLaw:
         return Torques(torque, np.clip(torque, -self.arm.max_torque, self.arm.max_torque))
 
     def _coriolis(self, q: Array, velocity: Array, along: Array) -> Array:
-        """Return C(q, velocity) along, shape (n_joints,) [N m]."""
+        """Return the product of C(q, velocity) and ``along``, shape (n_joints,) [N m]."""
         rest = np.zeros_like(q)
         gravity = self.arm.gravity_torque(q)
 
@@ -217,15 +220,16 @@ class AdaptiveLaw:
 
 
 class AdaptiveControl(BaselineRetargeter):
-    r"""Baseline M2: our reading of "discrete-time adaptive control" in the thesis.
+    r"""Baseline M2: our interpretation of "discrete-time adaptive control" in the thesis.
 
-    The thesis refers to Liang et al. 2016, of which we know the abstract: arm configuration from a Kinect by vectors, a
-    stiffness index from the hand's gesture, a biomimetic controller in discrete time, on a simulated Baxter. The
+    The thesis refers to Liang et al. 2016, of which only the abstract was available to us. It describes an arm
+    configuration computed from Kinect vectors, a stiffness index from the hand's gesture, and a biomimetic controller
+    in discrete time on a simulated Baxter. The
     equations are those of the human-like controllers of Yang et al. 2011 and Li and Burdet 2016, made discrete.
 
     The person's joint angles, held between frames, pass a first-order low-pass filter at 3 Hz, :math:`q_r \leftarrow
-    q_r + (1 - e^{-2\pi f T})(q_h - q_r)`. An :class:`AdaptiveLaw` computes torques, limited to the rated ones, which
-    drive the simulated arm (:class:`JointPlant`). The position that the arm reaches is the command. The method tracks
+    q_r + (1 - e^{-2\pi f T})(q_h - q_r)`. An :class:`AdaptiveLaw` computes torques within the rated limits, which drive
+    the simulated arm (:class:`JointPlant`). The position that the arm reaches is the command. The method tracks
     joints: the tool is not where the hand is.
 
     Only the torque limits the joint velocity. ``notes`` has ``"saturated"``, the number of joints and steps at the
@@ -234,16 +238,17 @@ class AdaptiveControl(BaselineRetargeter):
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: between the person's arm and the robot's.
+        correspondence: correspondence between the person's arm and the robot's.
         dt: control period T [s].
         scene: ignored.
-        velocity_scaling: scale every step, of the reference and of the command, so that no joint exceeds its limit.
+        velocity_scaling: whether to scale every step of the reference and of the command so that no joint exceeds
+            its limit.
         relative: map the change of the person's joint angles since the person began to lead; otherwise the angles
             themselves, approached at limited speed. See
             :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
 
     Attributes:
-        torque: of the last control period, shape (n_joints,) [N m].
+        torque: torque of the last control period, shape (n_joints,) [N m].
 
     Raises:
         InputError: when the arm does not have the joint axes of a person's arm.
@@ -251,7 +256,9 @@ class AdaptiveControl(BaselineRetargeter):
 
     name: ClassVar[str] = "m2"
     title: ClassVar[str] = "M2"
-    caption: ClassVar[str] = "Our reading of an adaptive controller in discrete time that follows the person's joints."
+    caption: ClassVar[str] = (
+        "Our interpretation of an adaptive discrete-time controller that follows the person's joints."
+    )
 
     def __init__(
         self,
@@ -317,7 +324,7 @@ class AdaptiveControl(BaselineRetargeter):
 
     @property
     def notes(self) -> dict[str, float]:
-        """Counts and RMS torque so far; see the class and its base."""
+        """Counts and RMS torque so far; see this class and its base class."""
         rms = math.sqrt(self._squares / self._periods) if self._periods else 0.0
         return {
             **super().notes,

@@ -1,4 +1,4 @@
-"""BaselineRetargeter: what the baselines M1 to M3 share, so that they differ from each other only in the method."""
+"""BaselineRetargeter: the common part of the baselines M1 to M3, which thus differ only in the method."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ROUNDING = 1.0 + 1e-9
 
 
 class BaselineRetargeter(Retargeter):
-    """A method to compare with, behind the same front end as every other method.
+    """A baseline method with the same input processing as every other method.
 
     The estimate of the person's arm, the engagement, the clutch and the scale are those of
     :class:`~imitarm.retarget.retargeter.Retargeter`. Where the published methods say nothing, all baselines do the
@@ -37,7 +37,7 @@ class BaselineRetargeter(Retargeter):
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: between the person's arm and the robot's.
+        correspondence: correspondence between the person's arm and the robot's.
         dt: control period [s].
         scene: ignored.
         velocity_scaling: scale every step as a whole so that no joint exceeds its velocity limit.
@@ -65,7 +65,7 @@ class BaselineRetargeter(Retargeter):
         """Return the desired joint positions at the end of this period, shape (n_joints,) [rad], before any limit."""
 
     def _holding(self) -> Array:
-        """Return the desired joint positions while the person is lost: the present ones."""
+        """Return the desired joint positions while the person is lost: the current ones."""
         return self.latest.q
 
     @property
@@ -73,7 +73,7 @@ class BaselineRetargeter(Retargeter):
         """Counts so far, by name.
 
         ``"velocity_excess"``: joints and steps that were, or without scaling would have been, too fast;
-        ``"position_clips"``: joints and steps that were cut at a limit of position.
+        ``"position_clips"``: joints and steps that were clipped at a position limit.
         """
         return {name: float(self.counts[name]) for name in ("velocity_excess", "position_clips", *self.counts)}
 
@@ -97,11 +97,11 @@ class BaselineRetargeter(Retargeter):
 
     @property
     def _steps_per_frame(self) -> int:
-        """Control steps until the next frame is expected, rounded up, so that no step stands still."""
+        """Control steps until the next frame is expected, rounded up, so that the robot does not pause."""
         return max(math.ceil(self._period / self.dt - 1e-6), 1)
 
     def _limited(self, wanted: Array) -> Array:
-        """Return the joints that are reached: within their range, and with velocity scaling if requested."""
+        """Return the joint positions reached: within their ranges, and with velocity scaling if requested."""
         before = self.latest.q
         step = wanted - before
         fractions = np.abs(step) / (self.dt * self.arm.max_velocity)

@@ -33,13 +33,14 @@ class DemonstratedMotion:
     """The motion of one engagement, sampled at the control period.
 
     Attributes:
-        shown_times: when the person showed each sample [s], on the recording's clock, shape (n,); evenly spaced until
+        shown_times: times at which the person showed each sample [s], on the recording's clock, shape (n,); evenly
+            spaced until
             the motion is slowed down.
-        points: shoulder, elbow, wrist in the base frame, as corrected so far, shape (n, 3, 3) [m].
+        points: shoulder, elbow and wrist in the base frame, after the corrections so far, shape (n, 3, 3) [m].
         hands: rotations of the hand, quaternions wxyz, shape (n, 4).
-        shown: the person's points before all corrections, shape (n, 3, 3) [m].
+        shown: the same points before all corrections, shape (n, 3, 3) [m].
         closed: whether the hand was closed; None where unknown.
-        joints: of the robot, shape (n, n_joints) [rad]; without columns until they are mapped.
+        joints: joint positions of the robot, shape (n, n_joints) [rad]; zero columns before they are mapped.
     """
 
     shown_times: Array
@@ -65,7 +66,7 @@ class DemonstratedMotion:
         return len(self.shown_times)
 
     def estimate(self, i: int) -> ArmEstimate:
-        """Return sample ``i`` as an estimate, as live methods receive it."""
+        """Return sample ``i`` as an estimate, the input of live methods."""
         s, e, w = self.points[i]
         rest = np.zeros(3)
         return ArmEstimate(
@@ -77,7 +78,10 @@ class DemonstratedMotion:
         return map(self.estimate, range(len(self)))
 
     def at(self, where: Array) -> DemonstratedMotion:
-        """Return the motion at fractional sample numbers, shape (m,); it is slower where they are closer together."""
+        """Return the motion at fractional sample numbers, shape (m,).
+
+        It is slower where the numbers are closer together.
+        """
         n = np.arange(len(self))
         near = tuple(self.closed[int(i)] for i in np.clip(where.astype(int), 0, len(self) - 1))
 
@@ -101,8 +105,8 @@ def engagements(
     """Yield the estimates, at least two, of each engagement in a recording; all methods share the engagement rule.
 
     Args:
-        frames: in order of time.
-        correspondence: between the person's arm and the robot's.
+        frames: frames in order of time.
+        correspondence: correspondence between the person's arm and the robot's.
         rule: the times of the engagement.
     """
     estimator, engagement = ArmEstimator(correspondence), Engagement(correspondence, rule)
@@ -128,7 +132,7 @@ def engagements(
 
 
 class Constraint(Protocol):
-    """A condition on the tool, as annotated by a teacher."""
+    """A condition on the tool, such as a teacher annotates."""
 
     def __call__(self, positions: Array, rotations: Array, /) -> Mask:
         """Return whether it holds, shape (n,), for positions (n, 3) [m] and rotations (n, 3, 3) in the base frame."""
@@ -162,7 +166,7 @@ class FeasibilityCheck:
     Args:
         arm: the robot's arm with its tool.
         dt: sampling period [s].
-        constraints: additional ones, by name.
+        constraints: additional constraints, by name.
 
     Raises:
         InputError: when a constraint has the name of a built-in condition.
@@ -176,15 +180,15 @@ class FeasibilityCheck:
         taken = sorted({"limits", "speed", "singular", "stretched"} & set(self.constraints))
         if taken:
             raise InputError(
-                f"FeasibilityCheck: a constraint can't be named {taken[0]!r}, because that one is built in; rename it"
+                f"FeasibilityCheck: a constraint can't be named {taken[0]!r}, because this name is built in; rename it"
             )
 
     def reasons(self, joints: Array) -> dict[str, Mask]:
-        """Return the violated samples of each condition, shape (n,) bool, for joints (n, n_joints) [rad]."""
+        """Return the samples that violate each condition, shape (n,) bool, for joints (n, n_joints) [rad]."""
         return {"speed": self.too_fast(joints), **self.postures(joints)}
 
     def anywhere(self, joints: Array) -> Mask:
-        """Return where any condition is violated, shape (n,), for joints (n, n_joints) [rad]."""
+        """Return the samples that violate any condition, shape (n,), for joints (n, n_joints) [rad]."""
         return np.asarray(np.any(list(self.reasons(joints).values()), axis=0))
 
     def too_fast(self, joints: Array) -> Mask:
@@ -200,7 +204,7 @@ class FeasibilityCheck:
         return np.asarray(np.abs(np.diff(joints, axis=0)) / (self.dt * self.arm.max_velocity))
 
     def postures(self, joints: Array) -> dict[str, Mask]:
-        """Return the violated samples of each condition on single postures, shape (n,) bool."""
+        """Return the samples that violate each condition on single postures, shape (n,) bool."""
         jacobians = np.array([self.arm.tool_jacobian(q) for q in joints]).reshape(-1, 6, self.arm.n_joints)
         found: dict[str, Mask] = {
             "limits": self.outside(joints),
@@ -225,7 +229,7 @@ class FeasibilityCheck:
         return any(found.any() for found in self.postures(joints).values())
 
     def outside(self, joints: Array) -> Mask:
-        """Return where a joint is outside its range, shape (n,)."""
+        """Return the samples at which a joint is outside its range, shape (n,)."""
         beyond = (joints < self.arm.lower - _WITHIN) | (joints > self.arm.upper + _WITHIN)
         return np.asarray(beyond.any(axis=1))
 
@@ -233,7 +237,8 @@ class FeasibilityCheck:
 def stretch(joints: Array) -> Array:
     r"""Return how far the arm is stretched: distance shoulder to wrist over reach, (n,), for joints (n, n_joints).
 
-    This is measured on the person's chain, to which the joints belong: upper arm and forearm along the joint axes and
+    The stretch is measured on the person's arm, to which the joints belong: upper arm and forearm along the joint axes
+    and
     equally long (Sawyer's are 0.412 and 0.411 m), so it is :math:`|\cos(q_3/2)|`. The robot's own distance from
     shoulder to wrist is largest with a bent elbow, because of the offsets between its links.
     """

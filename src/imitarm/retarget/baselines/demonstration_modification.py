@@ -1,7 +1,8 @@
 """DemonstrationModification: baseline M1, the person's joint angles, corrected where the arm can't follow.
 
-There are four corrections, in place of the teacher's advice: slower, wrist closer, other elbow position, repair by key
-frames. Each changes one segment of a :class:`~imitarm.retarget.baselines.demonstrated_motion.DemonstratedMotion` by a
+Four corrections replace the teacher's advice: slow the motion down, move the wrist closer, rotate the elbow, or repair
+key frames. Each changes one segment of a :class:`~imitarm.retarget.baselines.demonstrated_motion.DemonstratedMotion` by
+a
 weight that is 1 where the change is needed and decays to 0 at the segment's ends, so that the motion stays continuous.
 """
 
@@ -61,23 +62,23 @@ COUNTED = (
     "shown_time",
     "corrected_time",
 )
-"""Names of the counts that are summed over the engagements of a recording."""
+"""Names of counts that are summed over the engagements of a recording."""
 
 _STRIDE = 10  # every tenth sample is checked first
 _SLOWEST = 10.0  # largest factor of slowing down
 
 
 class DemonstrationModification(BaselineRetargeter):
-    """Baseline M1: our reading of "demonstration modification" in the thesis.
+    """Baseline M1: our interpretation of "demonstration modification" in the thesis.
 
     It combines Argall's advice operators, which derive corrected data from an execution and a teacher's advice on a
     segment of it, and Mueller et al. 2018, who annotate constraints and replace key frames that violate them. The paper
-    cited by the thesis is about policies of a mobile robot; the possible corrections for an arm, and the program that
-    replaces the teacher, are ours.
+    cited by the thesis is about policies of a mobile robot; we designed the possible corrections for an arm and the
+    program that replaces the teacher.
 
     The method is offline. :meth:`run` processes the whole recording:
 
-    1. the person's joint angles, in closed form, become the robot's
+    1. the person's joint angles are computed in closed form and mapped to the robot's
        (:class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`);
     2. :class:`~imitarm.retarget.baselines.demonstrated_motion.FeasibilityCheck` finds the infeasible segments;
     3. each of them, extended by 0.2 s on both sides, is changed by the first correction that makes it feasible: slower,
@@ -96,19 +97,19 @@ class DemonstrationModification(BaselineRetargeter):
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: between the person's arm and the robot's.
+        correspondence: correspondence between the person's arm and the robot's.
         dt: control period [s].
         scene: ignored.
-        velocity_scaling: scale every step as a whole so that no joint exceeds its velocity limit.
-        relative: map the change of the person's joint angles since the person began to lead; otherwise the angles
-            themselves, approached at limited speed. See
+        velocity_scaling: whether to scale every step as a whole so that no joint exceeds its velocity limit.
+        relative: whether to map the change of the person's joint angles since the person began to lead; otherwise
+            the angles themselves are mapped and approached at limited speed. See
             :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
         constraints: additional conditions, by name, for example ``{"table": above(0.02)}``.
-        annotation_time: time that a teacher needs for each segment in addition to watching it [s].
-        seed: of the samples that repair key frames.
+        annotation_time: time that a teacher needs for each segment, in addition to the time for watching it [s].
+        seed: seed of the samples that repair key frames.
 
     Attributes:
-        check: finds the infeasible samples.
+        check: feasibility check that finds the infeasible samples.
 
     Raises:
         InputError: when the arm does not have the joint axes of a person's arm, or a number is out of range.
@@ -117,7 +118,7 @@ class DemonstrationModification(BaselineRetargeter):
     name: ClassVar[str] = "m1"
     title: ClassVar[str] = "M1"
     caption: ClassVar[str] = (
-        "Our reading of demonstration modification: the person's joint angles, corrected where the arm can't follow."
+        "Our interpretation of demonstration modification: human joint angles, corrected where the arm can't follow."
     )
 
     def __init__(
@@ -162,11 +163,12 @@ class DemonstrationModification(BaselineRetargeter):
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
         """Retarget a whole recording and correct it; ``notes`` lists the changes.
 
-        Where the motion is slowed, the result is longer than the recording; ``shown_times`` says when the person showed
-        each sample. The targets are slowed down with the motion, but not corrected in any other way.
+        If the motion is slowed down, the result is longer than the recording; ``shown_times`` holds the time at which
+        the person showed each sample. The targets are slowed down like the motion; the other corrections do not change
+        them.
 
         Args:
-            skeletons: in order of time.
+            skeletons: skeletons in order of time.
             q: start posture, shape (n_joints,) [rad]; None: ``arm.home``.
 
         Raises:
@@ -209,7 +211,7 @@ class DemonstrationModification(BaselineRetargeter):
         }
 
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
-        """Complete the shown times: the last steps show ``shown``, and in the steps before them the robot waits."""
+        """Complete the shown times. The last steps correspond to ``shown``; in the steps before them the robot waits."""
         rest = len(steps) - len(self._shown_times) - len(shown)
         begin = float(self._shown_times[-1]) if len(self._shown_times) else -self.dt
         waited = begin + self.dt * np.arange(1, rest + 1)
@@ -217,7 +219,7 @@ class DemonstrationModification(BaselineRetargeter):
         self._shown_times = np.concatenate([self._shown_times, np.minimum(waited, ahead), shown])
 
     def _rest(self, steps: list[RetargetStep], duration: float, state: EngagementState) -> None:
-        """Rest for a time, at the end or between two engagements."""
+        """Rest for some time, at the end or between two engagements."""
         q = self.latest.q
         for _ in range(round(duration / self.dt)):
             self._append(steps, RetargetStep(0.0, q, q, None, state), q)
@@ -239,7 +241,7 @@ class DemonstrationModification(BaselineRetargeter):
             self._append(steps, done, q)
 
     def _append(self, steps: list[RetargetStep], step: RetargetStep, wanted: Array) -> None:
-        """Append a step towards joints (n_joints,) [rad], as far as the limits allow."""
+        """Append a step towards joint positions (n_joints,) [rad], as far as the limits allow."""
         before, q = self.latest, self._limited(wanted)
         velocity = (q - before.q) / self.dt
         self.latest = replace(step, time=before.time + self.dt, q=q, velocity=velocity)
@@ -252,14 +254,14 @@ def slowed(
     r"""Slow a segment down: its time passes :math:`1 + w\,(s - 1)` times as slowly.
 
     Args:
-        motion: with joints.
+        motion: motion with joint positions.
         first: first sample of the segment.
-        past: the one after its last.
-        weight: w, shape (past - first,).
+        past: sample after the last one of the segment.
+        weight: weight w of each sample, shape (past - first,).
         factor: s, at least 1.
 
     Returns:
-        the motion, and the sample at which the segment now ends.
+        The motion, and the sample at which the segment now ends.
     """
     stretch = np.ones(len(motion))
     stretch[first:past] += weight * (factor - 1.0)
@@ -270,14 +272,14 @@ def slowed(
 
 
 def pull(points: Array, joints: Array) -> Array:
-    r"""Return the factor :math:`\kappa` of the distance shoulder to wrist for a stretch of 78/80 at most, shape (n,).
+    r"""Return the factor :math:`\kappa` of the distance shoulder to wrist that limits the stretch to 78/80, shape (n,).
 
     Where the robot's elbow angle equals the person's, this is :math:`\kappa = 0.78/(\rho |W - S|)`; where it differs
-    (relative mapping), the person's elbow must bend by the amount that is missing at the robot's elbow.
+    (relative mapping), the person's elbow must bend by the angle that the robot's elbow lacks.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
-        joints: of the robot, shape (n, n_joints) [rad].
+        joints: joint positions of the robot, shape (n, n_joints) [rad].
     """
     s, e, w = np.moveaxis(points, 1, 0)
     upper, fore, reach = _length(e - s), _length(w - e), _length(w - s)
@@ -293,7 +295,7 @@ def pulled_in(points: Array, kappa: Array) -> Array:
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
-        kappa: shape (n,), at most 1.
+        kappa: factors, at most 1, shape (n,).
 
     Returns:
         shape (n, 3, 3) [m]; the bones keep their lengths.
@@ -348,11 +350,11 @@ def repaired(
     feasible, :math:`\mu_k` is clipped to the joint ranges.
 
     Args:
-        joints: of the whole motion, shape (n, n_joints) [rad].
+        joints: joint positions of the whole motion, shape (n, n_joints) [rad].
         first: first sample of the segment.
-        past: the one after its last.
+        past: sample after the last one of the segment.
         check: the feasibility check.
-        rng: for the samples.
+        rng: random generator for the samples.
 
     Returns:
         joints, shape (n, n_joints) [rad], unchanged outside the segment; number of key frames without a feasible
@@ -404,14 +406,14 @@ class SegmentCorrector:
     """Corrects the motion of one engagement in rounds (baseline M1).
 
     Args:
-        mapping: of the person's joints, started where the robot is.
-        clutch: of this engagement.
+        mapping: mapping of the person's joints, started at the robot's current posture.
+        clutch: clutch of this engagement.
         check: the feasibility check.
-        rng: for the samples of a repair.
+        rng: random generator for the samples of a repair.
 
     Attributes:
         rounds: number of rounds so far.
-        counts: by the names of :data:`COUNTED`; times in s.
+        counts: counts by the names in :data:`COUNTED`; times in s.
     """
 
     def __init__(
@@ -426,7 +428,7 @@ class SegmentCorrector:
 
         Args:
             motion: without joints.
-            rounds: at most.
+            rounds: largest number of rounds.
         """
         dt = self._check.dt
         motion = motion.with_joints(np.array([self._mapping.joints(e, self._clutch) for e in motion.estimates()]))
@@ -474,7 +476,7 @@ class SegmentCorrector:
     def _mapped(
         self, name: str, motion: DemonstratedMotion, first: int, past: int
     ) -> Iterator[tuple[str, DemonstratedMotion, int]]:
-        """Yield a motion with the joints of a segment mapped again, unless every tenth sample already shows a fault."""
+        """Yield a motion with the joints of a segment mapped again, if every tenth sample is feasible."""
         before = motion.joints[max(first - 1, 0)]
         self._mapping.resume(before)
         for i in range(first, past, _STRIDE):

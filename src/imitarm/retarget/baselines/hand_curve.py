@@ -31,14 +31,14 @@ _RESTART = 0.25  # [s] a source whose clock jumps by more has restarted
 
 @dataclass(frozen=True, eq=False)
 class RotationCurve:
-    r"""Rotations along a curve: :math:`R(t) = R_0 \exp(c(t))` with c a :class:`NURBS` of rotation vectors.
+    r"""Rotations along a curve: :math:`R(t) = R_0 \exp(c(t))` where c is a :class:`NURBS` of rotation vectors.
 
-    Roll, pitch and yaw would wrap around and have singularities; rotation vectors relative to a mean rotation have
-    neither below 360 degrees.
+    Roll, pitch and yaw wrap around and have singularities; rotation vectors relative to a mean rotation have neither
+    problem below 360 degrees.
 
     Attributes:
         reference: :math:`R_0`, quaternion wxyz, shape (4,).
-        vectors: c [rad] over time [s].
+        vectors: curve c of the rotation vectors [rad] over time [s].
     """
 
     reference: Array
@@ -64,16 +64,16 @@ def fit_rotations(
 
     Args:
         times: strictly increasing, shape (k,) [s].
-        quaternions: unit, wxyz, shape (k, 4); signs do not matter.
-        confidence: 0 to 1, shape (k,); None: all 1.
-        degree: as for :func:`fit_nurbs`, like all other arguments.
+        quaternions: unit quaternions wxyz, shape (k, 4); signs do not matter.
+        confidence: confidences from 0 to 1, shape (k,); None: all 1.
+        degree: see :func:`fit_nurbs`, like all other arguments.
         n_control: number of control points.
         smoothing: a number, ``"gcv"`` or ``"morozov"``.
         sigma: standard deviation of a rotation vector on each axis [rad].
-        robust: reduce the weight of outliers.
+        robust: whether to reduce the weight of outliers.
 
     Raises:
-        InputError: as :func:`fit_nurbs`.
+        InputError: for the same reasons as :func:`fit_nurbs`.
     """
     q = np.asarray(quaternions, dtype=float)
     if q.ndim != 2 or q.shape[1] != 4:
@@ -111,10 +111,10 @@ class HandSample:
     """Pose of a hand in one frame.
 
     Attributes:
-        time: on the source's clock [s].
+        time: time on the source's clock [s].
         wrist: position in the base frame, shape (3,) [m].
         hand: rotation in the base frame, quaternion wxyz, shape (4,).
-        confidence: of the position and of the rotation, 0 to 1.
+        confidence: confidence of the position and of the rotation, 0 to 1.
     """
 
     time: float
@@ -128,8 +128,8 @@ class HandCurve:
     """A smooth motion of a hand.
 
     Attributes:
-        wrist: position [m] over time [s].
-        hand: rotation over time.
+        wrist: wrist position [m] over time [s].
+        hand: hand rotation over time.
     """
 
     wrist: NURBS
@@ -140,7 +140,7 @@ class HandCurve:
         """Fit both curves to at least four samples.
 
         Raises:
-            InputError: when there are fewer, or times do not increase.
+            InputError: when there are fewer samples, or times do not increase.
         """
         if len(samples) <= _DEGREE:
             raise InputError(f"HandCurve: needs at least {_DEGREE + 1} frames that show the arm, got {len(samples)}")
@@ -171,17 +171,19 @@ class HandCurve:
 
 
 class DelayedCurve:
-    """Smooths a hand's motion live: fits a curve to the last 0.6 s and evaluates it ``lag`` seconds in the past.
+    """Smooths a hand's motion during capture.
+
+    Fits a curve to the last 0.6 s and evaluates it ``lag`` seconds in the past.
 
     The end of a fitted curve changes with every new frame, while a slightly earlier point is supported by frames on
-    both sides. The lag is chosen for this reason. Frames arrive irregularly, so time is counted in control steps and
+    both sides. This is the reason for the lag. Frames arrive irregularly, so time is counted in control steps and
     only corrected by the frames.
 
     Args:
         window: duration to which the curve is fitted [s].
         lag: delay of the evaluation [s].
-        smooth: False: return the newest frame unchanged.
-        whole: a curve of the complete motion, which is then evaluated without lag instead.
+        smooth: whether to fit a curve; False returns the newest frame unchanged.
+        whole: a curve of the complete motion; if given, it is evaluated without lag.
     """
 
     def __init__(
@@ -212,7 +214,7 @@ class DelayedCurve:
         self._clock += dt
 
     def now(self) -> tuple[Array, Array] | None:
-        """Return wrist (3,) [m] and hand (4,) to follow now; None before the first frame."""
+        """Return the current target of wrist (3,) [m] and hand (4,); None before the first frame."""
         if not self._samples:
             return None
         curve = self._curve if self._whole is None else self._whole

@@ -21,29 +21,33 @@ _RCOND = 1e-6  # ignores only singular values that are numerically zero
 
 
 class IncrementalIK(BaselineRetargeter):
-    r"""Baseline M3: our reading of "incremental inverse kinematics" in the thesis.
+    r"""Baseline M3: our interpretation of "incremental inverse kinematics" in the thesis.
 
     The thesis cites Ijspeert et al. 2002 for it, which is the paper on movement primitives; its abstract has no
-    incremental inverse kinematics. So this is not a published method, but an interpretation of the name. Once per frame
+    incremental inverse kinematics. This is therefore not a published method, but an interpretation of the name. Once
+    per frame
     it computes
 
     .. math:: \Delta q = J^+ \left(\Delta x_d + K\,e\right), \qquad e = \log(T_d\,T(q)^{-1}),
 
-    with :math:`\Delta x_d` the displacement of the target since the last frame and e the error to the last target. The
-    step is spread evenly over the control steps of one frame. The pseudo-inverse is plain: it inverts even the smallest
-    singular value, so the step explodes near the edge of the workspace. Each joint is limited to its own velocity,
+    where :math:`\Delta x_d` is the displacement of the target since the last frame and e the error relative to the last
+    target. The
+    step is spread evenly over the control steps of one frame. The pseudo-inverse is undamped: it inverts even the
+    smallest singular value, so the step grows without bound near the edge of the workspace. Each joint is limited to
+    its own velocity,
     which changes the direction of the tool's motion, and then to its range. ``notes`` counts how often: ``"caps"``
     joints and steps, ``"capped_steps"`` steps.
 
-    The movement primitives that the cited paper would add are left out: they belong to the learned skill, can be used
-    with every method, and would compare primitives instead of mappings.
+    The movement primitives of the cited paper are left out. They belong to the learned skill and can be used with every
+    method; including them would compare primitives instead of mappings.
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: between the person's arm and the robot's.
+        correspondence: correspondence between the person's arm and the robot's.
         dt: control period [s].
         scene: ignored.
-        velocity_scaling: scale every step as a whole so that no joint exceeds its limit, instead of limiting each
+        velocity_scaling: whether to scale every step as a whole so that no joint exceeds its limit, instead of
+            limiting each
             joint.
         gain: K, fraction of the error that is corrected per frame.
 
@@ -53,7 +57,7 @@ class IncrementalIK(BaselineRetargeter):
 
     name: ClassVar[str] = "m3"
     title: ClassVar[str] = "M3"
-    caption: ClassVar[str] = "Our reading of incremental inverse kinematics: no treatment of singularities."
+    caption: ClassVar[str] = "Our interpretation of incremental inverse kinematics: no treatment of singularities."
 
     def __init__(
         self,

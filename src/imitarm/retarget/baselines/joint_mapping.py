@@ -17,7 +17,8 @@ from imitarm.validation import flag
 Array = NDArray[np.float64]
 
 _STRETCHED = ((0.0,) * 7, (0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0))
-"""Postures in which an arm may be stretched forward: Sawyer's zero; the Panda's, which points up at zero; mirrored."""
+"""Postures in which an arm may be stretched forward: Sawyer's zero posture; that of the Panda, which points up at zero;
+its mirror image."""
 _ALIGNED = 0.999  # smallest cosine between a joint's axis and the person's
 _ANY = LimbLengths(0.3, 0.26)  # where only rotations matter
 _AHEAD = np.array([1.0, 0.0, 0.0])
@@ -27,17 +28,19 @@ class JointMapping:
     r"""Maps the seven angles of a person's arm to seven robot joints with the same order of axes.
 
     When the arm is stretched forward, a person's joints rotate about z, y, x, y, x, y, x
-    (:mod:`imitarm.retarget.human_arm`). Sawyer's joints do the same at zero, and the Panda's when its second joint is
-    at a right angle, some of them in the opposite direction. With that posture :math:`q^*` and the directions
+    (:mod:`imitarm.retarget.human_arm`). Sawyer's joints have the same axes at zero. The Panda's have them when its
+    second joint is at a right angle, some with the opposite direction. With that posture :math:`q^*` and the directions
     :math:`\sigma_i = \pm 1` the mapping is
 
     .. math:: q_i = q^*_i + \sigma_i\,\theta_i \quad\text{(absolute)}, \qquad
               q_i = q_{i,0} + \sigma_i\,(\theta_i - \theta_{i,0}) \quad\text{(relative)},
 
-    the latter relative to the joints of both when the person began to lead. This holds for shoulder and elbow, i = 1 to
-    4. The last three joints follow in closed form from the desired rotation of the tool: the hand's own when the
-    mapping is absolute and the correspondence follows the whole hand, otherwise that of the clutch's target. Link
-    lengths are not used, so the tool is not where the hand is: this is inherent in mapping joints.
+    the latter relative to the joint positions of person and robot when the person began to lead. This holds for
+    shoulder and elbow, i = 1 to
+    4. The last three joints follow in closed form from the desired rotation of the tool: the hand's rotation when
+       the mapping is absolute and the correspondence follows the whole hand, otherwise the rotation of the clutch's
+       target. Link
+    lengths are not used, so the tool is not where the hand is; this is inherent in a mapping of joints.
 
     Angles are continuous from frame to frame, without jumps by 360 degrees; an undefined angle keeps its value.
 
@@ -67,7 +70,7 @@ class JointMapping:
         self._origin: tuple[Array, Array] | None = None  # robot's joints and person's angles when engaged
 
     def resume(self, q: Array) -> None:
-        """Continue from joints ``q``, shape (7,) [rad], with the same origin: to map a part of a motion again."""
+        """Continue from joints ``q``, shape (7,) [rad], with the same origin; used to map a part of a motion again."""
         self._q = np.array(q, dtype=float)
         if self._origin is not None:
             q0, theta0 = self._from
@@ -77,7 +80,7 @@ class JointMapping:
         """Return the joints for one frame of the person's arm, before any limit, shape (7,) [rad].
 
         Args:
-            estimate: of the person's arm.
+            estimate: estimate of the person's arm.
             clutch: the poses of hand and tool when the person began to lead.
         """
         hand = quaternion_to_matrix(estimate.hand)
@@ -113,8 +116,8 @@ class JointMapping:
 
         Args:
             theta: the person's angles, shape (7,) [rad].
-            hand: desired rotation of the robot's hand: that of the tool times the inverse of that of the stretched arm,
-                (3, 3).
+            hand: desired rotation of the robot's hand: the tool's rotation times the inverse of its rotation in the
+                stretched arm, shape (3, 3).
         """
         begins = self._origin is None
         if self._origin is None:
@@ -138,9 +141,9 @@ class Approach:
     """Moves to a distant first goal at limited speed, then follows the mapping.
 
     Args:
-        arm: gives the velocity limits.
+        arm: arm that provides the velocity limits.
         dt: control period [s].
-        fraction: of the velocity limits, while approaching.
+        fraction: speed of the approach as a fraction of the velocity limits.
     """
 
     def __init__(self, arm: ArmModel, dt: float, fraction: float = 0.6) -> None:
@@ -148,7 +151,10 @@ class Approach:
         self.active = True
 
     def towards(self, q: Array, goal: Array) -> Array:
-        """Return the position one period after ``q``: towards ``goal``, or at it once it has been reached."""
+        """Return the position one period after ``q``.
+
+        A step towards ``goal``, or ``goal`` itself once it has been reached.
+        """
         if self.active:
             reached = q + np.clip(goal - q, -self._most, self._most)
             self.active = bool((reached != goal).any())

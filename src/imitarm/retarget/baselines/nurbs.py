@@ -35,16 +35,17 @@ def basis_functions(knots: Array, degree: int, u: ArrayLike) -> tuple[Indices, A
         N_{i,p}(u) = \frac{u - u_i}{u_{i+p} - u_i} N_{i,p-1}(u)
         + \frac{u_{i+p+1} - u}{u_{i+p+1} - u_{i+1}} N_{i+1,p-1}(u)
 
-    with 0/0 = 0, and with the last span closed at the right, so that the last function is 1 at the end. At every ``u``
+    where 0/0 = 0, and the last span is closed at the right, so that the last function is 1 at the end. At every ``u``
     only p + 1 of them are non-zero; the recursion runs over these, where no divisor is zero.
 
     Args:
         knots: non-decreasing, the first and the last repeated degree + 1 times, shape (m,).
         degree: p.
-        u: shape (k,); clipped to the range of the knots.
+        u: parameters, shape (k,); clipped to the range of the knots.
 
     Returns:
-        indices of the first non-zero function, shape (k,), and the values of it and the next ones, shape (k, degree +
+        Indices of the first non-zero function, shape (k,), and the values of this function and the following ones,
+        shape (k, degree +
         1).
     """
     at = np.minimum(np.maximum(np.asarray(u, dtype=float), knots[degree]), knots[-degree - 1])
@@ -68,7 +69,8 @@ class NURBS:
 
     .. math:: C(u) = \frac{\sum_i N_{i,p}(u)\, w_i P_i}{\sum_i N_{i,p}(u)\, w_i}
 
-    with the functions of :func:`basis_functions` over the knots :math:`\{a, \dots, a, u_{p+1}, \dots, u_{m-p-1}, b,
+    The functions are those of :func:`basis_functions` over the knots :math:`\{a, \dots, a, u_{p+1}, \dots, u_{m-p-1},
+    b,
     \dots, b\}`, a and b repeated p + 1 times. For a curve fitted to a motion the parameter is the time [s].
 
     Attributes:
@@ -133,7 +135,7 @@ class NURBS:
         :math:`C^{(r)} = \frac1W \bigl(A^{(r)} - \sum_{j=1}^r \binom rj W^{(j)} C^{(r-j)}\bigr)`.
 
         Args:
-            u: where; a single number gives shape (d,). Beyond the ends it is the derivative at the end.
+            u: parameters; a single number gives shape (d,). Beyond the ends, the derivative at the end is returned.
             order: 0 (the point itself) to ``degree``.
 
         Raises:
@@ -164,12 +166,12 @@ class NURBS:
 
 
 def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
-    """Return knots that follow the density of the data: every span contains some (Piegl and Tiller, Eq 9.69).
+    """Return knots that follow the density of the data, so that every span contains data (Piegl and Tiller, Eq 9.69).
 
     Args:
         u: parameters of the data, increasing, shape (k,), k at least ``n_control``.
         n_control: number of control points.
-        degree: of the curve.
+        degree: degree of the curve.
 
     Returns:
         shape (n_control + degree + 1,).
@@ -209,7 +211,7 @@ class _Problem:
         return np.asarray((self.values[:, None, :] @ control[self.reached])[:, 0] - self.points)
 
     def with_weights(self, weights: Array) -> _Problem:
-        """Return the same samples for a rational curve with weights (n,)."""
+        """Return these samples for a rational curve with weights (n,)."""
         weighted = self.values * weights[self.reached]
         return _Problem(self.first, weighted / weighted.sum(axis=1, keepdims=True), self.points, self.rows)
 
@@ -231,7 +233,8 @@ def fit_nurbs(
     .. math:: \min_P \sum_k c_k \Bigl|\sum_i R_{ik} P_i - Q_k\Bigr|^2 + \mu \sum_j |(D P)_j|^2,
         \qquad R_{ik} = \frac{N_i(t_k)\, w_i}{\sum_j N_j(t_k)\, w_j}
 
-    with D the second differences of :func:`bends`. The parameter is the time, not the chord length, because the speed
+    where D are the second differences of :func:`bends`. The parameter is the time, not the chord length, because the
+    speed
     is part of the motion. The normal equations are banded with width p, so the time grows linearly with the number of
     samples; ``"gcv"`` takes longer because it needs the inverse.
 
@@ -244,8 +247,9 @@ def fit_nurbs(
         smoothing: :math:`\mu`, or ``"gcv"``: by generalised cross validation, which assumes independent errors, or
             ``"morozov"``: such that the residual equals ``sigma``.
         sigma: standard deviation of a sample on each axis, in the points' unit; None: from the residuals.
-        robust: reduce the weight of samples farther than 2.5 sigma from the curve (Huber), in three passes.
-        rational: also fit the weights w, between 0.2 and 5, mean 1; otherwise all are 1. This is needed only for exact
+        robust: whether to reduce the weight of samples farther than 2.5 sigma from the curve (Huber), in three passes.
+        rational: whether to fit the weights w too, between 0.2 and 5, with mean 1; otherwise all are 1. This is
+            needed only for exact
             arcs.
 
     Raises:
@@ -289,7 +293,7 @@ def _checked(
     t, q = np.asarray(times, dtype=float), np.array(points, dtype=float)
     c = np.ones(len(t)) if confidence is None else np.array(confidence, dtype=float)
     if t.ndim != 1 or q.ndim != 2 or len(q) != len(t) or c.shape != t.shape:
-        raise InputError(f"fit_nurbs: needs times (k,), points (k, d), confidence (k,); got {t.shape}, {q.shape}")
+        raise InputError(f"fit_nurbs: needs times (k,), points (k, d) and confidence (k,), got {t.shape}, {q.shape}")
     if degree < 2:
         raise InputError(f"fit_nurbs: degree must be at least 2, or the speed is discontinuous; got {degree!r}")
     if not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
@@ -320,9 +324,11 @@ def _check_options(smoothing: Smoothing, sigma: float | None) -> None:
 def bends(knots: Array, degree: int) -> Array:
     r"""Return the second differences D of the control points, shape (n - 2, 3): row j acts on points j, j+1, j+2.
 
-    Control points belong to the means of p knots, :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`, which are denser near
-    the ends. There plain differences :math:`P_{j+1} - 2 P_j + P_{j-1}` would see a curvature in a straight uniform
-    motion and slow it down. So they are divided differences, :math:`h (\frac{P_{j+1} - P_j}{g_{j+1} - g_j} - \frac{P_j
+    Each control point belongs to the mean of p knots, :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`, which are denser
+    near
+    the ends. There, plain differences :math:`P_{j+1} - 2 P_j + P_{j-1}` would not vanish for a straight uniform motion
+    and would slow it down. For this reason they are divided differences, :math:`h (\frac{P_{j+1} - P_j}{g_{j+1} - g_j}
+    - \frac{P_j
     - P_{j-1}}{g_j - g_{j-1}})` with h the mean distance; for uniform knots they equal the plain ones.
     """
     means = np.convolve(knots[1:-1], np.full(degree, 1.0 / degree), "valid")
@@ -378,7 +384,7 @@ def _strength(problem: _Problem, confidence: Array, smoothing: Smoothing, sigma:
 
 
 def _cross_validated(problem: _Problem, confidence: Array) -> float:
-    r"""Return the mu with the lowest :math:`k\,RSS / (k - \mathrm{tr} H)^2`, H the smoothing matrix."""
+    r"""Return the mu with the lowest :math:`k\,RSS / (k - \mathrm{tr} H)^2`, where H is the smoothing matrix."""
     count = float((confidence > 0.0).sum())
     eye = np.eye(problem.n_control)
 
@@ -396,7 +402,7 @@ def _cross_validated(problem: _Problem, confidence: Array) -> float:
 
 
 def _least(score: Callable[[float], float]) -> float:
-    """Return ``10**d`` with the lowest ``score(d)``; d is searched among whole numbers, then near the best."""
+    """Return ``10**d`` with the lowest ``score(d)``; whole numbers d are tried first, then values near the best."""
     decades = np.arange(_MU[0], _MU[1] + 0.5)
     best = float(decades[int(np.argmin([score(float(d)) for d in decades]))])
     finer = minimize_scalar(score, bounds=(best - 1.0, best + 1.0), method="bounded", options={"xatol": 0.1})

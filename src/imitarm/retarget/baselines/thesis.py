@@ -1,4 +1,4 @@
-"""ThesisRetargeter: the method of the thesis's Chapter 3, corrected, or with its misprints one by one."""
+"""ThesisRetargeter: the method of the thesis's Chapter 3, corrected, or with selected misprints."""
 
 from __future__ import annotations
 
@@ -64,17 +64,17 @@ class HumanArmTracker:
     .. math:: \tau \leftarrow \tau + J^+ \varepsilon, \qquad
         \varepsilon = \begin{pmatrix} p_d - p(\tau) \\ \log(R_d R(\tau)^T) \end{pmatrix}
 
-    with :math:`p_d, R_d` the corrected wrist and hand and J the Jacobian of the person's arm; directions in which a
-    straight arm can't move are left out of :math:`J^+`. The first frame, and the first after a gap, is solved in closed
-    form.
+    where :math:`p_d, R_d` are the corrected wrist and hand and J is the Jacobian of the person's arm; :math:`J^+`
+    leaves out directions in which a straight arm can't move. The first frame, and the first frame after a gap, are
+    solved in closed form.
 
     Attributes:
         angles: tau, shape (7,) [rad]; None before the first frame.
 
     Args:
         iterations: per frame.
-        faults: misprints to reproduce, of :data:`PRINTED`; ``"limbs"``, ``"dh"``, ``"error"``, ``"rpy"`` and ``"step"``
-            concern this class.
+        faults: misprints from :data:`PRINTED` to reproduce; ``"limbs"``, ``"dh"``, ``"error"``, ``"rpy"`` and
+            ``"step"`` concern this class.
     """
 
     def __init__(self, iterations: int = 3, faults: Collection[str] = ()) -> None:
@@ -91,7 +91,7 @@ class HumanArmTracker:
         """Process a frame; return the tracked arm's wrist (3,) [m] and hand quaternion (4,) in the base frame.
 
         Args:
-            estimate: of the arm, with true bone lengths.
+            estimate: estimate of the arm, with true bone lengths.
             lengths: these lengths.
         """
         elbow, wrist = estimate.elbow, estimate.wrist
@@ -181,24 +181,24 @@ class ThesisRetargeter(Retargeter):
 
     At each control step the tool moves towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
     3.9). The length of every step is limited, because otherwise the damping stops the arm. Joint positions and
-    velocities stay within their limits. Accelerations, the elbow, obstacles and the loss of the person are not treated,
+    velocities stay within their limits. Accelerations, the elbow, obstacles and tracking losses are not handled,
     because the thesis
-    does not: when the person is lost, the target stays, and it jumps when the person returns.
+    does not handle them: when the person is lost, the target stays, and it jumps when the person returns.
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: between the person's arm and the robot's.
+        correspondence: correspondence between the person's arm and the robot's.
         dt: control period [s].
         scene: ignored.
-        small_angle: ``"thesis"``: with the term printed after Eq 3.9.
-        as_printed: True: reproduce all misprints of :data:`PRINTED`; or the names of some. Limits are kept
+        small_angle: ``"thesis"`` includes the term printed after Eq 3.9.
+        as_printed: names of misprints from :data:`PRINTED` to reproduce; True: all of them. Limits are kept
             nevertheless.
         smoothing: ``"live"``; ``"global"``: :meth:`run` fits one curve to the whole recording, without lag
             (:meth:`step` is live); None: no curve.
-        lag: of the live curve [s].
+        lag: lag of the live curve [s].
         iterations: increments per frame.
-        gain: K of the twist :math:`K \log(T_d T^{-1})` [1/s]; one over the frame period.
-        max_speed: the twist is limited to this [m/s], 1 rad counted as 0.3 m.
+        gain: gain K of the twist :math:`K \log(T_d T^{-1})` [1/s]: the inverse of the frame period.
+        max_speed: largest norm of the twist [m/s], with 1 rad counted as 0.3 m.
 
     Raises:
         InputError: when a number is out of range.
@@ -251,7 +251,7 @@ class ThesisRetargeter(Retargeter):
         """Retarget a whole recording; ``smoothing="global"`` fits one curve to all of it.
 
         Args:
-            skeletons: in order of time.
+            skeletons: skeletons in order of time.
             q: start posture, shape (n_joints,) [rad]; None: ``arm.home``.
 
         Raises:
