@@ -1,1 +1,1 @@
-"""Experiments: seeded families of scenes and recordings, runs that can be continued, saved results, tables."""
+"""Experiments: seeded families of scenes and recordings, resumable runs, saved results, and tables."""

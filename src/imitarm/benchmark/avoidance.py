@@ -39,7 +39,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a method in one scene.
+    """Result of a method in one scene.
 
     Attributes:
         accepted: whether the method accepts the scene and returns a path to execute.
@@ -96,7 +96,7 @@ def run_family(skill: Skill, cases: Iterable[Case], method: str = "certified") -
 
 
 def _families(path: Array, planar: bool) -> list[tuple[str, bool, Callable[[int], Case]]]:
-    """Return the name of each family, whether it can be solved, and the function that makes its scenes."""
+    """Return the name of each family, whether its scenes have a solution, and the function that makes them."""
     rows: list[tuple[str, bool, Callable[[int], Case]]] = [
         (f"{k} on the path", True, lambda s, k=k: sparse_clutter(s, path, n_obstacles=k, planar=planar))  # type: ignore[misc]
         for k in (1, 2, 3)
@@ -136,7 +136,7 @@ def success_table(
     Args:
         seeds: scenes in each family.
         first: first seed; 2000 and on are the test seeds.
-        methods: of :data:`imitarm.policies.adaptation.ADAPTERS`.
+        methods: names in :data:`imitarm.policies.adaptation.ADAPTERS`.
         on_done: called with the number of finished rows and the total number.
     """
     rows: list[tuple[str, ...]] = []

@@ -41,9 +41,9 @@ class Method:
     """A retargeting method with its options: a row of the tables.
 
     Attributes:
-        retargeter: its name in :data:`imitarm.retarget.RETARGETERS`.
-        label: its name in tables and figures; empty: the method's own title.
-        options: for its constructor.
+        retargeter: name of the method in :data:`imitarm.retarget.RETARGETERS`.
+        label: name of the row in tables and figures; empty: the method's title.
+        options: options for the method's constructor.
     """
 
     retargeter: str
@@ -62,7 +62,8 @@ class Method:
 
 MAIN: Mapping[str, Method] = {name: Method(name) for name in RETARGETERS}
 """Every registered method with its default options. The built-in ones are those of thesis Table 3.1 and Figs 3.6 to
-3.8: ``thesis`` is its method Me with the equations corrected, M1 to M3 are our reading of its baselines; ``modern`` is
+3.8: ``thesis`` is its method Me with the equations corrected, M1 to M3 are our interpretation of its baselines;
+``modern`` is
 this library's own. Methods of other packages are added by entry points."""
 
 VARIANTS: Mapping[str, Method] = {
@@ -103,7 +104,7 @@ class Experiment:
         method: one of :data:`METHODS`.
         robot: one of :data:`ROBOTS`; stacking needs the Sawyer.
         seed: seed of the person.
-        repeat: number of the recording or trial among those of this person.
+        repeat: number of the recording or trial of this person.
         seconds: approximate duration of reaches and drawings [s].
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
         data: folder of real recordings, for the task that needs them.
@@ -151,7 +152,7 @@ class Experiment:
                 saved.
 
         Returns:
-            The result; when the method fails, one without values and with the reason in ``failure``.
+            The result. When the method fails, it has no values, and ``failure`` holds the reason.
         """
         began = clock.perf_counter()
         try:
@@ -202,7 +203,7 @@ class StackingOutcome:
         failure: one of :data:`imitarm.tasks.stack.FAILURES`; empty on success.
         reason: reason in words.
         stacked: cubes in the tower at the end.
-        time: until the person had finished, or the time limit [s].
+        time: time until the person had finished, or the time limit [s].
         path_length: path length of the tool [m].
         mean_torque: mean of the absolute torque of each joint [N m].
         rms_torque: root mean square of each joint's torque [N m].
@@ -234,9 +235,9 @@ def run_stacking(
     Args:
         method_name: one of :data:`METHODS`.
         person: seed of the person.
-        repeat: number of the trial among those of this person.
+        repeat: number of the trial of this person.
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
-        arm: the Sawyer with the gripper, when it is loaded already.
+        arm: the Sawyer with the gripper, if it is already loaded.
     """
     arm = ArmModel.load("sawyer", tool="gripper") if arm is None else arm
     done = run_stack(person, repeat, method(method_name), arm=arm, camera=camera_maker(sigma))
@@ -272,9 +273,9 @@ class Result:
     """The result of an experiment, as plain values.
 
     Attributes:
-        experiment: which one.
+        experiment: experiment that was run.
         code: version of the code that ran, see :func:`imitarm.benchmark.provenance.code_version`.
-        values: the measures by name: those of :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics` with
+        values: measures by name: those of :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics` with
             ``recorded`` [s], ``beyond_reach`` (fraction of the time) and the method's own ``notes``; or those of
             :class:`StackingOutcome`; empty after a failure.
         failure: reason why there are no measures; empty if there are.
@@ -321,7 +322,7 @@ class Result:
 
     @classmethod
     def load(cls, path: Path) -> Result:
-        """Read a file that :meth:`save` wrote; None in the file stands for nan.
+        """Read a file that :meth:`save` wrote; null in the file represents nan.
 
         Raises:
             FileFormatError: when the file is not such a result.
@@ -349,7 +350,7 @@ def plain(value: Any) -> Any:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file under a temporary name and rename it, so that no reader finds half of it."""
+    """Write a text file under a temporary name and rename it, so that no reader finds an incomplete file."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         aside.write_text(text, encoding="utf-8")

@@ -1,7 +1,7 @@
 """Seeded families of scenes around one seeded skill; the same seed gives the same scene on every machine.
 
-Every scene is a :class:`Case`: obstacles, forbidden directions, and whether a solution exists. The latter follows from
-the construction of the scene, not from a tested method.
+Every scene is a :class:`Case`: obstacles, forbidden directions, and whether a solution exists. The existence of a
+solution follows from the construction of the scene, not from a tested method.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class Case:
 
 
 def s_shaped_demonstrations(*, planar: bool, n_demonstrations: int = 8, seed: int = 0) -> list[Demonstration]:
-    """Make demonstrations of an S-shaped reach of 0.6 m, precise at both ends and loose between them.
+    """Make demonstrations of an S-shaped reach of 0.6 m, precise at both ends and variable between them.
 
     Args:
-        planar: keep the height constant, as in a task on a table.
+        planar: whether to keep the height constant, as in a task on a table.
         n_demonstrations: how many.
         seed: seed of the differences between the demonstrations.
     """
@@ -94,14 +94,16 @@ def random_obstacle(
 
 
 def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, kinds: tuple[str, ...] = KINDS) -> Case:
-    """Family S1/S3: obstacles of all kinds placed on the path, well apart; solvable, since one can go round each.
+    """Family S1/S3: obstacles of all kinds placed on the path, well apart.
+
+    Solvable, because a path can go round each of them.
 
     Args:
         seed: number of the scene.
         path: nominal path on which the obstacles are placed, shape (n, 3) [m].
         n_obstacles: how many.
         planar: whether the path must stay in its plane.
-        kinds: the shapes from which to choose.
+        kinds: shapes from which to choose.
     """
     rng = np.random.default_rng([11, n_obstacles, planar, seed])
     ends = path[[0, -1]]
@@ -175,13 +177,13 @@ class RandomScene:
 
     Attributes:
         seed: number of the scene.
-        family: how the obstacles were placed.
+        family: name of the rule by which the obstacles were placed.
         scene: obstacles; some move.
         tool_spheres: rows x y z r in the tool's frame, shape (m, 4) [m].
         clearance: required [m].
         forbidden: directions in which nothing may move, shape (m, 3).
         pinned: times at which the path must not move [s].
-        n_samples: along the path.
+        n_samples: number of samples along the path.
     """
 
     seed: int
@@ -204,7 +206,7 @@ def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> R
         seed: number of the scene.
         path: nominal path, shape (n, 3) [m].
         duration: duration of the path [s].
-        rotates: whether the skill rotates the tool, so that the tool may have spheres beside the tip.
+        rotates: whether the skill rotates the tool, so that the tool may have spheres away from the tip.
     """
     rng = np.random.default_rng([31, seed])
     family = RANDOM_FAMILIES[int(rng.choice(len(RANDOM_FAMILIES), p=[0.1, 0.1, 0.3, 0.12, 0.06, 0.06, 0.16, 0.1]))]
@@ -321,7 +323,7 @@ def _huge(rng: np.random.Generator, path: Array, duration: float, planar: bool, 
 
 
 def _thin(rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float) -> tuple[Obstacle, ...]:
-    """Plates and rods of a millimetre or two."""
+    """Plates and rods that are one or two millimetres thick."""
     made: list[Obstacle] = []
     for _ in range(int(rng.integers(1, 4))):
         pose = Pose(_inner_point(rng, path, 0.02), quaternion_exp(_rotation(rng, planar)))
@@ -349,7 +351,7 @@ def _enclosing(
 
 
 def _moving(rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float) -> tuple[Obstacle, ...]:
-    """Obstacles that cross the path at 0.1 to 0.6 m/s, about when the tool is there."""
+    """Obstacles that cross the path at 0.1 to 0.6 m/s, at about the time when the tool is there."""
     made = []
     for _ in range(int(rng.integers(1, 4))):
         at = int(rng.uniform(0.15, 0.85) * (len(path) - 1))

@@ -33,14 +33,15 @@ class MappingBenchmark:
 
     Attributes:
         people: number of simulated persons.
-        first: number of the first; they are ``first`` to ``first + people - 1``. Persons below 200 are for developing
+        first: number of the first person; the persons are ``first`` to ``first + people - 1``. Persons below 200
+            are for developing
             methods, those from 200 on for testing: no method is tested with a person that it was tuned with.
         repeats: closed-loop trials of each person; there is one recording of each kind and person to replay.
-        methods: of :data:`imitarm.benchmark.experiment.METHODS`.
-        kinds: of recordings, of :data:`imitarm.benchmark.recordings.KINDS`.
+        methods: names in :data:`imitarm.benchmark.experiment.METHODS`.
+        kinds: kinds of recordings, from :data:`imitarm.benchmark.recordings.KINDS`.
         seconds: approximate duration of a recording [s].
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
-        live: whether cubes are stacked in closed loop, by the main methods among ``methods``.
+        live: whether the main methods among ``methods`` also stack cubes in closed loop.
         data: folder of real recordings; empty: the captured arm is left out.
 
     Raises:
@@ -66,7 +67,7 @@ class MappingBenchmark:
             raise InputError("the benchmark needs a method, and a kind of recording or the closed loop")
 
     def experiments(self) -> list[Experiment]:
-        """Return all experiments, those of one recording next to each other."""
+        """Return all experiments, grouped by recording."""
         persons = range(self.first, self.first + self.people)
         found = [
             Experiment(kind, method, seed=person, seconds=self.seconds, sigma=self.sigma)
@@ -100,7 +101,7 @@ _TORQUES = {
 
 
 def tables(results: Results) -> list[Table]:
-    """Return every table that the results fill, the claims of the thesis first."""
+    """Return all tables for which there are results, the claims of the thesis first."""
     replayed, found = results.tasks(), []
     if replayed:
         stacking = results.tasks(["stacking"]) or replayed
@@ -122,7 +123,7 @@ def tables(results: Results) -> list[Table]:
 
 
 def write_tables(results: Results, found: Sequence[Table], folder: Path) -> tuple[Path, Path]:
-    """Write ``mapping.md`` and ``mapping.json`` into the folder; return where they are."""
+    """Write ``mapping.md`` and ``mapping.json`` into the folder; return their paths."""
     document, data = folder / "mapping.md", folder / "mapping.json"
     write_text(document, "\n".join(table.markdown() for table in found))
     content = {

@@ -1,4 +1,4 @@
-"""Comparisons: ``modern`` with each other method, and the thesis's claims with the results."""
+"""Comparisons of ``modern`` with each other method, and of the thesis's claims with the results."""
 
 from __future__ import annotations
 
@@ -32,15 +32,20 @@ COMPARED = (
     Figure("limit_violations", "frames beyond a limit", digits=0),
     *SMOOTHNESS,
 )
-"""The measures in which ``modern`` is compared with the other methods: all of the tables of accuracy, effort, torque
+"""The measures in which ``modern`` is compared with the other methods: all measures in the tables of accuracy, effort,
+torque
 and smoothness, and the frames that break a limit."""
 STACKED = Figure("success", "stacked [%]", 100.0, 0, more=True)
 LIVE_COMPARED = (STACKED, *LOOP, TORQUES[1], EFFORT[4], EFFORT[6])
-"""The measures that are compared in closed loop; all but the rate are of the trials in which both methods succeeded."""
+"""The measures that are compared in closed loop; all except the success rate use only trials in which both methods
+succeeded."""
 
 
 def _compared(results: Results, tasks: Sequence[str]) -> Iterator[tuple[Figure, str, Comparison, float]]:
-    """Give measure, other method, ``modern`` minus that method, and p after Holm's correction within the measure."""
+    """One comparison.
+
+    Measure, other method, ``modern`` minus that method, and p after Holm's correction within the measure.
+    """
     baselines = [name for name in results.methods if name != OURS and results.of(name, tasks)]
     if not results.of(OURS, tasks):
         return
@@ -59,8 +64,9 @@ def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
     ]
     columns = ("measure", f"{OURS} minus", "difference (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
     note = (
-        "↑: a larger value is better; else a smaller one. Persons are resampled; p by sign flips of the persons' "
-        "differences, corrected within each measure. Pairs: recordings for which both methods have a value."
+        "↑: a larger value is better; otherwise a smaller one. Intervals: by resampling the persons. "
+        "p: by sign flips of the persons' differences, corrected within each measure. "
+        "Pairs: recordings for which both methods have a value."
     )
     return Table(f"Paired comparison: {', '.join(tasks)}", columns, tuple(rows), note)
 
@@ -78,7 +84,7 @@ def better_methods_table(results: Results, tasks: Sequence[str]) -> Table:
     columns = ("recordings", "measure", "better", f"{OURS} minus it (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
     note = (
         f"All compared measures whose interval shows that {OURS} is worse (for any p), and all methods that stacked "
-        f"more often. ↑: a larger value is better; else a smaller one."
+        f"more often. ↑: a larger value is better; otherwise a smaller one."
     )
     return Table(f"Where another method is better than {OURS}", columns, tuple(rows), note)
 
@@ -196,7 +202,7 @@ def verdict(comparisons: Sequence[Comparison], sign: float) -> str:
 
     Args:
         comparisons: Me minus each baseline.
-        sign: sign of the differences according to the claim, -1 or 1.
+        sign: claimed sign of the differences, -1 or 1.
     """
     corrected = holm([c.p for c in comparisons])
     shown = [
@@ -209,7 +215,7 @@ def verdict(comparisons: Sequence[Comparison], sign: float) -> str:
 
 
 def _against(pairs: Sequence[tuple[str, Values, Values]], sign: float) -> Verdict:
-    """Compare Me with baselines: name, Me's values, theirs."""
+    """Compare Me with baselines, each given by its name, the values of Me, and its own values."""
     found = [(name, compare(ours, theirs)) for name, ours, theirs in pairs]
     texts = [
         f"{METHODS[name].title} {100 * c.relative:+.0f} %" if math.isfinite(c.relative) else f"{METHODS[name].title} –"
@@ -234,7 +240,7 @@ def _quicker(results: Results, me: str, _: Sequence[str]) -> Verdict:
 
 
 def _two_leads(results: Results, me: str, tasks: Sequence[str]) -> Verdict:
-    """M2 has the smallest torque of all, and takes the longest."""
+    """M2 has the smallest torque of all and takes the longest time."""
     others = [name for name in (me, "m1", "m3") if name in results.methods]
     if "m2" not in results.methods or not results.of("m2", [LIVE]):
         return "–", "not run"
@@ -256,7 +262,7 @@ def _farther_from_singular(results: Results, me: str, _: Sequence[str]) -> Verdi
 
 
 def _rated(results: Results, me: str, tasks: Sequence[str]) -> Verdict:
-    """Mean torques as large as printed, joint by joint: within the printed interval."""
+    """The mean torque of each joint is within the printed interval."""
     inside = 0
     for joint, column in enumerate(PRINTED_TORQUES.T):
         low, high = bootstrap(column)
@@ -276,9 +282,9 @@ _MEANS = PRINTED_TORQUES.mean(axis=0).tolist()
 CLAIMS: Sequence[tuple[str, Callable[[Results, str, Sequence[str]], Verdict]]] = (
     ("less torque than M1, M2, M3 (Fig 3.6)", _less("mean_torque")),
     ("a shorter path than M1, M2, M3, by up to 5 % (Fig 3.7)", _less("path_length")),
-    ("done in less time than M1, M2, M3 (Fig 3.8)", _quicker),
+    ("shorter time than M1, M2, M3 (Fig 3.8)", _quicker),
     ("M2 has the smallest torque, but takes longest (text beside Fig 3.7)", _two_leads),
-    ("singularity is minimised: farther from it than M3 at the edge of reach", _farther_from_singular),
+    ("singularities are avoided: farther from them than M3 at the edge of reach", _farther_from_singular),
     (f"mean torques of {min(_MEANS):.0f} to {max(_MEANS):.0f} N m at every joint (Table 3.1)", _rated),
     (f"four cubes stacked in {PRINTED_TIME.mean():.1f} s (Table 3.1)", _like_printed_time),
 )

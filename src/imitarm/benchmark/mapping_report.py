@@ -1,4 +1,4 @@
-"""The mapping benchmark as one self-contained HTML page: tables, figures, playback of person and robot.
+"""The mapping benchmark as one self-contained HTML page with tables, figures and playback of person and robot.
 
 The figures follow Figs 3.6 to 3.8 of the thesis; each is one ``<svg>`` element.
 """
@@ -26,8 +26,8 @@ from imitarm.viewer.retarget_report import PLAYER_KEYS, MethodResult, RetargetRe
 
 _SHOWN: Final = 9.0  # [s] of the recording that is played
 _WORDS: Final = {
-    "Interval": "The 95 % confidence interval of a mean over persons, from resampling the persons. Two intervals that "
-    "overlap do not rule out a difference; the paired comparison tests it.",
+    "Interval": "The 95 % confidence interval of a mean over persons, from resampling the persons. Overlapping "
+    "intervals do not rule out a difference; the paired comparison tests for it.",
     "Lag": "The constant delay at which the path of the tool fits the true path of the hand best.",
     "From first hold": "The distance between the tool and its true target from the first engagement to the end, "
     "including the time in which the method does not follow.",
@@ -43,13 +43,13 @@ def write_mapping_report(
 
     Args:
         results: results of the benchmark.
-        tables: as the command printed them.
+        tables: tables printed by the command.
         path: the file to write; its folder must exist.
-        provenance: the facts that are needed to repeat the benchmark.
+        provenance: facts needed to repeat the benchmark.
         folder: folder of the recordings; None: they were not saved.
 
     Returns:
-        Where it was written, absolute.
+        Absolute path of the page.
 
     Raises:
         InputError: when the file can't be written, or the drawing libraries are not installed.
@@ -64,7 +64,7 @@ def mapping_report_html(
     """Return the whole page; see :func:`write_mapping_report`."""
     shared, players = _players(results, folder)
     verdict, good = _verdict(results)
-    summary = "All methods on the same recordings of simulated people, and the same people stacking cubes with each."
+    summary = "Every method follows the same recordings of simulated people, and the same people stack cubes with it."
     return render(
         "mapping.html",
         Header("Mapping benchmark", verdict, good, summary, _tiles(results)),
@@ -204,7 +204,7 @@ def limit_violations(results: Results, tasks: Sequence[str], *, name: str = "lim
 
 
 def times(results: Results, *, name: str = "times") -> str:
-    """Draw the time to stack four cubes for each method, of the trials that succeeded (Fig 3.8)."""
+    """Draw the time to stack four cubes for each method, in the successful trials (Fig 3.8)."""
 
     def values(method: str) -> Values:
         return results.values(method, [LIVE], "time")
@@ -215,7 +215,7 @@ def times(results: Results, *, name: str = "times") -> str:
 
 
 def successes(results: Results, *, name: str = "successes") -> str:
-    """Draw the rate of stacked towers, with intervals over persons."""
+    """Draw the rate of successful towers, with intervals over persons."""
 
     def rate(method: str) -> Interval:
         return _scaled(rate_interval(results.values(method, [LIVE], "success")), 100.0)

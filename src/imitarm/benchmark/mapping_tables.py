@@ -14,7 +14,7 @@ from imitarm.benchmark.tables import Table
 from imitarm.evaluation.intervals import Interval, Values, interval, rate_interval
 
 TEST = 200
-"""First of the test persons, who are not used while methods are developed."""
+"""First of the test persons, which are not used for developing methods."""
 _DEGREES = 180.0 / math.pi
 
 
@@ -23,9 +23,9 @@ class Figure:
     """A measure with its title and the unit in which it is reported.
 
     Attributes:
-        name: in ``Result.values``.
-        title: with its unit.
-        factor: from SI.
+        name: name in ``Result.values``.
+        title: title with the unit.
+        factor: factor from SI units to the reported unit.
         digits: number of decimals.
         more: whether a larger value is better.
     """
@@ -93,17 +93,17 @@ class Results:
         return [r for r in self.all if r.experiment.method == method and r.experiment.task in tasks]
 
     def tasks(self, among: Sequence[str] = KINDS) -> list[str]:
-        """Return those tasks that have results."""
+        """Return the tasks that have results."""
         return [task for task in among if any(r.experiment.task == task for r in self.all)]
 
     def values(self, method: str, tasks: Sequence[str], name: str, joint: int | None = None) -> Values:
-        """Return a number of each recording, by person and recording; nan where it is not known.
+        """Return one value for each recording, by person and recording; nan where it is unknown.
 
         Args:
             method: whose.
-            tasks: at which.
-            name: name of the measure; ``"limit_violations"`` is the sum of the three counts. With the loop closed
-                ``"success"`` is 1 or 0, and the rest is known only of the trials that succeeded.
+            tasks: tasks to evaluate.
+            name: name of the measure; ``"limit_violations"`` is the sum of the three counts. In closed loop,
+                ``"success"`` is 1 or 0, and the other measures are known only for successful trials.
             joint: index of the joint, for measures of each joint; None: the mean over the joints.
         """
         return {
@@ -153,7 +153,7 @@ def written_each(values: Values, figure: Figure) -> str:
 
 
 def _cells(results: Results, name: str, task: str, figures: Sequence[Figure]) -> list[str]:
-    """Return figures of one kind of recording: with intervals over persons, or the range for the captured arm."""
+    """Return the values for one kind of recording, with intervals over persons or, for the captured arm, the range."""
     found = [results.values(name, [task], figure.name) for figure in figures]
     if task == CAPTURED:
         return [written_each(values, figure) for values, figure in zip(found, figures, strict=True)]
@@ -184,7 +184,7 @@ def recordings_table(results: Results) -> Table:
 
 
 def persons_note(results: Results) -> str:
-    """Return a sentence about the simulated persons of the tables, and whether methods were developed with them."""
+    """Return a sentence about the simulated persons of the tables and whether methods were developed with them."""
     seen = sorted({r.experiment.seed for r in results.all if r.experiment.task != CAPTURED})
     if not seen:
         return ""
@@ -275,8 +275,8 @@ def success_table(results: Results) -> Table:
         rows.append((METHODS[name].title, *rate, *cells, why))
     columns = ("method", "stacked>", "95 % [%]>", *(f"{figure.title}>" for figure in LOOP), "failures")
     note = (
-        "The interval of the rate is Wilson's with an effective number of trials, which is smaller the more persons "
-        "differ; one more failure never raises its lower end. Time, path and torque are means over persons (95 % "
-        f"interval) of the trials that succeeded. {persons_note(results)}"
+        "The interval of the rate is Wilson's with an effective number of trials, which decreases as the "
+        "differences between persons increase; one more failure never raises its lower end. "
+        f"Time, path and torque are means over persons (95 % interval) of the trials that succeeded. {persons_note(results)}"
     )
     return Table("Four cubes stacked, closed loop", columns, tuple(rows), note)

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 OUTCOMES = ("arrived", "refused", "waited", "too near", "touched", "stopped")
 """Possible outcomes of a placement: arrived with the clearance kept; refused before any motion; not finished in time;
-finished, but nearer than required; contact, also of the arm with itself; a protective stop or a failure."""
+finished, but closer than required; contact (including self-collision); a protective stop or a failure."""
 
 CLEARANCE = 0.02  # [m] required
 _DT = 0.01  # [s]
@@ -52,7 +52,7 @@ class Setup:
     Attributes:
         skill: path of a skill file.
         robot: name of an arm, or a path.
-        tool: name of a tool, or a path; None: none.
+        tool: name of a tool, or a path; None: no tool.
     """
 
     skill: str
@@ -70,8 +70,8 @@ class PlacementResult:
         seed: seed of the placement.
         outcome: one of :data:`OUTCOMES`.
         clearance: smallest measured distance of arm and tool to an obstacle [m]; nan without a motion.
-        duration: duration of the motion over that of the skill; nan without a motion.
-        planning: wall time until the policy answered or refused [s].
+        duration: duration of the motion divided by that of the skill; nan without a motion.
+        planning: wall time until the policy accepted or refused [s].
         reason: reason in words.
     """
 
@@ -90,7 +90,7 @@ def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
 
     Args:
         skill: whose path.
-        arm: whose tool must be clear at start and goal.
+        arm: arm whose tool must be clear of obstacles at start and goal.
         seed: seed of the scene; every third has one obstacle.
         start: joint positions at the start, shape (n_joints,) [rad].
 

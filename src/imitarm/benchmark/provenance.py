@@ -1,4 +1,4 @@
-"""Version of the code that made a result: the commit of its checkout, or the installed version."""
+"""Version of the code that produced a result: the commit of its checkout, or the installed version."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def version_of(package: Path, installed: str) -> str:
 
     Args:
         package: the folder, with an ``__init__.py``.
-        installed: what to return when Git does not know the folder.
+        installed: text to return when the folder is not in a Git repository.
     """
     if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
         return installed  # also for an environment that lies inside somebody's repository
@@ -52,7 +52,7 @@ def origin(versions: Iterable[str]) -> str:
     """Return a sentence that says which code made the results, and whether it differs from the running code.
 
     Args:
-        versions: versions of the code of each result, see :func:`code_version`.
+        versions: code version of each result, see :func:`code_version`.
     """
     found, now = sorted(set(versions)), code_version()
     if found == [now]:

@@ -1,4 +1,4 @@
-"""Recordings of real people lead the simulated arms: ``imitarm benchmark people``."""
+"""Recordings of real people drive simulated arms: ``imitarm benchmark people``."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def real_motions(data: Path, videos: Sequence[str] = ()) -> Iterator[Motion]:
         videos: videos of a person, or recordings of one.
 
     Raises:
-        InputError: when a file is missing or can't be read, or MediaPipe is needed and not there.
+        InputError: when a file is missing or can't be read, or MediaPipe is needed but not installed.
     """
     for name, (file, side) in _GESTURES.items():
         yield Motion(name, _person(str(data / "kinect_gestures" / file)), side)
@@ -104,7 +104,7 @@ def tables(motions: Sequence[Motion]) -> list[Table]:
 
 
 class Start(NamedTuple):
-    """The start of an arm that follows a motion, from which the whole motion is within reach.
+    """The setup of an arm that follows a motion, with a start from which the whole motion is within reach.
 
     The fields are the arm, the skeletons at the playback speed, the correspondence, the first posture (n_joints,)
     [rad], and the largest speed of the target [m/s].

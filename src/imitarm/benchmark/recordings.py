@@ -1,4 +1,4 @@
-"""The recordings of the mapping benchmark: simulated people before simulated cameras, the same for every method."""
+"""Recordings of the mapping benchmark: simulated people and simulated cameras, the same for every method."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ Array = NDArray[np.float64]
 
 KINDS = ("inside", "edge", "drawing", "stacking")
 """Kinds of recordings of simulated people: reaches well inside the workspace; reaches with the arm stretched out every
-few seconds, beyond what the robot reaches; circles, eights and waves; stacking of four cubes."""
+few seconds, beyond the reach of the robot; circles, eights and waves; stacking of four cubes."""
 CAPTURED = "captured"
-"""The kind that needs real data: an arm recorded by motion capture, before a simulated camera."""
+"""The kind that needs real data: an arm recorded by motion capture, in front of a simulated camera."""
 
 REPEATS = 100
-"""Largest number of recordings of one kind and person: more would get the seeds of the next person."""
+"""Largest number of recordings of one kind and person: a larger number would use the seeds of the next person."""
 _LONGEST = 120.0  # [s] of a recording
 
 REACH = 0.80  # [m] from the Sawyer's shoulder to its wrist when it is stretched
@@ -55,8 +55,8 @@ class Plan:
     Attributes:
         kind: one of :data:`KINDS`, or :data:`CAPTURED`.
         person: seed of the person, whose limbs and habits differ.
-        repeat: number among this person's recordings, 0 to 99: seeds motion and camera; of the captured arm: number of
-            the camera.
+        repeat: number of this person's recording, 0 to 99, which seeds motion and camera; for the captured arm,
+            number of the camera.
         seconds: approximate duration of reaches and drawings [s]; a capture is cut to it; stacking ignores it.
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
         data: folder of real recordings, for :data:`CAPTURED`.
@@ -99,10 +99,10 @@ class MappingRecording:
 
     Attributes:
         plan: the definition of the recording.
-        skeletons: as the camera saw them.
-        correspondence: the same for all methods.
+        skeletons: skeletons measured by the camera.
+        correspondence: correspondence for all methods.
         start: first posture of the robot, shape (n_joints,) [rad].
-        true_times: shape (m,) [s] since the first skeleton.
+        true_times: times of the true positions since the first skeleton, shape (m,) [s].
         true_points: true positions of shoulder, elbow, wrist, hand, hand tip and thumb, shape (m, 6, 3) [m], in the
             sensor's frame.
     """
@@ -167,7 +167,7 @@ def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
         arm: the robot that will follow it.
 
     Raises:
-        InputError: when it needs real data that are not there.
+        InputError: when it needs real data that are missing.
         TaskFailedError: when this person can't stack the cubes even with a gripper that moves exactly with the hand.
     """
     person = Person.from_seed(plan.person)
@@ -220,7 +220,7 @@ def _inside(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
 
 
 def _edge(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
-    """Return reaches as inside, with the arm stretched out to its full length every few seconds."""
+    """Return reaches like the kind "inside", with the arm fully stretched every few seconds."""
     inside, shoulder = reaching(person, plan.number, duration=plan.seconds), person.shoulder()
     begun, ended = REST, max(plan.seconds - 1.0, REST + _STRETCH)
     cycles = max(round((ended - begun) / _STRETCH), 1)
@@ -275,7 +275,7 @@ _MAKERS: dict[str, Callable[[Plan, Person], tuple[Truth, float, Orientation]]] =
 
 
 def _end(truth: Truth, latest: float) -> float:
-    """Return when a motion ends [s], at the latest at ``latest`` [s]."""
+    """Return the time at which a motion ends [s], at most ``latest`` [s]."""
     times = np.arange(0.0, latest, 0.02)
     return motion_end(times, np.array([truth(t).arm("right").wrist for t in times]))
 
@@ -300,7 +300,7 @@ def beyond_reach(recording: MappingRecording, arm: ArmModel) -> float:
     The target is the start plus the scaled displacement of the person's wrist; the tool keeps its orientation.
 
     Raises:
-        InputError: when the arm's file does not say where shoulder and wrist are.
+        InputError: when the arm's file does not define shoulder and wrist.
     """
     shoulder, _, wrist = arm.sew_points(recording.start)
     true = recording.true_arm(recording.true_times)

@@ -1,4 +1,4 @@
-"""An oracle that decides whether a path exists, to check refusals. It shares no code with the search of the library.
+"""An oracle that decides whether a path exists, to check refusals. It shares no code with the library's search.
 
 It looks at displacements of the nominal path, one grid of them for each of many times (layers), and gives one of three
 answers:
@@ -10,7 +10,7 @@ answers:
   the skill's components or, where these are too wide, of hat functions in time.
 * **undecided**: neither was shown with the finest grid.
 
-The limits are those of the library: no sample is displaced by more than 0.5 m, no step is longer than 8 times
+The oracle uses the limits of the library: no sample is displaced by more than 0.5 m, no step is longer than 8 times
 the longest step of the nominal path, fixed times do not move, and no displacement has a component in forbidden
 directions.
 """
@@ -76,7 +76,7 @@ def answer(question: Question) -> Answer:
 def is_solved(
     question: Question, axes: Array | None = None, grids_to_search: Sequence[tuple[float, float]] | None = None
 ) -> bool:
-    """Return whether a path is found and verified, on all grids or on given ones (reach and cell size [m])."""
+    """Return whether a path is found and verified, on all grids or on given grids (reach and cell size [m])."""
     axes = question.axes() if axes is None else axes
     if separation(question, question.nominal.times, question.nominal.positions) >= -1e-9:
         return True
@@ -189,7 +189,7 @@ def _layer(
     from_fixed: bool,
     to_fixed: bool,
 ) -> tuple[list[tuple[Array, Array]], list[Bools], Bools, Bools]:
-    """Return distances and gradients of a layer, free moves along each axis, free moves from before, free cells."""
+    """Return distances and gradients of a layer, free moves along each axis and from the layer before, free cells."""
     shape = (side,) * d
     free, ahead = np.ones(shape, dtype=bool), np.ones(shape, dtype=bool)
     sides = [np.ones(shape, dtype=bool) for _ in range(d)]

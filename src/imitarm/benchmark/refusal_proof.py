@@ -1,4 +1,4 @@
-"""Proof that no path exists, by flooding boxes of space over time.
+"""Proof that no path exists, by a flood fill of boxes in space over time.
 
 A box counts as free if any of its points may be free at any time of an interval. If no chain of such boxes leads from
 the start to the goal, then no continuous displacement of the path does either.
@@ -30,7 +30,7 @@ _DENSE = 4000
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """A scene as the oracle sees it.
+    """A scene in the form that the oracle uses.
 
     Attributes:
         nominal: the nominal path, n samples.
@@ -39,7 +39,7 @@ class Question:
         spheres: spheres of the tool, rows x y z r, shape (m, 4) [m].
         clearance: required [m].
         forbidden: directions in which nothing may move, shape (k, 3).
-        fixed_times: at which the path must not move [s].
+        fixed_times: times at which the path must not move [s].
     """
 
     nominal: Trajectory
@@ -74,8 +74,8 @@ def separation(question: Question, times: Array, positions: Array) -> float:
     """Return the smallest proven distance along a path, minus the required clearance [m].
 
     A point is at least ``u . p - max_x u . x`` away from a convex obstacle, for any unit vector u; the maximum over the
-    points x of the obstacle is its support function. The proof relies on no other geometry of the library; the gradient
-    of its distance is only used to propose u.
+    points x of the obstacle is its support function. The proof uses no other geometry of the library; the library's
+    distance gradient only proposes u.
 
     Args:
         question: obstacles, spheres and clearance.
@@ -103,7 +103,7 @@ class _Cells:
     Attributes:
         frame: rows are the directions of the edges, an orthonormal basis of the permitted plane, line or space, (d, 3).
         size: size of a box along each edge, shape (d,) [m].
-        lowest: coordinates of the lowest corner of all, shape (d,) [m].
+        lowest: smallest coordinates of all boxes, shape (d,) [m].
         counts: boxes along each edge, shape (d,).
     """
 
@@ -113,7 +113,7 @@ class _Cells:
     counts: tuple[int, ...]
 
     def window(self, centre: Array) -> tuple[tuple[int, int], ...]:
-        """Return the first and the past-the-last index, along each edge, of the boxes in reach."""
+        """Return, along each edge, the first index of the boxes in reach and the index after the last."""
         low = np.floor((self.frame @ centre - MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         high = np.ceil((self.frame @ centre + MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         return tuple((max(a, 0), min(b, n)) for a, b, n in zip(low, high, self.counts, strict=True))
@@ -176,11 +176,11 @@ def _cells(question: Question, frame: Array, size: Array) -> _Cells:
 
 
 def is_impossible(question: Question, cells: _Cells) -> bool:
-    """Prove that there is no path: flood, interval after interval, every box that may be free during a part of it.
+    """Prove that there is no path: flood, in each interval, every box that may be free during a part of it.
 
     A box is blocked when all of its corners are inside the same inflated obstacle, because the obstacle is convex.
     Boxes are fixed in space, so the motion of the tip does not matter. All other motion (out of the permitted plane, of
-    spheres beside the tip, of the obstacles) is subtracted from the distance.
+    spheres away from the tip, of the obstacles) is subtracted from the distance.
     """
     d = len(cells.frame)
     moving = any(obstacle.velocity.any() for obstacle in question.obstacles)

@@ -31,10 +31,10 @@ class Verdict:
 
     Attributes:
         seed: number of the scene.
-        family: how its obstacles were placed.
+        family: name of the family of the scene.
         accepted: whether the adaptation is feasible.
         margin: smallest proven distance minus required clearance along an accepted path [m]; nan when refused.
-        oracle: the oracle's answer for the scene; for an accepted one, possible or undecided.
+        oracle: answer of the oracle for the scene; for an accepted scene, "possible" or "undecided".
         seconds: compute time of the adaptation [s].
     """
 
@@ -113,13 +113,13 @@ def refusal_table(
     files: Sequence[Path] = (),
     on_done: Callable[[int, int], None] | None = None,
 ) -> tuple[Table, list[Verdict]]:
-    """Run random scenes, skill after skill in turn, and count.
+    """Run random scenes, with the skills in turn, and count the results.
 
     Args:
         n_scenes: how many.
         first: seed of the first scene.
-        files: skills besides the two that are packaged.
-        on_done: called with the number of scenes done and to do.
+        files: skill files used in addition to the two packaged skills.
+        on_done: called with the number of finished scenes and the total number.
     """
     skills = skills_to_adapt(files)
     verdicts = []

@@ -34,7 +34,7 @@ def run_all(
     backend: str = LOCAL,
     on_done: OnDone | None = None,
 ) -> list[Result]:
-    """Run experiments in parallel and return their results, in their order.
+    """Run experiments in parallel and return their results in the same order.
 
     Each result is a file of its own in ``folder/runs``, written as soon as the experiment is done. A saved result of
     the same configuration and the same code is read instead of run again. The values do not depend on ``jobs``.
@@ -43,8 +43,9 @@ def run_all(
         experiments: the experiments to run.
         folder: folder for results and recordings; created if missing.
         jobs: number of processes; None: one for each processor; 1: only this process.
-        fresh: ignore saved results and run all experiments again.
-        reuse: use saved results of the same configuration even if other code made them; each result names its code.
+        fresh: whether to ignore saved results and run all experiments again.
+        reuse: whether to use saved results of the same configuration even if other code produced them; each result
+            names its code.
         backend: a backend of joblib: ``"loky"`` (local processes), or one whose workers see the same folder, such as
             ``"dask"`` or ``"ray"``.
         on_done: called with the progress.
@@ -78,12 +79,12 @@ def _prepared(folder: str | Path) -> Path:
     try:
         (place / _RUNS).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{place}: results can't be kept there ({error.strerror}); name another folder") from error
+        raise InputError(f"{place}: results can't be saved there ({error.strerror}); name another folder") from error
     return place
 
 
 def _kept(place: Path, experiment: Experiment, reuse: bool) -> Result | None:
-    """Return the saved result; None when it is missing, can't be read, or (unless ``reuse``) other code made it."""
+    """Return the saved result; None when it is missing or unreadable, or (unless ``reuse``) other code produced it."""
     path = Result.path(place / _RUNS, experiment)
     try:
         found = Result.load(path) if path.exists() else None
@@ -117,7 +118,7 @@ def _run(job: Job) -> Experiment:
 def _parallel(
     function: Callable[[Job], Experiment], jobs: Sequence[Job], backend: str, workers: int
 ) -> Iterator[Experiment]:
-    """Call a function for each job, in parallel, and yield each result as soon as it is there."""
+    """Call a function for each job, in parallel, and yield each result as soon as it is available."""
     import joblib  # noqa: PLC0415  (takes long to import)
 
     try:
@@ -131,7 +132,7 @@ def _parallel(
 
 @lru_cache(maxsize=1)
 def _end_with(parent: int) -> None:
-    """End this worker when its parent is gone, because workers outlive a parent that was killed."""
+    """End this worker when its parent has ended, because workers survive a killed parent."""
     if os.getppid() == parent:
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 

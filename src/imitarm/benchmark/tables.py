@@ -15,7 +15,7 @@ END = "<!-- end -->"
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text: ``title``, ``columns`` (one that ends in ``>`` holds numbers), ``rows``, ``note``."""
+    """A table of text with title, columns, rows and note; a column name that ends in ``>`` marks numbers."""
 
     title: str
     columns: tuple[str, ...]
@@ -32,10 +32,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Place:
-    """The place of a benchmark's tables in a document.
+    """The location of a benchmark's tables in a document.
 
     Attributes:
-        document: the file, Markdown.
+        document: path of the Markdown document.
         benchmark: its name; the tables stand between the lines ``<!-- imitarm benchmark NAME -->`` and
             ``<!-- end -->``.
 
@@ -60,7 +60,7 @@ class Place:
         Args:
             found: the tables.
             command: the command that printed the tables.
-            versions: versions of the code that made each result; the document says if it differs from the running code.
+            versions: code version of each result; the document says if it differs from the running code.
         """
         head, tail = self._parts()
         body = "\n".join(table.markdown() for table in found)

@@ -1,6 +1,6 @@
-"""Capture: a person as skeletons, and the sources that deliver them.
+"""Capture: skeletons of a person, and the sources that deliver them.
 
-``SOURCES`` is the registry: a new source is one class and one line here, or one line in the entry points of another
+``SOURCES`` is the registry. To add a source, write one class and register it here, or by an entry point of another
 package (group ``imitarm.sources``). The source then appears in the ``--help`` of every command that takes a source.
 """
 

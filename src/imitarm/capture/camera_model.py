@@ -54,7 +54,7 @@ _IN_LINE = math.radians(3.0)  # a hand that is this close to the line of sight t
 
 
 def _mixing() -> Array:
-    """Return the matrix that correlates independent errors of the joints; rows of unit length, shape (25, 25)."""
+    """Return the matrix (25, 25) that correlates independent errors of the joints; its rows have unit length."""
     rows = np.eye(len(JOINTS))
     sides = [
         (near if near in JOINT else f"{near}_{side}", f"{far}_{side}", correlation)
@@ -68,7 +68,7 @@ def _mixing() -> Array:
 
 
 def _white_ratios() -> Array:
-    """Return the white noise relative to sigma: at rest, and its increase per m/s, shape (2, 25)."""
+    """Return the white noise relative to sigma: its value at rest and its increase per m/s, shape (2, 25)."""
     return np.array([_WHITE.get(name.removesuffix("_left").removesuffix("_right"), _WHITE_BODY) for name in JOINTS]).T
 
 
@@ -77,9 +77,12 @@ _SHAPE = (len(JOINTS), 3)
 
 
 class SkeletonCamera:
-    r"""A simulated skeleton camera with the errors of a real one; docs/capture.md says how they were measured.
+    r"""A simulated skeleton camera with the errors of a real one.
 
-    A joint at x is seen at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma`` on each axis
+    Docs/capture.md describes how these errors were measured.
+
+    A joint at x is measured at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma`` on each
+    axis
     across the line of sight and 1.4 times that along it; both are 1.5 times as large for finger tips and thumbs. It is
     a Matern process of order 3/2 over time t and path length :math:`|dx|` together,
 
@@ -91,9 +94,10 @@ class SkeletonCamera:
     forearm varies less than that of an upper arm. ``n`` is white noise and grows with the joint's speed: for elbow and
     wrist and ``sigma`` of 12 mm, it is 0.2 mm at rest plus 5 mm per m/s. ``b`` is a bias of the elbow's depth.
 
-    * Frames come at ``rate`` with ``jitter``; 3 % of the intervals are twice as long, 1 % of the frames show nobody.
-    * Dropouts: ``dropout`` times per second an arm is inferred (error three times as large), or lost, or nobody is
-      seen at all, for 2 to 20 frames.
+    * Frames arrive at ``rate`` with ``jitter``; 3 % of the intervals are twice as long, and 1 % of the frames show
+      nobody.
+    * Dropouts: ``dropout`` times per second an arm is inferred (error three times as large), or lost, or the whole
+      person is lost, for 2 to 20 frames.
     * Occlusion: a forearm behind the torso, and an elbow behind its own hand, are inferred.
     * Occasionally the hand state is wrong for one or two frames.
 
@@ -105,7 +109,8 @@ class SkeletonCamera:
         dropout: dropouts of each arm per second [Hz].
         occlusion: whether hidden joints are inferred.
         elbow_bias: largest bias of the elbow's depth [m]; the actual bias is drawn uniformly within it.
-        faultless: no dropouts, occlusions, jitter or wrong hand states; with ``sigma=0`` and ``elbow_bias=0`` the
+        faultless: whether to omit dropouts, occlusions, jitter and wrong hand states; with ``sigma=0`` and
+            ``elbow_bias=0`` the
             camera reports the truth.
 
     Raises:
@@ -154,7 +159,7 @@ class SkeletonCamera:
         return cls(0, sigma=0.0, rate=rate, jitter=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
 
     def next_time(self, time: float) -> float:
-        """Return the time of the frame after the one at ``time`` [s]."""
+        """Return the time of the frame that follows the one at ``time`` [s]."""
         period = 1.0 / self.rate
         if self.faultless:
             return time + period
@@ -222,7 +227,7 @@ class SkeletonCamera:
 
     @staticmethod
     def _hide(points: Array, tracking: NDArray[np.int8]) -> None:
-        """Mark joints as inferred that something closer to the sensor hides."""
+        """Mark joints as inferred that are hidden behind parts of the body closer to the sensor."""
         top, low = points[JOINT["spine_shoulder"]], points[JOINT["spine_base"]]
         for index in _ARM.values():
             arm = points[index]

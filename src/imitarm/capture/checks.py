@@ -1,4 +1,4 @@
-"""check finds faults in a recording of a person; repaired fixes those that can be fixed without guessing."""
+"""Find faults in a recording of a person (``check``), and fix those that need no guess (``repaired``)."""
 
 from __future__ import annotations
 
@@ -76,12 +76,13 @@ def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIs
 def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]]:
     """Fix the faults that can be fixed without guessing, and report each change.
 
-    Of several persons the one with the most frames is kept. A frame is dropped when it is not later than the one
-    before, or repeats it exactly. Joints in a spike count as lost, and so do the joints of an arm that is frozen while
-    the body moves. Left and right that were exchanged from one frame to the next are exchanged back.
+    If there are several persons, the one with the most frames is kept. A frame is dropped when it is not later than the
+    previous
+    frame or repeats it exactly. Joints in a spike count as lost, and so do the joints of an arm that is frozen while
+    the body moves. If left and right were exchanged from one frame to the next, they are exchanged back.
 
     Returns:
-        the repaired recording, and a line for each kind of change; no lines if nothing was changed.
+        The repaired recording, and one line for each kind of change; no lines if nothing was changed.
     """
     notes: list[str] = []
     frames = recording.skeletons
@@ -138,7 +139,7 @@ def _without_spikes(frames: list[Skeleton], notes: list[str]) -> list[Skeleton]:
 
 
 def _with_lost(skeleton: Skeleton, joints: Mask) -> Skeleton:
-    """Return the skeleton with some joints lost, shape (25,)."""
+    """Return the skeleton with the given joints, shape (25,), marked as lost."""
     if not joints.any():
         return skeleton
     tracking = np.where(joints, Tracking.LOST, skeleton.tracking).astype(np.int8)
@@ -181,7 +182,7 @@ class _View:
         return RecordingIssue(severity, code, message, self.frames[i], float(self.times[i] - self.times[0]), remedy)
 
     def unit_remedy(self) -> str:
-        """Return a remedy: the unit of time that fits, or, if none fits, what to check instead."""
+        """Return a remedy: the unit of time that fits or, if no unit fits, what to check instead."""
         fit = time_unit_that_fits(1.0 / self.period, self.time_unit)
         if fit is None:
             return "look at the spikes and jumps; if there are none, check the units of time and length"
@@ -195,7 +196,7 @@ class _View:
 def _people(recording: SkeletonRecording) -> Iterator[RecordingIssue]:
     n = len(recording)
     if not any((skeleton.tracking > Tracking.LOST).any() for skeleton in recording.skeletons):
-        message = f"nobody is seen in any of {n} frames" if n else "holds no frames"
+        message = f"nobody is visible in any of {n} frames" if n else "holds no frames"
         remedy = "stand 1.5 to 3 m in front of the sensor and record again"
         yield RecordingIssue("error", "nobody", message, remedy=remedy)
         return
@@ -241,7 +242,7 @@ def _rate(view: _View) -> Iterator[RecordingIssue]:
         remedy = view.unit_remedy() if fits else "use a faster camera or computer; 30 are usual"
         yield view.issue("error", "frame-rate", message, remedy)
     elif rate < _LOW_RATE[0]:
-        yield view.issue("warning", "frame-rate", message, "more light or a smaller model; 30 are usual")
+        yield view.issue("warning", "frame-rate", message, "use more light or a smaller model; 30 are usual")
 
 
 def _hand_speed(view: _View) -> Iterator[RecordingIssue]:
@@ -322,7 +323,7 @@ def _jumps(view: _View) -> Iterator[RecordingIssue]:
 
 
 def _followed(view: _View) -> list[int]:
-    """Return the joints that matter to a robot: those of the arm and of the trunk."""
+    """Return the joints that affect a robot: those of the arm and of the trunk."""
     return [*_ARM[view.side].tolist(), *_TRUNK.tolist()]
 
 

@@ -1,4 +1,4 @@
-"""Sources that filter another source: one person of several, left and right kept apart, in real time."""
+"""Sources that filter another source: select one person, correct exchanged sides, or play in real time."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ _TORSO = np.array([JOINT[name] for name in ("spine_shoulder", "spine_mid", "neck
 
 
 class PersonFilter(SkeletonSource):
-    """Passes on one person of a source that may see several.
+    """Selects one person of a source that may see several.
 
     The first person seen is followed until they have been out of view for more than ``patience`` on the source's
-    clock; everybody else is ignored. Another person is followed only after that, when every retargeter has stopped and
-    engages anew. A source that sees only one person may give the next one the same number; so a person who appears
-    farther away than anyone can have walked is also ignored.
+    clock; everybody else is ignored. Another person is followed only after that time; by then every retargeter has
+    stopped and must engage again. A source that tracks only one person may give the next person the same number.
+    Therefore, a person who
+    appears farther away than the followed person can have walked is ignored too.
 
     Args:
         source: the source to filter.
-        person: follow only this person, by the source's number; None: the first who is seen.
+        person: number, in the source, of the only person to follow; None: the first person who is seen.
         patience: [s].
 
     Attributes:
-        followed: number of the followed person; None: nobody yet.
+        followed: number of the followed person; None before a person is followed.
         passed_over: number of ignored skeletons of other persons.
 
     Raises:
@@ -53,7 +54,7 @@ class PersonFilter(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether the source is over."""
+        """Whether the source has ended."""
         return self._source.over
 
     def close(self) -> None:
@@ -61,7 +62,7 @@ class PersonFilter(SkeletonSource):
         self._source.close()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton of the followed person; None when none came within ``timeout`` seconds."""
+        """Return the next skeleton of the followed person; None when none arrived within ``timeout`` seconds."""
         until = clock.monotonic() + timeout
         while not self._source.over:
             skeleton = self._source.read(max(until - clock.monotonic(), 0.0))
@@ -72,7 +73,7 @@ class PersonFilter(SkeletonSource):
         return None
 
     def _is_followed(self, skeleton: Skeleton) -> bool:
-        """Return whether a skeleton is that of the followed person, and store the place of that person."""
+        """Return whether a skeleton shows the followed person, and store the position of that person."""
         if self._only is not None and skeleton.person != self._only:
             self.passed_over += 1
             return False
@@ -95,7 +96,7 @@ class PersonFilter(SkeletonSource):
         return True
 
     def _can_be_there(self, time: float, torso: Array | None) -> bool:
-        """Return whether the followed person can have walked to a place, and no other person was seen closer to it."""
+        """Return whether the followed person can have walked to a position, and no other person was closer to it."""
         if torso is None or self._place is None:
             return self._stranger is None
         before, place = self._place
@@ -114,7 +115,7 @@ def _distance(a: Array, b: Array) -> float:
 
 
 def _torso(skeleton: Skeleton) -> Array | None:
-    """Return the place of a person: the first joint of the torso that is seen, else the middle of the shoulders."""
+    """Return the position of a person: the first visible joint of the torso, else the middle of the shoulders."""
     for point in skeleton.positions[_TORSO]:
         if point[0] == point[0]:  # not nan
             return np.asarray(point)
@@ -146,30 +147,34 @@ _DECIDING = _pairs(("shoulder", "hip", "elbow", "wrist"))
 
 
 def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
-    r"""Return the skeleton with left and right assigned as in the frame before.
+    r"""Return the skeleton with left and right assigned as in the previous frame.
 
-    Let :math:`l, r` be the positions of a left and a right joint and :math:`l', r'` those in the frame before, a time t
-    earlier. Sides are exchanged back when that shortens the motion since the frame before by more than limbs can move:
+    Let :math:`l, r` be the positions of a left and a right joint and :math:`l', r'` those in the previous frame, a time
+    t
+    earlier. The sides are exchanged back when this shortens the motion since the previous frame by more than limbs can
+    move:
 
     .. math:: \sum_j |l_j - l'_j| + |r_j - r'_j| > \sum_j |l_j - r'_j| + |r_j - l'_j| + n\,\max(0.15, v t)
 
-    summed over n pairs of joints that are seen in both frames. Shoulders and hips (v = 0.5 m/s) decide about the whole
-    body; then hands, with or without elbows (v = 4 m/s), decide about arms that were exchanged while the body was not.
-    Hands that meet are too close to each other to fulfil the inequality and are not exchanged. When one joint of a pair
-    is lost, the other one decides.
+    summed over the n pairs of joints that are visible in both frames. Shoulders and hips (v = 0.5 m/s) decide about the
+    whole
+    body; then the hands, with or without elbows (v = 4 m/s), decide about arms that were exchanged while the rest of
+    the body was not.
+    Hands that meet are too close to each other to fulfil the inequality and are not exchanged. If one joint of a pair
+    is lost, only the other one is used.
 
     Args:
         skeleton: as the camera reports it.
-        before: the frame before, with correct sides.
+        before: previous frame, with correct sides.
 
     Returns:
-        the same skeleton when nothing was exchanged.
+        The same skeleton when nothing was exchanged.
     """
     return _kept(skeleton, before.positions, abs(skeleton.time - before.time))
 
 
 def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
-    """Return the skeleton with left and right as at ``before``, positions (25, 3) [m] a ``period`` [s] earlier."""
+    """Return the skeleton with left and right as in ``before``, the positions (25, 3) [m] a ``period`` earlier."""
     if not (_gain(skeleton.positions, before, _DECIDING, _LEAST) > 0.0).any():  # nearly always
         return skeleton
     order = np.arange(len(JOINTS))
@@ -192,16 +197,16 @@ def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
 
 
 def _gain(now: Array, before: Array, pairs: NDArray[np.int64], margin: float) -> Array:
-    """Return how much closer each joint is to the other side's old position than to its own, minus ``margin`` / 2.
+    """Return how much closer each joint is to the other side's previous position than to its own, less ``margin / 2``.
 
     Args:
         now: positions (25, 3) [m].
         before: likewise.
         pairs: joints of the left and the right side, shape (2, n).
-        margin: for each pair [m].
+        margin: margin of each pair [m].
 
     Returns:
-        shape (2, n) [m]; nan where a joint is lost, or was lost in the frame before.
+        shape (2, n) [m]; nan where a joint is lost, or was lost in the previous frame.
     """
     there, here = before[pairs], now[pairs]
     straight, crossed = here - there, here - there[::-1]
@@ -211,7 +216,7 @@ def _gain(now: Array, before: Array, pairs: NDArray[np.int64], margin: float) ->
 
 
 class SideMemory:
-    """Keeps the sides of one person apart, frame by frame.
+    """Corrects exchanged sides of one person, frame by frame.
 
     Attributes:
         swaps: frames in which sides were exchanged back.
@@ -238,10 +243,11 @@ class SideMemory:
 
 
 class SideFilter(SkeletonSource):
-    """Passes on a source with left and right kept apart, for each person; see :func:`unswapped`.
+    """Corrects exchanged left and right sides in a source, for each person; see :func:`unswapped`.
 
-    Only motion is used: the sides of the first frame are assumed to be correct. After half a second without frames it
-    starts anew; by then every retargeter has stopped.
+    The filter uses only motion: it assumes that the sides of the first frame are correct. After half a second
+        without frames,
+        it restarts; by then every retargeter has stopped.
 
     Args:
         source: a source that may exchange left and right.
@@ -259,7 +265,7 @@ class SideFilter(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether the source is over."""
+        """Whether the source has ended."""
         return self._source.over
 
     def close(self) -> None:
@@ -267,7 +273,7 @@ class SideFilter(SkeletonSource):
         self._source.close()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton with correct sides; None when none came within ``timeout`` seconds."""
+        """Return the next skeleton with correct sides; None when none arrived within ``timeout`` seconds."""
         skeleton = self._source.read(timeout)
         if skeleton is None:
             return None
@@ -275,10 +281,10 @@ class SideFilter(SkeletonSource):
 
 
 class RealtimeSource(SkeletonSource):
-    """Delays a source so that it runs in real time: each skeleton comes no earlier than its time since the first one.
+    """Delays a source so that it runs in real time: it returns no skeleton earlier than its time since the first one.
 
     Args:
-        source: gives skeletons as fast as they are read.
+        source: source that returns skeletons as fast as they are read.
     """
 
     def __init__(self, source: SkeletonSource) -> None:
@@ -289,7 +295,7 @@ class RealtimeSource(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether the source is over."""
+        """Whether the source has ended."""
         return self._waiting is None and self._source.over
 
     def close(self) -> None:

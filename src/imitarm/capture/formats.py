@@ -1,4 +1,4 @@
-"""Files of skeletons: imitarm's own text format, tables of programs on the Kinect SDK, and motion capture of an arm."""
+"""Files of skeletons: imitarm's own text format, tables from Kinect SDK programs, and motion capture of an arm."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NAMES = (
     *(f"{joint}_{part}" for joint in JOINTS for part in ("x", "y", "z", "tracking")),
 )
 UNFINISHED = "not closed"
-"""The number of frames in the header of a file that is still being written."""
+"""Placeholder for the number of frames in the header of a file that is still being written."""
 
 TICK = 1e-7  # [s] time unit of the Kinect SDK
 _KINECT_COLUMNS = 1 + 4 * len(JOINTS)
@@ -56,10 +56,10 @@ def is_native(head: bytes) -> bool:
 
 
 def native_header(source: str, frames: str) -> str:
-    """Return the lines before the first skeleton.
+    """Return the header: the lines before the first skeleton.
 
     Args:
-        source: where the skeletons are from.
+        source: origin of the skeletons.
         frames: number of frames, or :data:`UNFINISHED`; padded, so that it can be overwritten in place.
     """
     remarks = {
@@ -88,8 +88,8 @@ def native_line(skeleton: Skeleton) -> str:
 def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read imitarm's own format.
 
-    A recording that was not closed, because its writer was killed or is still running, is read up to its last complete
-    line; an issue reports the loss.
+    If the recording was not closed because its writer was killed or is still running, it is read up to the last
+    complete line, and an issue reports the loss.
 
     Args:
         path: path for messages.
@@ -124,7 +124,7 @@ def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[Recordi
     issues = []
     if unfinished:
         lost = " and the frame that was being written is lost" if torn else ""
-        message = f"was not closed: its writer was stopped or is still at work; {n} whole frames were read{lost}"
+        message = f"was not closed: its writer was stopped or is still running; {n} whole frames were read{lost}"
         issues.append(
             RecordingIssue("note", "not-closed", message, n - 1, remedy="save it under another name to keep it")
         )
@@ -140,7 +140,7 @@ def _is_unfinished(content: bytes) -> bool:
 
 
 def _persons(table: Table, content: bytes) -> list[int]:
-    """Return the column of persons: the Kinect SDK counts bodies in numbers too large for a float."""
+    """Return the column of persons as integers; the body numbers of the Kinect SDK are too large for a float."""
     lines = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n")
     fields = [lines[line - 1].split(b",")[1].strip() for line in table.lines]
     _refuse(table, np.array([_WHOLE.fullmatch(field) is None for field in fields]), "the person is not a whole number")
@@ -153,7 +153,8 @@ def _persons(table: Table, content: bytes) -> list[int]:
 def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read a table of 101 columns: time in units of 100 ns, then x, y, z [m] and state of 25 joints in SDK order.
 
-    Time counts from the first frame. Such a file holds neither person numbers nor hand states. A comma at the end of
+    Times are counted from the first frame. Such a file contains neither person numbers nor hand states. A comma at the
+    end of
     a line is accepted.
 
     Args:
@@ -197,7 +198,7 @@ def _skeletons(
     """Build skeletons from columns.
 
     Args:
-        table: the table that was read, for messages.
+        table: table that was read, for messages.
         times: shape (n,) [s].
         joints: x, y, z [m] and tracking state of each joint, shape (n, 25, 4).
         hands: state of the left and of the right hand, shape (n, 2); None: not in the file.
@@ -226,7 +227,7 @@ def _refuse(table: Table, bad: NDArray[np.bool_] | np.bool_, what: str) -> None:
 
 
 def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssue]:
-    """Return an issue about joints that can't have been measured, with the unit of length that fits, if any."""
+    """Return an issue about implausible joint positions, with the unit of length that fits, if any."""
     with np.errstate(invalid="ignore"):
         far = (joints[..., 3] > 0) & ~(np.abs(joints[..., :3]) <= FARTHEST).all(axis=2)
     if not far.any():
@@ -259,8 +260,9 @@ def is_motion_capture(head: bytes) -> bool:
 def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read markers as :meth:`MotionCapture.load` does, and add a body to the arm.
 
-    The right arm is the captured one, with its own bones, and is tracked. The rest of the body was not captured: it is
-    that of an average person who stands upright in front of a sensor, and is given as inferred.
+    The right arm is the captured arm with its measured bone lengths, and is marked as tracked. The rest of the body was
+    not captured. It is
+    synthesised as an average person who stands upright in front of a sensor, and is marked as inferred.
 
     Args:
         path: path of the file.
@@ -299,7 +301,7 @@ class MotionCapture:
     def load(cls, path: str | Path, *, to_body: ArrayLike | None = None) -> MotionCapture:
         """Read markers of a right arm from a file of tab-separated values in millimetres.
 
-        The wrist is taken midway between the two markers at the hand's near end.
+        The wrist is midway between the two markers at the proximal end of the hand.
 
         Args:
             path: the file.
@@ -344,9 +346,9 @@ class MotionCapture:
         return cls(table[:, 0], np.stack([s, e, 0.5 * (left + right), tip, thumb], axis=1), path.name)
 
     def truth(self, person: Person) -> Truth:
-        """Return the motion as if ``person`` did it in front of a sensor; the arm keeps its captured bone lengths.
+        """Return the motion as if ``person`` made it in front of a sensor; the arm keeps its captured bone lengths.
 
-        The arm is interpolated linearly between frames, and at rest before the first and after the last one. The rest
+        The arm is interpolated linearly between frames and rests before the first and after the last frame. The rest
         of the body stands upright at the person's place.
         """
         to_sensor = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])

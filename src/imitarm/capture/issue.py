@@ -12,11 +12,11 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class RecordingIssue:
-    """One fault of a recording of a person, or one useful fact before a robot follows it.
+    """One fault of a recording of a person, or one fact to know before a robot follows the recording.
 
     Attributes:
-        severity: ``"error"``: no robot can follow this recording as it is; ``"warning"``: look at it; ``"note"``: for
-            information.
+        severity: ``"error"``: no robot can follow this recording as it is; ``"warning"``: the fault should be
+            inspected; ``"note"``: for information.
         code: short name that stays the same from version to version, such as ``"gap"``.
         message: what is wrong, with figures.
         frame: the first frame concerned, counted from 0; None when the whole recording is concerned.

@@ -1,4 +1,4 @@
-"""Kinect v2 and Azure Kinect: cameras whose own drivers track bodies."""
+"""Kinect v2 and Azure Kinect: cameras whose drivers track bodies."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ INSTEAD = (
     "without it: record elsewhere as a table of the Kinect SDK and open the file, receive udp:PORT from a machine that "
     "has the camera, or use webcam:NUMBER or video:FILE"
 )
-"""What to do instead when a camera can't be opened."""
+"""Alternatives when a camera can't be opened."""
 
 _SILENT = 3.0  # [s] without a frame: the camera is gone, since it sends frames with or without a person
 _LONGEST_WAIT = 0.5  # [s] for one call of the driver, so that Ctrl-C is noticed
@@ -42,7 +42,7 @@ class BodyCamera(SkeletonSource):
 
     @abstractmethod
     def _frame(self, timeout: float) -> list[Skeleton] | None:
-        """Return all bodies of the next frame, or None when no frame came within ``timeout`` seconds.
+        """Return all bodies of the next frame, or None when no frame arrived within ``timeout`` seconds.
 
         Raises:
             TaskFailedError: when the driver reports a failure.
@@ -66,7 +66,7 @@ class BodyCamera(SkeletonSource):
         """Return the next skeleton, or None when none came within ``timeout`` seconds or the source is over.
 
         Raises:
-            TaskFailedError: when the driver fails, or no frame came for 3 s: the camera was unplugged.
+            TaskFailedError: when the driver fails, or no frame arrived for 3 s because the camera was unplugged.
         """
         until = clock.monotonic() + timeout
         while not self._over and not self._waiting:
@@ -92,7 +92,7 @@ class BodyCamera(SkeletonSource):
         """Wait for the very first frame.
 
         Raises:
-            InputError: when no frame came within ``seconds``, or the driver fails; the camera is released.
+            InputError: when no frame arrived within ``seconds``, or the driver fails; the camera is released.
         """
         until = clock.monotonic() + seconds
         try:
@@ -125,7 +125,7 @@ _V2_START = 10.0  # [s] within which the first frame must come: a cold camera ta
 
 
 class KinectV2Source(BodyCamera):
-    """All persons in front of a Kinect v2, with the states of their hands.
+    """Skeletons of all persons in front of a Kinect v2, with the states of their hands.
 
     Coordinate frame and joints are those of the SDK. A hand state is used when the SDK reports high confidence. Times
     are those of the sensor's clock.
@@ -193,7 +193,7 @@ _TRACKING = np.array([Tracking.LOST, Tracking.INFERRED, Tracking.TRACKED, Tracki
 
 
 def _joint_indices() -> tuple[tuple[int, ...], ...]:
-    """Return, for each of the 25 joints, the indices of the SDK's joints; the joint is midway between them."""
+    """Return, for each of the 25 joints, the indices of the two SDK joints between which it is midway."""
     named: dict[str, tuple[int, ...]] = {"spine_base": (0,), "spine_mid": (1,), "spine_shoulder": (4, 11)}
     named |= {"neck": (3,), "head": (26,)}  # spine_shoulder: between the clavicles
     arm = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
@@ -207,7 +207,7 @@ _FROM = _joint_indices()
 
 
 class AzureKinectSource(BodyCamera):
-    """All persons in front of an Azure Kinect.
+    """Skeletons of all persons in front of an Azure Kinect.
 
     The SDK's 32 joints are converted to the 25 of the Kinect v2, and the depth camera's frame (x right, y down,
     millimetres) to that of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK can't tell open from closed hands, so
@@ -256,7 +256,7 @@ class AzureKinectSource(BodyCamera):
         self._tracker = self._call_driver("start body tracking", driver.start_body_tracker)
 
     def _call_driver(self, what: str, call: Callable[[], Any]) -> Any:
-        """Call the driver; where it would print a message and end the program, raise an error."""
+        """Call the driver, and raise an error where it would print a message and end the program."""
         said = io.StringIO()
         try:
             with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):

@@ -1,7 +1,7 @@
 r"""MediaPipe: skeletons of a person in a video or in front of a webcam, converted from MediaPipe's 33 landmarks.
 
 MediaPipe gives each landmark twice: in the image, and in metres relative to the middle of the hips (x to the image's
-right, y down, z away), as seen by a camera that looks straight at the person. The sensor frame of
+right, y down, z away), for a camera that looks straight at the person. The sensor frame of
 :class:`~imitarm.capture.skeleton.Skeleton` (x to the sensor's left, y up, z away) is MediaPipe's frame rotated by 180
 degrees about z.
 """
@@ -69,9 +69,9 @@ class PoseLandmarks:
 
     Attributes:
         time: time of the image [s].
-        world: relative to the middle of the hips, x to the image's right, y down, z away, shape (33, 3) [m].
-        image: place in the image, 0 to 1 from the left and from the top, shape (33, 2); beyond this range when not in
-            view.
+        world: positions relative to the middle of the hips, x to the image's right, y down, z away, shape (33, 3) [m].
+        image: position in the image, 0 to 1 from the left and from the top, shape (33, 2); outside this range when
+            not in view.
         visibility: visibility of each landmark, 0 to 1, shape (33,).
 
     Raises:
@@ -95,17 +95,20 @@ class PoseLandmarks:
 class LandmarkConverter:
     r"""Converts landmarks to skeletons.
 
-    **Where the person stands.** MediaPipe's metres are relative to the hips, so a hip that moves would move a hand that
-    is at rest. The translation t of the hips is chosen so that the landmarks :math:`X_j, Y_j, Z_j` agree with the
+    **Where the person stands.** MediaPipe's positions in metres are relative to the hips, so a motion of the hips would
+    move a hand that is at rest. The translation t of the hips is chosen so that the landmarks :math:`X_j, Y_j, Z_j`
+    agree with the
     image. With image coordinates :math:`u, v` from the middle, in units of the focal length, and visibility :math:`k`,
 
     .. math:: \min_t \sum_j k_j^2 \left( (X_j + t_x - u_j (Z_j + t_z))^2 + (Y_j + t_y - v_j (Z_j + t_z))^2 \right)
 
-    which is linear in t. Across the line of sight, t is accurate to centimetres. Along it, t is as accurate as
-    MediaPipe's metres and the field of view, and noisy; so the distance is averaged over 0.1 s before x and y are
-    fitted again. All joints move by the same t, so positions relative to other joints do not change.
+    which is linear in t. Across the line of sight, t is accurate to centimetres. Along the line of sight, the accuracy
+    of t depends on MediaPipe's scale and on the field of view, and t is noisy. Therefore the distance is averaged over
+    0.1 s before x and y are fitted again. All joints move by the same t, so positions relative to other joints do not
+    change.
 
-    **Perspective.** MediaPipe's metres are those of a camera that looks straight at the person. They are rotated by the
+    **Perspective.** MediaPipe's positions in metres assume a camera that looks straight at the person. They are rotated
+    by the
     angle between the camera's axis and the line of sight to the hips.
 
     Args:
@@ -151,7 +154,7 @@ class LandmarkConverter:
 
     @staticmethod
     def _fit(world: Array, uv: Array, visibility: Array) -> Array | None:
-        """Return the translation from the hips to the camera, shape (3,) [m]; None when none fits."""
+        """Return the translation from the hips to the camera, shape (3,) [m]; None if no translation fits."""
         weight = visibility[_FITTED]
         if weight.sum() < _LEAST_WEIGHT:
             return None
@@ -168,7 +171,7 @@ class LandmarkConverter:
         return np.asarray(place)
 
     def _averaged(self, time: float, depth: float) -> float:
-        """Return the distance averaged over the last images [m]."""
+        """Return the distance to the hips averaged over the last images [m]."""
         if self._distance is not None and 0.0 < time - self._distance[0] <= _GAP:
             before, past = self._distance
             depth = past + (1.0 - math.exp(-(time - before) / DEPTH_MEMORY)) * (depth - past)
@@ -177,7 +180,7 @@ class LandmarkConverter:
 
 
 def _rotation_towards(place: Array) -> Array:
-    """Return the rotation from the camera's axis to the line of sight to a place, shape (3, 3)."""
+    """Return the rotation from the camera's axis to the line of sight to a point, shape (3, 3)."""
     x, y, z = place / math.sqrt(float(place @ place))
     cross = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + z))
@@ -194,7 +197,7 @@ def _tracking(landmarks: PoseLandmarks) -> NDArray[np.int8]:
 # --- the process that runs MediaPipe
 
 PROTOCOL = 1
-"""Version of the lines of text; :mod:`imitarm.capture.mediapipe_worker` describes them."""
+"""Version of the text protocol; :mod:`imitarm.capture.mediapipe_worker` describes it."""
 
 _START = 60.0  # [s] within which the first image must be processed: the very first start reads 400 MB
 _SILENT = 20.0  # [s] without a line: the process hangs
@@ -206,7 +209,7 @@ _CHATTER = r"[IW]\d{4} |INFO: |WARNING: All log messages"  # what MediaPipe logs
 
 
 class MediaPipeSource(SkeletonSource):
-    """Skeletons of the person in a video, or in front of a webcam.
+    """Skeletons of the person in a video or in front of a webcam.
 
     MediaPipe tracks one person. It runs in another process, in another environment (see
     :mod:`imitarm.capture.mediapipe_environment`), and sends its landmarks as lines of text, which
@@ -214,11 +217,11 @@ class MediaPipeSource(SkeletonSource):
     clock at which an image arrived.
 
     Args:
-        film: a video file, or the number of a webcam.
-        realtime: return a video's skeletons no earlier than the video would show them; else as fast as they are
-            tracked.
+        film: path of a video file, or number of a webcam.
+        realtime: whether to return a video's skeletons no earlier than the video would show them; otherwise as fast
+            as they are tracked.
         field_of_view: field of view of the longer side of the image [deg].
-        python: interpreter that has MediaPipe; None: :func:`~imitarm.capture.mediapipe_environment.find_python`.
+        python: Python interpreter with MediaPipe; None: :func:`~imitarm.capture.mediapipe_environment.find_python`.
 
     Attributes:
         images: number of images processed so far.
@@ -226,7 +229,7 @@ class MediaPipeSource(SkeletonSource):
     Raises:
         InputError: when MediaPipe is not installed, the file is not a video, or there is no such webcam.
         TaskFailedError: from :meth:`read`, when MediaPipe's process dies, hangs or sends invalid lines, the video is
-            cut off, or the webcam is gone. Earlier skeletons are valid.
+            cut off, or the webcam is gone. Skeletons returned earlier remain valid.
     """
 
     def __init__(
@@ -300,7 +303,7 @@ class MediaPipeSource(SkeletonSource):
         return wait <= 0.0 or clock.monotonic() >= self._began + time
 
     def _line(self, timeout: float) -> list[bytes] | None:
-        """Return the words of the next line; None when no line came in time."""
+        """Return the words of the next line; None when no line arrived in time."""
         before = clock.monotonic()
         try:
             line = self._process.line(min(timeout, max(_SILENT - self._silent, 0.0) + _TICK))

@@ -1,7 +1,9 @@
-"""MediaPipe's own Python environment: find it, make it, and run it as a process that writes lines of text.
+"""MediaPipe's own Python environment.
 
-MediaPipe 0.10.21, the last version that includes its models, needs numpy below 2; imitarm needs numpy 2. So MediaPipe
-is installed in another environment, without imitarm::
+Find it, create it, and run MediaPipe in it as a process that writes lines of text.
+
+MediaPipe 0.10.21, the last version that includes its models, needs numpy below 2; imitarm needs numpy 2. MediaPipe is
+therefore installed in another environment, without imitarm::
 
     python -m imitarm.capture.mediapipe_environment            # makes it where imitarm looks for it
 """
@@ -38,8 +40,9 @@ REQUIREMENTS = (
     "flatbuffers>=2.0",
     "matplotlib",
 )
-"""What pose tracking needs. MediaPipe also requires jax, sentencepiece and sounddevice, which serve other tasks, and
-an OpenCV with windows; so it is installed without its requirements."""
+"""Packages needed for pose tracking. MediaPipe also requires jax, sentencepiece and sounddevice, which serve other
+tasks, and
+an OpenCV with windows; therefore it is installed without its requirements."""
 
 _STAMP = "imitarm-mediapipe.txt"  # written last: without it the environment is incomplete
 _COMMAND = "-m imitarm.capture.mediapipe_environment"
@@ -50,7 +53,7 @@ def find_python() -> Path:
     """Return the Python that has MediaPipe: ``IMITARM_MEDIAPIPE_PYTHON``, or one in :func:`folders`.
 
     Raises:
-        InputError: when no such Python is found; the message says how to make the environment.
+        InputError: when no such Python is found; the message says how to create the environment.
     """
     named = os.environ.get(VARIABLE)
     if named:
@@ -67,7 +70,10 @@ def find_python() -> Path:
 
 
 def folders() -> list[Path]:
-    """Return the folders searched: in a checkout, then in the user's data; the environment is made in the first."""
+    """Return the folders searched: in a checkout, then in the user's data folder.
+
+    A new environment is created in the first one.
+    """
     checkout = Path(__file__).resolve().parents[3]
     beside = [checkout / ".venv-mediapipe"] if (checkout / "pyproject.toml").is_file() else []
     if sys.platform == "win32":
@@ -85,10 +91,10 @@ def python_of(folder: Path) -> Path:
 
 
 def make(folder: Path) -> Path:
-    """Make the environment, from scratch if it exists; return its Python.
+    """Create the environment, from scratch if it exists; return its Python.
 
     Args:
-        folder: to make; nothing else may be in it.
+        folder: folder to create; it must not contain anything else.
 
     Raises:
         InputError: when the folder holds something else, or this machine has no suitable Python.
@@ -108,7 +114,7 @@ def make(folder: Path) -> Path:
 
 
 def suitable_python() -> str:
-    """Return a Python for which MediaPipe exists: this one, else one on the path.
+    """Return a Python version for which MediaPipe exists: the running one, else one on the path.
 
     Raises:
         InputError: when no such Python is found.
@@ -135,7 +141,7 @@ def _run(what: str, command: list[str]) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Make the environment in the given folder, else where imitarm looks for it; return the exit status."""
+    """Create the environment in the given folder, else where imitarm looks for it; return the exit status."""
     folder = Path(arguments[0]) if arguments else folders()[0]
     try:
         sys.stdout.write(f"made {make(folder)}\n")
@@ -159,10 +165,10 @@ class LineProcess:
     :meth:`close` ends it in any case, and so does deleting this object.
 
     Args:
-        command: with all its arguments.
-        keep: number of lines that may wait to be read.
-        newest: when more lines would wait, drop the oldest line, but never the very first one; otherwise the program
-            waits.
+        command: command with all its arguments.
+        keep: largest number of unread lines.
+        newest: whether to drop the oldest unread line, but never the very first one, when there would be more;
+            otherwise the program waits.
         chatter: regular expression of lines on its standard error to leave out of :meth:`ended`.
 
     Raises:
@@ -195,15 +201,15 @@ class LineProcess:
         return self._process.pid
 
     def line(self, timeout: float) -> bytes | None:
-        """Return the next line without its line break, or None when no line came within ``timeout`` seconds.
+        """Return the next line without its line break, or None when no line arrived within ``timeout`` seconds.
 
         Raises:
-            EOFError: when there will be no more.
+            EOFError: when there are no more lines.
         """
         return self._lines.take(timeout)
 
     def ended(self) -> str:
-        """Wait up to a second for the end; return the exit status and the last output on standard error."""
+        """Wait up to a second for the program to end; return the exit status and the last output on standard error."""
         try:
             status = f"exit status {self._process.wait(_GRACE)}"
         except subprocess.TimeoutExpired:

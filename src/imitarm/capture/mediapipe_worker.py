@@ -9,7 +9,8 @@ imitarm. :mod:`imitarm.capture.mediapipe` starts it and reads its standard outpu
     end IMAGES                                last, when the video is over
     error TEXT                                last, when it can't go on
 
-TIME is that of the image: the video's own time, or for a webcam the monotonic clock when the image came. By hand::
+TIME is the time of the image: the time in the video or, for a webcam, the monotonic clock when the image arrived. By
+hand::
 
     .venv-mediapipe/bin/python -I src/imitarm/capture/mediapipe_worker.py video FILE
 """

@@ -28,7 +28,7 @@ _SPEED = (0.25, 0.55)  # [m/s] mean speed of a reach
 def minimum_jerk(points: ArrayLike, times: ArrayLike) -> BSpline:
     """Return the quintic spline through ``points`` (n, d) at ``times`` (n,) that is at rest at both ends.
 
-    It is the path of least jerk through these points (Flash and Hogan 1985).
+    This is the minimum-jerk path through these points (Flash and Hogan 1985).
     """
     at = np.asarray(points, dtype=float)
     zero = np.zeros(at.shape[1])
@@ -38,14 +38,14 @@ def minimum_jerk(points: ArrayLike, times: ArrayLike) -> BSpline:
 
 
 def reaching(person: Person, seed: int, *, duration: float = 12.0, kind: str = "inside") -> Truth:
-    """Return the motion of a person who reaches from place to place with the right hand.
+    """Return the motion of a person who reaches from point to point with the right hand.
 
     Args:
         person: who moves.
-        seed: seed of the places and the speeds.
+        seed: seed of the points and the speeds.
         duration: [s]; the hand is still during the first second.
-        kind: ``"inside"``: well within reach. ``"edge"``: every second reach stretches the arm fully and stays there
-            for a while, at and beyond the reach of a robot of the same proportions.
+        kind: ``"inside"``: reaches well within the workspace. ``"edge"``: every second reach stretches the arm fully
+            and stays there for some time, at or beyond the reach of a robot of the same proportions.
 
     Raises:
         UnknownNameError: when there is no such kind.
@@ -116,14 +116,14 @@ DRAWINGS: dict[str, tuple[_Shape, tuple[float, float, float], tuple[float, float
 def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "circle") -> Truth:
     r"""Return the motion of a person who draws a shape repeatedly with the right hand.
 
-    The angle along the shape is :math:`\omega\,s(t)`. The warped time s stands still during the first second and at the
-    end and runs at the rate of t in between; it changes its rate with a minimum-jerk profile.
+    The angle along the shape is :math:`\omega\,s(t)`. The warped time s is constant during the first second and at the
+    end, and advances like t in between. The transitions have a minimum-jerk profile.
 
     Args:
         person: who moves.
-        seed: of place, size and period.
+        seed: seed of position, size and period of the shape.
         duration: [s]; the hand is still during the first second.
-        kind: one of :data:`DRAWINGS`.
+        kind: shape, one of :data:`DRAWINGS`.
 
     Raises:
         UnknownNameError: when there is no such shape.
@@ -145,7 +145,7 @@ def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "c
 
 
 def _warped_time(time: float, duration: float) -> float:
-    """Return the warped time of a hand that begins and ends at rest [s]."""
+    """Return the warped time [s] of a hand that begins and ends at rest."""
     begun = min(max(time, REST), duration) - REST
     ended = begun - (duration - REST - _RAMP)
     passed = max(begun - _RAMP, 0.0) + _RAMP * _ramped(min(begun / _RAMP, 1.0))

@@ -1,4 +1,4 @@
-"""Person: a synthetic person, seeded: lengths of the limbs, place in front of the sensor, posture of the elbow."""
+"""Person: a seeded synthetic person with limb lengths, a position in front of the sensor and an elbow posture."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ class Person:
               a = \frac{L_U^2 + r^2 - L_F^2}{2r},\quad h = \sqrt{L_U^2 - a^2},\quad r = |W - S| .
 
     Attributes:
-        seed: seed of all attributes below, for a person made by :meth:`from_seed`.
+        seed: seed of all attributes below, for a person created by :meth:`from_seed`.
         stature: height [m].
         upper_arm: shoulder to elbow [m].
         forearm: elbow to wrist [m].
-        hand: wrist to finger tip [m].
+        hand: distance from wrist to finger tip [m].
         position: position of the point on the floor between the feet, x and z in the sensor's frame, shape (2,) [m].
-        swivel: psi, the angle of the elbow outwards from straight down, while the hand is low [rad].
-        lift: increase of psi with the height of the hand [rad/m].
+        swivel: psi, angle by which the elbow points outwards from straight down while the hand is low [rad].
+        lift: increase of psi per height of the hand [rad/m].
         tremor: amplitude [m], frequency [rad/s] and phase [rad] of the hand's tremor, for each of n waves and each
             axis, shape (3, n, 3).
         sway: amplitude [m], frequency [rad/s] and phase [rad] of the body's sway along x and z, shape (3, 2).
@@ -82,7 +82,10 @@ class Person:
 
     @classmethod
     def from_seed(cls, seed: int) -> Person:
-        """Return synthetic person number ``seed``; limbs deviate by up to 15 percent from those of the stature."""
+        """Return synthetic person number ``seed``.
+
+        Limb lengths deviate by up to 15 percent from the average for the stature.
+        """
         rng = np.random.default_rng([30310, whole_number(seed, "Person.from_seed: seed", at_least=0)])
         stature = float(np.clip(rng.normal(1.72, 0.09), 1.50, 1.95))
         proportion = np.clip(rng.normal(1.0, 0.05, 3), 0.85, 1.15)
@@ -137,11 +140,11 @@ class Person:
         """Return the true positions of all joints while the wrist is held at ``wrist``; the other arm hangs down.
 
         Args:
-            time: [s]; tremor and sway depend on it.
-            wrist: desired position of the wrist in the sensor's frame, shape (3,) [m]; when it is out of reach, the
-                arm stretches towards it.
-            swivel: psi [rad]; None: this person's habit, :attr:`swivel` and :attr:`lift`.
-            hand: rotation of the hand in the sensor's frame, shape (3, 3), its x along the hand, its y towards the
+            time: time for tremor and sway [s].
+            wrist: desired position of the wrist in the sensor's frame, shape (3,) [m]; if the position is out of
+                reach, the arm stretches towards it.
+            swivel: angle psi [rad]; None: this person's habit, from :attr:`swivel` and :attr:`lift`.
+            hand: rotation of the hand in the sensor's frame, shape (3, 3), with x along the hand and y towards the
                 thumb; None: in line with the forearm, with the thumb up as far as possible.
             closed: whether the hand is a fist.
             side: side of the arm that moves.
@@ -251,8 +254,8 @@ def _cross(a: Array, b: Array) -> Array:
 def _rotated(vector: Array, direction: Array) -> Array:
     """Return a vector, perpendicular to forward, after the smallest rotation from forward to ``direction``.
 
-    Directions defined for an arm that points forward so change continuously as the arm moves, except when it points
-    straight backwards.
+    Directions defined for an arm that points forward thus change continuously as the arm moves, except when the arm
+    points straight backwards.
     """
     both = direction + _FORWARD
     square = float(both @ both)

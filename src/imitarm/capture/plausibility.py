@@ -1,4 +1,4 @@
-"""Checks whether a recording can be that of a person in front of a sensor: units, axes, repeated frames, spikes."""
+"""Checks whether a recording can show a person in front of a sensor: units, axes, repeated frames, spikes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
         unit: the unit in which the stamps were read [s].
 
     Returns:
-        the name of the unit, and the factor by which the times must be multiplied. None when no other unit fits.
+        the name of the unit, and the factor by which the times must be multiplied. The result is None when no other
+        unit fits.
     """
     low, high = PLAUSIBLE_RATE
     fits = [
@@ -66,10 +67,10 @@ def time_unit_name(unit: float) -> str:
 
 
 def length_unit_that_fits(limb: float) -> str | None:
-    """Return the unit in which the length of a limb is that of a person's, None when no unit fits.
+    """Return the unit in which the length of a limb is plausible for a person; None when no unit fits.
 
     Args:
-        limb: length of an upper arm or a forearm, as read; in metres it is not plausible.
+        limb: length of an upper arm or a forearm as read, which is not plausible in metres.
     """
     low, high = PLAUSIBLE_LIMB
     fits = [name for name, unit in _LENGTH_UNITS.items() if low <= limb * unit <= high]
@@ -80,10 +81,11 @@ def length_unit_that_fits(limb: float) -> str | None:
 
 
 def axes_that_fit(positions: Array) -> tuple[str, str] | None:
-    """Return the fault of the axes of positions (n, 25, 3), and the axes that fit; None when the axes are right.
+    """Return the fault in the axes of positions (n, 25, 3), and the axes that fit; None when the axes are correct.
 
     In the sensor's frame the spine points up (y), and the trunk is in front of the sensor (z above 0). Of all axes in
-    which both hold, those are proposed in which the person also faces the sensor: the right shoulder has a larger x
+    which both hold, the function proposes those in which the person also faces the sensor: the right shoulder has a
+        larger x
     than the left one. A right-handed choice is preferred to a mirrored one.
     """
     spine = _median(_mean(positions[:, _UPPER]) - _mean(positions[:, _LOWER]))
@@ -117,7 +119,7 @@ def axes_that_fit(positions: Array) -> tuple[str, str] | None:
 
 
 def _mean(points: Array) -> Array:
-    """Return the mean over the joints that are seen, shape (n, 3); nan in frames without any."""
+    """Return the mean over the visible joints, shape (n, 3); nan in frames without visible joints."""
     seen: Mask = np.all(np.isfinite(points), axis=2, keepdims=True)
     count = seen.sum(axis=1)
     total = np.where(seen, points, 0.0).sum(axis=1)
@@ -134,7 +136,7 @@ def _median(points: Array) -> Array:
 
 
 def repeats_previous(positions: Array) -> Mask:
-    """Return whether each frame, after the first, repeats the one before in every digit; shape (n - 1,)."""
+    """Return whether each frame after the first repeats the previous frame exactly, shape (n - 1,)."""
     same = (positions[1:] == positions[:-1]) | (np.isnan(positions[1:]) & np.isnan(positions[:-1]))
     seen = np.any(np.all(np.isfinite(positions[1:]), axis=2), axis=1)
     return np.asarray(same.all(axis=(1, 2)) & seen)
@@ -162,7 +164,7 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
         spikes: whether each joint is in a spike, shape (n, 25).
 
     Returns:
-        the speed; nan when no hand is seen in at least 10 places.
+        The speed; nan when no hand is visible at 10 or more positions.
     """
     speeds = []
     for wrist in (JOINT[f"wrist_{side}"] for side in SIDES):
@@ -177,8 +179,9 @@ def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
     r"""Find joints that jump away for one to three frames and come back.
 
     A joint is in a spike when it is more than 0.2 m from the straight line between the frames before and after, these
-    two are less than half as far apart, and either it gets there and back faster than 10 m/s, or a bone of the arm
-    that ends in it is more than 0.12 m longer or shorter than in those two frames. At both ends of a recording, a jump
+    two are less than half as far apart, and one of two conditions holds: the joint moves there and back faster than 10
+    m/s, or an arm bone that ends at the joint is more than 0.12 m longer or shorter than in those two frames. At both
+    ends of a recording, a jump
     of more than 0.3 m faster than 10 m/s is enough.
 
     Args:

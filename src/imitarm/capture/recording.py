@@ -1,4 +1,4 @@
-"""SkeletonRecording: recorded skeletons, to inspect, cut, slow down and replay; and how they are written to a file."""
+"""SkeletonRecording: recorded skeletons that can be inspected, cut, slowed down, replayed and saved."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ class SkeletonRecording(SkeletonSource):
     Args:
         skeletons: skeletons in the order they came.
         name: name for messages, for example the file's name.
-        realtime: replay at the recorded speed; else as fast as skeletons are read.
-        issues: found while reading.
+        realtime: whether to replay at the recorded speed; otherwise as fast as skeletons are read.
+        issues: issues found while reading.
         time_unit: unit of the file's time stamps [s], for messages about times that are not plausible.
 
     Attributes:
         skeletons: all skeletons, in the order in which they were recorded.
-        issues: found while reading.
-        time_unit: as given.
+        issues: issues found while reading.
+        time_unit: unit of the file's time stamps, as given [s].
     """
 
     argument = "FILE"
@@ -74,7 +74,7 @@ class SkeletonRecording(SkeletonSource):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> SkeletonRecording:
-        """Read a recording; as :func:`read_recording`."""
+        """Read a recording; see :func:`read_recording`."""
         return read_recording(argument, realtime=realtime)
 
     def __len__(self) -> int:
@@ -88,7 +88,7 @@ class SkeletonRecording(SkeletonSource):
 
     @property
     def persons(self) -> tuple[int, ...]:
-        """Numbers of the persons in it, in order of appearance."""
+        """Numbers of the recorded persons, in order of appearance."""
         return tuple(dict.fromkeys(skeleton.person for skeleton in self.skeletons))
 
     @property
@@ -103,7 +103,7 @@ class SkeletonRecording(SkeletonSource):
         """Return the skeletons of one person.
 
         Raises:
-            InputError: when that person is not in it; the message says who is.
+            InputError: when the person is not in the recording; the message lists the persons in it.
         """
         kept = [skeleton for skeleton in self.skeletons if skeleton.person == number]
         if not kept:
@@ -115,11 +115,11 @@ class SkeletonRecording(SkeletonSource):
         """Return the part of the recording between two times; time stamps do not change.
 
         Args:
-            start: since the first frame [s].
-            end: since the first frame [s]; None: to the last one.
+            start: start of the part, since the first frame [s].
+            end: end of the part, since the first frame [s]; None: the last frame.
 
         Raises:
-            InputError: when nothing is left.
+            InputError: when no frame is left.
         """
         start = finite_number(start, "SkeletonRecording.trim: start", "s")
         first = min((skeleton.time for skeleton in self.skeletons), default=0.0)
@@ -141,8 +141,9 @@ class SkeletonRecording(SkeletonSource):
         """Write imitarm's own format, from which every skeleton is read back bit for bit.
 
         Args:
-            path: file to write; it is written under another name and renamed when it is complete.
-            replace: an existing file may be replaced.
+            path: file to write; the recording is written under another name, and the file is renamed when it is
+                complete.
+            replace: whether an existing file may be replaced.
 
         Raises:
             InputError: when there are no skeletons, or the file can't be written.
@@ -187,11 +188,13 @@ class SkeletonRecording(SkeletonSource):
 
 
 def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecording:
-    """Read a recording: imitarm's own format, a Kinect SDK table, or motion capture; the content decides which.
+    """Read a recording: imitarm's own format, a Kinect SDK table, or motion capture.
+
+    The format is detected from the content.
 
     Args:
         path: the file; it may be the ``.part`` file of a recorder that was killed.
-        realtime: replay at the recorded speed.
+        realtime: whether to replay at the recorded speed.
 
     Raises:
         InputError: when there is no such file.
@@ -227,11 +230,11 @@ class SkeletonRecorder:
     Args:
         path: path of the file.
         source: origin of the skeletons, written into the file.
-        replace: an existing file may be replaced.
+        replace: whether an existing file may be replaced.
 
     Attributes:
         path: path of the file.
-        n_frames: written so far.
+        n_frames: number of frames written so far.
 
     Raises:
         InputError: when the file exists and may not be replaced, another recorder has left or is writing
@@ -302,7 +305,7 @@ def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
 
 
 def _between(before: Skeleton, after: Skeleton, fraction: float) -> Skeleton:
-    """Return the person between two frames; ``fraction`` is that of the time from the first to the second."""
+    """Return the person between two frames, at ``fraction`` of the time from the first to the second."""
     tracking = np.minimum(before.tracking, after.tracking)
     lost = tracking == Tracking.LOST
     positions = before.positions + fraction * (after.positions - before.positions)

@@ -1,6 +1,7 @@
 """Quality of a skeleton camera, measured on its skeletons: noise, bone lengths, frame intervals, agreement of views.
 
-As a program it measures how well MediaPipe sees a person in videos, and how well several views of one motion agree::
+Run as a program, it measures how well MediaPipe tracks a person in videos, and how well several views of one motion
+agree::
 
     python -m imitarm.capture.sensor_quality .cache/pose2sim/*.mp4
 """
@@ -41,8 +42,8 @@ class SensorNoise:
 
     White noise is estimated from fifth-order differences of neighbouring frames, in which a person's motion nearly
     vanishes: noise of standard deviation :math:`\sigma` gives differences of standard deviation
-    :math:`\sqrt{252}\,\sigma`. The median of their size is taken, so that single jumps don't count. Slow errors show as
-    bones that change their lengths.
+    :math:`\sqrt{252}\,\sigma`. The median of their size is taken, so that single jumps don't count. Slow errors appear
+    as changing bone lengths.
 
     Attributes:
         n_frames: number of skeletons.
@@ -50,8 +51,8 @@ class SensorNoise:
         jitter: standard deviation of the intervals without the late ones [s].
         late: fraction of the intervals that are longer than 1.4 times the median one.
         longest_interval: [s].
-        at_rest: white noise of each joint while it is slower than 0.1 m/s, root mean square over the axes, shape (25,)
-            [m]; nan where the joint was not that slow for long enough.
+        at_rest: white noise of each joint while it is slower than 0.1 m/s, root mean square over the axes, shape
+            (25,) [m]; nan if the joint was not slow for long enough.
         in_motion: white noise of each joint while it is faster than 0.4 m/s, shape (25,) [m].
         bones: mean and standard deviation of the length of each bone of both arms, by name (``"left forearm"``) [m].
         inferred: fraction of the frames in which each joint is inferred or lost, shape (25,).
@@ -148,7 +149,7 @@ _LIMBS = {"upper arm": (0, 1), "forearm": (1, 2)}
 
 
 def guarded(recording: SkeletonRecording) -> SkeletonRecording:
-    """Return a recording filtered by :class:`SideFilter`, as a retargeter receives it."""
+    """Return a recording filtered by :class:`SideFilter`, the input of a retargeter."""
     return SkeletonRecording(list(SideFilter(recording)), name=recording.name)
 
 
@@ -158,7 +159,7 @@ def tracked_fraction(recording: SkeletonRecording, side: str) -> float:
 
 
 def bone(recording: SkeletonRecording, side: str, name: str) -> tuple[float, float]:
-    """Return the median length of ``"upper arm"`` or ``"forearm"`` [m], and its robust standard deviation over it."""
+    """Return the median length of ``"upper arm"`` or ``"forearm"`` [m], and its robust relative standard deviation."""
     arms = [skeleton.arm(side) for skeleton in recording.skeletons]
     inner, outer = _LIMBS[name]
     lengths = np.array([np.linalg.norm(a.points[outer] - a.points[inner]) for a in arms if a.confidence[:3].min() >= 1])
@@ -171,13 +172,13 @@ def bone(recording: SkeletonRecording, side: str, name: str) -> tuple[float, flo
 def arm_raised(recording: SkeletonRecording, side: str) -> dict[float, float]:
     """Return the angle between arm (shoulder to wrist) and spine, by time rounded to a millisecond [rad].
 
-    The angle does not depend on the place of the camera; times at which the arm is not tracked are left out.
+    The angle does not depend on the position of the camera; times at which the arm is not tracked are left out.
     """
     return _angles(recording, (f"shoulder_{side}", f"wrist_{side}"), ("spine_base", "spine_shoulder"), side)
 
 
 def elbow_bent(recording: SkeletonRecording, side: str) -> dict[float, float]:
-    """Return the angle between forearm and upper arm, by time rounded to a millisecond [rad]; as :func:`arm_raised`."""
+    """Return the angle between forearm and upper arm [rad], by time in milliseconds; see :func:`arm_raised`."""
     return _angles(recording, (f"elbow_{side}", f"wrist_{side}"), (f"elbow_{side}", f"shoulder_{side}"), side)
 
 
@@ -196,9 +197,9 @@ def _angles(
 
 
 def agreement(one: dict[float, float], other: dict[float, float]) -> tuple[float, int]:
-    """Return the correlation of two signals over the times they have in common, and the number of these times.
+    """Return the correlation of two signals at their common times, and the number of these times.
 
-    The correlation is nan when there are fewer than 20.
+    The correlation is nan when there are fewer than 20 common times.
     """
     common = sorted(one.keys() & other.keys())
     if len(common) < _LEAST_COMMON:
@@ -210,8 +211,8 @@ def agreement(one: dict[float, float], other: dict[float, float]) -> tuple[float
 def wrist_difference(one: SkeletonRecording, other: SkeletonRecording) -> float:
     """Return the root mean square difference of two views of the wrists, relative to the shoulders [m].
 
-    The best rotation between the views, one for the whole recording, is removed first, so the cameras' places and axes
-    do not count. The result is the error of both views together; nan when they have fewer than 20 frames in common.
+    First, one rotation that aligns the views best over the whole recording is removed, so the cameras' positions and
+    axes have no effect. The result is the combined error of both views; nan when they have fewer than 20 common frames.
     """
     found = [{round(s.time, 3): s for s in view.skeletons} for view in (one, other)]
     pairs: list[tuple[Array, Array]] = []

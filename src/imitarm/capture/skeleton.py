@@ -1,4 +1,4 @@
-"""Skeleton: a person at one time, as a camera reports it; SkeletonSource: delivers skeletons."""
+"""Skeleton: the joints of a person at one time, as a camera reports them. SkeletonSource: delivers skeletons."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class HandState(IntEnum):
 
 
 CONFIDENCE = np.array([0.0, 0.2, 1.0])
-"""Weight of a position in estimates, by its :class:`Tracking`; docs/retargeting.md has the estimates."""
+"""Weight of a position in estimates, by its :class:`Tracking`; docs/retargeting.md describes the estimates."""
 CONFIDENCE.setflags(write=False)
 
 
@@ -116,7 +116,7 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A person at one time, as a camera reports it.
+    """The joints of a person at one time, as a camera reports them.
 
     The coordinate frame is that of the Kinect v2: origin in the sensor, x to the sensor's left, y up, z away from the
     sensor, right-handed. The right hand of a person who faces the sensor has a larger x than the left one.
@@ -207,26 +207,26 @@ def number_after_colon(word: str, what: str, text: str, largest: int) -> int:
 class SkeletonSource(ABC):
     """A source of skeletons: a recording, a camera, a stream, or a synthetic person.
 
-    Iterating gives skeletons in the order of their times until the source is over::
+    Iteration yields skeletons in the order of their times until the source ends::
 
         with open_source("synthetic:7") as source:
             for skeleton in source:
                 ...
 
-    A source of your own is a class that derives from this one and implements :meth:`read` and :attr:`over`::
+    To write your own source, derive a class from this one and implement :meth:`read` and :attr:`over`::
 
         class GloveSource(SkeletonSource):
             argument, description, live = "PORT", "a data glove at a serial port", True
 
-    and one line in the ``pyproject.toml`` of your package, which makes every command of imitarm accept ``glove:PORT``::
+    Then add one line to the ``pyproject.toml`` of your package, and every command of imitarm accepts ``glove:PORT``::
 
         [project.entry-points."imitarm.sources"]
         glove = "my_package.glove:GloveSource"
 
     Attributes:
         name: name for messages and for recordings, for example the file's name.
-        argument: what a user writes after the colon, for example ``"SEED"``; empty: there is no colon.
-        description: one line for ``--help``.
+        argument: text that a user writes after the colon, for example ``"SEED"``; empty if there is no colon.
+        description: description in one line for ``--help``.
         live: whether the source goes on until it is stopped.
         has_realtime: whether :meth:`open` implements ``realtime``; if not, the commands delay its skeletons.
     """
@@ -239,11 +239,13 @@ class SkeletonSource(ABC):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> SkeletonSource:
-        """Open the source with the argument that a user wrote after the colon; by default the constructor gets it.
+        """Open the source with the argument that a user wrote after the colon.
+
+        By default it is passed to the constructor.
 
         Args:
             argument: the text after the colon; empty when :attr:`argument` is empty.
-            realtime: for a source that is not live: return each skeleton at its time.
+            realtime: whether a source that is not live returns each skeleton at its time.
 
         Raises:
             InputError: when the argument is wrong, or a device or a program is missing.
@@ -252,12 +254,12 @@ class SkeletonSource(ABC):
 
     @abstractmethod
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton, or None when none came within ``timeout`` seconds or the source is over."""
+        """Return the next skeleton, or None when none arrived within ``timeout`` seconds or the source has ended."""
 
     @property
     @abstractmethod
     def over(self) -> bool:
-        """Whether no more skeletons will come."""
+        """Whether the source has ended, so that no more skeletons will follow."""
 
     def close(self) -> None:  # noqa: B027 (a source without anything to release needs none)
         """Release files, sockets and devices; a second call does nothing."""

@@ -1,4 +1,4 @@
-"""open_source: open the source of skeletons that a word such as ``webcam:0`` names."""
+"""open_source: open a source of skeletons by a name such as ``webcam:0``."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from imitarm.files.part_file import PART
 
 
 def open_source(word: str | Path, *, realtime: bool = False) -> SkeletonSource:
-    """Open the source of skeletons that a word names.
+    """Open a source of skeletons by name.
 
     Args:
-        word: a file's name, or ``NAME`` or ``NAME:ARGUMENT`` of one of :data:`~imitarm.capture.SOURCES`; an existing
+        word: name of a file, or ``NAME`` or ``NAME:ARGUMENT`` of one of :data:`~imitarm.capture.SOURCES`; an existing
             file of that name takes precedence.
-        realtime: replay a source that is not live at the recorded speed; else as fast as skeletons are read.
+        realtime: whether to replay a source that is not live at the recorded speed; otherwise as fast as skeletons
+            are read.
 
     Raises:
         UnknownNameError: when there is neither such a file nor such a source.
@@ -30,7 +31,7 @@ def open_source(word: str | Path, *, realtime: bool = False) -> SkeletonSource:
 
 
 def find_source(word: str | Path) -> tuple[type[SkeletonSource], str]:
-    """Return the source that a word names, and its argument, without opening it.
+    """Return the source of this name and its argument, without opening it.
 
     Raises:
         UnknownNameError: when there is neither such a file nor such a source.
@@ -69,7 +70,7 @@ def _class_of(name: str) -> type[SkeletonSource]:
 
 
 def source_words() -> dict[str, str]:
-    """Return the form of each source's word, with a description; this imports all sources."""
+    """Return the syntax of each source's name, with a description; this imports all sources."""
     words = {}
     for name in SOURCES:
         try:
@@ -83,7 +84,7 @@ def source_words() -> dict[str, str]:
 
 
 def is_live(word: str | Path) -> bool:
-    """Return whether the source that a word names runs until it is stopped, without opening it.
+    """Return whether the source of this name runs until it is stopped, without opening it.
 
     Raises:
         InputError: for the same reasons as :func:`find_source`.
@@ -92,10 +93,10 @@ def is_live(word: str | Path) -> bool:
 
 
 def followed(source: SkeletonSource, *, person: int | None = None) -> PersonFilter:
-    """Return one person of a source, with left and right kept apart: the source to give to a retargeter.
+    """Return one person of a source, with exchanged sides corrected: the source to give to a retargeter.
 
     Args:
-        source: as opened.
-        person: number of the person to follow; None: the first who is seen.
+        source: opened source.
+        person: number of the person to follow; None: the first person who is seen.
     """
     return PersonFilter(SideFilter(source), person=person)

@@ -20,7 +20,7 @@ _LONGEST_WAIT = 60_000_000_000  # [ns] the longest that a datagram can state
 class SkeletonSender:
     """Sends skeletons to one address, one datagram for each, without waiting and without repetition.
 
-    A lost skeleton is not sent again, because a newer one follows within a thirtieth of a second.
+    A lost skeleton is not sent again, because the next one follows within 1/30 s.
 
     Args:
         address: host and port of the receiver.
@@ -28,7 +28,7 @@ class SkeletonSender:
 
     Attributes:
         sent: number of skeletons sent.
-        failed: number of skeletons not sent, because nobody listens or the operating system refused them.
+        failed: number of skeletons not sent because nobody listens or the operating system rejected them.
 
     Raises:
         InputError: when there is no such host.
@@ -66,11 +66,11 @@ class SkeletonSender:
 
 
 def frame_of(skeleton: Skeleton, waited_ns: int = 0) -> SkeletonFrame:
-    """Return a skeleton as it is sent: lost positions are 0, because a datagram must not hold nan.
+    """Return the message for a skeleton; lost positions are 0, because a datagram must not contain nan.
 
     Args:
         skeleton: skeleton to send.
-        waited_ns: time between exposure and sending [ns].
+        waited_ns: time from exposure to sending [ns].
     """
     seen = skeleton.tracking != Tracking.LOST
     positions = np.where(seen[:, None], skeleton.positions, 0.0)
@@ -93,20 +93,20 @@ class Arrival(NamedTuple):
 
 
 class UdpSource(SkeletonSource):
-    """Skeletons from a :class:`SkeletonSender`, live.
+    """Live skeletons from a :class:`SkeletonSender`.
 
     Datagrams that are late, damaged, foreign or hostile are dropped and counted by a
     :class:`~imitarm.transmission.datagram_filter.DatagramFilter`. A sender that is killed and started again is
     accepted after half a second of silence; its times are shifted so that they continue after the gap, and every
-    retargeter engages anew.
+    retargeter engages again.
 
     Args:
-        port: to listen on; 0: any free one.
+        port: port to listen on; 0: any free port.
         host: address of this machine to listen on; the default hears this machine only.
         clock_ns: clock for the time of receiving [ns].
 
     Attributes:
-        gate: decides which datagrams are used, and counts the dropped ones.
+        gate: filter that selects the datagrams to use, and counts the dropped ones.
         arrival: how the last skeleton arrived; None before the first.
 
     Raises:
@@ -130,7 +130,7 @@ class UdpSource(SkeletonSource):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> UdpSource:
-        """Listen on the port, and address, that a user wrote after the colon.
+        """Listen on the port, and optionally the address, that a user wrote after the colon.
 
         Raises:
             InputError: when the port is not a number, is taken, or the address is not one of this machine's.
@@ -155,7 +155,7 @@ class UdpSource(SkeletonSource):
             pass
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton; None when none came within ``timeout`` seconds, or the source was closed."""
+        """Return the next skeleton; None when none arrived within ``timeout`` seconds, or the source was closed."""
         until = clock.monotonic() + timeout
         while not self._closed:
             for data, address in waiting(self._socket):
@@ -172,7 +172,7 @@ class UdpSource(SkeletonSource):
         return None
 
     def _skeleton(self, frame: SkeletonFrame, now: int, queued: float) -> Skeleton:
-        """Return the received skeleton, with a time that increases also when the sender is started again."""
+        """Return the received skeleton, with a time that still increases when the sender is restarted."""
         if self.datagram_filter.n_sessions != self._sessions:
             self._sessions = self.datagram_filter.n_sessions
             silent = 0.0 if self.arrival is None else 1e-9 * (now - self.arrival.received_ns)

@@ -1,4 +1,4 @@
-"""SyntheticSource: skeletons of a synthetic person, as a simulated camera sees them; seeded."""
+"""SyntheticSource: skeletons of a synthetic person, measured by a simulated camera; seeded."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MOTIONS: dict[str, Callable[..., Truth]] = {
 class SyntheticSource(SkeletonSource):
     """A synthetic person in front of a simulated camera; the same seeds give the same skeletons.
 
-    What the camera sees can be compared with the truth::
+    The measured positions can be compared with the true ones::
 
         source = SyntheticSource.from_seed(3, kind="edge")
         for seen in source:
@@ -33,7 +33,8 @@ class SyntheticSource(SkeletonSource):
         truth: true positions of all joints, as a function of time.
         camera: the simulated camera.
         duration: [s].
-        realtime: return each skeleton at its time, as a camera does; else as fast as skeletons are read.
+        realtime: whether to return each skeleton at its time, as a camera does; otherwise as fast as skeletons are
+            read.
         name: name for messages.
 
     Attributes:
@@ -44,7 +45,7 @@ class SyntheticSource(SkeletonSource):
     """
 
     argument = "SEED"
-    description = "a synthetic person in front of a simulated camera, which has the errors of a real one"
+    description = "a synthetic person in front of a simulated camera with realistic errors"
     has_realtime = True
 
     def __init__(
@@ -69,10 +70,10 @@ class SyntheticSource(SkeletonSource):
         """Return person number ``seed`` in motion in front of camera number ``seed``, whose noise is 1 to 2 cm.
 
         Args:
-            seed: of person, motion and camera.
-            duration: [s]; the hand is still during the first second.
-            kind: of motion, one of :data:`MOTIONS`.
-            realtime: return each skeleton at its time.
+            seed: seed of person, motion and camera.
+            duration: duration of the motion [s]; the hand is at rest during the first second.
+            kind: kind of motion, one of :data:`MOTIONS`.
+            realtime: whether to return each skeleton at its time.
 
         Raises:
             UnknownNameError: when there is no such motion.

@@ -1,7 +1,7 @@
 """The ``imitarm`` command: one file a subcommand, each with ``add_arguments(parser)`` and ``run(arguments)``.
 
-A module is imported only when its command is used, so ``imitarm --help`` answers at once. A new command is a
-file in this folder and a line in ``COMMANDS``.
+A module is imported only when its command is used, so ``imitarm --help`` answers at once. To add a command, write a
+file in this folder and add a line to ``COMMANDS``.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from imitarm.errors import ImitarmError
 COMMANDS = {
     "capture": "record a person's motion from a camera or a file, and check it",
     "calibrate": "measure a person's arm, locate the sensor, choose how the robot follows",
-    "retarget": "turn a person's motion into a robot's, ready to learn from",
+    "retarget": "convert a person's motion to a robot demonstration",
     "teleoperate": "let a person move a robot in real time",
     "serve": "make a simulated robot available to other processes over UDP",
-    "lint": "check demonstrations and say what is wrong with them",
+    "lint": "check demonstrations and list their faults",
     "learn": "learn a skill from demonstrations",
     "reproduce": "let a simulated arm reproduce a skill around obstacles",
     "demo": "learn a sweep, reproduce it around obstacles, write a report",
@@ -35,7 +35,7 @@ examples:
   imitarm learn recordings/ --task pour --out pour.json --units cm --duration 10
   imitarm robots sawyer
 
-Say 'imitarm COMMAND --help' for what a command takes. Exit status: 0 when done, 1 when it could not be done,
+Run 'imitarm COMMAND --help' for the options of a command. Exit status: 0 when done, 1 when it could not be done,
 2 when the input is wrong, 130 when interrupted.
 """
 
@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; a failure is one message, never a traceback.
 
     Args:
-        argv: the arguments without the program's name; None: those of this process.
+        argv: arguments without the program's name; None: the arguments of this process.
     """
     # Many small matrices: one thread is quicker than several that wait for each other. NumPy is not loaded yet.
     os.environ.setdefault("OMP_NUM_THREADS", "1")

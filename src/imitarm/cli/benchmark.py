@@ -1,4 +1,4 @@
-"""``imitarm benchmark``: measure how good the methods are, beside what the thesis reports."""
+"""``imitarm benchmark``: measure the methods and compare the results with those of the thesis."""
 
 from __future__ import annotations
 
@@ -45,7 +45,9 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parsers = parser.add_subparsers(metavar="BENCHMARK", required=True, title="benchmarks")
-    mapping = parsers.add_parser("mapping", help="retargeting: every method on the same recordings (thesis Table 3.1)")
+    mapping = parsers.add_parser(
+        "mapping", help="compare all retargeting methods on the same recordings (thesis Table 3.1)"
+    )
     mapping.add_argument("--people", type=int, metavar="N", help="simulated people; default: 10, with --quick 2")
     mapping.add_argument(
         "--first",
@@ -57,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument(
         "--repeats", type=int, metavar="N", help="closed-loop trials of each person; default: 5, with --quick 1"
     )
-    mapping.add_argument("--quick", action="store_true", help="a few short recordings, to see that it runs")
+    mapping.add_argument("--quick", action="store_true", help="use a few short recordings, for a quick test")
     mapping.add_argument("--methods", nargs="+", choices=METHODS, metavar="NAME", help=f"of {', '.join(METHODS)}")
     mapping.add_argument("--kinds", nargs="+", choices=KINDS, metavar="KIND", help=f"recordings: {', '.join(KINDS)}")
     mapping.add_argument(
@@ -66,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument(
         "--sigma", type=float, metavar="MM", help="standard deviation of the camera's error; default: 10 to 20 mm"
     )
-    mapping.add_argument("--no-live", action="store_true", help="no closed loop, recordings only")
+    mapping.add_argument("--no-live", action="store_true", help="use recordings only, without the closed loop")
     mapping.add_argument("--no-replay", action="store_true", help="closed loop only")
     mapping.add_argument("--data", type=Path, metavar="DIR", help="folder of real recordings: adds a captured arm")
     mapping.add_argument("--out", type=Path, metavar="DIR", help="folder of the results; default: benchmark-mapping")
@@ -77,9 +79,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--reuse", action="store_true", help="use saved results of the same configuration even if other code made them"
     )
     mapping.add_argument("--jobs", type=int, metavar="N", help="processes; default: one for each processor")
-    mapping.add_argument("--backend", default=LOCAL, metavar="NAME", help="of joblib: loky (local), dask, ray")
+    mapping.add_argument("--backend", default=LOCAL, metavar="NAME", help="backend of joblib: loky (local), dask, ray")
     mapping.set_defaults(benchmark=_mapping)
-    other = parsers.add_parser("avoidance", help="rate at which a method keeps its clearance in seeded scenes")
+    other = parsers.add_parser("avoidance", help="measure how often a method keeps its clearance in seeded scenes")
     other.add_argument("--seeds", type=int, default=200, metavar="N", help="scenes in each family; default: 200")
     other.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000, the test seeds")
     other.add_argument("--methods", nargs="+", choices=ADAPTERS, default=list(ADAPTERS))
@@ -88,10 +90,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     third = parsers.add_parser("refusals", help="check accepted paths and refusals in random scenes by an oracle")
     third.add_argument("--scenes", type=int, default=1000, metavar="N", help="how many; default: 1000")
     third.add_argument("--first", type=int, default=0, metavar="N", help="first seed; default: 0")
-    third.add_argument("--skills", type=Path, nargs="+", default=[], metavar="FILE", help="skills to adapt as well")
+    third.add_argument("--skills", type=Path, nargs="+", default=[], metavar="FILE", help="additional skills to adapt")
     _add_fill(third)
     third.set_defaults(benchmark=_refusals)
-    placed = parsers.add_parser("placements", help="policies on a simulated arm, among seeded obstacles on the path")
+    placed = parsers.add_parser(
+        "placements", help="compare policies on a simulated arm with seeded obstacles on the path"
+    )
     placed.add_argument("--skill", type=Path, metavar="FILE", help="default: the packaged sweep, Sawyer and brush")
     placed.add_argument("--policies", nargs="+", choices=POLICIES, default=["acfra"], metavar="NAME")
     placed.add_argument("--seeds", type=int, default=50, metavar="N", help="placements; default: 50")
@@ -101,7 +105,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_robot_options(placed)
     _add_fill(placed)
     placed.set_defaults(benchmark=_placements)
-    people = parsers.add_parser("people", help="recordings of real people lead the simulated arms")
+    people = parsers.add_parser("people", help="let recordings of real people drive simulated arms")
     people.add_argument(
         "data", type=Path, metavar="DATA", help="folder of real recordings, with kinect_gestures and mocap_arm"
     )
@@ -227,7 +231,7 @@ def _placements(arguments: argparse.Namespace) -> int:
 
 
 def _people(arguments: argparse.Namespace) -> int:
-    """Let recordings of real people lead the arms, and print the tables."""
+    """Let recordings of real people drive the arms, and print the tables."""
     place = _place(arguments, "people")
     motions = list(real_motions.real_motions(arguments.data, arguments.videos))
     _report(real_motions.tables(motions), place, [code_version()])
@@ -235,7 +239,7 @@ def _people(arguments: argparse.Namespace) -> int:
 
 
 def _place(arguments: argparse.Namespace, benchmark: str) -> Place | None:
-    """Return the document for the tables, which is checked before the run; None without one."""
+    """Return the document for the tables, which is checked before the run; None if there is no document."""
     return None if arguments.fill is None else Place(arguments.fill, benchmark)
 
 
@@ -268,7 +272,7 @@ def _configured(arguments: argparse.Namespace) -> MappingBenchmark:
 
 
 def _command() -> str:
-    """Return the command without the names of this machine's files."""
+    """Return the command without file names of this machine."""
     words, places = sys.argv[1:], {"--out", "--report", "--fill", "--jobs", "--backend"}
     kept = [
         w

@@ -1,4 +1,4 @@
-"""``imitarm calibrate``: measure limbs, locate the sensor, choose scale and orientation; all in one file."""
+"""``imitarm calibrate``: measure limbs, locate the sensor, choose scale and orientation, and save them in one file."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _ORIENTATIONS: dict[Orientation, str] = {
     "fixed": "the tool does not rotate",
 }
 _ANCHORS: dict[Anchor, str] = {
-    "shoulder": "the robot's arm is stretched when yours is: the whole workspace, less precise",
+    "shoulder": "the robot's arm is stretched when your arm is: whole workspace, less precise",
     "object": "1 cm of the hand is 1 cm of the tool: for objects that you and the robot both have in front of you",
 }
 _TRIES = 3
@@ -78,10 +78,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_source(sensor, "--source", "guided: measure the hand with this source; ")
     sensor.add_argument("--points", metavar="FILE", help="guided: points in the robot's base frame, x y z [m]")
-    sensor.add_argument("--seconds", type=float, default=1.0, metavar="S", help="guided: for each point; default: 1")
-    clutch = kinds.add_parser("clutch", help="choose scale and orientation; asks for what is not given")
+    sensor.add_argument(
+        "--seconds", type=float, default=1.0, metavar="S", help="guided: measuring time for each point; default: 1"
+    )
+    clutch = kinds.add_parser("clutch", help="choose scale and orientation; asks for values that are not given")
     add_robot_options(clutch)
-    clutch.add_argument("--scale", type=float, metavar="RHO", help="motion of the tool over motion of the hand")
+    clutch.add_argument("--scale", type=float, metavar="RHO", help="tool motion divided by hand motion")
     clutch.add_argument("--anchor", choices=ANCHORS, help="suggest a scale: " + _listed(_ANCHORS))
     clutch.add_argument("--orientation", choices=get_args(Orientation), help=_listed(_ORIENTATIONS))
     for one in (limbs, sensor):
@@ -97,7 +99,7 @@ def _listed(choices: Mapping[Any, str]) -> str:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, print the result and its accuracy, write it.
+    """Measure, print the result and its accuracy, and write it to the file.
 
     Raises:
         InputError: when an option or a file is wrong, or the points can't be used.
@@ -180,7 +182,7 @@ def _read_pairs(path: str) -> tuple[list[list[float]], list[list[float]]]:
 
 
 def _columns(path: str, names: Sequence[str]) -> list[list[float]]:
-    """Return columns of a table: by their names if it has names, else in the given order."""
+    """Return columns of a table, by name if it has column names, otherwise in the given order."""
     table = read_table(path)
     if table.names is not None:
         lower = [name.lower() for name in table.names]
@@ -196,7 +198,7 @@ def _columns(path: str, names: Sequence[str]) -> list[list[float]]:
 
 
 def _guided(arguments: argparse.Namespace) -> SensorFit:
-    """Let the user touch all points, and touch the ones with a large residual again."""
+    """Let the user touch all points, and then the points with a large residual again."""
     if arguments.source is None or arguments.points is None:
         raise InputError("sensor: a guided calibration needs both --source and --points")
     points = _columns(arguments.points, ("x", "y", "z"))
@@ -265,10 +267,10 @@ def _clutch(arguments: argparse.Namespace, before: Calibration) -> Calibration:
 
 
 def ask(question: str) -> str:
-    """Show a question and return the answer, in lower case.
+    """Show a question and return the answer in lower case.
 
     Raises:
-        InputError: when nobody can answer, because input has ended.
+        InputError: when nobody can answer because the input has ended.
     """
     remark(question)
     try:
@@ -309,14 +311,14 @@ def touched_points(
     A hand that moved or was not seen is measured again.
 
     Args:
-        source: observes the hand, live or replayed in real time.
-        points: in the robot's base frame, shape (n, 3) [m].
+        source: source that observes the hand, live or replayed in real time.
+        points: points in the robot's base frame, shape (n, 3) [m].
         side: side of the hand.
-        seconds: duration of each measurement.
+        seconds: duration of each measurement [s].
         only: index of the single point to touch, from 0; None: all points.
 
     Returns:
-        position of the hand in the sensor's frame, shape (3,) [m], for each point that was not skipped, from 0.
+        Position of the hand in the sensor's frame, shape (3,) [m], by the index of each point that was not skipped.
 
     Raises:
         InputError: when the user gives up, the source is over, or fewer than four points are left.

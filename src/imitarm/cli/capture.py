@@ -1,4 +1,4 @@
-"""``imitarm capture``: take a person's motion from a source, record it, send it, check it."""
+"""``imitarm capture``: read a person's motion from a source, and record, send or check it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ examples:
   imitarm capture synthetic:7 --send 127.0.0.1:7400
 
 Each frame is written immediately: a program that is killed leaves FILE.part, which can be read. Ctrl-C ends a live
-source and keeps what was recorded. Exit status 2 when --check finds an error.
+source and keeps the recorded frames. Exit status 2 when --check finds an error.
 """
 
 
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_argument(
         "--repair",
         action="store_true",
-        help="fix what needs no guess: several persons, wrong order, repeated frames, spikes, exchanged sides",
+        help="fix faults that need no guess: several persons, wrong order, repeated frames, spikes, exchanged sides",
     )
 
 
@@ -108,7 +108,7 @@ def _tell_sent(sender: SkeletonSender, address: str) -> None:
 
 
 def _check_options(arguments: argparse.Namespace) -> None:
-    """Check options that would otherwise fail only after the work."""
+    """Check the options that would otherwise cause a failure only after the capture."""
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
     if arguments.trim is not None and not 0.0 <= arguments.trim[0] < arguments.trim[1] < np.inf:
@@ -117,7 +117,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
 
 
 def _chosen(source: SkeletonSource, person: int | None) -> SkeletonSource:
-    """Return the source, or one person of it; when a recording lacks that person, the error says who is in it."""
+    """Return the source, or one person of it; if a recording lacks that person, the error lists the persons in it."""
     if person is None:
         return source
     if isinstance(source, SkeletonRecording):
@@ -126,7 +126,7 @@ def _chosen(source: SkeletonSource, person: int | None) -> SkeletonSource:
 
 
 def _finished(recording: SkeletonRecording, arguments: argparse.Namespace) -> SkeletonRecording:
-    """Return the recording, trimmed and repaired as asked; if that changed it, the output file is written again."""
+    """Return the recording, trimmed and repaired as requested; the output file is rewritten if it changed."""
     done = recording
     if arguments.trim is not None:
         done = done.trim(*arguments.trim)

@@ -43,7 +43,7 @@ _SUMMARY = (
 
 _CAPTIONS = {
     "free": "No obstacle is in the way: the brush follows the learned path.",
-    "two_boxes": "Two boxes stand on the learned path, one before the crumbs and one behind them.",
+    "two_boxes": "Two boxes stand on the learned path, one in front of the crumbs and one behind them.",
     "tall_and_low": "A tall and a low box stand on opposite sides of the learned path.",
     "boxes_and_cone": "A box and a cone stand on the learned path, and a tall box narrows the space around them.",
     "cone_first": "A cone and a box stand on the learned path, and a large box narrows the space around them.",
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("demo"), metavar="FOLDER", help="folder for the results; default: demo"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed for the places of the crumbs; default: 0")
+    parser.add_argument("--seed", type=int, default=0, help="seed for the positions of the crumbs; default: 0")
     parser.add_argument(
         "--method", choices=ADAPTERS, default="certified", help="method that adapts the path; default: certified"
     )

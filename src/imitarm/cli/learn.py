@@ -38,12 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add_reading_arguments(parser)
     parser.add_argument("--repair", action="store_true", help="drop rows with invalid numbers or times")
-    parser.add_argument("--allow-errors", action="store_true", help="learn, and write the skill, in spite of errors")
+    parser.add_argument("--allow-errors", action="store_true", help="learn and write the skill despite errors")
     learning = parser.add_argument_group("learning")
     learning.add_argument("--task", default="", metavar="NAME", help="name of the task, stored in the skill")
     learning.add_argument("--align", choices=METHODS, default="dtw", help="method of alignment; default: dtw")
     learning.add_argument(
-        "--samples", type=int, metavar="N", help="per aligned demonstration; default: 200, more for long paths"
+        "--samples", type=int, metavar="N", help="samples per aligned demonstration; default: 200, more for long paths"
     )
     learning.add_argument(
         "--components", type=_components, default="auto", metavar="K", help="number of Gaussians; default: auto"
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Read, check and align the demonstrations, learn the skill, evaluate it, and save it.
 
     Raises:
-        InputError: when an option, a file or the path of the skill is not valid, or the check finds an error.
+        InputError: when an option, a file or the path of the skill file is not valid, or the check finds an error.
         TaskFailedError: when the skill does not reproduce the motion.
     """
     inputs = [*(("FILE", file) for file in files_of(arguments.files)), *robot_files(arguments)]
@@ -106,7 +106,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _samples_needed(demonstrations: Sequence[Demonstration]) -> int:
-    """Return 200 samples; proportionally more, up to 2000, for paths longer than 6 times their extent."""
+    """Return the number of samples.
+
+    200, and proportionally more, up to 2000, for paths longer than 6 times their extent.
+    """
     most = 1.0
     for one in demonstrations:
         motion = one.trajectory.resample(400)

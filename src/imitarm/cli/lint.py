@@ -1,4 +1,4 @@
-"""``imitarm lint``: list what is wrong with demonstrations."""
+"""``imitarm lint``: list the faults of demonstrations."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def check_outputs(
     force: bool | None = None,
     new_folders: bool = False,
 ) -> None:
-    """Refuse outputs that would overwrite an input, another output or an existing file.
+    """Reject outputs that would overwrite an input, another output or an existing file.
 
     Args:
         outputs: option and file of each output; None: the output is not written.

@@ -1,4 +1,4 @@
-"""Shared by all commands that read a person from a source: arguments, reading, and printing of issues."""
+"""The common part of all commands that read a person from a source: arguments, reading, and printing of issues."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WAIT = 0.2  # [s] for one read of a silent source
 
 
 class _SourceArgument(argparse.Action):
-    """Stores the word that names a source; its help lists all sources, which are imported only to show it."""
+    """Stores the name of a source. The help text lists all sources, which are imported only to show it."""
 
     @property
     def help(self) -> str | None:
@@ -80,14 +80,14 @@ def gather(
 
     Args:
         source: to read from.
-        seconds: how long, by the clock when live, else by the skeletons' times; None: to the end.
+        seconds: duration, by the clock for a live source, otherwise by the skeletons' times; None: to the end.
         what: text of the progress bar, for example ``"capturing"``.
-        live: whether the source goes on until it is stopped.
-        total: expected duration, where it is known without ``seconds`` [s].
+        live: whether the source runs until it is stopped.
+        total: expected duration, if known without ``seconds`` [s].
         on_skeleton: called with each skeleton.
 
     Returns:
-        the skeletons, and whether the user stopped it.
+        The skeletons, and whether the user stopped the reading.
     """
     taken: list[Skeleton] = []
     began = clock.monotonic()
@@ -132,12 +132,12 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
         side: side of the arm that the robot follows.
 
     Returns:
-        the skeletons; what was changed and what is wrong, a sentence each; and the person's true motion, when the
-        source is a synthetic one.
+        The skeletons; the changes and issues, one sentence each; and the person's true motion if the source is
+        synthetic.
 
     Raises:
         InputError: when the source or an option is wrong.
-        TaskFailedError: when fewer than two skeletons came.
+        TaskFailedError: when fewer than two skeletons arrived.
     """
     if is_live(arguments.source) and (arguments.trim is not None or arguments.pace != 1.0):
         raise InputError("--trim, --pace: a live source can't be cut or slowed; record it by 'imitarm capture' first")

@@ -26,7 +26,7 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "files", nargs="+", metavar="FILE", help=f"demonstrations, or folders of them; formats: {', '.join(READERS)}"
     )
-    unsaid = parser.add_argument_group("for what the files do not state")
+    unsaid = parser.add_argument_group("for values that the files do not state")
     unsaid.add_argument("--units", choices=LENGTH_UNITS, help="unit of lengths; default: as the file says, else m")
     unsaid.add_argument(
         "--time-units", choices=TIME_UNITS, help="unit of time stamps; default: as the file says, else s"
@@ -40,7 +40,7 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
         choices=QUATERNION_ORDERS,
         help="order of quaternion columns without names; default: as the file says, else wxyz",
     )
-    parser.add_argument("--thin", action="store_true", help="drop rows that only repeat a held value")
+    parser.add_argument("--thin", action="store_true", help="drop rows that only repeat the previous value")
     parser.add_argument("--all", action="store_true", help="list every finding; default: one row for each kind")
     add_robot_options(parser, default=None)  # else recordings of another arm would be compared with Sawyer
 
@@ -64,9 +64,9 @@ def read_and_lint(
 
     Args:
         arguments: those of :func:`add_reading_arguments`.
-        arm: the arm that was recorded.
+        arm: arm that was recorded.
         task: name of the task.
-        repair: drop invalid rows before the checks.
+        repair: whether to drop invalid rows before the checks.
 
     Raises:
         InputError: when there are no files, or an option is wrong for all of them.
@@ -98,7 +98,7 @@ def show_findings(raw: Sequence[RawDemonstration], findings: Sequence[Finding], 
     Args:
         raw: the demonstrations that were read.
         findings: about them.
-        every: print one row for each finding; otherwise one row for each kind, with a count.
+        every: whether to print one row for each finding; otherwise one row for each kind, with a count.
     """
     groups = [[f] for f in findings] if every else _kinds(findings)
     if findings:

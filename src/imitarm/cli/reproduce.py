@@ -57,25 +57,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tool-radius",
         type=float,
         metavar="MM",
-        help="radius of a sphere about the tip, in place of the tool's own shape",
+        help="radius of a sphere about the tip that replaces the shape of the tool",
     )
     avoid.add_argument(
         "--tool-only",
         action="store_true",
-        help="let the links come near obstacles; only the tool keeps its clearance (for comparison)",
+        help="do not keep the links away from obstacles; only the tool keeps its clearance (for comparison)",
     )
     held = avoid.add_mutually_exclusive_group()
     held.add_argument("--keep-height", action="store_true", help="move the path only sideways, as on a table")
     held.add_argument("--not-down", action="store_true", help="never move the path downwards")
     moved = parser.add_argument_group("other start and goal")
     triple = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
-    moved.add_argument("--start", **triple, help="where the motion begins [cm]; default: as learned")  # type: ignore[arg-type]
-    moved.add_argument("--goal", **triple, help="where it ends [cm]; default: as the scene says, else as learned")  # type: ignore[arg-type]
-    parser.add_argument("--control", choices=("position", "torque"), default="position", help="of the simulated drives")
+    moved.add_argument("--start", **triple, help="start of the motion [cm]; default: as learned")  # type: ignore[arg-type]
+    moved.add_argument("--goal", **triple, help="goal of the motion [cm]; default: from the scene, else as learned")  # type: ignore[arg-type]
+    parser.add_argument(
+        "--control", choices=("position", "torque"), default="position", help="control mode of the simulated drives"
+    )
     output = parser.add_argument_group("output")
-    output.add_argument("--out", type=Path, metavar="FILE", help="the measured motion, as a demonstration (CSV)")
+    output.add_argument("--out", type=Path, metavar="FILE", help="write the measured motion as a demonstration (CSV)")
     output.add_argument("--force", action="store_true", help="replace existing files")
-    output.add_argument("--report", type=Path, metavar="FILE", help="a page with 3-D playback and figures (HTML)")
+    output.add_argument("--report", type=Path, metavar="FILE", help="write a page with 3-D playback and figures (HTML)")
 
 
 def run(arguments: argparse.Namespace) -> int:

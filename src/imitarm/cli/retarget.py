@@ -1,4 +1,4 @@
-"""``imitarm retarget``: convert a person's motion into a robot's, save it as a demonstration, and report on it."""
+"""``imitarm retarget``: convert a person's motion to a robot's, save it as a demonstration, write a report."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--drive", action="store_true", help="let the simulated robot execute the motion, and measure it"
     )
-    parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles that 'modern' avoids (YAML)")
+    parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles that the method 'modern' avoids (YAML)")
     person = parser.add_argument_group("the person")
-    person.add_argument("--side", choices=SIDES, help="the arm; default: as calibrated, else right")
+    person.add_argument("--side", choices=SIDES, help="arm of the person; default: as calibrated, else right")
     person.add_argument(
         "--person",
         type=int,
         metavar="N",
-        help="number of the person, of several; default: in a recording the one seen most, else the first",
+        help="number of the person, if there are several; default: the one seen most (recordings), else the first",
     )
     person.add_argument("--calibration", type=Path, metavar="FILE", help="file written by 'imitarm calibrate'")
     person.add_argument(
@@ -89,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scale",
         type=float,
         metavar="FACTOR",
-        help="motion of the robot over motion of the person; default: as calibrated, else 1",
+        help="robot motion divided by the person's motion; default: as calibrated, else 1",
     )
     follow.add_argument(
         "--orientation",
@@ -101,10 +101,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     output = parser.add_argument_group("output")
     output.add_argument("--task", default="", metavar="WORDS", help="name of the task, saved in the demonstration")
-    output.add_argument("--out", type=Path, metavar="FILE", help="the demonstration (CSV); with 'all' one per method")
+    output.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="write the demonstration (CSV); with '--method all', one file per method",
+    )
     output.add_argument("--force", action="store_true", help="overwrite existing files")
     output.add_argument("--keep-waiting", action="store_true", help="keep the time before and after the person led")
-    output.add_argument("--report", type=Path, metavar="FILE", help="a page with person and robot side by side (HTML)")
+    output.add_argument(
+        "--report", type=Path, metavar="FILE", help="write a page with person and robot side by side (HTML)"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +168,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _output_files(arguments: argparse.Namespace, names: Sequence[str]) -> dict[str, Path]:
     """Return the demonstration's file for each method.
 
-    Check everything now that would otherwise fail only after the run.
+    It also checks everything that would otherwise cause a failure only after the run.
     """
     slowed((), arguments.pace)
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
@@ -349,10 +356,10 @@ def suggestion(
     fitted: bool,
     pace: float,
 ) -> str:
-    """Return which options to try when the tool did not follow, the most promising first; empty when it did.
+    """Return the options to try if the tool did not follow, the most promising first; empty if it did.
 
     Args:
-        tracking: tracking of the run.
+        tracking: tracking result of the run.
         skeletons: skeletons of the person.
         correspondence: correspondence between person and robot, the input of the method.
         fitted: whether ``--fit`` was given.

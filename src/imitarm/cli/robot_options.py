@@ -17,7 +17,7 @@ def add_robot_options(parser: argparse.ArgumentParser, *, default: str | None = 
 
     Args:
         parser: parser of the command.
-        default: the robot that is taken when none is named; None for a command that can do without a robot.
+        default: robot to use when none is named; None for a command that does not require a robot.
     """
     group = parser.add_argument_group("the robot arm")
     group.add_argument(
@@ -45,7 +45,7 @@ def add_robot_options(parser: argparse.ArgumentParser, *, default: str | None = 
 
 
 def load_robot(arguments: argparse.Namespace) -> ArmModel:
-    """Load the arm that the options name, and print what had to be assumed about it.
+    """Load the arm that the options name, and print the assumptions about it.
 
     Raises:
         InputError: if no robot is named but another option needs one, or the robot can't be loaded.

@@ -22,7 +22,7 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes."""
+    """Add the command's arguments."""
     parser.add_argument("arm", nargs="?", metavar="ARM", help="the same as --robot; default: list all known arms")
     add_robot_options(parser, default=None)
 
@@ -61,7 +61,7 @@ def _list(tool: str | None) -> None:
     )
     say(
         f"tools: {', '.join(sorted(TOOLS))}",
-        "any MJCF or URDF file is an arm too; give a name or a path to see its joints and limits",
+        "any MJCF or URDF file of an arm can be used too; give a name or a path to see its joints and limits",
     )
 
 

@@ -50,21 +50,22 @@ def run_scene(
     """Let a policy reproduce its skill on a simulated robot, and collect the result for the report.
 
     Args:
-        name: short and unique.
-        title: for tables and the report.
+        name: short, unique name of the scene.
+        title: title for tables and the report.
         robot: robot at its start posture, in its scene.
-        policy: not yet reset.
+        policy: policy before its reset.
         clearance: required clearance [m].
         link_clearance: required clearance of every link [m]; None: only the tool keeps a clearance.
-        tool_radius: for the drawing [m].
-        tool_spheres: for the drawing, in place of ``tool_radius``: rows x, y, z, radius, shape (m, 4) [m].
-        demonstrations: aligned, to measure the distance to.
-        evaluate: the task's success test; returns the rollout with its verdict.
-        caption: a sentence about what the scene shows.
+        tool_radius: radius of the tool for drawing [m].
+        tool_spheres: spheres of the tool for drawing, instead of ``tool_radius``: rows x, y, z, radius, shape (m,
+            4) [m].
+        demonstrations: aligned demonstrations for measuring the deviation.
+        evaluate: success test of the task; returns the rollout with its verdict.
+        caption: one sentence that describes the scene.
         progress: called with the fraction of the motion that is done, 0 to 1.
 
     Returns:
-        The result; when the policy refuses, it has no rollout, but the reason.
+        The result. If the policy refuses, it has a reason but no rollout.
     """
     scene = robot.scene_at_start
     frames = FrameRecorder(robot.model)
@@ -159,7 +160,7 @@ def learning_summary(
 
 
 def provenance(**facts: object) -> Mapping[str, object]:
-    """Return what is needed to repeat a run: command, versions, platform, and the given ``facts``."""
+    """Return the facts needed to repeat a run: command, versions, platform, and the given ``facts``."""
     return {
         "command": shlex.join(["imitarm", *sys.argv[1:]]),
         **facts,

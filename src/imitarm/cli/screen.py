@@ -43,7 +43,7 @@ def show_table(
     Args:
         columns: headings; one that ends in ``>`` is right-aligned.
         rows: the cells.
-        title: above the table.
+        title: title above the table.
         styles: one colour for each row; empty: no colours.
     """
     table = Table(title=title or None, title_justify="left", header_style="bold")
@@ -56,7 +56,7 @@ def show_table(
 
 
 def working(what: str) -> Status:
-    """Show that work is going on while the ``with`` block runs; silent when stderr is not a terminal."""
+    """Show an activity indicator while the ``with`` block runs; silent when stderr is not a terminal."""
     return _console(sys.stderr).status(what)
 
 
@@ -68,11 +68,11 @@ def progress_bar() -> Progress:
 
 @contextmanager
 def watched(what: str, fraction: Callable[[], float]) -> Iterator[None]:
-    """Show the progress of work that does not report it, while the ``with`` block runs; it appears after 2 s.
+    """Show the progress of work that does not report it while the ``with`` block runs; the bar appears after 2 s.
 
     Args:
         what: description of the work.
-        fraction: returns the fraction that is done, 0 to 1; called five times per second from another thread.
+        fraction: function that returns the finished fraction, 0 to 1; called five times per second from another thread.
     """
     over = threading.Event()
 

@@ -144,7 +144,9 @@ def _show_summary(server: RobotServer) -> None:
 
 
 class Trace:
-    """A file with one line for each control period, written at once, so that a killed process loses none.
+    """A file with one line for each control period.
+
+    Each line is written immediately, so that a killed process loses none.
 
     Columns: time [s], status (0 stopped, 1 following, 2 slowing, 3 fault), then set-point [rad], its velocity [rad/s]
     and measured position [rad] of each joint.
@@ -152,7 +154,7 @@ class Trace:
     Args:
         path: file to write.
         arm: arm whose joints are written.
-        replace: replace an existing file.
+        replace: whether to replace an existing file.
 
     Raises:
         InputError: when the file exists already, or cannot be written.

@@ -59,9 +59,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_source(parser)
     person = parser.add_argument_group("the person")
     person.add_argument("--side", choices=SIDES, help="arm of the person; default: as calibrated, else right")
-    person.add_argument("--person", type=int, metavar="N", help="which of several people; default: the first one seen")
+    person.add_argument(
+        "--person",
+        type=int,
+        metavar="N",
+        help="number of the person, if there are several; default: the first one seen",
+    )
     person.add_argument("--calibration", type=Path, metavar="FILE", help="file written by 'imitarm calibrate'")
-    person.add_argument("--scale", type=float, metavar="RHO", help="robot's motion relative to the hand's; default: 1")
+    person.add_argument("--scale", type=float, metavar="RHO", help="robot motion divided by hand motion; default: 1")
     person.add_argument(
         "--orientation",
         choices=get_args(Orientation),
@@ -130,7 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_options(arguments: argparse.Namespace) -> None:
-    """Check before the run what would otherwise fail only after it."""
+    """Check the options that would otherwise cause a failure only after the run."""
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
     if not 50.0 <= arguments.rate <= 1000.0:  # at a lower rate the jerk cannot be limited
@@ -146,7 +151,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
 
 
 def _correspondence(arguments: argparse.Namespace) -> Correspondence:
-    """Return the calibration, changed by the options."""
+    """Return the calibration with the changes that the options request."""
     calibration = Calibration() if arguments.calibration is None else Calibration.load(arguments.calibration)
     found = calibration.correspondence()
     if calibration.orientation is None:  # a camera measures the rotation of the hand poorly
@@ -242,7 +247,8 @@ class EnablePrompt:
     Args:
         tell: prints a line.
         enable_first: enable the robot at the start without asking.
-        read: blocks until something is typed and returns it; empty: the input has ended. None: standard input.
+        read: function that blocks until a line is typed and returns it; an empty result means that the input has
+            ended. None: standard input.
     """
 
     def __init__(
@@ -257,7 +263,7 @@ class EnablePrompt:
         threading.Thread(target=self._reading, daemon=True).start()
 
     def reset(self) -> None:
-        """Note that the robot can be controlled: the next problem is a new one."""
+        """Record that the robot can be controlled, so that the next problem counts as new."""
         self._first, self._asked = False, ("", False)
 
     def __call__(self, problem: str, stopped: bool) -> bool:
@@ -265,7 +271,7 @@ class EnablePrompt:
 
         Args:
             problem: why the robot cannot be controlled.
-            stopped: whether it is stopped.
+            stopped: whether the robot is stopped.
 
         Raises:
             TaskFailedError: when the robot is stopped and nobody can answer.
@@ -299,7 +305,7 @@ class EnablePrompt:
 
 
 def _standard_input() -> bytes:
-    """Block until something is typed and return it; empty if nothing can be typed here."""
+    """Block until a line is typed and return it; the result is empty if there is no terminal input."""
     try:
         if os.isatty(0) and hasattr(os, "tcgetpgrp") and os.tcgetpgrp(0) != os.getpgrp():
             return b""  # in the background, where reading would suspend the process

@@ -1,7 +1,7 @@
 """Align demonstrations: trim idle ends, and bring matching parts of all motions to the same time.
 
-People never show a motion twice at the same speed. If they are averaged at equal times, a bend that comes early in one
-demonstration
+People never repeat a motion at exactly the same speed. If demonstrations are averaged at equal times, a bend that
+occurs early in one demonstration
 and late in another is smeared: the mean cuts corners and flattens peaks. Alignment changes when a demonstration reaches
 each point, never the points.
 
@@ -10,7 +10,8 @@ path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` obeys
 
     D(i, j) = c(i, j) + min(D(i-1, j-1) + c(i, j), D(i-1, j) + p, D(i, j-1) + p)
 
-(Sakoe and Chiba 1978, symmetric form: the diagonal counts twice). The price ``p`` of a step that is not diagonal keeps
+(Sakoe and Chiba 1978, symmetric form, in which a diagonal step counts twice). The price ``p`` of a step that is not
+diagonal keeps
 noise from distorting time; |i - j| stays within the band. All cells of one anti-diagonal are computed together, for all
 pairs of motions.
 """
@@ -64,10 +65,10 @@ class Alignment:
     """Aligned demonstrations, and what was changed.
 
     Attributes:
-        demonstrations: all with the same times, from 0 to ``duration``.
+        demonstrations: demonstrations with common times from 0 to ``duration``.
         duration: the median of the trimmed demonstrations' durations [s].
         kept_rows: first and last row of each demonstration that were kept, shape (n_demonstrations, 2).
-        durations: duration of each trimmed demonstration, before [s], shape (n_demonstrations,).
+        durations: duration of each trimmed demonstration before alignment [s], shape (n_demonstrations,).
         warps: for each sample of the common motion, the fraction of its own trimmed duration that each demonstration
             has passed, 0 to 1, strictly increasing, shape (n_demonstrations, n).
         method: ``"dtw"`` or ``"resample"``.
@@ -102,7 +103,7 @@ def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Meth
     Positions, rotations and joints all follow the same warp.
 
     Args:
-        demonstrations: demonstrations of one motion, at least one.
+        demonstrations: one or more demonstrations of one motion.
         n: number of samples of each result.
         method: ``"dtw"`` or ``"resample"``.
 
@@ -160,7 +161,7 @@ def _trimmed(demonstration: Demonstration, rows: tuple[int, int]) -> Demonstrati
 
 
 def _retimed(demonstration: Demonstration, warp: Array, times: Array) -> Demonstration:
-    """Return the demonstration at ``times``; ``warp`` is the fraction of its own duration that has passed at each."""
+    """Return the demonstration at ``times``; ``warp`` is the elapsed fraction of its own duration at each time."""
     motion = demonstration.trajectory
     own = warp * motion.duration
     joints = demonstration.joints
@@ -173,7 +174,7 @@ def noise_level(values: Array) -> float:
     """Return the standard deviation of white noise on smooth samples (n, d), from their third differences.
 
     For white noise of deviation s the variance of a third difference is 20 s^2; the median makes the result robust to
-    the remaining motion. With fewer than 20 samples, noise and motion can't be separated: the result is 0.
+    the remaining motion. With fewer than 20 samples, noise and motion can't be separated, and the result is 0.
     """
     if len(values) < 20:
         return 0.0
@@ -189,12 +190,13 @@ def turns(quaternions: Array) -> Array:
 
 
 def moving_rows(times: Array, positions: Array, quaternions: Array | None = None) -> tuple[int, int] | None:
-    """Return the first and the last row between which the tool moves; None when it never does.
+    """Return the first and the last row between which the tool moves; None if it never moves.
 
-    The motion begins at the last row within 0.1 mm of the start before the tool is 0.5 mm away from it. Speed does not
-    matter, so a slow motion is never taken for rest. The end is found in the same way, from the last row backwards; 0.1
+    The motion begins at the last row within 0.1 mm of the start before the tool is 0.5 mm away from it. The speed is
+    not used, so a slow motion is never mistaken for rest. The end is found in the same way, from the last row
+    backwards; 0.1
     s more is kept on both sides. With noisy samples, both distances are at least 4 standard deviations of the averaged
-    noise. Rotation on the spot counts as motion.
+    noise. Rotation without displacement counts as motion.
 
     Args:
         times: strictly increasing, shape (n,) [s].
@@ -209,7 +211,7 @@ def moving_rows(times: Array, positions: Array, quaternions: Array | None = None
 
 
 def _moving(times: Array, values: Array, still: float) -> tuple[int, int] | None:
-    """Return the rows between which ``values`` (n, d) change, by more than ``still`` and the noise."""
+    """Return the rows between which ``values`` (n, d) change by more than ``still`` and the noise."""
     noise, step = noise_level(values), float(np.median(np.diff(times)))
     left = _LEFT * still
     quiet = (_NOISE_FACTOR * noise / left) ** 2 * step  # an average over so long has noise below the larger distance
@@ -234,7 +236,7 @@ def _moving(times: Array, values: Array, still: float) -> tuple[int, int] | None
 
 
 def held_rows(values: Array) -> NDArray[np.bool_]:
-    """Return whether each row of one recorded quantity (n, d) only repeats a held value, shape (n,)."""
+    """Return whether each row of one recorded quantity (n, d) only repeats the previous value, shape (n,)."""
     none = np.zeros(len(values), dtype=bool)
     steps = np.abs(np.diff(values, axis=0))
     same = np.asarray(~(steps > 0.0).any(axis=1))
@@ -263,7 +265,7 @@ def smooth_slope(times: Array, values: Array, window: float = _WINDOW) -> tuple[
     Args:
         times: strictly increasing, shape (n,) [s].
         values: shape (n, d).
-        window: length [s]; the next samples on both sides always count.
+        window: length of the window [s]; it always includes the neighbouring samples on both sides.
 
     Returns:
         least-squares slopes (n, d) [unit/s], means (n, d), and the number of samples in each window (n,).
@@ -318,7 +320,7 @@ def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, In
 
 
 def _trace(total: Array, cost: Array, price: float) -> Indices:
-    """Walk back from the last pair of samples to the first, for all pairs of motions together."""
+    """Trace the path from the last pair of samples back to the first, for all pairs of motions together."""
     length, pairs, width = total.shape
     every = np.arange(pairs)
     diagonal, column = np.full(pairs, length - 1), np.full(pairs, width // 2)
@@ -348,7 +350,8 @@ def identity_warps(n_demonstrations: int, n: int) -> Array:
 def features(trajectories: Sequence[Trajectory]) -> Array:
     """Return the features by which motions are compared, shape (n_demonstrations, n, 3), or 6 with rotations [m].
 
-    Each path is moved to the common start and goal, because a motion that began at another place did not begin earlier.
+    Each path is moved to the common start and goal, because a motion that began at another position did not begin
+    earlier.
     Rotations count as rotation vectors from their mean, times a lever of 0.1 m.
     """
     parts = [to_common_ends(np.stack([trajectory.positions for trajectory in trajectories]))]
@@ -385,13 +388,13 @@ def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0
     The first barycentre is the medoid. Each motion is matched with the barycentre by :func:`dtw`, its matched times are
     smoothed into a warp, and the mean of the warped motions is the next barycentre (averaging as in Petitjean et al.
     2011, with one smooth warp for each motion in place of sets of matched samples). The warps are centred: their mean
-    at every time of the common motion is that time. So the common speed profile is the mean one, not that of the
-    medoid.
+    at every time of the common motion is that time. Therefore the common speed profile is the mean profile, not that of
+    the medoid.
 
     Args:
         values: features, shape (n_demonstrations, n, d), evenly spaced in time.
         band: largest time shift before centring, as a fraction of the duration.
-        stiffness: price of warping time, in mean squared deviations from the barycentre.
+        stiffness: cost of warping time, in mean squared deviations from the barycentre.
         n_iterations: largest number of rounds.
 
     Returns:

@@ -24,7 +24,7 @@ _DEGREES = 2.5 * np.pi  # [rad] no joint rotates farther, so these are degrees
 
 
 def check_arm(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
-    """Find joints of another arm, joints in degrees, beyond their limits or too fast, and positions out of reach."""
+    """Find joints of another arm, in degrees, beyond their limits or too fast, and positions out of reach."""
     if motion.joints is None:
         yield from _check_reach(motion, arm)
         return
@@ -87,15 +87,15 @@ def reach(arm: ArmModel, *, n_samples: int = 400, seed: int = 0) -> tuple[Array,
     """Return the shoulder of an arm, and the largest distance of the tool's tip from it.
 
     The shoulder is the point of the first joint's axis that is nearest to the axis of the second joint. The distance is
-    the largest one that gradient ascent within the joint limits finds from random postures: a close lower bound.
+    the largest distance that gradient ascent within the joint limits finds from random postures, a tight lower bound.
 
     Args:
-        arm: with its tool.
+        arm: arm with its tool.
         n_samples: number of random postures; ascent starts from the best four.
         seed: of these postures.
 
     Returns:
-        centre in the base frame, shape (3,) [m], and distance [m].
+        Shoulder position in the base frame, shape (3,) [m], and largest distance [m].
     """
     centre = _shoulder(arm)
     low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)

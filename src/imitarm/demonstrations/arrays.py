@@ -1,6 +1,6 @@
-"""Reader of NumPy files (.npy, .npz), and the meaning of columns without names, which follows from their number.
+"""Reader of NumPy files (.npy, .npz). The number of columns determines the meaning of columns without names.
 
-Nothing is ever unpickled.
+Pickled objects are never loaded.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 # columns without names, by their number ("q": the four numbers of a quaternion)
 UNNAMED = {2: "xy", 3: "xyz", 4: "txyz", 7: "xyzq", 8: "txyzq"}
-COUNTS = "2 (x y), 3 (x y z), 7 (x y z and quaternion), or 4 or 8 with the time in front"
+COUNTS = "2 (x y), 3 (x y z), 7 (x y z and quaternion), or 4 or 8 with the time as first column"
 
 _NPY, _NPZ = b"\x93NUMPY", b"PK\x03\x04"
 _FEWEST_ROWS = 20  # of a demonstration; a stack with fewer rows than this and than demonstrations is transposed
@@ -62,7 +62,7 @@ def unnamed_columns(
     """Assign the columns of a table without names by their number (see ``UNNAMED``).
 
     Raises:
-        InputError: when that number has no meaning, or the options do not fit.
+        InputError: when the number of columns is unknown, or the options do not fit.
     """
     said = said or SaidUnits()
     layout = UNNAMED.get(values.shape[1])
@@ -108,7 +108,7 @@ def _load(path: str, content: bytes) -> Any:
 
 
 def _check_size(content: bytes) -> None:
-    """Refuse a header that states more data than the file holds, before memory for it is allocated."""
+    """Reject a header that states more data than the file contains, before memory is allocated."""
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -144,7 +144,7 @@ def _stack(source: str, array: Array, options: ReadOptions) -> list[RawDemonstra
 
 
 def _check_matrices(source: str, array: Array) -> None:
-    """Refuse stacks of rotation or transformation matrices, whose rows are not samples."""
+    """Reject stacks of rotation or transformation matrices, whose rows are not samples."""
     square = array.ndim >= 3 and array.shape[-2:] in ((4, 4), (3, 4), (3, 3))
     flat = array.ndim == 2 and array.shape[1] in (9, 12, 16) and len(array) > 1
     if not square and not flat:

@@ -1,8 +1,8 @@
-"""Lint: list what is wrong with demonstrations before a skill is learned from them.
+"""Lint: list the faults of demonstrations before a skill is learned from them.
 
 Each check yields findings. This module checks each motion, and compares the motions with each other. If some
-demonstrations run backwards, stop early, end elsewhere or take another path, the mean of all is a motion that nobody
-has shown. Checks of the numbers in a file are in ``raw.py``, checks against an arm in ``arm_checks.py``.
+demonstrations run backwards, stop early, end elsewhere or take another path, the mean is a motion that nobody
+demonstrated. Checks of the numbers in a file are in ``raw.py``, checks against an arm in ``arm_checks.py``.
 """
 
 from __future__ import annotations
@@ -80,13 +80,13 @@ def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: Arm
     Args:
         demonstrations: demonstrations of one motion. Raw demonstrations (``read_raw``) may contain invalid numbers,
             which are reported; a Demonstration can't contain any.
-        arm: the arm that was recorded, with its tool; None: joint limits and reach are not checked.
+        arm: arm that was recorded, with its tool; None: joint limits and reach are not checked.
 
     Returns:
         Findings, errors first, then warnings, then notes; empty when nothing was found.
 
     Raises:
-        InputError: when there are no demonstrations, or another object was given.
+        InputError: when there are no demonstrations, or an object is not a demonstration.
     """
     check_arm_model(arm, "lint: arm")
     if not sequence(demonstrations, object, "lint: demonstrations"):
@@ -118,7 +118,7 @@ def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: Arm
 
 
 def check_gaps(motion: ValidRows) -> Iterator[Finding]:
-    """Find times without samples."""
+    """Find gaps in time without samples."""
     steps = np.diff(motion.times)
     gaps = np.flatnonzero(steps > max(_GAP, _GAP_STEPS * float(np.median(steps))))
     if len(gaps):
@@ -140,15 +140,15 @@ def check_idle(motion: ValidRows) -> Iterator[Finding]:
     enough = max(_IDLE, _IDLE_FRACTION * motion.duration)
     head, tail = motion.times[rows[0]], motion.duration - motion.times[rows[1]]
     if head > enough:
-        message = f"stands for {head:.2f} s at the start, rows {motion.rows[0]} to {motion.rows[rows[0]]}"
+        message = f"rests for {head:.2f} s at the start, rows {motion.rows[0]} to {motion.rows[rows[0]]}"
         yield motion.finding("note", "idle-head", message, "none needed: align trims it", 0)
     if tail > enough:
-        message = f"stands for {tail:.2f} s at the end, rows {motion.rows[rows[1]]} to {motion.rows[-1]}"
+        message = f"rests for {tail:.2f} s at the end, rows {motion.rows[rows[1]]} to {motion.rows[-1]}"
         yield motion.finding("note", "idle-tail", message, "none needed: align trims it", rows[1])
 
 
 def check_jumps(motion: ValidRows) -> Iterator[Finding]:
-    """Find steps that are much faster than those around them: lost samples, glitches, a tracker that jumped."""
+    """Find steps that are much faster than the steps around them: lost samples, glitches, jumps of a tracker."""
     remedy = "record again, or cut the file before or after it"
     jumps, size = _jumps(motion.times, motion.positions, _JUMP_DISTANCE)
     if len(jumps):
@@ -166,7 +166,7 @@ def _jumps(times: Array, values: Array, floor: float) -> tuple[NDArray[np.int64]
     """Return the samples (k,) before which ``values`` (n, d) jump, and the size of each jump (k,).
 
     A step is compared with the median of the steps two and three before and after it, so that neither a single bad
-    sample (two large steps) nor a quick start is hidden by its own neighbours.
+    sample (two large steps) nor a fast start is hidden by its own neighbours.
     """
     if len(times) < 8:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -198,7 +198,7 @@ def check_units(motion: ValidRows) -> Iterator[Finding]:
 
 
 def check_speed(motion: ValidRows) -> Iterator[Finding]:
-    """Find motions that are faster than a person guides an arm."""
+    """Find motions that are too fast for a person who guides an arm."""
     speed, _ = smooth_speed(motion.times, motion.positions)
     fast = float(np.percentile(speed, 95))
     if fast > _FAST and np.abs(motion.positions).max() <= _FAR:
@@ -288,7 +288,7 @@ def check_agreement(motions: Sequence[ValidRows]) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class _Scale:
-    """How differences are reported: factor to the unit, the unit, and the smallest one that counts."""
+    """How differences are reported: conversion factor, unit, and smallest relevant difference."""
 
     factor: float
     unit: str
@@ -311,7 +311,7 @@ def _mean_distance(paths: Array, others: Array) -> Array:
 
 
 def _backwards(paths: Array, size: float, motions: Sequence[ValidRows], scale: _Scale) -> Iterator[_Odd]:
-    """Find motions that fit the most typical one much better when they are reversed."""
+    """Find motions that fit the most typical motion much better when they are reversed."""
     forward, backward = _mean_distance(paths, paths), _mean_distance(paths[:, ::-1], paths)
     typical = int(np.argmin(forward.sum(axis=1)))
     differs = forward[:, typical] > max(scale.smallest, _DIFFERENT * size)
@@ -321,7 +321,7 @@ def _backwards(paths: Array, size: float, motions: Sequence[ValidRows], scale: _
 
 
 def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: _Scale) -> Iterator[_Odd]:
-    """Find motions that stop, or begin, in the middle of the path of others."""
+    """Find motions that end or begin in the middle of the path of others."""
     m, n, _ = paths.shape
     for end, verb in (("goal", "stops"), ("start", "begins")):
         along = paths if end == "goal" else paths[:, ::-1]  # towards the end in question
@@ -371,7 +371,7 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
             continue  # one among many is an outlier
         groups = f"of {_names(motions, few)} and of {_names(motions, many)}"
         message = f"the {what} {groups} are {factor * gap:.0f} {unit} apart"
-        remedy = "learn each group as a skill of its own: the mean of both is a motion that nobody has shown"
+        remedy = "learn each group as a skill of its own: the mean of both is a motion that nobody demonstrated"
         yield motions[few[0]].finding(severity, code, message, remedy)
 
 
@@ -389,8 +389,9 @@ def _angles(rotations: Array, reference: Array) -> Array:
 def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | None:
     """Return one of two groups as a mask (m,), and the gap between the groups; None when there is only one group.
 
-    The gap is the longest link of the minimum spanning tree. It must exceed ``floor``, and the next longest link by a
-    factor: then neighbours are much nearer within the groups.
+    The gap is the longest link of the minimum spanning tree. The gap must exceed ``floor``, and the next longest link
+    by a
+    factor, so that neighbours within the groups are much closer.
     """
     m = len(distance)
     nearest, inside, links = distance[0].copy(), np.arange(m) == 0, []
@@ -409,13 +410,13 @@ def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | N
 
 
 def _names(motions: Sequence[ValidRows], which: NDArray[np.int64]) -> str:
-    """Return up to three names, and how many more there are."""
+    """Return up to three names and the number of further names."""
     names = [motions[i].name for i in which]
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _outliers(motions: Sequence[ValidRows], positions: Array, rotations: Array | None) -> Iterator[Finding]:
-    """Find demonstrations that, once aligned, are unusually far from the medoid, the one nearest to all others."""
+    """Find aligned demonstrations that are unusually far from the medoid, the motion nearest to all others."""
     distance = _mean_distance(positions, positions)
     center = int(np.argmin(np.sum(distance, axis=1)))
     for i in _unlike(distance[center], center, _OUTLIER_DISTANCE):
@@ -434,7 +435,7 @@ def _outliers(motions: Sequence[ValidRows], positions: Array, rotations: Array |
 
 
 def _unlike(distance: Array, center: int, floor: float) -> list[int]:
-    """Return the demonstrations that are unusually far from the medoid ``center``, of distances (n,)."""
+    """Return the demonstrations that are unusually far from the medoid ``center``, given their distances (n,)."""
     others = np.delete(distance, center)
     usual = float(np.median(others))
     spread = 1.4826 * float(np.median(np.abs(others - usual)))

@@ -1,4 +1,4 @@
-"""A demonstration as it was recorded, and the checks of the numbers in its file."""
+"""A demonstration as recorded, and checks of the numbers in its file."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class Finding:
 
     Attributes:
         severity: ``"error"``: no good skill can be learned; ``"warning"``: check it; ``"note"``: for information.
-        code: short name that stays the same from version to version, such as ``"gap"``.
-        message: what is wrong, with figures.
+        code: short name that does not change between versions, such as ``"gap"``.
+        message: description of the fault, with figures.
         source: the demonstration concerned; empty when it concerns all of them.
         row: the first sample concerned, from 0; None when it concerns the whole motion.
         line: the line of that sample in the text file, from 1; None when the file is not text.
-        remedy: what to do. Options are written as arguments of ``read``, for example ``units="mm"``.
+        remedy: action that fixes the fault. Options are written as arguments of ``read``, for example ``units="mm"``.
     """
 
     severity: Severity
@@ -75,24 +75,24 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class RawDemonstration:
-    """One motion as it was recorded, in SI units, before invalid rows are refused.
+    """One motion as recorded, in SI units, before the check for invalid rows.
 
-    :class:`~imitarm.trajectory.Demonstration` refuses times that do not increase, numbers that are not finite and
-    quaternions whose length is not one. ``lint`` checks the raw demonstration instead, so that it can list them all.
+    :class:`~imitarm.trajectory.Demonstration` rejects times that do not increase, numbers that are not finite and
+    quaternions whose length is not one. ``lint`` checks the raw demonstration instead, so that it can list all faults.
 
     Attributes:
-        source: the file, and the part of it.
-        times: shape (n,) [s], in any order.
+        source: name of the file and, if needed, of the part in it.
+        times: time stamps in any order, shape (n,) [s].
         positions: positions of the tool in the base frame, shape (n, 3) [m]; None when only joints were recorded.
-        quaternions: wxyz of any length, shape (n, 4); None when not recorded.
-        joints: shape (n, n_joints) [rad]; None when not recorded.
+        quaternions: quaternions wxyz of any length, shape (n, 4); None when not recorded.
+        joints: joint positions, shape (n, n_joints) [rad]; None when not recorded.
         joint_names: one name for each column of ``joints``.
         task: name of the task.
         lines: line of the text file of each row, from 1, shape (n,); None when the file is not text.
-        notes: what the reader left out or assumed.
+        notes: data that the reader left out, and its assumptions.
 
     Raises:
-        InputError: when an array has another shape or does not hold numbers, or joints and names do not agree.
+        InputError: when an array has the wrong shape or does not contain numbers, or joints and names do not agree.
     """
 
     source: str
@@ -120,7 +120,7 @@ class RawDemonstration:
 
     @classmethod
     def of(cls, demonstration: Demonstration | RawDemonstration) -> RawDemonstration:
-        """Return a demonstration as a raw one; a raw one is returned unchanged."""
+        """Return a demonstration as a raw demonstration; a raw demonstration is returned unchanged."""
         if isinstance(demonstration, RawDemonstration):
             return demonstration
         motion = instance(demonstration, Demonstration, "a demonstration").trajectory
@@ -157,7 +157,7 @@ class RawDemonstration:
         numbers, which must follow one another.
 
         Raises:
-            InputError: when there are no joints, the joints are those of another arm, or their order is not known.
+            InputError: when there are no joints, they belong to another arm, or their order is unknown.
         """
         if self.joints is None:
             raise InputError(f"{self.source}: holds no joint angles")
@@ -182,7 +182,7 @@ class RawDemonstration:
         """Return a copy with the tool's poses, which are computed from the joints if they were not recorded.
 
         Raises:
-            InputError: when the arm is needed and not given, or the joints are those of another arm.
+            InputError: when the arm is needed but not given, or the joints belong to another arm.
         """
         check_arm_model(arm, "arm")
         if self.positions is not None:
@@ -210,18 +210,17 @@ class RawDemonstration:
         return np.asarray(np.isfinite(self.times) & (self.times <= before))
 
     def held(self) -> NDArray[np.bool_]:
-        """Return whether each row only repeats a held value, shape (n,); all False unless values are sampled and held.
+        """Return whether each row only repeats the previous value, shape (n,); all False unless values are held.
 
-        A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest does not count
-        as held values,
-        nor is rounding: the value must be held many times during the motion, and must change by more than its last
-        digits between.
+        A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest and
+        rounding do not count as held values: values must be held many times during the motion and change by more
+            than their last digits in between.
         """
         masks = [held_rows(part) for part in (self.positions, self.quaternions, self.joints) if part is not None]
         return max(masks, key=lambda mask: int(mask.sum()), default=np.zeros(len(self), dtype=bool))
 
     def thinned(self) -> RawDemonstration:
-        """Return a copy without the rows that only repeat a held value; a note says how many were dropped."""
+        """Return a copy without the rows that only repeat the previous value; a note gives their number."""
         held = self.held()
         if not held.any():
             return self
@@ -240,7 +239,7 @@ class RawDemonstration:
         """Check all rows and return a valid demonstration.
 
         Args:
-            arm: the arm that was recorded; needed when only joints were recorded.
+            arm: arm that was recorded; needed when only joints were recorded.
             repair: drop rows that are not finite or not later than the row before, and say so in ``source``.
 
         Raises:
@@ -275,7 +274,7 @@ class RawDemonstration:
 
 
 def check_arm_model(arm: object, what: str) -> None:
-    """Raise InputError unless ``arm`` is an ArmModel or None, without importing the module of ArmModel."""
+    """Raise InputError if ``arm`` is neither an ArmModel nor None, without importing the module of ArmModel."""
     if arm is not None and not hasattr(arm, "tool_path"):
         raise InputError(f"{what} must be an ArmModel, got {arm!r:.60}; load it with ArmModel.load('sawyer')")
 
@@ -294,15 +293,17 @@ def _unit(raw: RawDemonstration, keep: NDArray[np.int64]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ValidRows:
-    """The valid rows of a raw demonstration: finite, each later than the one before, and not a repeated held value.
+    """The valid rows of a raw demonstration.
+
+    Finite, each later than the previous one, and without repeated held values.
 
     Attributes:
         raw: the demonstration.
         rows: the rows of ``raw`` that are used, shape (n,).
-        times: from the first valid row, shape (n,) [s].
+        times: times since the first valid row, shape (n,) [s].
         positions: shape (n, 3) [m].
-        quaternions: of length one, shape (n, 4), or None.
-        joints: shape (n, n_joints) [rad], or None.
+        quaternions: unit quaternions, shape (n, 4), or None.
+        joints: joint positions, shape (n, n_joints) [rad], or None.
     """
 
     raw: RawDemonstration
@@ -338,16 +339,16 @@ class ValidRows:
 
     @property
     def duration(self) -> float:
-        """From the first to the last valid row [s]."""
+        """Time from the first to the last valid row [s]."""
         return float(self.times[-1])
 
     @property
     def name(self) -> str:
-        """The source without its folder."""
+        """The name of the source without its folder."""
         return PurePath(self.raw.source).name or "a demonstration"
 
     def moving_part(self) -> Trajectory | None:
-        """Return the motion without idle ends, in 100 samples; None when the tool does not move."""
+        """Return the motion without idle ends, resampled to 100 samples; None when the tool does not move."""
         rows = moving_rows(self.times, self.positions, self.quaternions)
         if rows is None or rows[1] <= rows[0]:
             return None
@@ -356,7 +357,7 @@ class ValidRows:
         return Trajectory(self.times[keep], self.positions[keep], quaternions).from_zero().resample(_SAMPLES)
 
     def finding(self, severity: Severity, code: str, message: str, remedy: str, index: int | None = None) -> Finding:
-        """Return a finding about sample ``index`` of the valid ones."""
+        """Return a finding about the valid sample ``index``."""
         return self.raw.finding(severity, code, message, remedy, None if index is None else int(self.rows[index]))
 
 
@@ -373,7 +374,7 @@ def check_rows(raw: RawDemonstration) -> Iterator[Finding]:
 
 
 def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
-    """Find time stamps that do not increase, that are dates, or that are not in seconds."""
+    """Find time stamps that do not increase, are dates, or are not in seconds."""
     late = np.flatnonzero(raw.late())
     if len(late):
         row = int(late[0])
@@ -434,9 +435,9 @@ def check_held(raw: RawDemonstration) -> Iterator[Finding]:
 
 
 def check_notes(raw: RawDemonstration) -> Iterator[Finding]:
-    """Turn the reader's notes, on what it left out or assumed, into findings."""
+    """Convert the reader's notes about omissions and assumptions to findings."""
     for note in raw.notes:
-        yield raw.finding("note", "reader", note, "none, unless it matters to you")
+        yield raw.finding("note", "reader", note, "none, unless you need these data")
 
 
 RAW_CHECKS = (check_rows, check_stamps, check_quaternions, check_held, check_notes)

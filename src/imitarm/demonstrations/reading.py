@@ -40,7 +40,7 @@ _HEAD = 65536  # bytes of a file that a reader sees before it says whether it re
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Facts for which a file may have no entry, such as units.
+    """Facts that a file may not state, such as units.
 
     Attributes:
         units: unit of lengths, a key of ``LENGTH_UNITS``; None: as the file says, else m.
@@ -78,7 +78,7 @@ class ReadOptions:
         text(self.task, "task")
 
     def metres(self, source: str, positions: Array, said: str | None = None) -> Array:
-        """Return ``positions`` in metres; ``said`` is the unit that the file itself names.
+        """Return ``positions`` in metres; ``said`` is the unit stated in the file.
 
         Raises:
             FileFormatError: when the file names an unknown unit.
@@ -87,12 +87,12 @@ class ReadOptions:
         return positions * _factor(source, "units", self.units, said, LENGTH_UNITS, "m")
 
     def seconds(self, source: str, times: Array, said: str | None = None) -> Array:
-        """Return time stamps (n,) in seconds; ``said`` is the unit that the file itself names.
+        """Return time stamps (n,) in seconds; ``said`` is the unit stated in the file.
 
         Raises:
             FileFormatError: when the file names an unknown unit.
-            InputError: when the option contradicts the file, or the file has time stamps and a duration or rate was
-                given too.
+            InputError: when the option contradicts the file, or the file has time stamps and a duration or rate is
+                also given.
         """
         if self.duration is not None or self.rate is not None:
             raise InputError(f"{source}: has time stamps of its own; leave out duration and rate")
@@ -113,7 +113,7 @@ class ReadOptions:
         )
 
     def wxyz(self, source: str, quaternions: Array, said: str | None = None) -> Array:
-        """Return unnamed quaternion columns (..., 4) in the order w, x, y, z; ``said`` is the order the file states.
+        """Return unnamed quaternion columns (..., 4) in the order w, x, y, z; ``said`` is the order stated in the file.
 
         Raises:
             InputError: when the option contradicts the file.
@@ -138,7 +138,7 @@ def _factor(
 
 @dataclass(frozen=True)
 class SaidUnits:
-    """Units, and the order of quaternions, that a file states outside its column names; None: not stated."""
+    """Units and quaternion order that a file states outside its column names; None: not stated."""
 
     length: str | None = None
     time: str | None = None
@@ -149,11 +149,11 @@ class SaidUnits:
 class Reader(ABC):
     """Reads one file format.
 
-    A new format is one subclass and one line: in ``READERS`` for this package, in the entry points of any other
-    (group ``imitarm.readers``). It then works in ``read``, ``imitarm lint`` and ``imitarm learn``.
+    To add a format, write one subclass and register it: in ``READERS`` in this package, or by an entry point of
+        another package (group ``imitarm.readers``). It then works in ``read``, ``imitarm lint`` and ``imitarm learn``.
 
     Attributes:
-        suffixes: endings of file names, lower case with the dot, such as ``(".csv", ".txt")``.
+        suffixes: suffixes of file names in lower case, with the dot, such as ``(".csv", ".txt")``.
     """
 
     suffixes: ClassVar[tuple[str, ...]] = ()
@@ -178,11 +178,11 @@ _BUILT_IN = {
     "text table": "imitarm.demonstrations.text_tables:TextTableReader",
 }
 READERS: Registry[type[Reader]] = Registry("reader", "imitarm.readers", _BUILT_IN)
-"""The readers by name: these, and those that other packages add by entry points."""
+"""Readers by name: the built-in ones, and those that other packages add by entry points."""
 
 
 def files_of(paths: Paths) -> list[str]:
-    """Return the files to read; a folder stands for those of its files that have the suffix of a reader.
+    """Return the files to read; a folder is replaced by its files that have the suffix of a reader.
 
     Files of a folder come in natural order, ``demo_2`` before ``demo_10``; its subfolders are not entered.
 
@@ -221,7 +221,7 @@ def read_raw(
     task: str = "",
     thin: bool = False,
 ) -> list[RawDemonstration]:
-    """Read files without checking the numbers in them; options as in :func:`read`.
+    """Read files without checking the numbers in them; for the options, see :func:`read`.
 
     Raises:
         InputError: when a file can't be opened or an option does not fit it.
@@ -257,10 +257,11 @@ def read(
         rate: samples per second [Hz], for files without time stamps.
         quaternion_order: ``"wxyz"`` or ``"xyzw"``, for quaternion columns without names; None: as the file says, else
             wxyz.
-        arm: the arm that was recorded, with its tool; needed for files that hold joint angles only.
+        arm: arm that was recorded, with its tool; needed for files that contain only joint angles.
         task: name of the task; used where the file does not give one.
-        repair: drop rows that are not finite or not later than the row before, and say so in ``source``.
-        thin: drop rows that only repeat a held value (:meth:`RawDemonstration.held`).
+        repair: whether to drop rows that are not finite or not later than the previous row, with a remark in
+            ``source``.
+        thin: whether to drop rows that only repeat the previous value (:meth:`RawDemonstration.held`).
 
     Returns:
         One demonstration for each motion, in the order of the files. Planar motions (x y) get z = 0.
@@ -291,8 +292,8 @@ def known_formats() -> str:
 def _reader_of(path: str) -> Reader:
     """Return the reader that recognises the content of a file; the suffix must not contradict it.
 
-    Readers of other packages are asked first, because the text table takes any text; then the readers that know the
-    suffix.
+    Readers of other packages are tried first, because the text table reader accepts any text; then the readers that
+    know the suffix.
     """
     content = read_bytes(path)
     suffix, head = Path(path).suffix.lower(), content[:_HEAD]
@@ -310,5 +311,5 @@ def _reader_of(path: str) -> Reader:
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key that takes the numbers in a name as numbers."""
+    """Return a sort key that compares numbers in names as numbers."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", path.name)]

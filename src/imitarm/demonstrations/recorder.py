@@ -1,4 +1,4 @@
-"""DemonstrationRecorder: write a motion to a file while it happens; a killed program loses nothing."""
+"""DemonstrationRecorder: writes a motion to a file during the motion; a killed program loses no sample."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class DemonstrationRecorder:
 
     Args:
         path: the file to write.
-        arm: the arm that moves; the poses of its tool and its joints are written.
+        arm: arm that moves; the poses of its tool and its joint positions are written.
         task: name of the task.
-        source: origin of the motion, for the file.
+        source: origin of the motion, written into the file.
         replace: whether an existing file may be replaced.
 
     Attributes:

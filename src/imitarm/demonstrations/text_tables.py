@@ -1,6 +1,6 @@
 """Readers of text tables: imitarm's own CSV, and any other table of numbers.
 
-Column names come from a row of their own or from a remark. The number of columns decides only when nothing in the file
+Column names are read from a separate row or from a remark. The number of columns decides only when nothing in the file
 looks like column names. A name, unit or remark that is not understood is an error.
 """
 
@@ -100,9 +100,9 @@ class Column:
     """The meaning of one column name.
 
     Attributes:
-        what: ``t``, ``x``, ``y``, ``z``, ``qw`` to ``qz`` or ``joint``; empty when the name is not known.
-        unit: as in the name, in lower case; None when the name has none.
-        joint: the name of the joint, without words such as ``position.``.
+        what: quantity: ``t``, ``x``, ``y``, ``z``, ``qw`` to ``qz`` or ``joint``; empty when the name is not known.
+        unit: unit in the name, in lower case; None if the name has no unit.
+        joint: name of the joint, without words such as ``position.``.
         not_angle: the quantity in a joint's column if it is not its angle, for example ``"velocities"``.
     """
 
@@ -157,15 +157,15 @@ def named_columns(
 
     Args:
         source: name of the file, for messages.
-        names: one for each column; joints are known by names such as ``right_j0`` or ``panda_joint1``.
-        values: shape (n, len(names)).
-        options: facts for which the file may have no entry.
+        names: name of each column; joints are recognised by names such as ``right_j0`` or ``panda_joint1``.
+        values: numbers in the columns, shape (n, len(names)).
+        options: facts that the file may not state.
         said: units that the file states outside its column names.
 
     Raises:
         FileFormatError: when a unit is unknown, a quantity or a joint is given twice, or there is neither a position
             nor a joint angle.
-        InputError: when the options do not fit.
+        InputError: when the options do not fit the file.
     """
     said = said or SaidUnits()
     columns = [column_of(name) for name in names]
@@ -215,7 +215,7 @@ def _what_is_there(names: Sequence[str], columns: Sequence[Column]) -> str:
 
 
 def _unit_of(source: str, name: str, column: Column) -> str | None:
-    """Return the unit that a column's name states, as one of the known symbols."""
+    """Return the unit in a column's name as one of the known symbols."""
     if column.unit is None:
         return None
     kind = _KINDS.get(column.what, "rotation")
@@ -237,7 +237,7 @@ def _one_unit(
 ) -> str | None:
     """Return the common unit of ``columns``.
 
-    Columns without a unit in their names take the unit stated ``elsewhere``.
+    Columns without a unit in their names have the unit stated ``elsewhere``.
     """
     found = {units[i] or elsewhere for i in columns}
     if None in found and len(found) > 1:
@@ -266,7 +266,7 @@ def _times(
     options: ReadOptions,
     said: SaidUnits,
 ) -> Array:
-    """Return the time stamps (n,) [s]; a column of whole seconds and one of fractions are added."""
+    """Return the time stamps (n,) [s]; a column of whole seconds and a column of fractions are added."""
     if not units:
         return options.even_times(source, len(values))
     if len(units) == 1:
@@ -296,7 +296,7 @@ class ImitarmReader(Reader):
         return _NATIVE_MARK.match(head.replace(b"\r\n", b"\n").replace(b"\r", b"\n")) is not None
 
     def read(self, path: str, options: ReadOptions) -> list[RawDemonstration]:
-        """Return the one demonstration of the file; its numbers are not checked."""
+        """Return the demonstration in the file; its numbers are not checked."""
         table = read_demonstration_table(path)
         if options.units not in (None, "m") or options.time_units not in (None, "s"):
             raise InputError(f"{path}: is in m and s, as its header says; leave out units")
@@ -317,7 +317,7 @@ class ImitarmReader(Reader):
 class TextTableReader(Reader):
     """Any text table of numbers, separated by comma, semicolon, tab or blanks, with or without column names.
 
-    A remark ``# units: cm`` before the numbers, or a name such as ``x [cm]``, gives the unit. Recordings of joint
+    A remark ``# units: cm`` before the numbers, or a name such as ``x [cm]``, specifies the unit. Recordings of joint
     angles, such as those of Rethink's ``joint_recorder.py`` (``time,right_j0,...,right_j6``), are tables too.
     """
 
@@ -328,7 +328,7 @@ class TextTableReader(Reader):
         return kind_of(head) is None
 
     def read(self, path: str, options: ReadOptions) -> list[RawDemonstration]:
-        """Return the one motion of the file."""
+        """Return the motion in the file."""
         table = read_table(path)
         said = _said_units(table)
         names = _names_of(table)
@@ -365,7 +365,7 @@ def _said_units(table: Table) -> SaidUnits:
 
 
 def _names_of(table: Table) -> tuple[str, ...] | None:
-    """Return the column names that a row or a remark gives; None when nothing in the file looks like names.
+    """Return the column names in a row or a remark; None if nothing in the file looks like names.
 
     Raises:
         FileFormatError: when a remark looks like column names and does not fit the columns.
@@ -421,14 +421,14 @@ def _run_of_names(words: Sequence[str], width: int) -> tuple[str, ...] | None:
 
 
 def _other_units(words: Sequence[str], run: Sequence[str], text: str) -> bool:
-    """Return whether the words beside the names contain a unit that :func:`_said_units` does not use."""
+    """Return whether the other words contain a unit that :func:`_said_units` does not use."""
     beside = {word.lower() for word in words} - {word.lower() for word in run} - set(_PROSE_UNIT.findall(text.lower()))
     units = {word: unit for known in _UNITS.values() for word, unit in known.items()}
     return any(units.get(word, "m") not in ("m", "s", "rad") for word in beside - {"in"})
 
 
 def _listed_name(text: str) -> str | None:
-    """Return the name in a remark that gives one column: ``1: t [s]``, ``column 2: x``, or only ``x``."""
+    """Return the name in a remark about one column: ``1: t [s]``, ``column 2: x``, or only ``x``."""
     match = _NUMBERED.fullmatch(text.strip())
     names = split_names(match["name"] if match is not None else text.strip())
     alone = bool(names) and (match is not None or len(names) == 1)

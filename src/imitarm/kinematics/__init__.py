@@ -1,7 +1,7 @@
-"""How an arm, human or robot, moves.
+"""Kinematics of arms: poses, Jacobians and inverse kinematics.
 
-``pose`` has positions and rotations, ``arm`` the model of a robot arm, ``ik`` the inverse kinematics: the joint
-velocities for a desired motion of the tool.
+``pose`` contains positions and rotations, ``arm`` the model of a robot arm, and ``ik`` the inverse kinematics, which
+computes joint velocities for a desired motion of the tool.
 """
 
 from __future__ import annotations

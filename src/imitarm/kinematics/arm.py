@@ -73,7 +73,8 @@ class ArmModel(ArmKinematics):
 
     .. math:: M(q) \ddot q + C(q, \dot q) \dot q + g(q) = \tau
 
-    with the rigid-body inertia :math:`M`. Rotor inertia (``armature``), viscous damping and dry friction of the joints,
+    where :math:`M` is the rigid-body inertia. Rotor inertia (``armature``), viscous damping and dry friction of the
+    joints,
     which a simulated arm also has, are not included; their values are in ``spec()``.
 
     All poses are in the base frame, whose origin is that of the file. Jacobians have the linear rows first. Methods
@@ -82,7 +83,7 @@ class ArmModel(ArmKinematics):
 
     Attributes:
         name: for example ``"sawyer"``.
-        joint_names: from base to flange; the joints of a gripper are not among them.
+        joint_names: names of the joints from base to flange, without the joints of a gripper.
         lower: lower limits of the joint positions, shape (n_joints,) [rad]; -inf where there is no limit.
         upper: upper limits of the joint positions, shape (n_joints,) [rad]; inf where there is no limit.
         max_velocity: largest joint speeds, shape (n_joints,) [rad/s].
@@ -91,10 +92,10 @@ class ArmModel(ArmKinematics):
         home: a posture to start in, shape (n_joints,) [rad].
         tool_to_flange: pose of the tool's tip in the flange frame; the identity without a tool.
         tool_radius: radius of the cylinder about the tool's axis that contains the tool's head [m]; 0 without a tool.
-        sphere_bodies: for each sphere of :meth:`collision_spheres` the name of its body.
+        sphere_bodies: name of the body of each sphere of :meth:`collision_spheres`.
         cover: the spheres of :meth:`collision_spheres`.
         landmarks: shoulder, elbow and wrist, from sites of these names in the file; None if the file has none.
-        notes: assumptions about what the file does not say, and joints that are not part of the arm.
+        notes: assumptions about values that the file does not define, and joints that are not part of the arm.
     """
 
     lower: Array
@@ -122,7 +123,7 @@ class ArmModel(ArmKinematics):
         """Load a packaged arm, or any MJCF or URDF file.
 
         Limits come from the file. Where it has none, 2 rad/s and 10 rad/s^2 are assumed (0.2 m/s and 1 m/s^2 for
-        slides), and the torque is unlimited; ``notes`` says so. Speeds and accelerations have no place of their own in
+        slides), and the torque is unlimited; ``notes`` says so. Speeds and accelerations have no standard place in
         MJCF: put them into ``<custom><numeric name="max_velocity" data="..."/></custom>`` (and ``max_acceleration``),
         one value for each joint.
 
@@ -135,8 +136,9 @@ class ArmModel(ArmKinematics):
             tool: ``"gripper"``, ``"brush"``, the path of an MJCF file with a site ``tool`` at its tip, or None.
             flange: name of the body or site that is the flange; None: a site named ``flange``, else the end of the only
                 arm in the file, before jaws and fingers.
-            package_path: one or more folders in which meshes and ROS packages are looked for.
-            discard_meshes: leave out all meshes. Contact and :meth:`collision_spheres` then use only primitive shapes.
+            package_path: one or more folders to search for meshes and ROS packages.
+            discard_meshes: whether to leave out all meshes. Contact and :meth:`collision_spheres` then use only
+                primitive shapes.
 
         Raises:
             UnknownNameError: if an arm, tool or flange of that name is not known.
@@ -204,10 +206,10 @@ class ArmModel(ArmKinematics):
         """Return a fresh copy of the arm and its tool, for composing worlds; the base stands at the origin.
 
         Names are those of the file; names of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
-        The flange is the site ``"flange"``. Geoms of group 3 count for contact; all others are only drawn (a file that
-        does not separate the two is arranged in this way). The arm's joints have no actuators, so that a world adds the
-        ones it needs (joints carry their torque limit as ``actuatorfrcrange``). A gripper has one actuator,
-        ``"tool/opening"``, a position servo of its opening [m]. There are no keyframes: use :meth:`posture`.
+        The flange is the site ``"flange"``. Geoms of group 3 are used for contact, all others only for drawing; a file
+        without this separation is converted. The arm's joints have no actuators, so that a world adds the ones it needs
+        (joints carry their torque limit as ``actuatorfrcrange``). A gripper has one actuator, ``"tool/opening"``, a
+        position servo of its opening [m]. There are no keyframes: use :meth:`posture`.
         """
         return self._spec.copy()
 
@@ -253,7 +255,7 @@ class ArmModel(ArmKinematics):
     def tool_spheres(self) -> Array:
         """Spheres that cover everything that moves rigidly with the tool: last link, hand and fingers.
 
-        Rows x y z r in the tool's frame, shape (m, 4) [m]; a policy keeps these clear of obstacles.
+        Rows x y z r in the tool's frame, shape (m, 4) [m]; a policy keeps the required clearance for these spheres.
         """
         centers, radii = self.collision_spheres(self.home)
         rigid = self.cover.follows_last_joint
@@ -318,11 +320,11 @@ class ArmModel(ArmKinematics):
         return full[self._dofs][:, self._dofs].copy()
 
     def check_limits(self, q: ArrayLike, *, tolerance: float = 1e-6) -> None:
-        """Do nothing if ``q`` is within the limits of the joints.
+        """Check that ``q`` is within the limits of the joints.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
-            tolerance: how far outside a joint may be [rad].
+            tolerance: accepted distance outside a limit [rad].
 
         Raises:
             InputError: naming the first joint that is outside, its position and its limits.
@@ -348,7 +350,7 @@ class ArmModel(ArmKinematics):
 
 
 def _massless(geom: mujoco.MjsGeom) -> bool:
-    """Return whether leaving out ``geom`` changes no link's mass (a mass that was not given is nan)."""
+    """Return whether leaving out ``geom`` changes no link's mass (an unspecified mass is nan)."""
     return bool(geom.density == 0.0 and not geom.mass > 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Reading an arm, and the tool it holds, from MJCF or URDF files: the packaged ones and any other."""
+"""Reading an arm and its tool from MJCF or URDF files, packaged or of the user."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ TOOLS: Mapping[str, str] = {"brush": "brush.xml", "gripper": "gripper.xml"}
 """Packaged tools and their files."""
 
 TOOL_PREFIX = "tool/"
-"""Stands before every name that comes from a tool's file, except its site ``tool``."""
+"""Prefix of every name from a tool's file, except its site ``tool``."""
 
 _MESHES = {mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF, mujoco.mjtGeom.mjGEOM_HFIELD}
 _NAMES = {
@@ -59,18 +59,18 @@ _PLACEHOLDER_MASS, _PLACEHOLDER_INERTIA = 1e-3, 1e-6  # [kg], [kg m^2] of a link
 
 @dataclass(frozen=True, eq=False)
 class ArmFile:
-    """What was read: a spec with the tool attached, and the figures that MuJoCo has no place for.
+    """The result of reading: a spec with the tool attached, and values that MuJoCo can't store.
 
     Attributes:
         name: name of the arm.
-        spec: with sites ``flange`` and, with a tool, ``tool``.
+        spec: spec with a site ``flange`` and, if there is a tool, a site ``tool``.
         joints: names of the joints from base to flange, in order.
         max_velocity: largest speed of each joint [rad/s] or [m/s].
         max_acceleration: largest acceleration of each joint [rad/s^2] or [m/s^2].
         max_torque: largest torque of each joint [N m] or force [N]; inf when the file has no limit.
         home: position of every joint by name, including the joints of the tool.
         tool_radius: radius of the cylinder about the tool's axis that holds the tool's head [m]; 0 without a tool.
-        notes: assumptions about what the file does not say, and joints that were left out.
+        notes: assumptions about values that the file does not define, and joints that were left out.
         mass_faults: links whose mass or inertia can't be used, so that no torque can be computed.
     """
 
@@ -88,7 +88,7 @@ class ArmFile:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One file as read: an arm or a tool."""
+    """The content of one file: an arm or a tool."""
 
     spec: mujoco.MjSpec
     root: XmlElement
@@ -108,8 +108,8 @@ def read_arm(
         source: ``"sawyer"``, ``"panda"`` or the path of an MJCF or URDF file.
         tool: ``"gripper"``, ``"brush"``, the path of an MJCF file with a site ``tool``, or None.
         flange: body or site that is the flange; None: a site ``flange``, or the end of the only arm in the file.
-        discard_meshes: read the file without its meshes.
-        package_path: folders in which meshes and ROS packages are looked for.
+        discard_meshes: whether to read the file without its meshes.
+        package_path: folders to search for meshes and ROS packages.
 
     Raises:
         UnknownNameError: when the name is neither a packaged one nor a file.
@@ -210,7 +210,7 @@ def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _P
 
 @contextmanager
 def _no_engine_log() -> Iterator[None]:
-    """Keep MuJoCo from writing its warnings into the current folder; this module checks for their causes."""
+    """Prevent MuJoCo from writing its warnings into the current folder; this module checks for their causes itself."""
     former = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
@@ -220,7 +220,7 @@ def _no_engine_log() -> Iterator[None]:
 
 
 def _check_kind(path: Path, root: XmlElement) -> None:
-    """Refuse files that are not MJCF or URDF; the message says what they are.
+    """Reject files that are not MJCF or URDF; the message names their type.
 
     Raises:
         FileFormatError: when the file is a xacro file, a part of an MJCF file or something else.
@@ -252,7 +252,7 @@ def _check_kind(path: Path, root: XmlElement) -> None:
 
 
 def _check_numbers(path: Path, root: XmlElement) -> None:
-    """Refuse attributes that are NaN or infinite, and limits that are no numbers.
+    """Reject attributes that are NaN or infinite, and limits that are not numbers.
 
     Raises:
         FileFormatError: naming the joint, link or body around the attribute, and the line.
@@ -287,7 +287,7 @@ def _numbers(value: str) -> list[float]:
 
 
 def _check_sizes(model: mujoco.MjModel, path: Path, root: XmlElement) -> None:
-    """Refuse a model with NaN (which may come from an included file) or with sizes that no robot has."""
+    """Reject a model with NaN (possibly from an included file) or with sizes that are implausible for a robot."""
     kinds = {"body": model.body, "jnt": model.joint, "geom": model.geom, "site": model.site}
     for kind, item in kinds.items():
         for field in ("mass", "inertia", "pos", "ipos", "axis", "size"):
@@ -364,7 +364,7 @@ def compiled(spec: mujoco.MjSpec, what: object) -> mujoco.MjModel:
 
 
 def _one_line(error: Exception) -> str:
-    """Return MuJoCo's message in one line, without its remark on the copy that was compiled."""
+    """Return MuJoCo's message in one line, without its remark about the compiled copy."""
     return " ".join(str(error).split("The static bodies of the spec were fused")[0].split())
 
 
@@ -373,7 +373,7 @@ def _touches(geom: mujoco.MjsGeom) -> bool:
 
 
 def _separate_contact_shapes(spec: mujoco.MjSpec) -> None:
-    """Put every shape that can touch into group 3; a link without a visual shape gets a copy of it in group 2."""
+    """Put every shape with contact into group 3; if a link has no visual shape, group 2 gets a copy."""
     for body in spec.bodies:
         touching = [geom for geom in body.geoms if _touches(geom)]
         unseen = len(touching) == len(body.geoms)

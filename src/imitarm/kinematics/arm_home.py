@@ -34,7 +34,7 @@ def usable_posture(
         home: positions of all joints of the model by name, those of the arm in the middle of their ranges.
 
     Returns:
-        the posture, shape (n_joints,) [rad], and what the user should know about it.
+        The posture, shape (n_joints,) [rad], and notes for the user.
     """
     search = _HomeSearch(model, joints, home)
     middle = np.array([home[name] for name in joints])
@@ -55,7 +55,7 @@ def usable_posture(
 
 
 class _HomeSearch:
-    """Rates postures of an arm: how far from singular, how far from limits, whether links keep apart."""
+    """Rates postures of an arm by their distances from singularities, from limits and between links."""
 
     def __init__(self, model: mujoco.MjModel, joints: tuple[str, ...], home: Mapping[str, float]) -> None:
         self._model, self._data = model, mujoco.MjData(model)

@@ -41,7 +41,7 @@ class JointLimits:
         velocity: largest speed [rad/s] or [m/s].
         acceleration: largest acceleration [rad/s^2] or [m/s^2].
         torque: largest torque [N m] or force [N]; inf where the file has no limit.
-        notes: assumptions about what the file does not say.
+        notes: assumptions about values that the file does not define.
     """
 
     velocity: Array
@@ -62,11 +62,12 @@ class _Limb:
 
 
 def arm_end(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjsBody, list[str]]:
-    """Return the last body of the only arm in ``spec``, and notes on what was left out.
+    """Return the last body of the only arm in ``spec``, and notes on the bodies that were left out.
 
-    An arm ends before jaws and fingers: joints that are named so, that drive each other in parallel (mimic joints),
-    a short slide at the end, or several short chains that branch off behind a longer one. A short branch beside a
-    far longer chain (a head, a wheel) is left out.
+    An arm ends before jaws and fingers: joints with such names, parallel joints coupled to each other (mimic
+        joints), a short slide at the end, or several short chains that branch off at the end of a longer one. A short
+        branch next to a much
+    longer chain (such as a head or a wheel) is left out.
 
     Raises:
         InputError: when no joint moves a body, or when several chains could be the arm; the message lists them.
@@ -80,7 +81,9 @@ def arm_end(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjsBody, list[str]]
         notes.clear()
         limbs = _limbs(spec.worldbody, (), frozenset(), notes)
     if not limbs:
-        raise InputError(f"{path}: has no joint that moves a body, so it is no arm; give the MJCF or URDF file of one")
+        raise InputError(
+            f"{path}: has no joint that moves a body, so it is not an arm; give an arm's MJCF or URDF file"
+        )
     if len(limbs) > 1:
         choices = "; ".join(
             f"{limb.end.name!r} ({len(limb.joints)} joint{'s' * (len(limb.joints) > 1)}: {limb.joints[0]} to "
@@ -95,7 +98,7 @@ def arm_end(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjsBody, list[str]]
 
 
 def _limbs(body: mujoco.MjsBody, before: tuple[str, ...], hand: frozenset[str], notes: list[str]) -> list[_Limb]:
-    """Return the chains that could be an arm and that pass through ``body``; ``before`` are the joints above it."""
+    """Return the chains that could be an arm and that pass through ``body``; ``before`` holds the joints before it."""
     own = [joint.name for joint in body.joints]
     if hand.intersection(own):
         return []
@@ -123,7 +126,7 @@ def _limbs(body: mujoco.MjsBody, before: tuple[str, ...], hand: frozenset[str], 
 
 
 def _last_fixed(body: mujoco.MjsBody) -> mujoco.MjsBody:
-    """Follow fixed links from the last moving one as long as there is only one, or one named tool0 or flange."""
+    """Follow fixed links from the last moving link as long as there is only one, or one named tool0 or flange."""
     while True:
         fixed = [child for child in body.bodies if not list(child.joints)]
         named = [child for child in fixed if _END_LINK.search(child.name)]
@@ -207,7 +210,7 @@ def _joints_below(body: mujoco.MjsBody) -> set[str]:
 
 
 def check_joints(spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], path: Path, root: XmlElement) -> None:
-    """Refuse joints that an arm can't have: joints other than hinges and slides, and coupled joints.
+    """Reject joints that an arm can't have: joints other than hinges and slides, and coupled joints.
 
     Raises:
         InputError: naming the joint and its line.
@@ -254,7 +257,7 @@ def read_limits(
         model: the compiled ``spec``.
         joints: names of the arm's joints.
         path: path of the file, for messages.
-        root: the file's own elements, which hold what MuJoCo drops from a URDF.
+        root: the elements of the file itself, which include values that MuJoCo drops from a URDF.
 
     Raises:
         FileFormatError: naming the joint and its line.
@@ -350,7 +353,7 @@ def _torque_limit(model: mujoco.MjModel, name: str) -> float:
 
 
 def _located(names: list[str], all_names: tuple[str, ...], root: XmlElement) -> str:
-    """Return the names of joints with their lines, or "all joints" when it is all of them."""
+    """Return the names of joints with their lines, or "all joints" when the list is complete."""
     if len(names) == len(all_names):
         return "any joint"
     lines = {e.get("name"): e.line for e in reversed(list(root.walk())) if e.tag == "joint"}
@@ -382,7 +385,7 @@ def take_keyframe(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[dict[str,
 def check_keyframe(
     home: Mapping[str, float], name: str, model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root: XmlElement
 ) -> None:
-    """Refuse a keyframe outside the limits of the arm's joints.
+    """Reject a keyframe outside the limits of the arm's joints.
 
     Raises:
         FileFormatError: naming the keyframe, its line, the joint and its limits.
@@ -396,19 +399,19 @@ def check_keyframe(
             line = f" (line {keys[0].line})" if keys else ""
             raise FileFormatError(
                 f"{place(path, root, joint)} is at {value:.4g} in the keyframe {name!r}{line}, outside its limits "
-                f"[{low:.4g}, {high:.4g}]; correct the keyframe, or remove it to have a posture chosen"
+                f"[{low:.4g}, {high:.4g}]; correct the keyframe, or remove it so that a posture is chosen automatically"
             )
 
 
 def complete_home(
     spec: mujoco.MjSpec, model: mujoco.MjModel, joints: tuple[str, ...], given: Mapping[str, float], tool_prefix: str
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return a position for every joint of ``model``, and notes on it.
+    """Return a position for every joint of ``model``, and notes on the choice.
 
     Joints with given values keep them. A tool's fingers are open; other joints that do not belong to the arm are
     in the middle of their ranges; coupled joints follow their leader. The arm's own joints are in the middle
-    of their ranges too where that is a usable posture: away from singularities and with the links apart. Else the
-    most usable of many postures is taken.
+    of their ranges too where that is a usable posture: away from singularities and with the links apart. Otherwise
+        the best of many postures is taken.
     """
     home: dict[str, float] = {}
     for index in range(model.njnt):

@@ -23,7 +23,7 @@ _LANDMARKS = ("shoulder", "elbow", "wrist")  # sites that mark the three points
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Shoulder, elbow and wrist of an arm, defined by the sites of these names, and the joints that bend there.
+    """Shoulder, elbow and wrist of an arm, defined by the sites of these names, and the joints at elbow and wrist.
 
     The site ``elbow`` is on the link that the elbow's joint moves, the site ``wrist`` on the link that the bending
     joint of the wrist moves.
@@ -57,13 +57,13 @@ class Landmarks:
 
 
 class ArmMemory:
-    """MuJoCo's working memory for one arm in one thread, and the posture for which it holds the kinematics.
+    """MuJoCo's working memory for one arm in one thread, and the posture for which its kinematics are valid.
 
     Attributes:
         data: the kinematics of the posture.
         jacobian: Jacobian of the last requested site, shape (6, nv), linear rows first.
-        linear: its first three rows.
-        angular: its last three rows.
+        linear: first three rows of ``jacobian``.
+        angular: last three rows of ``jacobian``.
         sites: positions of the sites in the base frame, shape (nsite, 3) [m].
         force: generalised forces, shape (nv,).
     """
@@ -75,7 +75,7 @@ class ArmMemory:
 
         Args:
             model: the arm.
-            home: positions of all joints, fingers too, shape (nq,).
+            home: positions of all joints, including fingers, shape (nq,).
             positions: indices of the arm's joints in qpos.
             joints: indices of the arm's joints in qvel.
             landmarks: sites whose Jacobians :meth:`landmark_jacobians` returns.
@@ -137,7 +137,7 @@ class ArmKinematics:
             name: name of the arm.
             joint_names: the joints from base to flange, in order.
             model: a model with a site ``flange`` and, with a tool, a site ``tool``.
-            posture: positions of all joints of the model, fingers too, shape (nq,).
+            posture: positions of all joints of the model, including fingers, shape (nq,).
         """
         joints = [model.joint(joint).id for joint in joint_names]
         self.name, self.joint_names = name, joint_names
@@ -163,7 +163,7 @@ class ArmKinematics:
     def at(self, q: ArrayLike) -> ArmMemory:
         """Return this thread's working memory with the kinematics at ``q``.
 
-        It serves loops that need several results for one posture. It is recomputed only for a new posture, and is valid
+        Use it in loops that need several results for one posture. It is recomputed only for a new posture, and is valid
         until a method is called with another posture.
         """
         posture = self._checked(q, "q")
@@ -226,7 +226,7 @@ class ArmKinematics:
         Args:
             q: joint positions, shape (n_joints,) [rad].
             body: name of the body, as in ``spec()``.
-            point: its position at ``q`` in the base frame, shape (3,) [m].
+            point: position of the point at ``q`` in the base frame, shape (3,) [m].
 
         Returns:
             shape (3, n_joints) [m/rad].
@@ -247,7 +247,7 @@ class ArmKinematics:
         """Return shoulder, elbow and wrist in the base frame, shape (3, 3) [m].
 
         Raises:
-            InputError: if the arm's file does not say where they are.
+            InputError: if the arm's file does not define these points.
         """
         return np.array(self.at(q).sites[list(self.required_landmarks().sites)])
 
@@ -255,7 +255,7 @@ class ArmKinematics:
         """Return the Jacobians of shoulder, elbow and wrist, shape (3, 3, n_joints) [m/rad].
 
         Raises:
-            InputError: if the arm's file does not say where they are.
+            InputError: if the arm's file does not define these points.
         """
         self.required_landmarks()
         return np.array(self.at(q).landmark_jacobians()).reshape(3, 3, -1)
@@ -264,7 +264,7 @@ class ArmKinematics:
         """Return ``landmarks``, or raise an error if the arm has none.
 
         Raises:
-            InputError: if the arm's file does not say where shoulder, elbow and wrist are.
+            InputError: if the arm's file does not define shoulder, elbow and wrist.
         """
         if self.landmarks is None:
             raise InputError(
@@ -283,6 +283,6 @@ class ArmKinematics:
 
 
 def _columns(indices: NDArray[np.int32]) -> Columns:
-    """Return consecutive indices as a slice, which is several times quicker."""
+    """Return consecutive indices as a slice, which is several times faster."""
     first = int(indices[0])
     return slice(first, first + len(indices)) if np.all(np.diff(indices) == 1) else indices

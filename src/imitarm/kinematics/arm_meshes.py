@@ -25,14 +25,14 @@ _MOST_FOLDERS = 300  # of one folder that are looked into
 def find_meshes(spec: mujoco.MjSpec, path: Path, root: XmlElement, package_path: Iterable[Path]) -> None:
     """Replace the file name of every mesh in ``spec`` by the path at which it was found.
 
-    A file is looked for as it is written (below the file's ``meshdir``), relative to the robot's file, and in the
-    folders of ``package_path``. For ``package://NAME/...`` the package is a folder of that name, or one whose
+    Each file is searched for under the path as written (in the file's ``meshdir``), relative to the robot's file, and
+    in the folders of ``package_path``. For ``package://NAME/...`` the package is a folder of that name, or one whose
     ``package.xml`` has that name: above or beside the robot's file, in ``package_path``, and in the folders of the
     environment variables ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
 
     Raises:
-        FileFormatError: when a mesh is not found or has a format that can't be read; the message names the mesh, its
-            line, where it was looked for and the remedy.
+        FileFormatError: when a mesh is not found or has a format that can't be read; the message names the mesh,
+            its line, the paths searched and the remedy.
     """
     folder = path.resolve().parent
     extra = [Path(entry).expanduser().resolve() for entry in package_path]
@@ -122,7 +122,7 @@ def _name_in(manifest: Path, _changed: int) -> str | None:
 
 
 def _check_format(mesh: Path, where: str) -> None:
-    """Refuse a mesh that MuJoCo can't read; the message names its format."""
+    """Reject a mesh that MuJoCo can't read; the message names its format."""
     convert = (
         "convert it to binary STL or to OBJ (for example with MeshLab or Blender) and name the new file, or leave all "
         "meshes out with discard_meshes=True (--discard-meshes on the command line)"

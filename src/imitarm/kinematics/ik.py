@@ -39,13 +39,13 @@ _EYE = np.eye(6)
 
 @dataclass(frozen=True, eq=False)
 class IKStep:
-    """One step of inverse kinematics and how well it could be done.
+    """The result of one step of inverse kinematics and its remaining errors.
 
     Attributes:
         velocity: velocity of the joints, shape (n_joints,) [rad/s].
-        missing: target minus result of each task, in the task's own weighted units.
+        missing: target minus result of each task, in the weighted units of the task.
         limited: whether each joint velocity is at a bound of the box, shape (n_joints,) bool.
-        slack: by how much each row is violated, shape (m,); 0 where it holds.
+        slack: violation of each row, shape (m,); 0 where the row holds.
     """
 
     velocity: Array
@@ -62,10 +62,12 @@ class IKSolver:
     .. math:: \sum_i \tfrac12 |J_i v - t_i|^2 + \tfrac{\mu}2 |v|^2 + \tfrac{w_a}2 |v - v_p|^2
               + \sum_j \tfrac{c_j}2 \max(0, b_j - A_j v)^2 / |A_j|^2
 
-    with a Jacobian :math:`J_i` and a target :math:`t_i` for each task, the previous velocity :math:`v_p`, and the
-    rows :math:`A_j v \ge b_j` with their prices :math:`c_j`. Rows without a finite price are kept whenever the boxes
-    allow it. When they do not, the sum of the squared violations, in rad/s along each row, is minimised first, and the
-    tasks come second. The other methods take one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one
+    where each task has a Jacobian :math:`J_i` and a target :math:`t_i`, :math:`v_p` is the previous velocity, and the
+    rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite price are kept
+    whenever the boxes
+    allow it. If the boxes do not allow it, the sum of the squared violations, in rad/s along each row, is minimised
+    first, and the tasks have second priority. The other methods take one :class:`~imitarm.kinematics.tasks.TwistTask`,
+    optionally one
     :class:`~imitarm.kinematics.tasks.PostureTask`, and boxes:
 
     * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9): in joints scaled by their velocity limits
@@ -73,17 +75,18 @@ class IKSolver:
       :math:`\lambda^2=s_{min}(d-s_{min})` for :math:`d/2\le s_{min}<d` and :math:`\lambda=d/2` below, :math:`d=|t|`.
       This keeps the norm of the scaled velocity at most 1.
     * ``"dls_small_angle"``: the same with half the least singular value subtracted from d, as the thesis prints
-      after Eq 3.9; this weakens the damping; it is kept for comparison.
+      after Eq 3.9; this weakens the damping and is kept for comparison.
     * ``"svd"``, numerical filtering (Maciejewski and Klein 1988):
       :math:`v=\sum_i s_i/(s_i^2+\lambda_i^2)\, v_i u_i^T t` with :math:`\lambda_i^2=0.06^2(1-(s_i/0.06)^2)` where
       :math:`s_i<0.06`.
 
-    These three are scaled down as a whole when a joint would be too fast, then clipped to the box. A solver keeps no
+    These three methods scale the whole velocity down when a joint would be too fast, then clip it to the box. A solver
+    keeps no
     state between steps and can be used by several threads.
 
     Args:
         arm: the arm.
-        limits: kept in every step; None: the arm's :class:`~imitarm.kinematics.limits.JointLimits` alone.
+        limits: limits to keep in every step; None: only the arm's :class:`~imitarm.kinematics.limits.JointLimits`.
         dt: length of the control step [s].
         method: ``"qp"``, ``"dls"``, ``"dls_small_angle"`` or ``"svd"``.
 
@@ -121,10 +124,10 @@ class IKSolver:
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
-            tasks: one task or several; the first one is the tool's.
-            velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; with it the acceleration limits
-                are kept.
-            rows: more inequalities of this step, for ``"qp"`` only.
+            tasks: one or more tasks; the first one must be for the tool.
+            velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; needed for the acceleration
+                limits.
+            rows: additional inequalities in this step, only for ``"qp"``.
 
         Raises:
             InputError: when a shape is wrong, a number is not finite, or the method does not take such tasks or rows.
@@ -200,7 +203,7 @@ class IKSolver:
             if self.method != "qp":
                 if not (isinstance(task, PostureTask) and problem.tasks) or problem.posture is not None:
                     raise InputError(
-                        f"solve_ik: method {self.method!r} takes one TwistTask and perhaps a PostureTask after it, "
+                        f"solve_ik: method {self.method!r} takes one TwistTask and optionally a PostureTask after it, "
                         f"got {type(task).__name__}; use method='qp'"
                     )
                 problem.posture = task.drift(problem)
@@ -256,13 +259,12 @@ def solve_ik(
     Args:
         arm: the arm.
         q: joint positions, shape (n_joints,) [rad].
-        tasks: one task or several; the first one is the tool's.
-        limits: None: position, velocity and acceleration limits of the joints.
+        tasks: one or more tasks; the first one must be for the tool.
+        limits: limits to keep; None: position, velocity and acceleration limits of the joints.
         dt: length of the control step [s].
         method: ``"qp"``, ``"dls"``, ``"dls_small_angle"`` or ``"svd"``.
-        velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; with it the acceleration limits are
-            kept.
-        rows: more inequalities of this step, for ``"qp"`` only.
+        velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; needed for the acceleration limits.
+        rows: additional inequalities in this step, only for ``"qp"``.
 
     Returns:
         Joint velocity, shape (n_joints,) [rad/s].
@@ -309,7 +311,7 @@ def quadratic_program(problem: IKProblem) -> Array:
 
 
 def _stacked(tasks: list[TaskRows]) -> tuple[Array, Array]:
-    """Return what all tasks ask for, one below the other; filling takes half of the time of concatenating."""
+    """Return the stacked targets of all tasks; filling an array takes half as long as concatenating."""
     end, (m, n) = 0, tasks[0].jacobian.shape
     for part in tasks[1:]:
         m += len(part.target)
@@ -364,8 +366,8 @@ def _least_cost(box: Box, matrix: Array | None, least: Array | None, hessian: Ar
 def _least_violation(box: Box, matrix: Array, least: Array) -> tuple[Array, Array]:
     """Return a velocity that violates contradictory rows least (sum of squares), and the bounds that it keeps.
 
-    Each row gets a slack variable. daqp's own soft constraints would need none, but where they meet active bounds
-    its answers violate rows that can be kept (seen with version 0.11).
+    Each row gets a slack variable. daqp's own soft constraints need no slack variables, but at active bounds their
+    solutions violate rows that could be kept (observed with version 0.11).
     """
     m, n = matrix.shape
     lengths = np.sqrt(np.einsum("ij,ij->i", matrix, matrix))
@@ -379,7 +381,7 @@ def _least_violation(box: Box, matrix: Array, least: Array) -> tuple[Array, Arra
 
 
 def _unconstrained(box: Box, matrix: Array | None, least: Array | None, hessian: Array, linear: Array) -> Array | None:
-    """Return the unconstrained minimum if it keeps all limits; this is so in most steps, and takes half the time."""
+    """Return the unconstrained minimum if it keeps all limits, as in most steps; this takes half the time."""
     factor, velocity = hessian.copy(), np.empty(len(linear))
     if mujoco.mju_cholFactor(factor, _NULL) < len(linear):
         return None
@@ -459,7 +461,7 @@ def _undamped(problem: IKProblem, gram: Array) -> Array:
 
 
 def filtered_svd(problem: IKProblem) -> Array:
-    """Damp only the directions in which the arm hardly moves (Maciejewski and Klein 1988)."""
+    """Damp only the directions near a singularity (Maciejewski and Klein 1988)."""
     jacobian, target, _ = problem.tasks[0]
     squares, basis, _ = lapack.dsyev(jacobian.dot(jacobian.T))
     squares = np.maximum(squares, 0.0)
@@ -470,7 +472,7 @@ def filtered_svd(problem: IKProblem) -> Array:
 
 
 def _within_box(problem: IKProblem, result: Array, scale: Array | float, squares: Array, basis: Array) -> Array:
-    """Add the null-space drift to the posture, then scale the whole velocity, then clip each joint to its limits."""
+    """Add the null-space drift towards the posture, scale the whole velocity, and clip each joint to its limits."""
     if problem.posture is not None:
         jacobian = problem.tasks[0].jacobian
         drift = problem.posture / scale

@@ -15,7 +15,7 @@ from imitarm.kinematics.arm_kinematics import ArmMemory
 Array = NDArray[np.float64]
 
 ROTATION_LENGTH = 0.3
-"""[m/rad] A rotation of 1 rad counts as much as a displacement of 0.3 m."""
+"""[m/rad] A rotation of 1 rad is weighted like a displacement of 0.3 m."""
 
 
 class Box(NamedTuple):
@@ -34,13 +34,15 @@ class Rows(NamedTuple):
     """Linear inequalities on the joint velocity, ``matrix @ v >= lower``.
 
     With a finite price, a row a that is violated by s costs ``price * (s / |a|)^2 / 2`` beside the tasks, whose weight
-    is about 1: what counts is the joint velocity [rad/s] that is missing along the row, whatever the row's own unit.
-    Without one, rows come before all tasks: they give way only where they contradict the boxes or one another.
+    is about 1. The cost depends on the joint velocity [rad/s] that is missing along the row, not on the unit of the
+    row.
+    Without a finite price, rows have priority over all tasks: they are violated only if they contradict the boxes
+        or one another.
 
     Attributes:
         matrix: shape (m, n_joints).
         lower: shape (m,).
-        price: penalty of a violation.
+        price: penalty weight of a violation.
     """
 
     matrix: Array
@@ -68,7 +70,7 @@ class IKProblem:
 
     Attributes:
         arm: the arm.
-        memory: its kinematics at ``q``.
+        memory: kinematics of the arm at ``q``.
         q: joint positions, shape (n_joints,) [rad].
         velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: unknown, accelerations are not
             limited.

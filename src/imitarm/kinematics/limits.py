@@ -1,7 +1,7 @@
 """Limits of the joint velocity in one control step, as small objects that can be combined.
 
-A :class:`Limit` answers, at one control step, with a :class:`Box` (hard: always kept) or with :class:`Rows` (soft:
-linear inequalities that may be violated when they contradict a box, or at a given price).
+In each control step, a :class:`Limit` returns a :class:`Box` (hard, always kept) or :class:`Rows` (soft: linear
+inequalities that may be violated if they contradict a box, or at a given price).
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ _SIGN = np.array([[1.0], [-1.0]])
 
 
 class Limit(ABC):
-    """One limit of the joint velocity. A limit of your own is one class with this one method.
+    """One limit of the joint velocity. To write your own limit, implement this one method in a subclass.
 
     Attributes:
-        soft: whether the limit returns rows, which only the method ``"qp"`` can keep.
+        soft: whether the limit returns rows; only the method ``"qp"`` can keep rows.
     """
 
     soft: ClassVar[bool] = False
 
     @abstractmethod
     def restrict(self, problem: IKProblem) -> Box | Rows | None:
-        """Return the box or the rows for one control step; None when the limit is too far away to matter."""
+        """Return the box or the rows for one control step; None when the limit is too far away to have an effect."""
 
 
 class JointLimits(Limit):
@@ -50,9 +50,9 @@ class JointLimits(Limit):
     .. math:: v_b(D) = -a\,dt + \sqrt{a^2 dt^2 + 2 a D},
 
     the solution of :math:`v^2/(2a) + v\,dt = D`. The upper bound is
-    :math:`\min(v_{max},\; v_p + a\,dt,\; \max(v_b(D),\, v_p - a\,dt))` with :math:`v_p` the previous velocity; the
-    lower bound is its mirror image. When :math:`v_p` kept this bound one step ago, braking with a keeps it now, so
-    the box always holds a velocity.
+    :math:`\min(v_{max},\; v_p + a\,dt,\; \max(v_b(D),\, v_p - a\,dt))` where :math:`v_p` is the previous velocity; the
+    lower bound is its mirror image. If :math:`v_p` met this bound one step ago, braking with a meets it now, so the box
+    is never empty.
 
     The bound assumes that the joint moves by :math:`v\,dt` in one step. A robot with constant acceleration moves by
     :math:`(v_p + v)\,dt/2`; ``imitarm.robots.limit_velocity`` therefore evaluates this box at :math:`q + v_p\,dt/2`.
@@ -133,14 +133,14 @@ class ElbowSingularityLimit(Limit):
     """Keeps the elbow 0.15 rad away from its stretched position, on the side where it is.
 
     Where the upper arm and the forearm of an SRS arm are in line, the shoulder-wrist distance can't change any
-    faster: the arm is singular. The margin acts like one more position limit of the elbow joint (see
+    faster: the arm is singular. The margin acts like an additional position limit of the elbow joint (see
     :class:`JointLimits`). An arm that starts inside the margin can only move out of it.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.
 
     Raises:
-        InputError: when the arm does not say where its elbow is.
+        InputError: when the arm's file does not define its elbow.
     """
 
     def __init__(self, arm: ArmModel) -> None:
@@ -181,14 +181,15 @@ class WristSingularityLimit(Limit):
 
     The wrist is singular where the axes before and after its joint are parallel, at every multiple of pi. With D the
     distance to 0.1 rad from the nearest of them, the joint's velocity away from it must be at least
-    :math:`-v_b(D)` (see :class:`JointLimits`), or 5/s times what is missing once it is nearer. The price of a violation
-    is low, so that a hand can rotate through a singular position when it must.
+    :math:`-v_b(D)` (see :class:`JointLimits`), or 5/s times the missing distance once it is closer than that. The price
+    of a violation
+    is low, so that the wrist can rotate through a singular position if necessary.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.
 
     Raises:
-        InputError: when the arm does not say where its wrist is.
+        InputError: when the arm's file does not define its wrist.
     """
 
     soft: ClassVar[bool] = True
@@ -223,6 +224,6 @@ def singularity_limits(arm: ArmModel) -> tuple[Limit, ...]:
     """Return the limits that keep an SRS arm away from its elbow and wrist singularities.
 
     Raises:
-        InputError: when the arm does not say where its elbow and wrist are.
+        InputError: when the arm's file does not define its elbow and wrist.
     """
     return ElbowSingularityLimit(arm), WristSingularityLimit(arm)

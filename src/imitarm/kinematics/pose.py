@@ -1,8 +1,8 @@
 """Positions and rotations: quaternions (w, x, y, z) as arrays, and the typed :class:`Pose`.
 
 All functions take and return arrays with any leading shape and are vectorised over it. They do not check their
-arguments; :class:`Pose` does. A single rotation is computed with plain floats, which is faster than numpy for an array
-of four; control steps need many.
+arguments; :class:`Pose` does. Single rotations are computed with plain floats, which is faster than numpy for an array
+of four; a control step needs many of them.
 
 Rotation vectors (axis times angle) are in rad. Twists have shape (6,): linear velocity [m/s] first, then angular
 velocity [rad/s], both in the base frame.
@@ -194,7 +194,7 @@ def mean_quaternion(quaternions: ArrayLike) -> Array:
 
 
 def checked_unit_quaternions(quaternions: ArrayLike, what: str) -> Array:
-    """Return ``quaternions`` (..., 4) scaled to length one; refuse those whose length is not one.
+    """Return ``quaternions`` (..., 4) scaled to length one; raise an error if a length is not one.
 
     Args:
         quaternions: quaternions wxyz, shape (..., 4).
@@ -251,7 +251,7 @@ class Pose:
 
     @classmethod
     def trusted(cls, position: Array, quaternion: Array) -> Pose:
-        """Build without checks, for control steps, where checks take too long; the caller gives the arrays away.
+        """Build without checks, which take too long in control steps; the caller must not use the arrays afterwards.
 
         Args:
             position: shape (3,) [m]; from now on read-only.

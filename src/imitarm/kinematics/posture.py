@@ -36,13 +36,14 @@ def find_posture(
 
     The method is Levenberg-Marquardt: steps :math:`J^T(JJ^T+\mu)^{-1}e` of the joints that are not at a limit, with
     damping :math:`\mu` proportional to the squared error :math:`|e|^2` (Sugihara, IEEE T-RO 27(5), 2011), and a drift
-    towards the starting posture in the null space. It starts from ``q0``, then from ``home``, then from random ones.
+    towards the starting posture in the null space. The search starts from ``q0``, then from ``home``, then from random
+    postures.
 
     Args:
         arm: the arm.
         pose: desired pose in the base frame.
-        q0: posture to start from and to stay near to, shape (n_joints,) [rad]; None: ``home``.
-        frame: the frame that is to have this pose, ``"tool"`` or ``"flange"``.
+        q0: posture from which to start and near which to stay, shape (n_joints,) [rad]; None: ``home``.
+        frame: frame to bring to this pose, ``"tool"`` or ``"flange"``.
         restarts: number of random start postures.
         seed: seed of the random postures.
 
@@ -50,7 +51,7 @@ def find_posture(
         shape (n_joints,) [rad]; position within 1e-6 m and rotation within 1e-6 rad.
 
     Raises:
-        UnreachableError: naming the pose and how far off the best posture was.
+        UnreachableError: naming the pose and the error of the best posture.
         UnknownNameError: if the frame is not known.
         InputError: if another argument can't be used.
     """

@@ -40,14 +40,14 @@ class SelfClearance:
 
     .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
 
-    and a row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets it shrink no faster than exponentially. Where the
-    distance is below the clearance it must grow, at 25/s in place of :math:`\xi`. Every pair of spheres within 6 cm of
-    the clearance has a row (at most the 64 nearest pairs). So has the nearest pair of spheres of each of the ``n_rows``
-    nearest pairs of links within 15 cm.
+    and a row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets it shrink no faster than exponentially. If the distance
+    is below the clearance, it must grow, with 25/s instead of :math:`\xi`. Every pair of spheres within 6 cm of
+    the clearance has a row (at most the 64 nearest pairs). In addition, each of the ``n_rows`` nearest pairs of links
+    within 15 cm has a row for its nearest pair of spheres.
 
     These pairs are not checked: links that share a joint, links that can't touch within their joint limits
         (:func:`meeting_links`), and spheres that are nearer than the clearance in the arm's home posture. The base is
-        checked. What it stands on is not part of the arm: put it into the scene.
+        included in the check. The object on which it stands is not part of the arm: add it to the scene.
 
     Args:
         arm: the arm with its tool.
@@ -109,7 +109,7 @@ class SelfClearance:
         return float((np.linalg.norm(centers[self._outer] - centers[self._inner], axis=1) - self._sums).min())
 
     def nearest(self, q: ArrayLike) -> tuple[Indices, Array]:
-        """Return the pairs of spheres that have a row, the nearest first.
+        """Return the pairs of spheres that have a row, nearest first.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
@@ -133,7 +133,7 @@ class SelfClearance:
         return None if found is None else Rows(found[0], self.lower(found[1]))
 
     def near(self, q: ArrayLike) -> tuple[Array, Array] | None:
-        """Return gradients of the near distances (k, n_joints) [m/rad], and distance minus clearance (k,) [m].
+        """Return gradients of the distances of near pairs (k, n_joints) [m/rad], and distance minus clearance (k,) [m].
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
@@ -154,7 +154,7 @@ class SelfClearance:
         return np.where(room < 0.0, -_RETREAT_RATE, -self._gain) * room
 
     def periodic(self, dt: float = 0.01) -> PeriodicSelfClearance:
-        """Return a faster version of this check, for a control loop with period ``dt`` [s], at a fifth of the cost."""
+        """Return a version of this check for a control loop with period ``dt`` [s], at a fifth of the cost."""
         return PeriodicSelfClearance(self, dt)
 
     def _found(self, q: ArrayLike) -> tuple[Indices, Indices, Array, Array, Array]:
@@ -202,7 +202,7 @@ class PeriodicSelfClearance:
     speed.
 
     Args:
-        own: the self-clearance whose rows are approximated.
+        own: self-clearance whose rows are approximated.
         dt: control period [s].
     """
 
@@ -237,10 +237,11 @@ class PeriodicSelfClearance:
 def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
     """Return for every pair of links whether they can touch within the limits of the joints between them.
 
-    Link 0 is the base; link k is moved by k joints. Neighbouring links are reported as not meeting. For links with two
+    Link 0 is the base; link k is moved by k joints. Neighbouring links are always reported as not meeting. For links
+    with two
     or three joints between them, the distance of their exact shapes is measured in 512 postures that fill the ranges
     of these joints evenly (a Sobol sequence); links that never touch are reported as not meeting. Links with more
-    joints between them are reported as meeting.
+    joints between them are always reported as meeting.
 
     Args:
         arm: the arm with its tool.

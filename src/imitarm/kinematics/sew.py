@@ -1,10 +1,10 @@
-r"""The shoulder-elbow-wrist angle: where the elbow is on its circle about the line from shoulder to wrist.
+r"""The shoulder-elbow-wrist angle: the position of the elbow on its circle about the line from shoulder to wrist.
 
 The elbow of an arm with seven joints can move while the hand is at rest; one angle describes its position, for a person
 and for a robot. It is measured from a reference direction, and every choice of that direction has a singularity (Elias
-and Wen 2024). The ``"conventional"`` angle, from a fixed vector v, is undefined when the wrist is on the line through
-the shoulder along v. The ``"stereographic"`` angle is undefined only on one half of such a line, which can be chosen
-where no wrist goes. Here it points behind the base.
+and Wen 2024). The ``"conventional"`` angle, measured from a fixed vector v, is undefined when the wrist is on the line
+through the shoulder along v. The ``"stereographic"`` angle is undefined only on one half of such a line, which can be
+placed where the wrist never is. Here it points behind the base.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ _LOST = 1e-12  # squared sine below which an angle is only rounding
 
 
 class SewAngle(NamedTuple):
-    """The angle of one or many arms, and its derivatives.
+    """The SEW angle of one or more arms, and its derivatives.
 
     Attributes:
-        angle: in (-pi, pi], shape (...) [rad].
-        shoulder: derivative by the shoulder's position, shape (..., 3) [rad/m].
-        elbow: derivative by the elbow's, shape (..., 3) [rad/m].
-        wrist: derivative by the wrist's, shape (..., 3) [rad/m].
+        angle: SEW angle in (-pi, pi], shape (...) [rad].
+        shoulder: derivative with respect to the shoulder's position, shape (..., 3) [rad/m].
+        elbow: derivative with respect to the elbow's position, shape (..., 3) [rad/m].
+        wrist: derivative with respect to the wrist's position, shape (..., 3) [rad/m].
         bend: squared sine of the angle at the elbow, shape (...); 0 where the arm is straight and the angle is
             undefined.
         reference: squared length of the reference direction, shape (...); 0 where the reference is undefined.
@@ -54,14 +54,14 @@ def sew_angle(
 ) -> NDArray[np.float64]:
     r"""Return the angle of the elbow about the line from shoulder to wrist.
 
-    With :math:`\hat w` the direction from shoulder to wrist, e that from shoulder to elbow, :math:`e_t` behind the
-    base and :math:`e_r` up, the stereographic angle is measured from :math:`e_x`:
+    Let :math:`\hat w` be the direction from shoulder to wrist, e the direction from shoulder to elbow, :math:`e_t` the
+    direction behind the base and :math:`e_r` up. Then the stereographic angle is measured from :math:`e_x`:
 
     .. math::
         k_r = (\hat w - e_t) \times e_r, \quad k_x = k_r \times (W - S), \quad e_x = k_x / |k_x|, \quad
         \psi = \mathrm{atan2}(\hat w \cdot (e_x \times e),\; e_x \cdot e)
 
-    The conventional one is measured from the part of :math:`e_r` that is at right angles to :math:`\hat w`. Both angles
+    The conventional angle is measured from the component of :math:`e_r` perpendicular to :math:`\hat w`. Both angles
     increase when the elbow rotates right-handed about the direction to the wrist.
 
     Args:
@@ -83,7 +83,7 @@ def sew_angle(
 def sew_derivatives(
     shoulder: ArrayLike, elbow: ArrayLike, wrist: ArrayLike, *, convention: str = "stereographic"
 ) -> SewAngle:
-    """Return the angle of :func:`sew_angle` and its derivatives by the three points; same arguments."""
+    """Return the angle of :func:`sew_angle` and its derivatives with respect to the three points; same arguments."""
     formula = _formula(convention)
     points = [np.asarray(point, dtype=float) for point in (shoulder, elbow, wrist)]
     if any(point.shape[-1:] != (3,) for point in points):
@@ -119,7 +119,7 @@ def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereogr
 def one_angle(
     shoulder: Sequence[float], elbow: Sequence[float], wrist: Sequence[float], convention: str = "stereographic"
 ) -> SewAngle | None:
-    """Return the angle of one arm with derivatives as triples of floats, many times quicker than for arrays.
+    """Return the angle of one arm with derivatives as triples of floats, many times faster than for arrays.
 
     Args:
         shoulder: three floats [m].

@@ -1,4 +1,4 @@
-"""Cover the collision shapes of an arm with spheres, so that the whole arm can be kept clear of obstacles."""
+"""Cover the collision shapes of an arm with spheres, so that the whole arm can keep a clearance to obstacles."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 COLLISION_GROUP = 3
-"""Group of the geoms that count for contact; geoms that are only drawn are in groups 0 to 2."""
+"""Group of the geoms used for contact; geoms used only for drawing are in groups 0 to 2."""
 _SPACING = 0.9  # distance of neighbouring spheres on a bar, in radii: they then exceed the bar by a tenth
 _MOST_PIECES = 50  # of one bar
 _SMALLEST_CELL = 0.025  # [m] smallest cell of a plate, however thin it is
@@ -23,7 +23,7 @@ class SphereCover:
     """Spheres that cover all moving collision shapes (group 3) of a model, and how joints move them.
 
     Attributes:
-        bodies: for each sphere the name of the body that carries it.
+        bodies: name of the body that carries each sphere.
         radii: shape (m,) [m].
         links: number of the arm's joints that move each sphere, shape (m,).
         follows_last_joint: True for spheres that move rigidly with the flange, shape (m,).
@@ -81,13 +81,13 @@ class SphereCover:
     def speeds(self, data: mujoco.MjData, spheres: NDArray[np.int_], centers: Array, normals: Array) -> Array:
         """Return how fast each joint moves chosen spheres along chosen directions, shape (k, n_joints) [m/rad].
 
-        A joint's twist about the centre of mass ``o`` is ``(w, v)``, as MuJoCo keeps it; it moves ``c`` along ``n`` by
+        MuJoCo stores a joint's twist about the centre of mass ``o`` as ``(w, v)``; it moves ``c`` along ``n`` by
         ``n.(v + w x (c - o)) = n.v + w.((c - o) x n)``.
 
         Args:
             data: the kinematics of a posture.
             spheres: shape (k,).
-            centers: of these spheres, shape (3, k) [m].
+            centers: centers of these spheres, shape (3, k) [m].
             normals: the directions, unit vectors, shape (3, k).
         """
         a, b, c = centers - data.subtree_com[self._root][:, None]
@@ -108,7 +108,7 @@ class SphereCover:
         """Return the gradients of the distances of pairs of spheres, shape (k, n_joints) [m/rad].
 
         A joint that moves both spheres does not change their distance. A joint with axis a through the point o that
-        moves the outer one alone, whose center is c, changes it by n (a x (c - o)) = a (c x n) - n (a x o).
+        moves only the outer sphere, with center c, changes the distance by n (a x (c - o)) = a (c x n) - n (a x o).
 
         Args:
             data: the kinematics of a posture.
@@ -142,7 +142,7 @@ class SphereCover:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return the cross products of rows; np.cross takes many times as long for few rows."""
+    """Return the cross products of rows; np.cross takes many times longer for few rows."""
     return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
@@ -188,7 +188,7 @@ def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:
 
 
 def _pieces(half_length: float, radius: float) -> int:
-    """Return the number of spheres that cover a round bar; a thin wire gets fewer and larger ones."""
+    """Return the number of spheres that cover a round bar; a thin wire gets fewer, larger spheres."""
     return max(1, math.ceil(min(2.0 * half_length / (_SPACING * radius), _MOST_PIECES)))
 
 

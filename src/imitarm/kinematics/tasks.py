@@ -31,7 +31,7 @@ _LEAST = 1e-4  # squared: a quantity that changes less with the self-motion can'
 
 
 class Task(Protocol):
-    """One wanted motion. A task of your own is one class with this one method."""
+    """One wanted motion. To write your own task, implement this one method in a subclass."""
 
     def rows(self, problem: IKProblem) -> TaskRows | None:
         """Return the weighted rows of the task for one control step; None: no rows.
@@ -44,17 +44,18 @@ class Task(Protocol):
 class TwistTask(NamedTuple):
     r"""Move the tool (or the flange) with a twist.
 
-    A rotation of 1 rad counts like a displacement of ``rotation_length``. A twist longer than ``max_speed``, so
-    weighted, is
+    A rotation of 1 rad is weighted like a displacement of ``rotation_length``. A twist whose weighted norm exceeds
+    ``max_speed`` is
     scaled down: without this, damped least squares stops short of its target, because its damping grows with the error
         (thesis Eq 3.9).
 
     Attributes:
         twist: desired velocity in the base frame, linear rows first, shape (6,) [m/s, rad/s].
         frame: the frame that moves, ``"tool"`` or ``"flange"``.
-        rotation_length: displacement that counts like a rotation of 1 rad when the joints can't do the whole twist [m].
-            With a smaller value, the tool gives up more of its rotation and less of its displacement. Three numbers are
-            for rotations about the base's x, y and z axes.
+        rotation_length: displacement with the same weight as a rotation of 1 rad, used when the joints can't
+            achieve the whole twist [m].
+            With a smaller value, the rotation error becomes larger and the position error smaller. Three numbers
+            apply to rotations about the base's x, y and z axes.
         max_speed: the twist is scaled down to this weighted norm [m/s]; None: the default of the solver's method.
     """
 
@@ -87,7 +88,7 @@ class JointVelocityTask(NamedTuple):
 
     Attributes:
         velocity: desired joint velocity, shape (n_joints,) [rad/s].
-        weight: weight of this task; that of a twist is 1 [m^2].
+        weight: weight of this task [m^2]; the weight of a twist is 1.
     """
 
     velocity: ArrayLike
@@ -101,12 +102,12 @@ class JointVelocityTask(NamedTuple):
 
 
 class PostureTask(NamedTuple):
-    """Drift to a posture, as far as the other tasks leave freedom: :math:`v = k (q_{ref} - q)`.
+    """Drift towards a posture in the freedom that the other tasks leave: :math:`v = k (q_{ref} - q)`.
 
     Attributes:
         q: joint positions to drift to, shape (n_joints,) [rad].
         gain: k [1/s].
-        weight: weight of this task; that of a twist is 1 [m^2].
+        weight: weight of this task [m^2]; the weight of a twist is 1.
     """
 
     q: ArrayLike
@@ -145,7 +146,7 @@ class ElbowTask(NamedTuple):
         confidence: c, 0 to 1: certainty of the desired angle; 0: the elbow is not moved.
         gain: k [1/s].
         max_rate: limit of the desired rate of the angle [rad/s].
-        convention: convention of the angle.
+        convention: convention that defines the angle.
     """
 
     angle: float
@@ -198,11 +199,12 @@ def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] 
     e of the tool changes the quantity by :math:`g^T J^+ e`.
 
     Args:
-        jacobian: jacobian of the tool, shape (m, n_joints).
-        gradient: gradient of the quantity by the joints, shape (n_joints,).
+        jacobian: Jacobian of the tool, shape (m, n_joints).
+        gradient: gradient of the quantity with respect to the joint positions, shape (n_joints,).
 
     Returns:
-        the motion as a unit vector (n_joints,), how fast it changes the quantity, and :math:`g^T J^+`, shape (m,);
+        The motion as a unit vector (n_joints,), the rate at which it changes the quantity, and :math:`g^T J^+`, shape
+        (m,);
         None when no such motion changes it.
     """
     gram = jacobian.dot(jacobian.T)

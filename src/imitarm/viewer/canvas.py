@@ -1,4 +1,4 @@
-"""Matplotlib drawings as inline SVG that follows the light or dark colours of the page.
+"""Matplotlib drawings as inline SVG that adapts to the light or dark colours of the page.
 
 Text and axes have the colour of the text around the drawing (``currentColor``); the data have the colours of
 :mod:`~imitarm.viewer.palette`. The SVG refers to nothing outside the page.
@@ -76,10 +76,10 @@ class Canvas:
 
 @contextmanager
 def canvas(name: str, description: str, size: tuple[float, float]) -> Iterator[Canvas]:
-    """Give a figure of ``size`` [inch] to draw on, then convert it to SVG.
+    """Yield a figure of ``size`` [inch] to draw on, then convert it to SVG.
 
     Args:
-        name: unique in the page; all ids in the SVG begin with it.
+        name: name, unique in the page, with which all ids in the SVG begin.
         description: description of the figure, for screen readers.
         size: width and height [inch].
     """
@@ -100,7 +100,7 @@ def canvas(name: str, description: str, size: tuple[float, float]) -> Iterator[C
 
 
 def _inline(svg: str, name: str, description: str) -> str:
-    """Turn an SVG file into an element that can share a page with others."""
+    """Convert an SVG file to an element that can share a page with others."""
     prefix = re.sub(r"\W+", "-", name)
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", svg)  # two figures may not share an id

@@ -1,4 +1,4 @@
-"""Figures of a report over time, over the components and over their number, and small charts of all joints.
+"""Figures of a report: time series, displacements of components, choice of their number, small charts of joints.
 
 Every function returns one ``<svg>`` element. Figures of paths are in :mod:`~imitarm.viewer.maps`.
 """
@@ -28,7 +28,7 @@ def clearance(times: ArrayLike, distances: ArrayLike, required: float, *, name: 
     Args:
         times: shape (n_steps,) [s].
         distances: smallest distance between the arm, with its tool, and any obstacle, shape (n_steps,) [m].
-        required: clearance to keep [m].
+        required: required clearance [m].
         name: unique in the page.
 
     Returns:
@@ -83,9 +83,9 @@ def torques(
 
     Args:
         times: shape (n_steps,) [s].
-        values: shape (n_steps, n_joints) [N m].
+        values: torques, shape (n_steps, n_joints) [N m].
         limits: rated torque, shape (n_joints,) [N m].
-        joint_names: shown above each chart; by default joints are numbered.
+        joint_names: names shown above the charts; by default, joints are numbered.
         name: unique in the page.
 
     Returns:
@@ -155,7 +155,7 @@ def selection(
         bic: Bayesian information criterion, lower is better, shape (n,); may be empty.
         aic: Akaike information criterion, lower is better, shape (n,); may be empty.
         held_out_error: root mean square distance to held-out demonstrations, shape (n,) [m]; may be empty.
-        chosen: the number that was chosen.
+        chosen: number that was chosen.
         name: unique in the page.
 
     Returns:
@@ -193,8 +193,8 @@ class JointCurve:
     """The motion of one joint between its limits.
 
     Attributes:
-        title: above the chart.
-        values: over time, shape (n_steps,).
+        title: title above the chart.
+        values: values over time, shape (n_steps,).
         lower: lower limit.
         upper: upper limit.
         zero: whether to draw a line at 0.
@@ -215,7 +215,7 @@ def small_multiples(name: str, description: str, unit: str, times: Array, curves
         description: description for screen readers.
         unit: label of the vertical axis.
         times: shape (n_steps,) [s].
-        curves: one for each joint.
+        curves: curves to draw, one for each joint.
 
     Returns:
         An SVG element.
@@ -238,7 +238,7 @@ def small_multiples(name: str, description: str, unit: str, times: Array, curves
 
 @dataclass(frozen=True)
 class _Panel:
-    """A small chart on axes whose units are inches; axes of their own for each joint would take ten times as long."""
+    """A small chart on shared axes whose units are inches; separate axes for each joint would take ten times longer."""
 
     left: float
     bottom: float

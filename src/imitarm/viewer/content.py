@@ -1,4 +1,4 @@
-"""The content of a report: frozen results, the numbers that follow from them, and the same numbers as plain data.
+"""The content of a report: results, the numbers derived from them, and these numbers as plain data.
 
 :mod:`~imitarm.viewer.report` draws a page from them.
 """
@@ -73,10 +73,10 @@ class AdaptedPath(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SceneResult:
-    """One scene: what was planned and what the robot did.
+    """One scene: the planned path and the motion of the robot.
 
     Attributes:
-        name: short and unique in the report; used in links.
+        name: short name, unique in the report; used in links.
         title: title as shown to the reader.
         scene: goal and obstacles.
         success: whether the task succeeded.
@@ -84,9 +84,10 @@ class SceneResult:
         rollout: the measured motion; None when the robot did not start.
         adaptation: the planned path; None when nothing was adapted.
         rmse: root mean square distance from the measured path to the demonstrations [m]; NaN when unknown.
-        reason: why the run ended, in words.
+        reason: reason why the run ended.
         tool_radius: radius of the sphere that contained the tool in the plan [m].
-        tool_spheres: replaces ``tool_radius``: rows of x, y, z, radius in the tool frame, shape (m, 4) [m].
+        tool_spheres: spheres that contained the tool, instead of ``tool_radius``: rows of x, y, z, radius in the
+            tool frame, shape (m, 4) [m].
         recording: poses of all bodies, for the 3-D playback.
         torque_limits: rated torques, shape (n_joints,) [N m].
         joint_names: titles of the torque charts.
@@ -149,7 +150,7 @@ class SceneResult:
 
 
 class Candidate(Protocol):
-    """An evaluated number of components, as :class:`imitarm.skills.mixture_fitting.Candidate`."""
+    """The evaluation of a number of components, such as :class:`imitarm.skills.mixture_fitting.Candidate`."""
 
     @property
     def n_components(self) -> int:
@@ -170,16 +171,16 @@ class Candidate(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class LearningSummary:
-    """The demonstrations and what was learned from them.
+    """The demonstrations and the result of learning.
 
     Attributes:
-        demonstrations: checked and aligned, as they were used for learning.
+        demonstrations: checked and aligned demonstrations, as used for learning.
         means: means of the Gaussian components' positions, shape (n_components, 3) [m].
         covariances: covariances of the Gaussian components' positions, shape (n_components, 3, 3) [m^2].
         predicted: the learned path.
         candidates: the numbers of components that were evaluated.
-        findings: what ``lint`` reported about the recordings.
-        alignment: what ``align`` changed; None when it was not used.
+        findings: findings of ``lint`` about the recordings.
+        alignment: result of ``align``; None when it was not used.
         details: further facts, by name.
     """
 
@@ -200,14 +201,14 @@ class LearningSummary:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Everything that a page shows about one run.
+    """The content of a page about one run.
 
     Attributes:
         title: title of the page.
         scenes: results, in the order in which they are shown; names must be unique.
         summary: one or two sentences that introduce the page.
-        learning: the demonstrations and what was learned from them.
-        provenance: what is needed to repeat the run (command, seed, platform, versions, ...), by name; values that
+        learning: demonstrations and result of learning.
+        provenance: facts needed to repeat the run (command, seed, platform, versions, ...), by name; values that
             are mappings become tables of their own.
 
     Raises:

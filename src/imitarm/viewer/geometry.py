@@ -1,7 +1,7 @@
 """Triangle meshes of MuJoCo's geoms, with few triangles, sharp edges and smooth round surfaces.
 
 Renderers average the normals of triangles that share a vertex. Faces that meet at a sharp edge therefore get vertices
-of their own, and the faces of a round surface share theirs.
+of their own, and the faces of a round surface share vertices.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def capsule(radius: float, half_length: float) -> Mesh:
 
 
 def ellipsoid(semi_axes: ArrayLike) -> Mesh:
-    """Return an ellipsoid with ``semi_axes`` (3,) [m]; three equal ones make a sphere."""
+    """Return an ellipsoid with ``semi_axes`` (3,) [m]; three equal semi-axes give a sphere."""
     unit = capsule(1.0, 0.0)
     return Mesh(unit.vertices * np.asarray(semi_axes, dtype=float), unit.faces)
 
@@ -119,7 +119,7 @@ def _thinned(mesh: Mesh) -> Mesh:
 
 
 def _sharpened(mesh: Mesh) -> Mesh:
-    """Give faces that meet at a sharp edge vertices of their own; faces with similar normals share them."""
+    """Give separate vertices to faces that meet at a sharp edge; faces with similar normals share vertices."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15)

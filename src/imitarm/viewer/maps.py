@@ -1,4 +1,4 @@
-"""Figures of paths in the base frame: demonstrations, the learned path, how it was adapted around obstacles.
+"""Figures of paths in the base frame: demonstrations, the learned path, and its adaptation around obstacles.
 
 Every public function that draws returns one ``<svg>`` element. Figures over time are in :mod:`~imitarm.viewer.charts`.
 """
@@ -40,7 +40,7 @@ class View:
 
     @property
     def depth(self) -> int:
-        """The axis along which the figure looks."""
+        """The axis along the line of sight of the figure."""
         return 3 - self.across - self.up
 
     @property
@@ -55,7 +55,7 @@ class View:
 
     @classmethod
     def best(cls, positions: ArrayLike) -> View:
-        """Return the view that shows most of ``positions`` (n, 3) [m]; from above when that is nearly as good."""
+        """Return the view in which ``positions`` (n, 3) [m] extend most; from above if that is nearly as good."""
         spans = np.ptp(np.asarray(positions, dtype=float), axis=0)
         if spans[2] <= 1.25 * spans[:2].min():
             return cls(0, 1) if spans[0] >= spans[1] else cls(1, 0)
@@ -70,7 +70,7 @@ class View:
 def drawn_map(
     name: str, text: str, view: View, corners: Array, *, legend_rows: int, note: str = "", stretched: bool = False
 ) -> Iterator[tuple[Any, Canvas]]:
-    """Give axes that show ``corners`` (2, 2) [m]; the figure is as high as they need, and its SVG follows at the end.
+    """Yield axes that show ``corners`` (2, 2) [m] in a figure of suitable height, then convert it to SVG.
 
     Args:
         name: unique in the page.
@@ -78,8 +78,9 @@ def drawn_map(
         view: the axes to show.
         corners: lower and upper corner of the area that must be visible.
         legend_rows: number of rows of the legend.
-        note: added to the title.
-        stretched: whether a flat map may be stretched vertically, and the title says so, instead of equal scales.
+        note: text added to the title.
+        stretched: whether a flat map may be stretched vertically instead of drawn at equal scales; the title then
+            says so.
     """
     span = np.maximum(corners[1] - corners[0], 1e-3)
     width = _WIDTH - 0.72
@@ -128,7 +129,7 @@ class Grid:
     def distance_to(self, obstacle: Obstacle, depths: Array) -> Array:
         """Return the distance from each point to an obstacle (rows, columns) [m], the smallest over ``depths``.
 
-        For one depth the zero line is the cross-section of the obstacle there, for several its projection.
+        For one depth, the zero line is the cross-section of the obstacle; for several depths, it is the projection.
         """
         points = np.empty((len(depths), len(self.up), len(self.across), 3))
         points[..., self.view.across] = self.across
@@ -271,7 +272,7 @@ def adaptation(
     measured: Trajectory | None = None,
     name: str = "adaptation",
 ) -> str:
-    """Draw how a learned path was adapted around obstacles, and which components were moved.
+    """Draw a learned path, its adaptation around obstacles, and the displaced components.
 
     Args:
         nominal: the learned path.
@@ -336,7 +337,7 @@ def draw_components(
     displacement: ArrayLike | None,
     moved: ArrayLike | None,
 ) -> None:
-    """Draw the components; moved ones at their new place, with an arrow from the old one."""
+    """Draw the components; displaced components are drawn at the new position with an arrow from the old one."""
     centres, spreads = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
     shift = np.zeros_like(centres) if displacement is None else np.asarray(displacement, dtype=float)
     went = np.linalg.norm(shift, axis=1) > 0.0 if moved is None else np.asarray(moved, dtype=bool)

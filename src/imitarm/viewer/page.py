@@ -1,8 +1,8 @@
-"""A self-contained HTML page: what its templates are given, its 3-D players, and writing it to a file.
+"""A self-contained HTML page: the data of its templates, its 3-D players, and writing it to a file.
 
 The templates are in ``templates/``; Jinja escapes every text that they show. The page's content security policy forbids
 every request to the outside, so the browser enforces that the page needs no network. Each 3-D player is an iframe that
-is made when it scrolls into view; the code that all players share is stored once.
+is created when it scrolls into view; the code that all players share is stored once.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MM: Final = 1000.0  # [mm/m], and [ms/s]
 
 @dataclass(frozen=True)
 class Tile:
-    """A number in the header: ``value`` as text, ``unit``, and a ``label`` that says what it is."""
+    """A number in the header: ``value`` as text, ``unit``, and a ``label`` that names it."""
 
     value: str
     unit: str
@@ -40,9 +40,9 @@ class Header:
     Attributes:
         title: title of the page.
         verdict: the result in one line.
-        good: whether the result is a good one: green or red.
+        good: whether the result is good (green) or not (red).
         summary: one or two sentences; may be empty.
-        tiles: the numbers that matter most.
+        tiles: the most important numbers.
     """
 
     title: str
@@ -76,7 +76,7 @@ class Player:
 
     Attributes:
         title: title for screen readers.
-        own: the part of its page that no other player has, see :func:`shared_players`.
+        own: part of its page that is specific to this player, see :func:`shared_players`.
         keys: its legend.
     """
 
@@ -112,10 +112,10 @@ def render(
         header: the first part of the page.
         data: the page's numbers in SI units, ready for JSON; the reader can save them.
         data_name: file name under which they are saved.
-        provenance: what is needed to repeat the run, by name; values that are mappings become cards of their own.
-        words: what the technical words on the page mean.
+        provenance: facts needed to repeat the run, by name; values that are mappings become cards of their own.
+        words: explanations of the technical terms on the page.
         shared: beginning and end of every 3-D player, see :func:`shared_players`; None without players.
-        context: what else the template shows.
+        context: further data for the template.
 
     Raises:
         InputError: when jinja2 is not installed.
@@ -177,7 +177,7 @@ def anchor(kind: str, index: int, name: str) -> str:
 
 
 def shared_players(pages: Mapping[str, str]) -> tuple[tuple[str, str] | None, dict[str, str]]:
-    """Split 3-D pages into the beginning and end that they share and the middle that each has of its own.
+    """Split 3-D pages into a shared beginning and end and an individual middle.
 
     Most of each page is the player's code. Stored once, it makes a page with five players five times smaller.
 
@@ -198,7 +198,7 @@ def shared_players(pages: Mapping[str, str]) -> tuple[tuple[str, str] | None, di
 
 
 def _common_start(texts: list[str]) -> str:
-    """Return the longest text that all ``texts`` begin with (one text begins with all of itself)."""
+    """Return the longest common beginning of all ``texts``."""
     low, high = 0, min(map(len, texts))
     while low < high:
         middle = (low + high + 1) // 2
@@ -232,10 +232,10 @@ def draw_page(draw: Callable[[], str], path: str | Path) -> Path:
     """Write a page as one HTML file that needs no other file.
 
     The path is checked before anything is drawn. The page is written to a temporary file that is renamed at the end,
-    so an older page stays whole when writing fails.
+    so an older page stays intact when writing fails.
 
     Args:
-        draw: returns the page.
+        draw: function that returns the page.
         path: the file to write; its folder must exist.
 
     Returns:

@@ -1,6 +1,6 @@
 """Colours, each with one meaning in the 3-D view, the figures and the page.
 
-All are greys or from the Okabe-Ito palette, which colour-blind readers can tell apart. Line styles repeat the meaning,
+All are greys or from the Okabe-Ito palette, which colour-blind readers can distinguish. Line styles repeat the meaning,
 so every figure can be read without colour.
 """
 

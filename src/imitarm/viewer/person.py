@@ -52,7 +52,7 @@ class PersonMark:
     """A person to draw, frame by frame.
 
     Attributes:
-        name: unique in the 3-D scene.
+        name: name, unique in the 3-D scene.
         positions: positions of the joints :data:`imitarm.capture.skeleton.JOINTS` in the world frame, shape (n_frames,
             25, 3) [m]; NaN where lost.
         tracking: :class:`~imitarm.capture.skeleton.Tracking` of each joint, shape (n_frames, 25); inferred joints are
@@ -97,7 +97,7 @@ class PersonMark:
             skeletons: at least one skeleton, in the order of their times. After 0.25 s without a skeleton the person is
                 not drawn; after the last one the person stands still.
             times: times of the frames to draw, counted from the first skeleton, shape (n_frames,) [s].
-            sensor_to_base: transform of the correspondence; only its rotation is used.
+            sensor_to_base: pose of the sensor in the base frame; only its rotation is used.
             side: side of the arm that is followed.
             place: median position of the hips in the base frame: x and y [m].
             floor: height of the floor in the base frame [m].
@@ -126,7 +126,7 @@ class PersonMark:
 
 
 def _shift(joints: Array, place: tuple[float, float], floor: float) -> Array:
-    """Return the displacement (3,) [m] that puts joints (n, 25, 3) at a place on the floor."""
+    """Return the displacement (3,) [m] that puts joints (n, 25, 3) at a position on the floor."""
     usual = np.array([_median(joints[:, joint]) for joint in range(len(JOINTS))])
     feet = [usual[JOINT[f"{part}_{side}"], 2] for part in ("ankle", "foot") for side in ("left", "right")]
     low = np.nanmin(feet) - _SOLE if np.isfinite(feet).any() else np.nan
@@ -140,7 +140,7 @@ def _shift(joints: Array, place: tuple[float, float], floor: float) -> Array:
 
 
 def _median(points: Array) -> Array:
-    """Return the median of the points (n, 3) that are not NaN; NaN when all are."""
+    """Return the median of the points (n, 3) that are not NaN; NaN if all of them are."""
     known = points[np.isfinite(points).all(axis=1)]
     return np.median(known, axis=0) if len(known) else np.full(3, np.nan)
 
@@ -150,10 +150,10 @@ class _Piece:
     """A rigid piece of the figure and its pose in each frame.
 
     Attributes:
-        name: unique in the figure.
-        mesh: in the frame of the piece.
+        name: name, unique in the figure.
+        mesh: mesh in the frame of the piece.
         colour: ``"#rrggbb"``.
-        position: shape (n_frames, 3) [m]; NaN where unknown.
+        position: positions, shape (n_frames, 3) [m]; NaN where unknown.
         wxyz: shape (n_frames, 4).
         tracking: shape (n_frames,).
     """
@@ -201,7 +201,7 @@ def _rounded(values: Array) -> Array:
 
 
 def _pieces(person: PersonMark) -> Iterator[_Piece]:
-    """Give the bones, then the head and the trunk."""
+    """Yield the bones, then the head and the trunk."""
     p = {name: person.positions[:, JOINT[name]] for name in JOINTS}
     t = {name: person.tracking[:, JOINT[name]] for name in JOINTS}
     for start, end, *radii in _BONES:
@@ -259,7 +259,7 @@ def _paler(colour: str, white: float) -> list[float]:
 
 
 def _colour(side: str, start: str, end: str) -> str:
-    """Return the colour of a bone: that of a demonstration for the followed arm, of skin for hands and neck."""
+    """Return the colour of a bone: the demonstration's colour for the followed arm, skin colour for hands and neck."""
     followed = {f"{part}_{side}" for part in _ARM}
     if start in followed and end in followed:
         return palette.DEMONSTRATION

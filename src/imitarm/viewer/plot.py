@@ -30,7 +30,7 @@ def plot(thing: Any) -> Any:
     """Return a matplotlib figure of one object.
 
     Args:
-        thing: what to draw:
+        thing: object to draw:
 
             * a :class:`~imitarm.Trajectory`: its path, and x, y and z over time;
             * a :class:`~imitarm.Demonstration` or a list of them: the paths, and x, y and z over the time since the
@@ -44,7 +44,7 @@ def plot(thing: Any) -> Any:
 
     Returns:
         A :class:`matplotlib.figure.Figure`. Save it with ``figure.savefig("picture.png")``, or open a window with
-        ``matplotlib.pyplot.show()``; a notebook shows it by itself.
+        ``matplotlib.pyplot.show()``; a notebook displays it automatically.
 
     Raises:
         InputError: when the object is of another type, or matplotlib is not installed.
@@ -244,7 +244,7 @@ def _draw_obstacle(axes: Any, grid: Grid, obstacle: Obstacle, depths: Array, col
 
 
 def _corners(scene: Scene) -> Array:
-    """Return the corners (2, 3) [m] of the part of the base frame that holds the scene."""
+    """Return the corners (2, 3) [m] of the box that contains the scene in the base frame."""
     points = [np.zeros((1, 3))]
     if scene.goal is not None:
         points.append(scene.goal.position[None])

@@ -76,7 +76,7 @@ class FrameRecorder:
 
         Args:
             data: the state of the simulation, with its kinematics up to date.
-            time: simulated time [s]; None takes ``data.time``.
+            time: simulated time [s]; None: ``data.time``.
         """
         now = float(data.time if time is None else time)
         if not self._frames or now >= self._frames[-1][0] + self._period - 1e-9:

@@ -1,6 +1,6 @@
-"""The report of a run as one HTML page: every scene with its 3-D playback and figures, and what was learned.
+"""The report of a run as one HTML page: every scene with 3-D playback and figures, and the learned skill.
 
-The page is drawn from ``templates/report.html``; :mod:`~imitarm.viewer.content` holds what it is given.
+The page is drawn from ``templates/report.html``; :mod:`~imitarm.viewer.content` defines its content.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ _KEYS: Final = (
     Key(palette.MOVED, "component, moved", blob=True),
 )
 _WORDS: Final = {
-    "Demonstration": "One recording of a person who shows the motion, here by guiding the tool of the arm by hand.",
+    "Demonstration": "One recording of a motion demonstrated by a person, here by guiding the arm's tool by hand.",
     "Learned path": "The mean of all demonstrations. The robot follows it when no obstacle is in the way.",
-    "Gaussian component": "One of the pieces that the learned motion is made of. It is drawn as an ellipse that "
+    "Gaussian component": "One of the parts of which the learned motion consists. It is drawn as an ellipse that "
     "contains 95 % of what was demonstrated there. Where the ellipse is small, all demonstrations agree, and the task "
     "needs precision.",
     "Adaptation (ACFRA)": "Only the components near an obstacle are moved. Everywhere else the robot does exactly what "
@@ -122,7 +122,7 @@ def report_html(report: Report) -> str:
 
 
 def _header(report: Report) -> Header:
-    """Return title, verdict and the four numbers that matter most."""
+    """Return title, verdict and the four most important numbers."""
     obstructed = [scene for scene in report.scenes if scene.scene.obstacles]
     clear = sum(scene.rollout is not None and not scene.contact for scene in obstructed)
     required = min((scene.required_clearance for scene in obstructed), default=math.nan)
@@ -150,7 +150,7 @@ def _header(report: Report) -> Header:
 
 
 def _cells(scene: SceneResult) -> Iterator[str]:
-    """Give the cells of a scene's row in the table of results, after name, obstacles and outcome."""
+    """Return the cells of a scene's row in the table of results that follow name, obstacles and outcome."""
     adaptation = scene.adaptation
     yield number(MM * scene.min_clearance)
     yield number(MM * scene.required_clearance, 0) if scene.scene.obstacles else "–"
@@ -166,7 +166,7 @@ def _cells(scene: SceneResult) -> Iterator[str]:
 
 
 def _sentences(*texts: str) -> str:
-    """Return texts as sentences, one after the other; empty ones are left out."""
+    """Join texts as sentences; empty texts are left out."""
     return " ".join(f"{text[0].upper()}{text[1:].rstrip('.')}." for text in texts if text)
 
 
@@ -190,7 +190,7 @@ def _playback(scene: SceneResult) -> str:
 
 
 def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:
-    """Give the figures of a scene; ``key`` makes their names unique in the page."""
+    """Yield the figures of a scene; ``key`` makes their names unique in the page."""
     adaptation, rollout = scene.adaptation, scene.rollout
     if adaptation is not None:
         svg = maps.adaptation(
@@ -271,7 +271,7 @@ def _tool(scene: SceneResult) -> str:
 
 
 def _learning_figures(learning: LearningSummary) -> Iterator[Figure]:
-    """Give the figures of what was demonstrated and of how the number of components was chosen."""
+    """Yield the figures of the demonstrations and of the choice of the number of components."""
     yield Figure(
         maps.demonstrations(learning.demonstrations, learning.means, learning.covariances, learning.predicted),
         f"{len(learning.demonstrations)} demonstrations, {learning.n_components} components",

@@ -29,7 +29,7 @@ def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> 
 
     Args:
         runs: titles and runs.
-        name: unique in the page.
+        name: name, unique in the page.
 
     Returns:
         An SVG element.
@@ -75,7 +75,7 @@ def tool(run: Retargeting, path: Array, *, name: str = "tool") -> str:
     Args:
         run: the retargeted motion.
         path: path of the tool, shape (n, 3) [m].
-        name: unique in the page.
+        name: name, unique in the page.
 
     Returns:
         An SVG element.
@@ -157,12 +157,12 @@ def _percentages(run: Retargeting, times: Array, percentages: Array, what: str, 
 
 
 def elbow(run: Retargeting, points: Array, *, name: str = "elbow") -> str:
-    """Draw the directions of the upper arms of person and robot: how far upwards and how far to the left.
+    """Draw the directions of the upper arms of person and robot: the angles upwards and to the left.
 
     Args:
         run: the retargeted motion.
         points: the robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
-        name: unique in the page.
+        name: name, unique in the page.
 
     Returns:
         An SVG element; an empty string when the person's elbow was never known.

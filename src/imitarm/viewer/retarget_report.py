@@ -48,8 +48,8 @@ _WORDS: Final = {
     "target stands still. Stopped: it has been lost for longer; following resumes after the arm has been seen for "
     "0.5 s.",
     "Frames beyond a limit": "Control periods in which a joint exceeds a limit, computed from the joint positions "
-    "alone: what the drives of a real arm would have to do.",
-    "Smallest singular value": "How well the arm can move its tool in the worst direction. Near 0 the arm is almost "
+    "alone: the drives of a real arm would have to execute them.",
+    "Smallest singular value": "How well the arm can move its tool in its worst direction. Near 0 the arm is almost "
     "stretched or folded, and small motions of the tool need fast joints.",
     "Torque": "The torque that the motion needs by the inverse dynamics of the arm, without friction. The part due to "
     "weight holds the arm against gravity.",
@@ -62,7 +62,7 @@ class Measure:
 
     Attributes:
         label: label as shown to the reader.
-        value: in ``unit``; NaN when unknown.
+        value: value in ``unit``; NaN when unknown.
         unit: unit as shown to the reader.
         digits: number of decimals.
         better: whether ``"less"`` or ``"more"`` is better; ``""``: neither.
@@ -92,12 +92,12 @@ class MethodResult:
     """The result of one method on a recording.
 
     Attributes:
-        name: short and unique in the report.
-        title: the title of the tab.
+        name: short name, unique in the report.
+        title: title of the tab.
         run: the retargeted motion.
         measures: measures of the run; every method has the same measures in the same order.
         tables: further tables for the tab of this method.
-        notes: sentences that the reader should know about this run.
+        notes: remarks about this run for the reader, one sentence each.
         caption: one sentence that describes the method.
         clock: time of the person's motion for each sample of the run, counted from the first skeleton, shape (n,)
             [s]; None: the times of the run.
@@ -121,14 +121,14 @@ class RetargetReport:
         title: title of the page.
         methods: at least one method; the header is about the first one.
         skeletons: skeletons of the person, as the methods received them.
-        correspondence: which motion of the person corresponds to which motion of the robot.
+        correspondence: mapping from the person's motion to the robot's motion.
         verdict: the result in one line.
-        good: whether the result is a good one.
-        tiles: the measures that matter most.
+        good: whether the result is good.
+        tiles: the most important measures.
         scene: obstacles around the robot.
         summary: one or two sentences that introduce the page.
-        findings: what was wrong with the recording and how it was processed, one sentence each.
-        provenance: what is needed to repeat the run, by name.
+        findings: faults and processing steps of the recording, one sentence each.
+        provenance: facts needed to repeat the run, by name.
 
     Raises:
         InputError: when there is no method or no skeleton, a name is used twice, or the methods have different
@@ -162,7 +162,7 @@ def write_retarget_report(report: RetargetReport, path: str | Path) -> Path:
     """Write a report to one HTML file with :func:`~imitarm.viewer.page.draw_page` and return its absolute path.
 
     Args:
-        report: what the page shows.
+        report: content of the page.
         path: the file to write; its folder must exist.
 
     Raises:
@@ -176,7 +176,7 @@ def retarget_report_html(report: RetargetReport) -> str:
     """Return the whole page.
 
     Args:
-        report: what the page shows.
+        report: content of the page.
 
     Raises:
         InputError: when the drawing libraries are not installed.
@@ -218,8 +218,8 @@ def playback(report: RetargetReport, method: MethodResult, *, dark: bool = False
     """Return the 3-D page in which the person and the robot move side by side on one clock.
 
     Args:
-        report: with the person and the scene.
-        method: with the motion of the robot.
+        report: report with the person and the scene.
+        method: result with the motion of the robot.
         dark: dark controls and background.
     """
     run = method.run
@@ -249,7 +249,7 @@ def retargeting_frames(run: Retargeting, scene: Scene | None = None, *, rate: fl
 
     Args:
         run: the retargeted motion.
-        scene: obstacles to draw, where they are at the start.
+        scene: obstacles to draw, at their poses at the start.
         rate: frames per second [1/s].
     """
     spec = arm_world(run.arm, floor=_FLOOR)
@@ -288,7 +288,7 @@ def _row(measures: tuple[Measure, ...]) -> dict[str, Any]:
 
 
 def _figures(run: Retargeting, key: str) -> Iterator[Figure]:
-    """Give the figures of a run; ``key`` makes their names unique in the page."""
+    """Yield the figures of a run; ``key`` makes their names unique in the page."""
     path = run.arm.tool_path(run.joints)[0]
     yield Figure(
         retarget_charts.tool(run, path, name=f"{key}-tool"),

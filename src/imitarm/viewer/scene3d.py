@@ -187,7 +187,7 @@ def _free_port() -> int:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence rich, with which viser prints the address of its server; nobody should open it."""
+    """Silence rich, which viser uses to print the address of its server; nobody should open that address."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:

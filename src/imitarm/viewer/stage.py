@@ -1,4 +1,4 @@
-"""What every 3-D drawing needs: a model's meshes and floor, a camera, colours under viser's lights, moving nodes."""
+"""Common parts of 3-D drawings: a model's meshes and floor, a camera, colours under viser's lights, moving nodes."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Camera:
         """Return the nearest camera in ``direction`` from which all ``points`` (n, 3) [m] are visible.
 
         Args:
-            points: that must be visible, in the world frame.
-            direction: from the center of the points towards the camera.
+            points: points in the world frame that must be visible.
+            direction: direction from the center of the points towards the camera.
             aspect: width of the picture divided by its height.
         """
         p = np.asarray(points, dtype=float)
@@ -92,7 +92,7 @@ def _vertices(recording: Recording, frame: int, bodies: Iterable[int], parts: Ma
 
 
 def points_to_see(recording: Recording, parts: Mapping[int, list[Part]], paths: Iterable[Array]) -> Array:
-    """Return points (n, 3) [m] for the camera: moving bodies, what carries them, the paths and what is near them."""
+    """Return points (n, 3) [m] for the camera: moving bodies, their parents, the paths and nearby bodies."""
     model, still = recording.model, recording.positions[:1]
     turned = np.any(np.abs(recording.quaternions - recording.quaternions[:1]) > 1e-3, axis=(0, 2))
     moves = np.any(np.abs(recording.positions - still) > 1e-3, axis=(0, 2)) | turned
@@ -147,7 +147,7 @@ def node_name(kind: str, *names: object) -> str:
 
 
 def lit(rgba: Sequence[float], *, linear: bool = False) -> tuple[float, float, float]:
-    """Return the colour that looks like ``rgba`` under viser's lights, which are brighter than MuJoCo's.
+    """Return the colour that appears like ``rgba`` under viser's lights, which are brighter than MuJoCo's.
 
     Batches take colours in ``linear`` light, meshes in sRGB.
     """

@@ -211,7 +211,7 @@ class DemonstrationModification(BaselineRetargeter):
         }
 
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
-        """Complete the shown times. The last steps correspond to ``shown``; in the steps before them the robot waits."""
+        """Complete the shown times: the last steps correspond to ``shown``; before them, the robot waits."""
         rest = len(steps) - len(self._shown_times) - len(shown)
         begin = float(self._shown_times[-1]) if len(self._shown_times) else -self.dt
         waited = begin + self.dt * np.arange(1, rest + 1)
