@@ -277,6 +277,7 @@ def success_table(results: Results) -> Table:
     note = (
         "The interval of the rate is Wilson's with an effective number of trials, which decreases as the "
         "differences between persons increase; one more failure never raises its lower end. "
-        f"Time, path and torque are means over persons (95 % interval) of the trials that succeeded. {persons_note(results)}"
+        "Time, path and torque are means over persons (95 % interval) of the trials that succeeded. "
+        f"{persons_note(results)}"
     )
     return Table("Four cubes stacked, closed loop", columns, tuple(rows), note)

@@ -124,7 +124,7 @@ def _add_geom(
 
 
 def _shape(obstacle: Obstacle) -> tuple[mujoco.mjtGeom, list[float], Array | None]:
-    """Return the type of an obstacle's geom, its size, and the vertices of its mesh in the own frame."""
+    """Return the type of an obstacle's geom, its size, and the vertices of its mesh in the local frame."""
     types, solid = mujoco.mjtGeom, obstacle.solid()
     a, b, c = (float(length) for length in solid.size)
     primitives = {

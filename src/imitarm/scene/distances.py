@@ -32,10 +32,10 @@ class Solid(NamedTuple):
 
     Attributes:
         kind: one of :data:`KINDS`.
-        position: origin of the obstacle's own frame in the base frame, shape (3,) [m].
+        position: origin of the obstacle's local frame in the base frame, shape (3,) [m].
         quaternion: own_to_base rotation wxyz, shape (4,).
         size: see ``PackedObstacles.sizes``, shape (3,) [m].
-        polytope: faces and edges of a convex hull in its own frame; None for other kinds.
+        polytope: faces and edges of a convex hull in its local frame; None for other kinds.
     """
 
     kind: str
@@ -54,13 +54,13 @@ class _Members(NamedTuple):
 
 
 class _Frames(NamedTuple):
-    """The own frames of the obstacles, grouped by family, in the order of ``PackedObstacles._sorted``."""
+    """The local frames of the obstacles, grouped by family, in the order of ``PackedObstacles._sorted``."""
 
-    to_own: Array  # rotation of base vectors into each own frame, shape (n, 3, 3)
+    to_own: Array  # rotation of base vectors into each local frame, shape (n, 3, 3)
     rows: Array  # the same, axis first, for one product with many points, shape (3 n, 3)
     center: Array  # of each obstacle, in its own rotation, shape (3, n, 1) [m]
     velocity: Array  # of each obstacle, in its own rotation, shape (3, n, 1) [m/s]
-    upright: bool  # whether no own frame is rotated
+    upright: bool  # whether no local frame is rotated
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +69,12 @@ class PackedObstacles:
 
     Attributes:
         kinds: index of each shape in :data:`KINDS`, shape (n,).
-        positions: origin of the own frame in the base frame, shape (n, 3) [m].
+        positions: origin of the local frame in the base frame, shape (n, 3) [m].
         quaternions: own_to_base rotations wxyz, shape (n, 4).
         sizes: shape (n, 3) [m]. Sphere: radius; box: full edge lengths; capsule and cylinder: radius, length of the
             axis; cone: radius, height; ellipsoid: semi-axes; convex hull: half extents; half-space: nothing.
             Unused entries are 0.
-        velocities: velocities of the own frame's origin, shape (n, 3) [m/s].
+        velocities: velocities of the local frame's origin, shape (n, 3) [m/s].
         angular_velocities: about that origin, in the base frame, shape (n, 3) [rad/s].
         covariances: covariances of the positions, shape (n, 3, 3) [m^2]; 0 when unknown.
         stamps: when each obstacle was seen, shape (n,) [s].

@@ -1,4 +1,4 @@
-"""The distance formula of each family of shapes, in the obstacle's own frame, for any number of obstacles and points.
+"""The distance formula of each family of shapes, in the obstacle's local frame, for any number of obstacles and points.
 
 A formula takes points ``q`` (3, ...), a flag for normals, and the parameters of its shapes, which broadcast against
 ``q``. It returns signed distances (...) [m] and outward unit normals (3, ...), or None.
@@ -39,7 +39,7 @@ def rounds(q: Array, gradient: bool, radius: Array, half: Array | None) -> tuple
     """Spheres and capsules: the distance to the nearest point of a segment along z, less the radius.
 
     Args:
-        q: points in the own frames, shape (3, ...) [m].
+        q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
         radius: shape (...) [m].
         half: half of the segment's length, shape (...) [m], 0 for a sphere; None when all are spheres.
@@ -72,7 +72,7 @@ def slabs(
     a sphere is computed as a rounded point and a capsule as a rounded segment.
 
     Args:
-        q: points in the own frames, shape (3, ...) [m].
+        q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
         half: shape (3, ...) [m].
         rounding: shape (...) [m]; None for 0.
@@ -134,7 +134,7 @@ def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor:
     error in ``n`` enters squared and never makes the distance too large.
 
     Args:
-        q: points in the own frames, shape (3, ...) [m].
+        q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
         semi_axes: shape (3, ...) [m].
         beyond: ``g_j^2 - min g^2``, shape (3, ...) [m^2].
@@ -178,7 +178,7 @@ def cones(
     one of the signed distances to their lines.
 
     Args:
-        q: points in the own frames, shape (3, ...) [m].
+        q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
         radius: radius of the base, shape (...) [m].
         height: shape (...) [m].
@@ -243,7 +243,7 @@ FAMILIES = (
 
 @dataclass(frozen=True)
 class Polytope:
-    """Faces and edges of a hull in its own frame, so that they stay valid when the hull moves.
+    """Faces and edges of a hull in its local frame, so that they stay valid when the hull moves.
 
     With the planes ``n_i.x = b_i`` of its faces, inside ``sd = max_i (n_i.x - b_i)``. Outside, that maximum is a lower
     bound. It is the distance when its foot ``x - sd n_i`` is on the face; otherwise the nearest point is on an edge or
@@ -277,7 +277,7 @@ class Polytope:
 
     @cached_property
     def radius(self) -> float:
-        """Largest distance of a corner from the origin of the own frame [m]."""
+        """Largest distance of a corner from the origin of the local frame [m]."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
     @classmethod
@@ -318,7 +318,7 @@ class Polytope:
         return distance.reshape(q.shape[1:]), rows.T.reshape(q.shape) if gradient else None
 
     def distance_and_normal(self, q: Array) -> tuple[Array, Array]:
-        """Return signed distances (n,) and unit gradients (n, 3) at ``q`` (n, 3), both in the own frame."""
+        """Return signed distances (n,) and unit gradients (n, 3) at ``q`` (n, 3), both in the local frame."""
         if len(q) > _BLOCK:
             parts = [self.distance_and_normal(q[i : i + _BLOCK]) for i in range(0, len(q), _BLOCK)]
             return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])

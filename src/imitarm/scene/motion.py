@@ -24,7 +24,7 @@ from imitarm.validation import finite_array, finite_number
 Array = NDArray[np.float64]
 Motion = Callable[[float], "Pose | ArrayLike"]
 """A function of time [s] that returns the pose of an obstacle, or its position (3,) [m] when it does not rotate. Both
-are those of the obstacle's own frame (:class:`~imitarm.scene.distances.PackedObstacles`): the centre of a shape, the
+are those of the obstacle's local frame (:class:`~imitarm.scene.distances.PackedObstacles`): the centre of a shape, the
 mean of a hull's points."""
 
 _STEP = 1e-4  # [s] half of the interval over which velocities are differences
@@ -99,7 +99,7 @@ class MovingScene:
         self.at(self.scene.stamp)
 
     def poses(self, time: float) -> tuple[Array, Array]:
-        """Return the poses of all obstacles' own frames.
+        """Return the poses of all obstacles' local frames.
 
         Args:
             time: time on the clock of ``scene.stamp`` [s].

@@ -68,7 +68,7 @@ class _Single(NamedTuple):
     """One obstacle, prepared for distance queries."""
 
     formula: Formula
-    to_own: Array | None  # rotation of base vectors into the own frame, shape (3, 3); None when there is none
+    to_own: Array | None  # rotation of base vectors into the local frame, shape (3, 3); None when there is none
     center: Array  # of the obstacle, in its own rotation, shape (3, 1) [m]
     parameters: list[Array | None]  # of the formula
 
@@ -274,7 +274,7 @@ class Obstacle(ABC):
         The arguments must be valid.
 
         Args:
-            position: position of the own frame's origin, see :class:`~imitarm.scene.distances.PackedObstacles`, shape
+            position: position of the local frame's origin, see :class:`~imitarm.scene.distances.PackedObstacles`, shape
                 (3,) [m].
             quaternion: own_to_base rotation wxyz, shape (4,).
             velocity: shape (3,) [m/s].

@@ -95,7 +95,7 @@ class Scene:
         return self if time == self.stamp or self.packed.still else self.at(time)
 
     def poses(self, time: float) -> tuple[Array, Array]:
-        """Return the poses of the obstacles' own frames at ``time`` [s]: positions (n, 3) [m], quaternions (n, 4)."""
+        """Return the poses of the obstacles' local frames at ``time`` [s]: positions (n, 3) [m], quaternions (n, 4)."""
         packed = self.packed.after(time - self.stamp)
         return packed.positions, packed.quaternions
 
@@ -213,7 +213,7 @@ class Scene:
         return f"{obstacle.kind} {alike}"
 
     def check(self, tool_radius: float = 0.0) -> None:
-        """Refuse a goal that can't be reached without contact.
+        """Reject a goal that can't be reached without contact.
 
         Args:
             tool_radius: radius of the sphere around the tool's tip that must stay free [m]; at least 0.

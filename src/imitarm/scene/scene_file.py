@@ -184,7 +184,7 @@ def _obstacles(content: Mapping[Any, Any], key: str, metres: float) -> tuple[Obs
 
 
 def _check_distances(goal: Pose | None, obstacles: Iterable[Obstacle], units: str) -> None:
-    """Refuse a scene that lies within the robot's base, because its numbers are probably metres, not ``units``."""
+    """Reject a scene that lies within the robot's base, because its numbers are probably metres, not ``units``."""
     corners = [obstacle.bounds() for obstacle in obstacles] + ([] if goal is None else [goal.position])
     farthest = max((float(np.abs(corner).max()) for corner in corners), default=np.inf)
     if farthest < _NEAREST:
@@ -235,7 +235,7 @@ def _obstacle(entry: object, where: str, metres: float) -> Obstacle:
 
 
 def _check_size(key: str, value: Any, where: str) -> None:
-    """Refuse an obstacle of less than 1 mm, because its numbers are probably in another unit."""
+    """Reject an obstacle of less than 1 mm, because its numbers are probably in another unit."""
     numbers = np.asarray(value)
     sizes = np.ptp(numbers, axis=0) if key == "points" else np.atleast_1d(numbers)
     smallest = float(sizes.min()) * (2.0 if key in ("radius", "semi_axes") else 1.0)

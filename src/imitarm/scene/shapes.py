@@ -182,7 +182,7 @@ class Cone(PosedObstacle):
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid(PosedObstacle):
-    """All points with ``sum_j (y_j / g_j)^2 <= 1`` in its own frame; ``g`` are the semi-axes.
+    """All points with ``sum_j (y_j / g_j)^2 <= 1`` in its local frame; ``g`` are the semi-axes.
 
     Attributes:
         pose: obstacle_to_base, at the centre; the semi-axes are along its x, y and z.

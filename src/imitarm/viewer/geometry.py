@@ -139,7 +139,7 @@ def _sharpened(mesh: Mesh) -> Mesh:
 
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
-    """Return the triangles of a geom in its own frame; None for floors (large planes) and height fields.
+    """Return the triangles of a geom in its local frame; None for floors (large planes) and height fields.
 
     Args:
         model: any compiled MuJoCo model.
