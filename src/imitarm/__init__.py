@@ -1,6 +1,6 @@
 """Teach industrial robot arms by showing.
 
-The public names are listed in ``__init__.pyi`` and imported when first used, so that ``import imitarm`` stays quick.
+The public names are listed in ``__init__.pyi`` and imported when first used, so that ``import imitarm`` stays fast.
 """
 
 import lazy_loader

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class Status(Enum):
-    """State of a reproduction, as its policy sees it."""
+    """State of a reproduction from the view of its policy."""
 
     NOMINAL = "nominal"
     """The motion follows the learned path."""
@@ -25,7 +25,7 @@ class Status(Enum):
     WAITING = "waiting"
     """The motion is paused until something changes, for example until an obstacle moves away."""
     BRAKING = "braking"
-    """The motion is being stopped: its plan no longer holds."""
+    """The motion is being stopped because its plan is no longer valid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +36,12 @@ class Command:
         twist: twist of the tool in the base frame, linear velocity first, shape (6,) [m/s, rad/s].
         joint_velocity: velocity of the joints, shape (n_joints,) [rad/s]; it replaces the twist where it is given, for
             example along a planned joint path. None: the inverse kinematics chooses it.
-        posture: joint positions to drift towards, as far as the twist leaves freedom, shape (n_joints,) [rad]; None:
-            any.
-        elbow: SEW angle to rotate the elbow to, as far as the twist leaves freedom [rad]; None: any.
-        progress: fraction of the motion that is done, 0 to 1; nan: unknown.
+        posture: joint positions to drift towards in the freedom that the twist leaves, shape (n_joints,) [rad];
+            None: no preference.
+        elbow: SEW angle to which the elbow rotates in the freedom that the twist leaves [rad]; None: no preference.
+        progress: finished fraction of the motion, 0 to 1; nan if unknown.
         status: state of the reproduction.
-        reason: why the motion is not nominal, naming the obstacle; empty when nominal.
+        reason: reason why the motion is not nominal, with the name of the obstacle; empty when nominal.
     """
 
     twist: Array

@@ -1,14 +1,14 @@
-"""The errors that imitarm raises: one root, so that one ``except`` catches them all.
+"""The errors that imitarm raises; one base class, so that one ``except`` catches them all.
 
-Every message answers the reader's next question: what is wrong, where, and what to do about it.
-They are raised when something is built or read, not inside a control loop.
+Every message says what is wrong, where, and what to do about it.
+Errors are raised at construction or reading, not inside a control loop.
 """
 
 from __future__ import annotations
 
 
 class ImitarmError(Exception):
-    """Root of all errors raised on purpose by imitarm.
+    """Base class of all errors that imitarm raises deliberately.
 
     The command line shows only the message and exits with ``exit_status``:
     2 for bad input, 1 for a task that was understood but could not be done.
@@ -22,7 +22,7 @@ class InputError(ImitarmError, ValueError):
 
 
 class FileFormatError(InputError):
-    """A file that is damaged or has another format than expected; the message names the file and the place in it."""
+    """A file that is damaged or has another format than expected; the message names the file and the location in it."""
 
 
 class UnknownNameError(InputError):
@@ -33,9 +33,9 @@ class UnknownNameError(InputError):
         """Build the message ``unknown <kind> '<name>'; known: a, b, c``.
 
         Args:
-            kind: what was being named, for example ``"robot"``.
-            name: the name that was given.
-            known: an iterable of the names that exist.
+            kind: kind of the named object, for example ``"robot"``.
+            name: unknown name.
+            known: existing names.
         """
         names = ", ".join(sorted(str(k) for k in known))  # type: ignore[attr-defined]
         return cls(f"unknown {kind} {name!r}; known: {names}")

@@ -1,4 +1,4 @@
-"""A small table as HTML, for ``_repr_html_``: what a notebook shows of an object."""
+"""A small HTML table for ``_repr_html_``, which a notebook displays for an object."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ def html_table(title: str, rows: Mapping[str, object]) -> str:
     """Return an HTML table with one row for each name and value; all texts are escaped.
 
     Args:
-        title: above the table, for example the name of the class.
+        title: title above the table, for example the name of the class.
         rows: values by name, shown with ``str``. A row whose value is None or an empty text is left out.
     """
     cells = "".join(

@@ -1,4 +1,4 @@
-"""Registry: the classes of one family, from this package and, by entry points, from other packages."""
+"""Registry: the classes of one family, from this package and from other packages (by entry points)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Item = TypeVar("Item")
 class Registry(Mapping[str, Item], Generic[Item]):
     """The members of one family by name; each is imported when it is first used.
 
-    Built-in members are given as ``"module:attribute"``. An installed package adds its own under the entry-point
-    group of the family, in its ``pyproject.toml``::
+    Built-in members are given as ``"module:attribute"``. An installed package adds its members to the entry-point group
+    of the family in its ``pyproject.toml``::
 
         [project.entry-points."imitarm.policies"]
         mine = "my_package.my_policy:MyPolicy"
 
     Args:
-        kind: what a member is, for messages, for example ``"policy"``.
+        kind: kind of the members, for messages, for example ``"policy"``.
         group: the entry-point group, for example ``"imitarm.policies"``.
         built_in: built-in members of this package, ``"module:attribute"`` by name, in the order in which they are
             listed.

@@ -27,12 +27,12 @@ _KEPT = 1e-6  # [m/s] a row that is missed by less is kept: what rounding leaves
 
 @dataclass(frozen=True, eq=False)
 class SafetyStep:
-    """The filter's answer to one command.
+    """The result of the filter for one command.
 
     Attributes:
-        velocity: velocity of the joints, to be sent, shape (n_joints,) [rad/s].
-        changed: norm of the difference between ``velocity`` and the velocity that the command would give within the
-            joint limits alone [rad/s]; 0 when no clearance row was active.
+        velocity: joint velocity to send, shape (n_joints,) [rad/s].
+        changed: norm of the difference between ``velocity`` and the velocity that the command would yield with only
+            the joint limits [rad/s]; 0 when no clearance row was active.
         slack: largest violation of a clearance row [m/s]; 0 when all rows are kept.
         safe: whether ``velocity`` keeps every limit and every row; if False, no joint velocity does.
     """
@@ -44,10 +44,10 @@ class SafetyStep:
 
 
 class SafetyFilter:
-    r"""Turns commands into joint velocities that keep the arm's limits and its clearances.
+    r"""Converts commands to joint velocities that keep the arm's limits and its clearances.
 
-    Each step solves one quadratic program (:class:`~imitarm.kinematics.ik.IKSolver`): as near to the command as
-    possible,
+    Each step solves one quadratic program (:class:`~imitarm.kinematics.ik.IKSolver`): it finds the joint velocity
+        closest to the command
 
     * inside the position, velocity and acceleration limits of the joints, always;
     * so that no part of the arm approaches an obstacle faster than
@@ -55,7 +55,7 @@ class SafetyFilter:
       :class:`~imitarm.kinematics.self_clearance.SelfClearance` allows.
 
     Where these rows contradict the joint limits, no safe motion exists: the velocity violates the rows as little as
-        possible, which moves the arm away from what is too near, and ``safe`` is False.
+        possible, which moves the arm away from objects that are too close, and ``safe`` is False.
 
     The same filter serves every policy and teleoperation.
 
@@ -63,14 +63,14 @@ class SafetyFilter:
         arm: the arm with its tool.
         dt: control period [s].
         clearance: required distance of every part of the arm to every obstacle [m]; None: obstacles are ignored.
-        allowance: distance kept in addition to the clearance, because no robot moves exactly as commanded [m].
+        allowance: margin added to the clearance, because no robot moves exactly as commanded [m].
         self_clearance: required distance between links that are not neighbours [m]; None: not checked.
         limits: limits of the inverse kinematics; None: position, velocity and acceleration of each joint.
         method: method of the inverse kinematics; only ``"qp"`` keeps clearances, so with another method both clearances
             must be None.
 
     Raises:
-        InputError: when a number can't be used, or the method can't keep what is required.
+        InputError: when a number can't be used, or the method can't keep a required clearance.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class SafetyFilter:
             q: joint positions, shape (n_joints,) [rad].
             velocity: joint velocity that was sent last, shape (n_joints,) [rad/s]; None: unknown, accelerations are
                 not limited.
-            scene: obstacles as predicted for now, with their velocities.
+            scene: obstacles predicted for the current time, with their velocities.
 
         Raises:
             InputError: when a shape is wrong or a number is not finite.

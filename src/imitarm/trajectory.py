@@ -1,4 +1,4 @@
-"""Motions: Trajectory (timed poses), Demonstration (a motion that was shown), Rollout (a motion that a robot did).
+"""Motions: Trajectory (timed poses), Demonstration (a demonstrated motion), Rollout (a motion executed by a robot).
 
 All three are frozen, and their arrays are read-only copies.
 """
@@ -55,7 +55,7 @@ class Trajectory:
     """Timed poses of the tool in the base frame.
 
     Attributes:
-        times: strictly increasing, shape (n,) [s].
+        times: strictly increasing times, shape (n,) [s].
         positions: shape (n, 3) [m].
         quaternions: unit quaternions w, x, y, z with continuous signs, shape (n, 4); None when the rotation is not
             known.
@@ -120,7 +120,7 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
     def at(self, times: ArrayLike) -> tuple[Array, Array | None]:
-        """Interpolate positions linearly and rotations along the shortest arc; outside the motion, hold its ends.
+        """Interpolate positions linearly and rotations along the shortest arc; outside the motion, return its ends.
 
         Args:
             times: query times [s], shape (m,), or one number.
@@ -162,13 +162,13 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Demonstration:
-    """A motion that was shown, and its origin.
+    """A demonstrated motion and its origin.
 
     Attributes:
         trajectory: timed poses of the tool in the base frame.
         joints: joint angles (n, n_joints) [rad] of the arm that was guided; None when they were not recorded.
-        task: what was shown, for example ``"sweep"``.
-        source: where it comes from, for example a file name, a range of rows or the name of a recorder.
+        task: name of the demonstrated task, for example ``"sweep"``.
+        source: origin of the motion, for example a file name, a range of rows or the name of a recorder.
         joint_names: one name for each column of ``joints``; ``joint_1``, ``joint_2``, ... when not given.
 
     Raises:
@@ -216,7 +216,7 @@ class Demonstration:
         return replace(self, trajectory=trajectory, joints=joints)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a CSV file that names its units and its frame. No digit is lost. An existing file is replaced.
+        """Write a CSV file that states its units and its frame. All digits are kept. An existing file is replaced.
 
         Columns: ``t`` [s], ``x y z`` [m], ``qw qx qy qz`` when the rotation is known, then the joints by name [rad].
 
@@ -256,7 +256,7 @@ class Demonstration:
 
         Raises:
             InputError: when the file can't be opened.
-            FileFormatError: when it is damaged or incomplete, or has another format or a newer version.
+            FileFormatError: when the file is damaged or incomplete, or has another format or a newer version.
         """
         path = file_path(path, "Demonstration.load: path")
         table = read_demonstration_table(path)
@@ -272,14 +272,14 @@ class Demonstration:
 
 
 def read_demonstration_table(path: str | os.PathLike[str]) -> Table:
-    """Read the file of a demonstration as a table. The header is checked, the numbers are not.
+    """Read the file of a demonstration as a table. The header is checked, but not the numbers.
 
     Args:
         path: path of the file.
 
     Raises:
         InputError: when the file can't be opened.
-        FileFormatError: when it is damaged or incomplete, or has another format or a newer version.
+        FileFormatError: when the file is damaged or incomplete, or has another format or a newer version.
     """
     path = file_path(path, "read_demonstration_table: path")
     table = read_table(path)
@@ -310,7 +310,7 @@ def read_demonstration_table(path: str | os.PathLike[str]) -> Table:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
-    """A motion that a robot did, as it was measured.
+    """A measured motion of a robot.
 
     Attributes:
         trajectory: measured poses of the tool in the base frame, n samples.
@@ -320,7 +320,7 @@ class Rollout:
         clearance: smallest distance between the arm (with its tool) and any obstacle (n,) [m]; negative when they
             overlap, inf when there was no obstacle.
         success: whether the motion was finished in time.
-        reason: why it ended.
+        reason: reason why the motion ended.
         details: further measurements of the robot or the task, by name.
 
     Raises:

@@ -2,7 +2,7 @@
 
 Each function returns the value in a form that is safe to compute with, or raises :class:`InputError`. The message names
 the argument, its unit, what was expected and what was given. NaN, infinities, text, booleans, complex numbers,
-``None`` and masked entries are never numbers. Arrays of float64 are returned as they are, without a copy.
+``None`` and masked entries are never numbers. Arrays of float64 are returned without a copy.
 
 :func:`finite_vector` takes less than a microsecond for an array of float64, so that it may be used in a control loop.
 """
@@ -34,7 +34,7 @@ def finite_vector(value: Any, n: int, what: str, unit: str = "") -> Array:
 
     Args:
         value: the argument to check.
-        n: how many numbers are needed.
+        n: required number of numbers.
         what: the name of the argument in messages, for example ``"q"``.
         unit: the unit of the numbers in messages, for example ``"rad"``.
 
@@ -131,7 +131,7 @@ def whole_number(value: Any, what: str, *, at_least: int | None = None, at_most:
     """Return ``value`` as a whole number within the given bounds.
 
     Args:
-        value: the argument to check; a float is refused even if it has no fraction.
+        value: the argument to check; a float is rejected even if it has no fractional part.
         what: the name of the argument in messages.
         at_least: inclusive lower bound.
         at_most: inclusive upper bound.
@@ -149,7 +149,7 @@ def flag(value: Any, what: str) -> bool:
     """Return ``value`` as True or False.
 
     Raises:
-        InputError: when the value is not a boolean; ``"no"`` and ``0`` are not.
+        InputError: when the value is not a boolean; ``"no"`` and ``0`` are not booleans.
     """
     if not isinstance(value, bool | np.bool_):
         raise InputError(f"{what} must be True or False, got {_shown(value)}")
@@ -194,7 +194,7 @@ def choice(value: Any, names: Iterable[str], what: str) -> str:
     """Return ``value`` when it is one of ``names``.
 
     Raises:
-        UnknownNameError: when it is not; the message lists the names.
+        UnknownNameError: when it is not one of them; the message lists the names.
     """
     known = tuple(names)
     if not isinstance(value, str) or value not in known:
@@ -204,7 +204,9 @@ def choice(value: Any, names: Iterable[str], what: str) -> str:
 
 
 def sequence(value: Any, kind: type[T], what: str) -> tuple[T, ...]:
-    """Return ``value`` as a tuple when it is a sequence of objects of the class ``kind``; a text is not a sequence.
+    """Return ``value`` as a tuple when it is a sequence of objects of the class ``kind``.
+
+    A text does not count as a sequence.
 
     Raises:
         InputError: when the value is not such a sequence.
@@ -215,10 +217,10 @@ def sequence(value: Any, kind: type[T], what: str) -> tuple[T, ...]:
 
 
 def function(value: Any, what: str) -> Callable[..., Any]:
-    """Return ``value`` when it can be called.
+    """Return ``value`` if it is callable.
 
     Raises:
-        InputError: when it can't.
+        InputError: when it is not callable.
     """
     if not callable(value):
         raise InputError(f"{what} must be a function, got {_shown(value)}")
@@ -239,7 +241,7 @@ def file_path(value: Any, what: str) -> Path:
 
 
 def _real(value: Any, what: str, unit: str, n: int | None = None) -> Array:
-    """Convert to float64; refuse values that numpy would convert silently: text, booleans, None, masked entries."""
+    """Convert to float64; reject values that numpy would convert silently: text, booleans, None, masked entries."""
     if np.ma.is_masked(value):
         raise InputError(f"{what} has masked entries; fill them in or remove them first")
     try:

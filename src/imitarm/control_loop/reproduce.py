@@ -26,15 +26,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One control step, as ``on_step`` gets it.
+    """One control step, the argument of ``on_step``.
 
     Attributes:
-        time: since the reproduction began [s].
+        time: time since the reproduction began [s].
         tool_to_base: measured pose of the tool after the step.
         state: measured state of the arm after the step.
         scene: the observed scene.
         command: the policy's command.
-        safety: the safety filter's answer to this command.
+        safety: result of the safety filter for this command.
         clearance: measured distance from arm and tool to the nearest obstacle [m].
     """
 
@@ -59,20 +59,21 @@ def reproduce(
 ) -> Rollout:
     """Let ``policy`` reproduce its skill on ``robot``, and record what happens.
 
-    Every ``dt``: the scene is observed, the policy answers with a :class:`~imitarm.command.Command`, the
-    :class:`~imitarm.safety.SafetyFilter` turns it into joint velocities within the arm's limits and clearances, and
+    Every ``dt``: the scene is observed, the policy returns a :class:`~imitarm.command.Command`, the
+    :class:`~imitarm.safety.SafetyFilter` converts it to joint velocities within the arm's limits and clearances, and
     the robot moves. The motion ends when the policy has finished, when the robot has stopped to protect itself, or at
     ``timeout``. The robot is always braked to a stop, also after an exception.
 
     Args:
-        policy: decides the motion; its ``reset`` is called first.
+        policy: policy that decides the motion; its ``reset`` is called first.
         robot: what moves.
-        observe: returns the scene that is known at a time since the start [s]. The scene may be older; its ``stamp``
+        observe: function that returns the scene known at a given time since the start [s]. The scene may be older;
+            its ``stamp``
             says when it was seen.
         dt: control period [s]; a simulated robot needs a multiple of its timestep.
         timeout: longest duration [s].
-        safety: the filter; None: one for this arm that keeps its limits, keeps links 10 mm apart and touches no
-            obstacle. Its ``dt`` must be this ``dt``.
+        safety: safety filter; None: a filter for this arm that keeps its limits, keeps links 10 mm apart and touches no
+            obstacle. The filter's ``dt`` must equal this ``dt``.
         on_step: called after each step, for progress or drawing; an exception in it stops the robot and is raised
             again.
 
@@ -84,7 +85,7 @@ def reproduce(
         what the robot has in its :meth:`~imitarm.robots.robot.Robot.report`.
 
     Raises:
-        InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not answer with a Command.
+        InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not return a Command.
         InfeasibleError: the arm starts in contact with an obstacle, or the policy refuses; the robot has not moved.
     """
     dt, timeout = finite_number(dt, "reproduce: dt", "s"), finite_number(timeout, "reproduce: timeout", "s")

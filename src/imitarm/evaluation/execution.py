@@ -58,7 +58,7 @@ class Execution:
         clearance: smallest distance of the arm to an obstacle [m]; inf without obstacles.
         touched: names of the obstacles that were touched.
         fault: reason of a protective stop; empty without one.
-        duration: time until the protective stop, or of the whole motion [s].
+        duration: time until the protective stop, or duration of the whole motion [s].
     """
 
     error_rms: float
@@ -81,7 +81,7 @@ def execute_on_robot(
     Args:
         run: run of a method.
         scene: obstacles, as solid bodies.
-        progress: called with the fraction that is done, 0 to 1.
+        progress: called with the finished fraction, 0 to 1.
     """
     robot = SimulatedRobot(run.arm, scene=scene, q=run.joints[0])
     dt, n = float(run.times[1] - run.times[0]), len(run.times)

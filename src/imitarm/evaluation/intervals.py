@@ -28,11 +28,11 @@ class Interval:
     """A mean over persons and its 95 % confidence interval.
 
     Attributes:
-        mean: over persons, each represented by the mean of their recordings.
-        low: lower end; nan with fewer than two persons.
+        mean: mean over persons, each represented by the mean of their recordings.
+        low: lower end of the interval; nan with fewer than two persons.
         high: upper end.
         persons: number of persons.
-        used: recordings with a value.
+        used: number of recordings with a value.
         of: all recordings.
     """
 
@@ -50,7 +50,7 @@ class Interval:
 
 
 Values = Mapping[tuple[int, Any], float]
-"""A measured value of each recording, by person and a second key; nan where it is missing."""
+"""The measured value of each recording, by person and a second key; nan where it is missing."""
 
 
 def person_means(values: Values) -> Array:
@@ -107,7 +107,7 @@ class Comparison:
     """One method against another on the same recordings.
 
     Attributes:
-        difference: first method minus second, over the recordings for which both have a value.
+        difference: mean of first method minus second, over the recordings for which both have a value.
         relative: ``difference`` relative to the absolute mean of the second method; nan where that mean is zero.
         p: probability of a difference at least as large if the methods were equal, by sign flips of the persons'
             differences.
@@ -136,18 +136,20 @@ def compare(ours: Values, theirs: Values) -> Comparison:
 
 
 def rate_interval(outcomes: Values) -> Interval:
-    r"""Return a success rate, the mean over persons of each one's own rate, with its 95 % interval.
+    r"""Return a success rate, the mean of the persons' rates, with its 95 % interval.
 
     It is Wilson's interval with :math:`N / D` trials instead of the N actual ones (Rao and Scott, Biometrics 1992):
-    trials of one person are similar, and the design effect :math:`D = 1 + (m - 1) \rho` says by which factor m trials
+    trials of one person are similar, and the design effect :math:`D = 1 + (m - 1) \rho` is the factor by which m trials
     of one person count less than trials of m persons. :math:`\rho` is their correlation, estimated from how much the
-    persons' rates differ beyond chance. A few persons estimate it poorly, so it is averaged with a prior correlation of
-    0.3 that counts as two persons; when all trials had the same result, or there is only one person, it is 0.3. N / D
+    persons' rates differ beyond chance. The estimate from a few persons is poor, so it is averaged with a prior
+    correlation of 0.3 that counts as two persons. If all trials had the same result, or there is only one person, the
+    correlation is 0.3. N / D
     lies between the number of persons and N.
 
-    Failures of one person indicate that persons differ, and one more failure of another person that they do not. So an
-    additional failure could narrow the interval. The lower end is therefore the lowest of all results that are at least
-    as good in every trial, and the upper end the highest of all that are at least as bad.
+    Failures of only one person indicate that persons differ; an additional failure of another person indicates that
+    they do not. Therefore, an additional failure could narrow the interval. To prevent this, the lower end is the
+    lowest of all results that are at least as good in every trial, and the upper end is the highest of all results that
+    are at least as bad.
 
     Args:
         outcomes: outcome of each trial, 1 for success, 0 for failure.
@@ -167,12 +169,12 @@ def rate_interval(outcomes: Values) -> Interval:
 def _lower_end(rates: Array, each: float, step: int) -> float:
     """Return the lowest lower end of all results in which every person has at least this rate.
 
-    Among those with the same mean, the end is lowest where persons differ most: where the best person becomes perfect
-    before another improves (that result majorises all others). So only these need to be examined.
+    Among results with the same mean, the end is lowest where the persons differ most: the best person becomes
+        perfect before another one improves (this result majorises all others). Only these results need to be examined.
 
     Args:
-        rates: rates of the persons, shape (n,).
-        each: trials per person, on average.
+        rates: success rate of each person, shape (n,).
+        each: average number of trials per person.
         step: rates are examined in steps of ``1 / step``.
     """
     own = np.sort(rates)[::-1]
@@ -187,8 +189,8 @@ def _design_effect(rates: Array, each: float) -> Array:
     """Return the design effect: the number of trials of one person that count as one independent trial, (k,).
 
     Args:
-        rates: of n persons, in k results, shape (k, n).
-        each: trials per person, on average.
+        rates: rates of n persons in k results, shape (k, n).
+        each: average number of trials per person.
     """
     n, mean = rates.shape[1], rates.mean(axis=1)
     within, alike = mean * (1.0 - mean), np.full(len(rates), _ALIKE)
@@ -206,7 +208,7 @@ def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tup
     Args:
         successes: number of successes, 0 to ``trials``; neither need be an integer.
         trials: number of trials, at least 1.
-        z: normal quantile of the confidence.
+        z: normal quantile of the confidence level.
     """
     p = min(max(successes / trials, 0.0), 1.0)
     centre = p + z * z / (2 * trials)
@@ -216,9 +218,10 @@ def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tup
 
 
 def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
-    """Return the two-sided probability of such a large mean if every difference could have either sign.
+    """Return the two-sided probability of a mean at least this large if every difference could have either sign.
 
-    Exact for up to 14 differences: all sign flips are evaluated. With n differences it can't be less than 2 / 2^n.
+    Exact for up to 14 differences: all sign flips are evaluated. With n differences, the probability can't be less
+        than 2 / 2^n.
 
     Args:
         differences: one per person, shape (n,).

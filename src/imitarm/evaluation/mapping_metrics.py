@@ -1,4 +1,4 @@
-"""MappingMetrics: the measures of a retargeting as plain values; pure functions of the run."""
+"""MappingMetrics: the measures of a retargeting, computed from the run alone, as plain values."""
 
 from __future__ import annotations
 
@@ -41,9 +41,10 @@ _REST = 0.5  # [s] at the end: the last target is averaged over it
 class MappingMetrics:
     """The measures of a retargeting. Unknown values are nan.
 
-    The reference of tool and elbow is the clutch's law with the *true* hand since the person began to lead; each
-    engagement starts anew. Errors are averaged over the frames in which the person led, so read them together with
-    ``engaged_fraction``; ``tool_rms_from_first`` includes everything.
+    The reference of tool and elbow is the clutch's law applied to the *true* hand since the person began to lead; each
+    engagement has a new reference. Errors are averaged over the frames in which the person led, so compare them
+    together with
+    ``engaged_fraction``; ``tool_rms_from_first`` includes all frames after the first engagement.
 
     Attributes:
         duration: duration of the robot's motion [s].
@@ -56,8 +57,7 @@ class MappingMetrics:
         tool_rms_from_first: distance to the reference of the first engagement over all frames after it, in any state,
             including the lag [m].
         executed_rms: distance of the tool to the reference, including the lag, when an arm that keeps its limits of
-            position, velocity and acceleration executes the commands [m]: commands beyond the limits bring no
-            advantage.
+            position, velocity and acceleration executes the commands [m]: commands beyond the limits give no advantage.
         executed_rms_without_lag: ``executed_rms`` after removing the best constant lag [m].
         target_rms: distance of the tool to the method's own target [m].
         orientation_rms: angle between the tool's rotation and the reference [rad].
@@ -65,14 +65,14 @@ class MappingMetrics:
             :func:`~imitarm.evaluation.tracking.elbow_direction_errors` [rad].
         elbow_angle_rms: difference between the changes of the robot's and the person's SEW angle [rad].
         path_length: path length of the tool [m].
-        settling_time: from the end of the true hand's motion until the tool stays within 1 cm of the method's last
+        settling_time: time from the end of the true hand's motion until the tool stays within 1 cm of the method's last
             target for 0.5 s [s]; nan when it never does.
         mean_torque: mean absolute torque of each joint [N m].
         rms_torque: root mean square torque of each joint [N m].
-        mean_gravity_torque: mean absolute torque that holds the weight alone [N m].
-        mean_motion_torque: mean absolute torque without the part that holds the weight [N m].
+        mean_gravity_torque: mean absolute torque for holding the weight [N m].
+        mean_motion_torque: mean absolute torque without the part for holding the weight [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
-        gravity_effort: ``effort`` of the torques that hold the weight alone [N^2 m^2 s].
+        gravity_effort: ``effort`` of the torques for holding the weight [N^2 m^2 s].
         peak_torque_ratio: largest torque relative to the rated one.
         position_violations: frames in which a joint is outside its range; all violations are computed by finite
             differences of the positions alone.
@@ -84,10 +84,10 @@ class MappingMetrics:
         jerk_rms: RMS jerk of the tool's position [m/s^3].
         joint_jerk_rms: RMS jerk of all joints together [rad/s^3].
         spectral_arc_length: spectral arc length of the tool's speed; 0 is smoothest.
-        least_singular: smallest singular value of the tool's Jacobian during the motion, 1 rad counted as 0.3 m
-            [m/rad].
-        teaching_time: time of a teacher that the method's corrections took [s]; 0 for methods without a teacher.
-        failures: faults that the method itself detected and could not fix; 0 for methods that detect none.
+        least_singular: smallest singular value of the tool's Jacobian during the motion, with 1 rad counted as 0.3
+            m [m/rad].
+        teaching_time: teacher's time that the method's corrections require [s]; 0 for methods without a teacher.
+        failures: number of faults that the method detected but could not fix; 0 for methods without detection.
     """
 
     duration: float

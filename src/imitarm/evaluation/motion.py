@@ -22,7 +22,7 @@ _ROUNDED = 1e-9  # [rad] tolerance of a position limit
 
 @dataclass(frozen=True, eq=False)
 class ArmMotion:
-    """A joint motion of an arm, with the quantities of each posture.
+    """A joint motion of an arm, with derived quantities for each sample.
 
     Attributes:
         dt: sampling period [s].
@@ -30,9 +30,9 @@ class ArmMotion:
         tool: positions of the tool in the base frame, shape (n, 3) [m].
         quaternions: rotations of the tool, wxyz, shape (n, 4).
         sew: shoulder, elbow and wrist, shape (n, 3, 3) [m]; nan for an arm without these landmarks.
-        torques: required for the motion, by inverse dynamics, shape (n, n_joints) [N m].
-        gravity: the part of them that holds the arm's weight, shape (n, n_joints) [N m].
-        least_singular: smallest singular value of the tool's Jacobian, 1 rad counted as 0.3 m, shape (n,) [m/rad].
+        torques: torques required for the motion, from inverse dynamics, shape (n, n_joints) [N m].
+        gravity: part of ``torques`` that holds the arm's weight, shape (n, n_joints) [N m].
+        least_singular: smallest singular value of the tool's Jacobian, with 1 rad counted as 0.3 m, shape (n,) [m/rad].
     """
 
     dt: float
@@ -52,8 +52,8 @@ class ArmMotion:
 
         Args:
             arm: whose motion.
-            times: evenly spaced, shape (n,) [s], at least 4.
-            joints: shape (n, n_joints) [rad].
+            times: at least 4 evenly spaced times, shape (n,) [s].
+            joints: joint positions, shape (n, n_joints) [rad].
 
         Raises:
             InputError: when there are fewer than 4 samples, they are not evenly spaced, or a position is not finite.
@@ -94,7 +94,7 @@ class Violations:
         position: frames in which a joint is outside its range.
         velocity: frames in which a joint moved too fast.
         acceleration: frames in which the velocity of a joint changed too fast.
-        position_excess: largest distance of a joint from its range [rad]; 0 when all are inside.
+        position_excess: largest distance of a joint from its range [rad]; 0 when all joints are inside.
         velocity_ratio: largest velocity relative to its limit.
         acceleration_ratio: largest acceleration relative to its limit.
     """
@@ -112,7 +112,7 @@ def violations(arm: ArmModel, joints: ArrayLike, dt: float) -> Violations:
 
     Args:
         arm: whose limits.
-        joints: shape (n, n_joints) [rad].
+        joints: joint positions, shape (n, n_joints) [rad].
         dt: sampling period [s].
     """
     q = np.asarray(joints, dtype=float)
@@ -148,7 +148,8 @@ def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
     .. math:: -\int_0^{\omega_c} \sqrt{\left(\tfrac{1}{\omega_c}\right)^2
               + \left(\tfrac{d\hat V}{d\omega}\right)^2}\, d\omega, \qquad \hat V = |V(\omega)| / |V(0)|
 
-    with :math:`\omega_c` the largest frequency up to 20 Hz at which :math:`\hat V` exceeds 0.05 (SPARC: Balasubramanian
+    where :math:`\omega_c` is the largest frequency up to 20 Hz at which :math:`\hat V` exceeds 0.05 (SPARC:
+    Balasubramanian
     et al., J. NeuroEng. Rehabil. 2015). The value depends on the number of movements in a recording, so compare only
     motions of the same recording.
 

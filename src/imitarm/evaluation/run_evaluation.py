@@ -1,4 +1,4 @@
-"""evaluate_run: evaluate one retargeting by measures, one summary line, and warnings, for the CLI and from Python."""
+"""evaluate_run: evaluate one retargeting; returns measures, a summary line and warnings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _FOLLOWS = 0.5  # of the hand's own motion (RMS); a tool with a larger error doe
 
 @dataclass(frozen=True)
 class TargetTracking:
-    """How well a tool tracked the target that its own method gave it.
+    """How well a tool tracked the target that its own method computed.
 
     It tracked the target if the person led for at least half of the time, the distance was at most :data:`FAR` (RMS),
     and the tool was farther away for at most :data:`FAR_FRACTION` of the time with a target. These limits are a choice:
@@ -39,10 +39,11 @@ class TargetTracking:
     Attributes:
         title: title of the method.
         rms: root mean square distance to the target [m]; nan when there was none.
-        far_fraction: fraction of the time with a target in which the tool was farther than :data:`FAR`, 0 to 1; or nan.
-        far_time: time in which the tool was farther than :data:`FAR` [s].
-        farthest: largest distance [m]; or nan.
-        engagements: how often the person began to lead.
+        far_fraction: fraction of the time with a target in which the tool was farther away than :data:`FAR`, 0 to
+            1; nan without a target.
+        far_time: time in which the tool was farther away than :data:`FAR` [s].
+        farthest: largest distance to the target [m]; nan without a target.
+        engagements: number of times that the person began to lead.
         engaged_fraction: fraction of the whole time in which the person led, 0 to 1.
         violations: frames in which a joint exceeded a limit.
     """
@@ -120,8 +121,10 @@ class RunEvaluation:
         tracking: how well the tool tracked its own target.
         target_lag: lag of the tool behind its own target [s]; nan when it does not follow.
         hand_lag: lag of the tool behind the hand [s]; nan when it does not follow.
-        link_distance: smallest distance between links that are not neighbours [m], between the spheres that cover them.
-        truth_known: whether measures compare with the true hand; otherwise with the hand as the camera saw it.
+        link_distance: smallest distance between links that are not neighbours [m], measured between the spheres
+            that cover them.
+        truth_known: whether the measures compare with the true hand; otherwise they compare with the hand measured
+            by the camera.
         warnings: remarks for the user about this run, one sentence each.
     """
 
@@ -147,7 +150,7 @@ def evaluate_run(
         run: run of a method.
         skeletons: skeletons of the person, the input of the method.
         correspondence: correspondence between person and robot, the input of the method.
-        truth: the true positions of the person over time; None: what the camera saw is used instead.
+        truth: true positions of the person over time; None: the camera's measurements are used instead.
 
     Raises:
         TaskFailedError: when the arm is never seen.
@@ -184,7 +187,7 @@ def warnings_of(
     Args:
         run: run of a method.
         metrics: metrics of the run.
-        tracking: tracking of the run.
+        tracking: tracking result of the run.
         link_distance: smallest distance between links that are not neighbours [m].
     """
     dt = float(run.times[1] - run.times[0])
@@ -212,7 +215,7 @@ def warnings_of(
     }
     beyond = [f"{what} in {count} frames" for what, count in exceeded.items() if count]
     if beyond:
-        lines.append(f"exceeds limits of {', '.join(beyond)}: a real arm can't do this")
+        lines.append(f"exceeds limits of {', '.join(beyond)}: a real arm can't execute this")
     if link_distance < 0.0:
         lines.append("links come so close that they may touch: choose another start (--fit) or scale")
     if run.closed.any():
@@ -231,7 +234,7 @@ def winding(run: Retargeting) -> float:
 
 
 def _waiting_again(states: NDArray[np.str_]) -> int:
-    """Return in how many frames the robot waited after it had once followed."""
+    """Return the number of frames in which the robot waited after it had followed."""
     followed = np.flatnonzero(states == "following")
     return int(np.sum(states[followed[0] :] == "waiting")) if len(followed) else 0
 

@@ -40,7 +40,7 @@ class TrueArm:
         shoulder: shape (n, 3) [m].
         elbow: shape (n, 3) [m].
         wrist: shape (n, 3) [m].
-        hand: rotation, quaternion wxyz, shape (n, 4).
+        hand: rotation of the hand, quaternions wxyz, shape (n, 4).
     """
 
     times: Array
@@ -56,8 +56,8 @@ class TrueArm:
         Args:
             truth: the person's skeleton over time; called in the order of the times.
             times: times of a run, shape (n,) [s].
-            correspondence: gives the side of the arm and the pose of the sensor.
-            start: the person's time at the run's time 0, which is that of its first skeleton [s].
+            correspondence: correspondence with the side of the arm and the pose of the sensor.
+            start: time of the person at the run's time 0, which is the time of the first skeleton [s].
         """
         t = np.asarray(times, dtype=float)
         return cls.from_points(
@@ -71,7 +71,7 @@ class TrueArm:
         Args:
             times: shape (n,) [s].
             points: shoulder, elbow, wrist, hand, hand tip, thumb, in the sensor's frame, shape (n, 6, 3) [m].
-            correspondence: the pose of the sensor.
+            correspondence: correspondence with the pose of the sensor.
         """
         t, points = np.asarray(times, dtype=float), correspondence.sensor_to_base.apply(points)
         hands, hand = np.empty((len(t), 3, 3)), np.eye(3)
@@ -87,15 +87,15 @@ class TrueArm:
 
 
 def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Correspondence) -> TrueArm:
-    """Return a person's arm as a recording shows it, with its noise, linearly interpolated between frames.
+    """Return a person's arm as recorded, with the noise, interpolated linearly between frames.
 
-    In a comparison with a recording, no method can be better than the camera, and a smooth method appears slightly
-    worse than it is.
+    In a comparison with a recording, the camera's noise limits the accuracy of every method, and a smooth method
+    appears slightly worse than it is.
 
     Args:
         skeletons: skeletons in order of time.
-        times: since the first skeleton, shape (n,) [s].
-        correspondence: gives the side of the arm and the pose of the sensor.
+        times: times since the first skeleton, shape (n,) [s].
+        correspondence: correspondence with the side of the arm and the pose of the sensor.
 
     Raises:
         TaskFailedError: when shoulder, elbow and wrist are never seen together.
@@ -125,8 +125,8 @@ class EngagementPeriods:
 
     Attributes:
         engaged: whether the person led, shape (n,).
-        start: for each frame the frame just before the person began to lead, shape (n,); undefined where nobody led.
-        count: how often the person began to lead.
+        start: for each frame, the last frame before the person began to lead, shape (n,); undefined where nobody led.
+        count: number of times that the person began to lead.
     """
 
     engaged: Mask
@@ -139,8 +139,8 @@ class EngagementPeriods:
 
         Args:
             states: values of :class:`~imitarm.retarget.engagement.EngagementState`.
-            first_only: treat everything after the first engagement as one engagement, as if the person had never been
-                lost.
+            first_only: whether to treat all frames after the first engagement as one engagement, as if the person
+                had never been lost.
         """
         engaged = engaged_samples(states)
         begins = np.flatnonzero(engaged & ~np.concatenate([[False], engaged[:-1]]))
@@ -161,13 +161,13 @@ def reference_positions(
 
     .. math:: p(t) = p_{home} + \rho\,(W(t - lag) - W(t_e))
 
-    with :math:`t_e` the time at which the person began to lead, and :math:`p_{home}` the position of the tool at that
-    time.
+    where :math:`t_e` is the time at which the person began to lead, and :math:`p_{home}` the position of the tool at
+    that time.
 
     Args:
         true: the person's arm, in the axes of the base.
         tool: positions of the tool, shape (n, 3) [m].
-        periods: when the person led.
+        periods: times at which the person led.
         scale: rho.
         lag: largest time by which the tool may be late [s].
 
@@ -183,7 +183,7 @@ def reference_rotations(true: TrueArm, quaternions: Array, periods: EngagementPe
     Args:
         true: the person's arm, in the axes of the base.
         quaternions: quaternions of the tool, wxyz, shape (n, 4).
-        periods: when the person led.
+        periods: times at which the person led.
         orientation: ``"hand"``, ``"upright"`` or ``"fixed"``, see
             :class:`~imitarm.retarget.correspondence.Correspondence`.
     """
@@ -211,7 +211,7 @@ def best_lag(true: TrueArm, tool: Array, periods: EngagementPeriods, scale: floa
     """Return the constant lag with which the tool follows best [s], and the remaining RMS error [m].
 
     Lags from -0.1 to 0.8 s are tried; the result is the minimum of the parabola through the best and its neighbours.
-    Both are nan when nobody ever led; the lag is also nan when the hand did not move.
+    Both are nan if nobody led; the lag is also nan if the hand did not move.
     """
     engaged = periods.engaged
     if not engaged.any():
@@ -233,12 +233,13 @@ def target_lag(times: ArrayLike, tool: ArrayLike, targets: ArrayLike) -> float:
     """Return the constant lag with which a tool follows its target best [s], from 0 to 0.8 s.
 
     Args:
-        times: evenly spaced, shape (n,) [s].
+        times: evenly spaced times, shape (n,) [s].
         tool: positions, shape (n, 3) [m].
-        targets: shape (n, 3) [m]; nan where there is no target.
+        targets: target positions, shape (n, 3) [m]; nan where there is no target.
 
     Returns:
-        nan when there is no target, it does not move, or the tool does not follow it: at every lag its error exceeds
+        The lag is nan when there is no target, it does not move, or the tool does not follow it: at every lag its
+            error exceeds
         half of the target's own motion about its mean (RMS).
     """
     t, p, aim = (np.asarray(values, dtype=float) for values in (times, tool, targets))
@@ -266,12 +267,12 @@ def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods
     """Return the angle between the actual and the correct direction of the robot's upper arm, shape (n,) [rad].
 
     The correct direction follows from the direction at the start of the engagement by the smallest rotation that maps
-    the person's upper arm at that time to its present direction.
+    the person's upper arm at that time to its current direction.
 
     Args:
         true: the person's arm, in the axes of the base.
-        sew: the robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
-        periods: when the person led.
+        sew: robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
+        periods: times at which the person led.
     """
     person, robot = _unit(true.elbow - true.shoulder), _unit(sew[:, 1] - sew[:, 0])
     wanted = _rotated(person[periods.start], person, robot[periods.start])
@@ -283,8 +284,8 @@ def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) ->
 
     Args:
         true: the person's arm, in the axes of the base.
-        sew: the robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
-        periods: when the person led.
+        sew: robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
+        periods: times at which the person led.
 
     Returns:
         shape (n,) [rad], 0 to pi; nan where one of the arms is so straight that its elbow angle is poorly defined.
@@ -297,7 +298,7 @@ def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) ->
 
 
 def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, rest: float = 0.5) -> float:
-    """Return when a point came within ``radius`` [m] of its mean position in the last ``rest`` seconds.
+    """Return the time at which a point came within ``radius`` [m] of its mean position in the last ``rest`` seconds.
 
     Args:
         times: shape (n,) [s].
@@ -314,18 +315,18 @@ def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, res
 def settling_time(
     times: ArrayLike, positions: ArrayLike, goal: ArrayLike, end: float, radius: float = 0.01, stay: float = 0.5
 ) -> float:
-    """Return how long after ``end`` a point comes within ``radius`` of the goal and stays there for ``stay`` seconds.
+    """Return the time from ``end`` until a point comes within ``radius`` of the goal and stays for ``stay`` seconds.
 
     Args:
-        times: evenly spaced, shape (n,) [s].
+        times: evenly spaced times, shape (n,) [s].
         positions: shape (n, 3) [m].
         goal: shape (3,) [m].
-        end: when the motion towards the goal was over [s].
+        end: time at which the motion towards the goal ended [s].
         radius: [m].
         stay: [s].
 
     Returns:
-        [s], at least 0; nan when it never does, or the recording ends before it has stayed.
+        The time [s], at least 0; nan if the point never comes that close, or the recording ends before it has stayed.
     """
     t = np.asarray(times, dtype=float)
     inside = np.linalg.norm(np.asarray(positions, dtype=float) - np.asarray(goal, dtype=float), axis=1) <= radius

@@ -17,10 +17,10 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
     Args:
         path: file to write; an existing file is replaced.
-        text: its content, written as UTF-8.
+        text: content of the file, written as UTF-8.
 
     Raises:
-        InputError: when the file can't be written; what was there before is unchanged.
+        InputError: when the file can't be written; an existing file is then unchanged.
     """
     target = Path(path)
     aside: Path | None = None
@@ -51,10 +51,10 @@ def as_document(content: Any, kind: type[Document], path: str | os.PathLike[str]
     """Return plain values (dictionaries, lists, numbers, texts) as an object of a ``msgspec.Struct``.
 
     Args:
-        content: what a JSON or YAML reader returned.
-        kind: the Struct that describes the fields and their types.
+        content: result of a JSON or YAML reader.
+        kind: Struct that describes the fields and their types.
         path: path of the file, for messages.
-        remedy: what to do about a wrong field, for messages.
+        remedy: remedy for a wrong field, for messages.
 
     Raises:
         FileFormatError: when a field is missing or of another type; the message names the field.

@@ -14,19 +14,19 @@ PART = ".part"
 
 
 class PartFile:
-    """A text file for recorders, named ``PATH.part`` until it is finished.
+    """A text file for recorders with the name ``PATH.part`` until it is finished.
 
-    Each text is handed to the operating system before :meth:`write` returns: a program that is killed leaves all of it
-    in ``PATH.part``. An older file ``PATH`` stays intact until the new one is complete.
+    Each text is handed to the operating system before :meth:`write` returns: if the program is killed, ``PATH.part``
+    contains all written text. An older file ``PATH`` stays intact until the new one is complete.
 
     Args:
-        path: the final name.
-        begin: the text that is written first.
+        path: final name.
+        begin: text that is written first.
         replace: whether an existing file may be replaced.
 
     Attributes:
-        path: the final name.
-        part: the name until the file is finished.
+        path: final name.
+        part: name until the file is finished.
 
     Raises:
         InputError: when the path is a folder, the file exists and may not be replaced, ``PATH.part`` exists (left by
@@ -59,7 +59,7 @@ class PartFile:
             InputError: when the file is finished, or the disk is full.
         """
         if self._file is None:
-            raise InputError(f"{self.path}: this recorder is closed; make another one")
+            raise InputError(f"{self.path}: this recorder is closed; create another one")
         try:
             self._file.write(text)
             self._file.flush()
@@ -72,13 +72,13 @@ class PartFile:
         A second call does nothing.
 
         Args:
-            take: called with ``part``; makes ``path`` from it, or nothing, and returns whether it renamed ``part``. If
-                it did not, ``part`` is removed. If it did, a file of that name belongs to another recorder by now and
-                is left alone.
-            begin: replaces the text that was written first; must have the same length.
+            take: function called with ``part``, which may create ``path`` from it, and returns whether it renamed
+                ``part``. If it did not rename the file, ``part`` is removed. If it did, a file of that name now belongs
+                to another recorder and is not touched.
+            begin: text of the same length that replaces the text that was written first.
 
         Raises:
-            InputError: when this fails; what was written stays in ``part``.
+            InputError: when this fails; the written text stays in ``part``.
         """
         if self._file is None:
             return

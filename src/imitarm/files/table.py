@@ -1,4 +1,4 @@
-"""Tables of numbers in text files: errors name the line, and a write never leaves half a file.
+"""Tables of numbers in text files. Errors name the line, and writing never leaves an incomplete file.
 
 A table is lines of numbers, separated by comma, semicolon, tab or spaces. A row of column names may come first.
 Lines that start with ``#`` or ``%`` are remarks. Remarks before the numbers are kept: they may hold ``key: value``
@@ -44,12 +44,12 @@ class Table:
     """The content of a text file.
 
     Attributes:
-        path: the file, as the caller named it.
+        path: path of the file as given by the caller.
         remarks: the ``key: value`` remarks before the numbers, keys in lower case.
-        names: the column names, None when the file has none. They stand in a row of their own, or else in the last
-            remark before the numbers that has one word for each column.
-        values: the numbers, shape (n, columns). They may include nan and inf, which the caller must check.
-        lines: the line in the file of each row, from 1, shape (n,).
+        names: column names; None when the file has no names. They are in a separate row, or else in the last remark
+            before the numbers that has one word for each column.
+        values: the numbers, shape (n, columns). The numbers may include nan and inf, for which the caller must check.
+        lines: line number of each row in the file, from 1, shape (n,).
         ends_in_newline: False when the last line may have been cut off.
         names_line: the line of ``names``, from 1; None when there are no names.
         remark_lines: line number and text of each remark before the numbers, without the ``#``.
@@ -66,7 +66,7 @@ class Table:
 
     @property
     def named_by_row(self) -> bool:
-        """Whether the column names stand in a row of their own, not in a remark."""
+        """Whether the column names are in a separate row, not in a remark."""
         return self.names is not None and self.names_line not in {number for number, _ in self.remark_lines}
 
 
@@ -120,7 +120,7 @@ def split_names(text: str) -> tuple[str, ...]:
 
 
 def _separator(line: str) -> str | None:
-    """Return the separator of fields in ``line``; None means blanks."""
+    """Return the separator of fields in ``line``; None means spaces."""
     return next((s for s in ";\t," if s in line), None)
 
 
@@ -214,17 +214,17 @@ def write_table(
 ) -> None:
     """Write a table that :func:`read_table` reads back to the last bit.
 
-    The table goes to a temporary file first, which is then renamed: an older file stays intact until the new one is
-    complete.
+    The table is written to a temporary file, which is then renamed: an existing file stays intact until the new one
+        is complete.
 
     Args:
-        path: where to; an existing file is replaced.
-        remarks: written first, one line ``# key: value`` for each; line breaks become blanks.
+        path: file to write; an existing file is replaced.
+        remarks: remarks to write first, one line ``# key: value`` for each; line breaks become spaces.
         names: the column names.
         values: the numbers, shape (n, len(names)).
 
     Raises:
-        InputError: when it can't be written.
+        InputError: when the file can't be written.
     """
     head = [f"# {key}: {' '.join(str(value).split())}" for key, value in remarks.items()]
     body = [",".join(map(repr, row)) for row in np.asarray(values, dtype=float).tolist()]

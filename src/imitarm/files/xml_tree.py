@@ -1,4 +1,4 @@
-"""XML as a tree whose elements know their line, so that a message can say where to look."""
+"""XML as a tree whose elements know their line, so that messages can name the line."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class XmlElement:
     """One element of an XML file.
 
     Attributes:
-        tag: as written, with its prefix, for example ``"joint"`` or ``"xacro:macro"``.
-        attributes: by name, in the order of the file.
-        line: where the element begins, counted from 1.
+        tag: tag as written, with its prefix, for example ``"joint"`` or ``"xacro:macro"``.
+        attributes: attributes by name, in the order of the file.
+        line: line in which the element begins, counted from 1.
         children: elements directly inside this one.
     """
 
@@ -52,10 +52,10 @@ def read_xml(path: Path, expected: str = "") -> XmlElement:
 
     Args:
         path: the file.
-        expected: what the file should have been, for the message, for example ``"an MJCF or URDF file"``.
+        expected: expected type of the file, for messages, for example ``"an MJCF or URDF file"``.
 
     Raises:
-        FileFormatError: when the file is not well-formed XML; the message says at which line.
+        FileFormatError: when the file is not well-formed XML; the message names the line.
     """
     parser = expat.ParserCreate()
     parser.SetParamEntityParsing(expat.XML_PARAM_ENTITY_PARSING_NEVER)

@@ -1,4 +1,4 @@
-"""How a camera sees obstacles: depth images, and the obstacles found in them."""
+"""Perception of obstacles with a camera: depth images and the obstacles found in them."""
 
 from __future__ import annotations
 

@@ -19,8 +19,9 @@ Array = NDArray[np.float64]
 class Intrinsics:
     """A pinhole camera without distortion.
 
-    The point ``(x, y, z)`` in the camera's frame is seen at column ``u = fx x/z + cx`` and row ``v = fy y/z + cy``. The
-    frame has its origin at the pinhole, x to the right of the picture, y down and z forward. The centre of the first
+    The point ``(x, y, z)`` in the camera's frame is projected to column ``u = fx x/z + cx`` and row ``v = fy y/z +
+    cy``. The
+    frame has its origin at the pinhole, x to the right of the image, y down and z forward. The centre of the first
     pixel is at ``u = v = 0``.
 
     Attributes:
@@ -62,14 +63,14 @@ class Intrinsics:
         return cls(width, height, focal, focal, 0.5 * (whole_number(width, "width") - 1), 0.5 * (height - 1))
 
     def project(self, points: ArrayLike) -> Array:
-        """Return the columns and rows at which points are seen.
+        """Return the columns and rows to which points are projected.
 
         Args:
-            points: in the camera's frame, shape (..., 3) [m].
+            points: points in the camera's frame, shape (..., 3) [m].
 
         Returns:
-            u and v, shape (..., 2) [pixel]; nan for points that are not in front of the camera. They may be outside of
-            the picture.
+            u and v, shape (..., 2) [pixel]; nan for points that are not in front of the camera. They may be outside the
+            image.
         """
         x, y, z = np.moveaxis(finite_array(points, (..., 3), "points", "m"), -1, 0)
         ahead = np.where(z > 0.0, z, np.nan)
@@ -86,7 +87,7 @@ class DepthFrame:
     """One depth picture.
 
     Attributes:
-        stamp: when it was taken [s].
+        stamp: time at which the image was taken [s].
         depth: distance of the surface from the camera's plane (its z, not the length of the ray), shape
             (height, width) [m]; nan where nothing was measured. 0 and infinity are replaced by nan.
         intrinsics: the camera.

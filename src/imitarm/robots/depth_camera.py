@@ -16,13 +16,13 @@ _SEEN = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # groups of geoms that hav
 class DepthCamera:
     """Takes depth images by casting one ray through each pixel.
 
-    They are exact, without noise, and the same on every machine.
+    The images are exact, without noise, and the same on every machine.
 
     Args:
-        robot: the camera sees the world of this robot, including the arm.
+        robot: robot whose world, including the arm, the camera sees.
         intrinsics: the camera.
-        pose: camera_to_base for a fixed camera; camera_to_tool for a camera that is mounted on the tool. Its frame has
-            x to the right of the picture, y down and z forward.
+        pose: camera_to_base for a fixed camera; camera_to_tool for a camera that is mounted on the tool. The
+            camera's frame has x to the right of the image, y down and z forward.
         on_tool: whether the camera moves with the tool.
         farthest: largest depth that is measured [m].
 
@@ -50,11 +50,11 @@ class DepthCamera:
 
     @property
     def camera_to_base(self) -> Pose:
-        """The present pose of the camera."""
+        """The current pose of the camera."""
         return self.robot.tool_to_base @ self._pose if self._on_tool else self._pose
 
     def frame(self) -> DepthFrame:
-        """Return an image of the present scene."""
+        """Return an image of the current scene."""
         camera_to_base = self.camera_to_base
         directions = self._directions @ camera_to_base.rotation.T
         n = len(directions)

@@ -31,7 +31,7 @@ def limit_velocity(
 
     Args:
         limits: limits of the arm.
-        q: commanded joint positions now, shape (n_joints,) [rad].
+        q: current commanded joint positions, shape (n_joints,) [rad].
         previous: joint velocity commanded last, shape (n_joints,) [rad/s].
         velocity: requested joint velocity, shape (n_joints,) [rad/s].
         dt: time for which the velocity will be held [s].
@@ -54,7 +54,7 @@ def limit_velocity(
 class Robot(ABC):
     """A robot with an arm, simulated or real, that is commanded by joint velocities.
 
-    :meth:`move` limits a velocity and sends it. The sent velocities are integrated to ``set_point``, the joint
+    :meth:`move` limits a velocity and sends it. The integral of the sent velocities is ``set_point``, the joint
     positions that the drives track. The limits therefore hold for the commands and do not depend on measurement
     noise. Between two calls the acceleration is constant: the set-point moves by ``(previous + velocity) / 2 * dt``.
 
@@ -62,8 +62,8 @@ class Robot(ABC):
         arm: the model of the arm, with its limits.
         set_point: commanded joint positions, shape (n_joints,) [rad].
         velocity: commanded joint velocities, shape (n_joints,) [rad/s].
-        clamped: which limits changed the last command: any of ``"velocity"``, ``"acceleration"``, ``"position"``.
-        fault: why the robot has made a protective stop; empty if it has not.
+        clamped: limits that changed the last command: any of ``"velocity"``, ``"acceleration"``, ``"position"``.
+        fault: reason of a protective stop; empty if there was none.
     """
 
     following_error: ClassVar[float] = 0.1  # [rad] distance from its set-point at which a joint counts as blocked
@@ -87,7 +87,7 @@ class Robot(ABC):
 
     @abstractmethod
     def _send(self, previous: Array, velocity: Array, dt: float) -> None:
-        """Drive from ``set_point`` for ``dt`` with constant acceleration from ``previous`` to ``velocity``."""
+        """Drive from ``set_point`` for ``dt`` with constant acceleration from ``previous`` to ``velocity`` [rad/s]."""
 
     def move(self, velocity: ArrayLike, dt: float) -> ArmState:
         """Move for ``dt`` seconds; the joints reach ``velocity`` at the end.
@@ -130,7 +130,7 @@ class Robot(ABC):
     def grasp(self, opening: float) -> None:
         """Start to move the gripper's fingers to an opening; they continue to move while the arm moves.
 
-        Fingers that touch an object press on it with limited force, so ``grasp(0.0)`` grasps an object between them.
+        Fingers in contact with an object press with limited force, so ``grasp(0.0)`` grasps an object between them.
 
         Args:
             opening: distance between the fingers [m].

@@ -47,7 +47,7 @@ def fingerprint(arm: ArmModel) -> int:
 
 
 class Supervisor:
-    r"""Lets one remote client move a robot while it sends valid commands, and checks every one of them.
+    r"""Lets one remote client move a robot while it sends valid commands, and checks every command.
 
     ========== ============================================== ======================================================
     status     what the robot does                            what ends it
@@ -71,7 +71,8 @@ class Supervisor:
     .. math:: \dot q = f\,\dot q_c + \mathrm{sign}(e) \min(k |e|, \sqrt{a |e|}), \qquad
               e = q_c + \dot q_c\, s - q
 
-    with the gain k, the maximum acceleration a, the time s for which the command is extrapolated, and the fraction f
+    where k is the gain, a the maximum acceleration, s the time for which the command is extrapolated, and f the
+    fraction
     of its velocity: 1 for the first 30 ms, then decreasing to 0 at 100 ms. :meth:`Robot.move
     <imitarm.robots.robot.Robot.move>` limits this velocity again. No sequence of datagrams can therefore move the
     set-point beyond the limits of position, velocity and acceleration.
@@ -81,15 +82,15 @@ class Supervisor:
     Args:
         robot: robot to move.
         dt: time between two calls of :meth:`step` [s].
-        on_event: called with a text when the status changes.
+        on_event: function called with a text when the status changes.
 
     Attributes:
         robot: the robot.
         status: see the table.
         reason: why the robot is stopped or faulty.
-        challenge: number that ENABLE must carry now; 0 if the robot is not stopped.
+        challenge: number that ENABLE must currently contain; 0 if the robot is not stopped.
         datagram_filter: checks the owner's commands.
-        dropped: number of commands without effect by reason, besides those that the filter dropped.
+        dropped: number of commands without effect by reason, in addition to those that the filter dropped.
     """
 
     def __init__(self, robot: Robot, dt: float, *, on_event: Callable[[str], None] | None = None) -> None:
@@ -114,7 +115,7 @@ class Supervisor:
         """Process a datagram and return whether to answer its sender.
 
         Args:
-            data: data as received; may be anything.
+            data: received bytes, which may be arbitrary.
             now: time of receiving [ns].
         """
         try:
@@ -192,7 +193,7 @@ class Supervisor:
 
         Args:
             now: time [ns].
-            periods: length of the step in control periods; more than one after missed ones.
+            periods: length of the step in control periods; more than one after missed periods.
         """
         silence = 1e-9 * (now - self._received)
         if self.status in (RobotStatus.FOLLOWING, RobotStatus.SLOWING):
@@ -220,7 +221,7 @@ class Supervisor:
         """Return the state of the robot as a datagram.
 
         Args:
-            now: returns the time [ns].
+            now: function that returns the time [ns].
         """
         robot, state, header = self.robot, self.robot.state(), self._header
         if header is not None and self._applied == 0:
@@ -259,27 +260,29 @@ class Supervisor:
 class RobotServer:
     """Receives commands, moves a robot at a fixed rate, and answers each client that has asked, once per period.
 
-    It sends nothing unless asked, and a :class:`~imitarm.robots.server.Supervisor` checks everything it receives.
-    If the machine was too busy and periods were missed, the next step is longer by their time, up to 20 ms in total,
-    so that the robot keeps up with the commands. The limits still hold, because they are computed from the length of
-    the step. Time missed beyond that is skipped.
+    It sends nothing without a request, and a :class:`~imitarm.robots.server.Supervisor` checks everything it receives.
+    If the machine was too busy and periods were missed, the next step is lengthened by the missed time, up to 20 ms in
+    total, so that the robot keeps up with the commands. The limits still hold, because they are computed from the
+    length of
+    the step. Missed time beyond 20 ms is skipped.
 
     Args:
         robot: robot to serve.
         port: port to listen on; 0: any free port.
-        host: address of this machine to listen on; the default hears this machine only. There is no password: listen
+        host: address of this machine to listen on; by default, only this machine can connect. There is no password:
+            listen
             on a network only if everyone on it may move the robot.
         rate: control periods per second, 100 to 1000 [Hz]; the period of a simulated robot must be a multiple of its
             timestep.
         on_event: called with a text when the robot is enabled, slows or stops.
         clock_ns: returns the time [ns].
-        wait: waits until a datagram has arrived, at most some seconds, and returns whether one has; with a simulated
-            clock it lets the time pass.
+        wait: function that waits until a datagram arrives, at most for a number of seconds, and returns whether one
+            has arrived; a simulated clock advances here.
 
     Attributes:
         address: host and port on which it listens.
         supervisor: checks the commands and moves the robot.
-        rate_limiter: starts the control periods and counts the missed ones.
+        rate_limiter: timer that starts the control periods and counts the missed ones.
 
     Raises:
         InputError: when the rate is out of range, or the port is in use.

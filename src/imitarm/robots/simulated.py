@@ -1,4 +1,4 @@
-"""SimulatedRobot: the arm with its real inertias and limits in a MuJoCo world, and the drives that move its joints."""
+"""SimulatedRobot: an arm with its real inertias and limits in a MuJoCo world, with drives for its joints."""
 
 from __future__ import annotations
 
@@ -43,13 +43,12 @@ class SimulatedRobot(Robot):
     """An arm in a MuJoCo world, with drives that are limited to their rated torques.
 
     Both kinds of control follow the set-point ``q_d(t)`` and feed gravity, inertia and friction forward, see
-    :class:`Drives`: ``"position"`` is a stiff servo at each joint, ``"torque"`` is computed
-    torque and softer. Time advances only within :meth:`move` and :meth:`guide`, and the same commands always give the
-    same motion.
+    :class:`Drives`: ``"position"`` is a stiff servo at each joint, ``"torque"`` is the softer computed-torque control.
+    Time advances only within :meth:`move` and :meth:`guide`, and the same commands always give the same motion.
 
     Attributes:
         model: the compiled world.
-        data: its state; only to be read.
+        data: state of the simulation; read only.
         scene_at_start: the scene at time 0.
         contacts: names of the pairs that have touched since the last reset: arm geom and obstacle, arm geom and
             fixture, or two geoms of different links of the arm (a self-contact).
@@ -72,13 +71,13 @@ class SimulatedRobot(Robot):
         Args:
             arm: the arm with its tool.
             scene: its obstacles and fixtures become solid bodies; None: no obstacles. Its ``stamp`` is the start time
-                of the world. Without fixtures and ``world`` it gets a floor and a pedestal.
+                of the world. Without fixtures and ``world``, a floor and a pedestal are added.
             motion: motions of some obstacles, by name or index: functions of the time on the scene's clock, or a
                 recorded :class:`~imitarm.scene.motion.Track`. Other obstacles keep their velocities.
-            world: a world with the arm, made by :func:`~imitarm.robots.world.arm_world`, to which furniture was added;
-                it is copied. None: the world is built from the scene.
+            world: world with the arm, built by :func:`~imitarm.robots.world.arm_world` and possibly extended by
+                furniture; it is copied. None: the world is built from the scene.
             control: ``"position"`` or ``"torque"``.
-            q: joint angles to start at, shape (n_joints,) [rad]; None for ``arm.home``.
+            q: start posture, shape (n_joints,) [rad]; None: ``arm.home``.
             timestep: time step of the physics and of the drives [s].
 
         Raises:
@@ -165,7 +164,7 @@ class SimulatedRobot(Robot):
 
     @property
     def scene(self) -> Scene:
-        """The true present scene, with true velocities; ``stamp`` is its time on the scene's clock."""
+        """The true current scene, with true velocities; ``stamp`` is its time on the scene's clock."""
         return self._source.at(self.scene_at_start.stamp + self.time)
 
     @property
@@ -181,8 +180,8 @@ class SimulatedRobot(Robot):
     def grasp(self, opening: float) -> None:
         """Begin to move the fingers of a mounted gripper; see :meth:`~imitarm.robots.robot.Robot.grasp`.
 
-        The commanded opening changes at 0.12 m/s. The servo presses with its stiffness times the distance that is left,
-        at most with the force that its file allows. :meth:`reset` cancels the command.
+        The commanded opening changes at 0.12 m/s. The servo's force is its stiffness times the remaining distance,
+        limited to the force in its file. :meth:`reset` cancels the command.
         """
         self._drives.grasp(opening)
 
@@ -209,7 +208,7 @@ class SimulatedRobot(Robot):
         return {"contacts": frozenset(self.contacts), "contact_steps": self.contact_steps}
 
     def nearest_pair(self) -> tuple[str, str] | None:
-        """Return the names of the two geoms that have the :meth:`clearance`, the arm's first; None without any."""
+        """Return the names of the two geoms that define :meth:`clearance`, the arm's first; None if there are none."""
         pair = self._gauge.measure(self.data)[1]
         return None if pair is None else self._names(pair)
 
@@ -239,17 +238,18 @@ class SimulatedRobot(Robot):
         mujoco.mj_kinematics(self.model, self.data)  # a step leaves the bodies where it found them
 
     def guide(self, wrench: ArrayLike, dt: float) -> ArmState:
-        """Let a hand lead the arm by its tool for ``dt`` seconds while the drives carry the arm's weight.
+        """Let a hand guide the arm by its tool for ``dt`` seconds while the drives compensate the arm's weight.
 
-        Makers of robot arms call this zero gravity or free drive. The drives also compensate most of the dry friction
-        and damp a little, see :meth:`Drives.free`. Afterwards the set-point is the arm's posture.
+        Manufacturers of robot arms call this mode zero gravity or free drive. The drives also compensate most of the
+        dry friction and add a little damping, see :meth:`Drives.free`. Afterwards the set-point is the posture that the
+        arm has reached.
 
         Args:
             wrench: force [N] then torque [N m] of the hand on the tool's tip, in the base frame, shape (6,).
             dt: [s].
 
         Returns:
-            The measured state after it.
+            The measured state after ``dt``.
 
         Raises:
             InputError: when ``wrench`` is not six finite numbers.
@@ -288,11 +288,11 @@ def _checked_start(arm: ArmModel, q: ArrayLike) -> Array:
 
 
 def add_drives(spec: mujoco.MjSpec, arm: ArmModel) -> None:
-    """Give every joint of the arm one drive with its rated torque, in place of its own actuators.
+    """Replace the arm's actuators by one drive for each joint, with the rated torque.
 
     Args:
-        spec: the world that holds the arm; changed in place.
-        arm: its joints and rated torques are used.
+        spec: world that contains the arm; changed in place.
+        arm: arm whose joints and rated torques are used.
     """
     for actuator in list(spec.actuators):
         if actuator.target in arm.joint_names:
@@ -364,7 +364,7 @@ class Drives:
 
     @property
     def widest_opening(self) -> float:
-        """Opening of the gripper when it is wide open [m]; nan without a gripper."""
+        """Largest opening of the gripper [m]; nan without a gripper."""
         return float("nan") if self._gripper is None else float(self._model.actuator_ctrlrange[self._gripper, 1])
 
     def grasp(self, opening: float) -> None:
@@ -374,7 +374,7 @@ class Drives:
             InputError: when there is no gripper, or the opening is out of its range.
         """
         if self._gripper is None:
-            raise InputError(f"grasp: this world has no gripper (no actuator {GRIPPER!r}); load the arm with one")
+            raise InputError(f"grasp: this world has no gripper (no actuator {GRIPPER!r}); load the arm with a gripper")
         least, most = self._model.actuator_ctrlrange[self._gripper]
         if not least <= opening <= most:
             raise InputError(f"grasp: opening must be between {least:g} and {most:g} m, got {opening!r}")
@@ -410,7 +410,7 @@ class Drives:
         mujoco.mj_step2(self._model, self._data)
 
     def free(self, force: Array, torque: Array, site: int) -> None:
-        """Step with ``tau = h + 0.7 c sign(v) - D v``, with ``c`` the dry friction, while a hand pulls at a site.
+        """Step with ``tau = h + 0.7 c sign(v) - D v``, where ``c`` is the dry friction, while a hand pulls at a site.
 
         Args:
             force: force of the hand, in the base frame, shape (3,) [N].
@@ -428,7 +428,7 @@ class Drives:
         d.qfrc_applied[:] = 0.0
 
     def _prepare(self, stiff: bool) -> None:
-        """Before a step: switch the drives to their mode and move the set-point of the fingers on."""
+        """Prepare a step: switch the drives to the right mode and advance the set-point of the fingers."""
         self._use_servos(stiff)
         if self._opening_wanted is not None:
             now, most = float(self._data.ctrl[self._gripper]), FINGER_SPEED * self._model.opt.timestep

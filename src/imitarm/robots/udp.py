@@ -27,14 +27,14 @@ _ACTIVE = (RobotStatus.FOLLOWING, RobotStatus.SLOWING)
 
 
 class Echo(NamedTuple):
-    """The times of a command, as the server reports them.
+    """The times of a command that the server reports.
 
     Attributes:
         sequence: sequence number of the command.
         sent: time from sending to receiving [s]; to another machine, relative to the fastest command.
-        applied: time from receiving until the drives had a set-point computed from it [s].
-        applied_ns: the time of that, on the clock of this process [ns]; with another machine, the travel time of the
-            fastest command counts as 0.
+        applied: time from receiving the command until the drives had a set-point computed from it [s].
+        applied_ns: time at which the drives had that set-point, on the clock of this process [ns]; for another
+            machine, the travel time of the fastest command counts as 0.
     """
 
     sequence: int
@@ -48,10 +48,10 @@ class UdpRobot(Robot):
 
     :meth:`move` limits a velocity as every robot does and sends the resulting set-point; the server checks it again.
     The client sends commands only while the server reports that it follows this client, in a state that is at most
-    0.1 s old. Otherwise it sends no command and takes over the server's set-point. Therefore the arm never jumps after
+    0.1 s old. Otherwise it sends no command and adopts the server's set-point. Therefore the arm never jumps after
     a restart of the client or the server, or after an interrupted connection.
 
-    A stopped robot moves again only after :meth:`enable`, which a person must decide.
+    A stopped robot moves again only after :meth:`enable`, which requires a decision by a person.
 
     Args:
         arm: model of the arm that is served.
@@ -62,7 +62,8 @@ class UdpRobot(Robot):
 
     Attributes:
         reported: the newest state that the server has sent.
-        interruptions: how often the client has lost control of the robot, or had to take over the server's set-point.
+        interruptions: number of times that the client has lost control of the robot, or had to adopt the server's
+            set-point.
         sequence: sequence number of the last command; None before the first.
         datagram_filter: checks the received states.
 
@@ -105,7 +106,7 @@ class UdpRobot(Robot):
     sequence: int | None
 
     def _connect(self, address: Address, timeout: float) -> None:
-        """Ask until a state arrives, and take over its set-point."""
+        """Send requests until a state arrives, and adopt its set-point."""
         for _ in range(max(round(timeout / _RETRY_PERIOD), 1)):
             self._command(CommandMode.OBSERVE)
             self._sleep(_RETRY_PERIOD)
@@ -227,11 +228,13 @@ class UdpRobot(Robot):
         return self.state()
 
     def request_enable(self) -> None:
-        """Ask the server to let the robot move again; ``ready`` tells whether it does."""
+        """Ask the server to let the robot move again; ``ready`` is true once it does."""
         self._command(CommandMode.ENABLE, challenge=self.reported.challenge)
 
     def enable(self, timeout: float = 1.0) -> None:
-        """Let the robot move again, and wait until it is ready. A person must decide this, never a program by itself.
+        """Let the robot move again, and wait until it is ready.
+
+        A person must make this decision; a program must never make it alone.
 
         Args:
             timeout: longest time to wait [s].

@@ -53,7 +53,7 @@ def arm_world(
         arm: the arm with its tool.
         floor: see :func:`standard_fixtures`.
         pedestal_radius: see :func:`standard_fixtures`.
-        fixtures: replace the standard fixtures.
+        fixtures: fixtures that replace the standard ones.
 
     Returns:
         A specification that :class:`~imitarm.robots.simulated.SimulatedRobot` takes as ``world``.
@@ -79,11 +79,11 @@ def arm_world(
 
 
 def add_fixtures(spec: mujoco.MjSpec, fixtures: Sequence[Obstacle]) -> None:
-    """Add fixtures as solids that never move, each a geom of its name (``fixture/0`` and so on without one).
+    """Add fixtures as static geoms with their names (without a name: ``fixture/0`` and so on).
 
     Args:
-        spec: the world; changed in place. A fixture is not added when a geom of its name exists.
-        fixtures: in the base frame, which is the world frame.
+        spec: world; changed in place. A fixture is not added when a geom of its name exists.
+        fixtures: fixtures in the base frame, which is the world frame.
     """
     there = {geom.name for geom in spec.geoms}
     for name, fixture in zip(fixture_names(fixtures), fixtures, strict=True):
@@ -102,7 +102,7 @@ def add_obstacles(spec: mujoco.MjSpec, scene: Scene) -> None:
     """Add every obstacle of ``scene`` as a solid body that can be moved but not pushed away.
 
     Args:
-        spec: the world; changed in place.
+        spec: world; changed in place.
         scene: obstacles in the base frame, which is the world frame.
     """
     for index, obstacle in enumerate(scene.obstacles):
@@ -114,7 +114,7 @@ def add_obstacles(spec: mujoco.MjSpec, scene: Scene) -> None:
 def _add_geom(
     spec: mujoco.MjSpec, body: Any, name: str, obstacle: Obstacle, color: tuple[float, ...], **place: Any
 ) -> None:
-    """Add the shape of an obstacle to a body whose frame is the obstacle's own."""
+    """Add the shape of an obstacle to a body with the obstacle's local frame."""
     shape, size, vertices = _shape(obstacle)
     if vertices is None:
         body.add_geom(name=name, type=shape, size=size, rgba=color, **place)
@@ -144,7 +144,7 @@ def _shape(obstacle: Obstacle) -> tuple[mujoco.mjtGeom, list[float], Array | Non
 
 
 def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
-    """Return distinct surface points (m, 3) of a convex obstacle, farthest in directions all around."""
+    """Return distinct surface points (m, 3) of a convex obstacle: the farthest points in many directions."""
     azimuth = np.arange(n_around) * (2.0 * np.pi / n_around)
     height = np.linspace(-1.0, 1.0, n_up)
     flat = np.sqrt(1.0 - height**2)[:, None]
@@ -160,17 +160,18 @@ def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
 class ClearanceGauge:
     """Smallest distance from an arm to obstacles, and pairs in contact, from the simulator's geoms.
 
-    Bounding spheres come first: the distance between centres less both radii is a lower bound of a pair's distance.
+    Bounding spheres are evaluated first: the distance between centres less both radii is a lower bound of a pair's
+        distance.
     Pairs are then measured by ``mj_geomDistance``, nearest bound first, until the next bound exceeds the smallest
-    distance found. So most pairs cost nothing.
+    distance found. Most pairs therefore need no exact measurement.
 
     Args:
         model: the compiled world.
         arm_geoms: ids of the geoms of arm and tool.
         obstacle_geoms: ids of the geoms whose distance is measured.
-        fixture_geoms: ids of geoms that count for contact only: what the arm stands on.
-        links: number of the arm's joints that move each arm geom. Two geoms with different numbers that touch are
-            a self-contact; None for no self-contacts.
+        fixture_geoms: ids of the geoms on which the arm stands; they count only for contact.
+        links: number of the arm's joints that move each arm geom. Contact between two geoms with different numbers
+            is a self-contact; None: self-contacts are not checked.
     """
 
     def __init__(
@@ -201,7 +202,8 @@ class ClearanceGauge:
     def measure(self, data: mujoco.MjData) -> tuple[float, tuple[int, int] | None]:
         """Return the smallest signed distance [m], negative in contact, and the ids of the two geoms.
 
-        A self-contact counts with its depth. Without obstacles, or when all are farther than 100 m, the result is inf
+        For a self-contact, the distance is minus its depth. Without obstacles, or when all are farther than 100 m, the
+        result is inf
         and None.
         """
         smallest, pair = _FAR, None
@@ -222,7 +224,10 @@ class ClearanceGauge:
         return (smallest, pair) if pair is not None else (np.inf, None)
 
     def touching(self, data: mujoco.MjData) -> set[tuple[int, int]]:
-        """Return the pairs of geoms in contact now: arm and obstacle, arm and fixture, arm and arm (lower id first)."""
+        """Return the pairs of geoms currently in contact.
+
+        Arm and obstacle, arm and fixture, arm and arm (lower id first).
+        """
         if not data.ncon:
             return set()
         geoms = data.contact.geom

@@ -17,21 +17,22 @@ _UNMOVED = 1e-6  # [m/rad] a joint that changes a distance by less does not chan
 
 
 class ClearanceLimit:
-    r"""Inequalities on the joint velocity that keep every link, and the tool, clear of every obstacle.
+    r"""Inequalities on the joint velocity that keep a clearance between every link (and the tool) and every obstacle.
 
     Spheres cover the arm and its tool (``ArmModel.collision_spheres``). For the sphere with centre ``c`` and radius
-    ``r`` near an obstacle with signed distance ``sd`` and outward normal ``n``, the distance left is
-    ``h = sd(c) - r - clearance``. With ``v_o`` the velocity of the obstacle's nearest point, the row
+    ``r`` near an obstacle with signed distance ``sd`` and outward normal ``n``, the remaining distance is ``h = sd(c) -
+    r - clearance``. If ``v_o`` is the velocity of the obstacle's nearest point, the row
 
     .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - \xi h
 
-    lets this distance shrink at most exponentially, so that it stays positive. It can still become negative, because
-    links move on arcs and control steps are finite. Then it must grow, with ``retreat_rate`` in place of :math:`\xi`.
+    lets this distance shrink at most exponentially, so that it stays positive. h can still become negative, because
+    links move on arcs and control steps are finite. In this case it must grow, with ``retreat_rate`` instead of
+    :math:`\xi`.
     Every sphere within ``influence`` of an obstacle has a row; none is left out. The spheres contain the shapes they
     cover, so the true distance is never smaller than that of the spheres.
 
     Args:
-        arm: the arm with its tool.
+        arm: arm with its tool.
         clearance: required distance of every link to every obstacle [m].
         rate: ``xi``, the fraction of h by which h may shrink per second [1/s].
         influence: value of h beyond which a sphere has no row [m].
@@ -65,10 +66,10 @@ class ClearanceLimit:
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
-            scene: the obstacles, as predicted for now, with their velocities.
+            scene: obstacles predicted for the current time, with their velocities.
 
         Returns:
-            One row for each pair of a sphere and an obstacle within ``influence``, except those that are too near and
+            One row for each pair of a sphere and an obstacle within ``influence``, except pairs that are too close and
             whose distance no joint can change; None when there is no pair.
 
         Raises:

@@ -75,10 +75,10 @@ class PackedObstacles:
             axis; cone: radius, height; ellipsoid: semi-axes; convex hull: half extents; half-space: nothing.
             Unused entries are 0.
         velocities: velocities of the local frame's origin, shape (n, 3) [m/s].
-        angular_velocities: about that origin, in the base frame, shape (n, 3) [rad/s].
+        angular_velocities: angular velocities about that origin, in the base frame, shape (n, 3) [rad/s].
         covariances: covariances of the positions, shape (n, 3, 3) [m^2]; 0 when unknown.
-        stamps: when each obstacle was seen, shape (n,) [s].
-        track_ids: the number of its track, shape (n,); -1 without one.
+        stamps: time at which each obstacle was seen, shape (n,) [s].
+        track_ids: track number of each obstacle, shape (n,); -1 without a track.
         polytopes: faces and edges of each convex hull; None for other kinds.
     """
 
@@ -163,7 +163,7 @@ class PackedObstacles:
 
     @cached_property
     def _shapes(self) -> dict[str, object]:
-        """All values that do not depend on the poses, for copies."""
+        """Return all values that do not depend on the poses, for use in copies."""
         self._sorted, self._kept, self.radii  # noqa: B018  worked out once, for all copies
         return {key: value for key, value in self.__dict__.items() if key not in _OF_THE_POSE}
 
@@ -185,7 +185,7 @@ class PackedObstacles:
 
     @cached_property
     def _sorted(self) -> tuple[Indices, list[_Members]]:
-        """The order of the obstacles, grouped by family, and the families; every hull is a family of its own."""
+        """The order of the obstacles when grouped by family, and the families; every hull is a separate family."""
         names = [KINDS[kind] for kind in self.kinds.tolist()]
         merged = any(name in SLABS.kinds for name in names)  # then spheres and capsules are taken as rounded boxes
         order: list[int] = []
@@ -224,7 +224,7 @@ class PackedObstacles:
         return []
 
     def _limits(self, reach: Array) -> Array:
-        """Return the squared distance (n, m) from each origin beyond which a point is out of ``reach``."""
+        """Return the squared distance (n, m) from each origin beyond which a point is farther than ``reach``."""
         if not self._kept or self._kept[0][0] is not reach:
             limit = reach + self.radii[self._sorted[0], None]
             self._kept[:] = [(reach, limit * limit)]
@@ -235,10 +235,10 @@ def distances(packed: PackedObstacles, points: ArrayLike, times: ArrayLike | Non
     """Return the signed distance of every point to every obstacle, at one time or at several.
 
     Args:
-        packed: n obstacles, at their time 0.
+        packed: n obstacles at their reference time.
         points: points in the base frame, shape (..., 3) [m]. With ``times``: the points at each time, shape (k, ...,
             3), or (1, ..., 3) for points that do not move.
-        times: seconds after the obstacles' time, shape (k,) [s]; None for that time itself.
+        times: times after the obstacles' reference time, shape (k,) [s]; None: the reference time itself.
 
     Returns:
         Shape (n, ...) [m], or (n, k, ...) with ``times``; negative inside.
@@ -265,13 +265,14 @@ def distances_and_gradients(
 
 
 class NearPairs(NamedTuple):
-    """Pairs of a point and an obstacle that are near each other.
+    """Pairs of a point and an obstacle that are close to each other.
 
     Attributes:
         obstacle: index of the obstacle, shape (k,).
         point: index of the point, shape (k,).
         distance: signed distance of the two, shape (k,) [m].
-        normal: its gradient with respect to the point, in the base frame, one row for each axis, shape (3, k).
+        normal: gradient of the distance with respect to the point, in the base frame, one row for each axis, shape
+            (3, k).
     """
 
     obstacle: Indices
@@ -283,12 +284,12 @@ class NearPairs(NamedTuple):
 def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPairs | None:
     """Return all pairs of a point and an obstacle that are at most ``reach`` apart; None if there is no such pair.
 
-    Pairs are first sorted out by bounding spheres; the exact distance is computed only for the remaining pairs.
+    Bounding spheres first exclude most pairs; the exact distance is computed only for the remaining pairs.
 
     Args:
         packed: n obstacles.
-        points: finite, in the base frame, shape (m, 3) [m].
-        reach: reach of each point, shape (m,) [m]; the same array in every call saves time.
+        points: finite points in the base frame, shape (m, 3) [m].
+        reach: largest distance for each point, shape (m,) [m]; passing the same array in every call saves time.
     """
     frames, m = packed._frames, len(points)
     if frames.upright:

@@ -68,15 +68,15 @@ def slabs(
     """Boxes, cylinders and half-spaces are boxes of half size ``half``, rounded by ``rounding``.
 
     With ``a = |q| - half`` the distance is ``|max(a, 0)| + min(max_j a_j, 0) - rounding``. A half-space is a box of
-    infinite size. A cylinder (``turned``) is a box in ``(rho, z)`` with ``rho^2 = x^2 + y^2``. Next to them in a scene,
-    a sphere is computed as a rounded point and a capsule as a rounded segment.
+    infinite size. A cylinder (``turned``) is a box in ``(rho, z)`` with ``rho^2 = x^2 + y^2``. If a scene also contains
+    such shapes, a sphere is computed as a rounded point and a capsule as a rounded segment.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
         half: shape (3, ...) [m].
-        rounding: shape (...) [m]; None for 0.
-        turned: which ones are cylinders, shape (...); None for none.
+        rounding: radius of the rounding, shape (...) [m]; None: 0.
+        turned: whether each shape is a cylinder, shape (...); None: no cylinders.
     """
     a = np.abs(q)
     if turned is not None:
@@ -131,14 +131,14 @@ def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor:
     largest root of ``F(t) = sum_j (g_j y_j / (t + g_j^2))^2 - 1``. With ``s = t + min g^2`` the function
     ``h(s) = 1 / sqrt(F + 1)`` is concave and rises, so Newton's method on ``h = 1`` from the left never steps over the
     root and needs no bracket. With the unit normal ``n`` at ``e`` the distance is ``n.y - sqrt(sum_j g_j^2 n_j^2)``: an
-    error in ``n`` enters squared and never makes the distance too large.
+    error in ``n`` has a quadratic effect and never makes the distance too large.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
         semi_axes: shape (3, ...) [m].
         beyond: ``g_j^2 - min g^2``, shape (3, ...) [m^2].
-        floor: least value of the coordinate along the shortest axis, 0 along the others, shape (3, ...) [m].
+        floor: smallest value of the coordinate along the shortest axis, 0 along the other axes, shape (3, ...) [m].
     """
     y = np.maximum(np.abs(q), floor)  # off the plane of symmetry, where s and y vanish together
     scaled = semi_axes * y
@@ -174,8 +174,8 @@ def cones(
 ) -> tuple[Array, Array | None]:
     """Cones, which are triangles in the half-plane ``(rho, z)``: base at ``-height/2``, tip at ``+height/2``.
 
-    The distance outside is that to the nearer one of two segments, the slant side and the base; inside it is the larger
-    one of the signed distances to their lines.
+    Outside, the distance is the smaller distance to two segments, the slant side and the base; inside, it is the larger
+    signed distance to their lines.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
@@ -222,8 +222,8 @@ class Family(NamedTuple):
 
     Attributes:
         kinds: names of the shapes.
-        formula: see the module.
-        prepare: makes the parameters (..., n) from the kinds (n,) and sizes (n, 3) of n obstacles.
+        formula: formula as described in the module's docstring.
+        prepare: function that computes the parameters (..., n) from the kinds (n,) and sizes (n, 3) of n obstacles.
     """
 
     kinds: tuple[str, ...]
@@ -245,8 +245,10 @@ FAMILIES = (
 class Polytope:
     """Faces and edges of a hull in its local frame, so that they stay valid when the hull moves.
 
-    With the planes ``n_i.x = b_i`` of its faces, inside ``sd = max_i (n_i.x - b_i)``. Outside, that maximum is a lower
-    bound. It is the distance when its foot ``x - sd n_i`` is on the face; otherwise the nearest point is on an edge or
+    If ``n_i.x = b_i`` are the planes of its faces, the distance inside is ``sd = max_i (n_i.x - b_i)``. Outside, this
+    maximum is a lower bound of the distance. The bound is exact if the foot point ``x - sd n_i`` is on the face;
+    otherwise
+    the nearest point is on an edge or
     at a corner, and the distance is the smallest distance to an edge.
 
     Attributes:
@@ -254,7 +256,7 @@ class Polytope:
         triangles: rows of ``vertices``, counter-clockwise seen from outside, shape (k, 3).
         normals: outward unit normal of each face, shape (m, 3).
         offsets: distance of each face's plane from the centroid, shape (m,) [m].
-        cosines: between the faces' normals, shape (m, m).
+        cosines: cosines of the angles between the faces' normals, shape (m, m).
         starts: one end of each edge between two faces, shape (3, e) [m].
         directions: unit vectors along the edges, shape (3, e).
         lengths: lengths of the edges, shape (e,) [m].
@@ -313,7 +315,7 @@ class Polytope:
         )
 
     def formula(self, q: Array, gradient: bool) -> tuple[Array, Array | None]:
-        """Return distances and normals like the other formulas of this module."""
+        """Return distances and normals in the form of all formulas of this module."""
         distance, rows = self.distance_and_normal(np.ascontiguousarray(q.reshape(3, -1).T))
         return distance.reshape(q.shape[1:]), rows.T.reshape(q.shape) if gradient else None
 

@@ -1,4 +1,4 @@
-"""Obstacles that follow any function of time, or a recorded track; for simulated worlds and for replays."""
+"""Obstacles that follow an arbitrary function of time or a recorded track, for simulated worlds and replays."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _STEP = 1e-4  # [s] half of the interval over which velocities are differences
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A recorded motion, interpolated linearly and along the shortest rotations, and at rest before and after.
+    """A recorded motion with linear interpolation of positions and shortest rotations; at rest before and after it.
 
     Attributes:
         times: strictly increasing, shape (n,) [s].
         positions: shape (n, 3) [m].
-        quaternions: wxyz, shape (n, 4); None for an obstacle that does not rotate.
+        quaternions: quaternions wxyz, shape (n, 4); None for an obstacle that does not rotate.
 
     Raises:
         InputError: when a shape is wrong, a number is not finite or the times do not increase.
@@ -120,9 +120,9 @@ class MovingScene:
         return positions, quaternions
 
     def at(self, time: float) -> Scene:
-        """Return the scene at ``time`` [s], with the velocities that the obstacles have then.
+        """Return the scene at ``time`` [s], with the velocities of the obstacles at that time.
 
-        The velocity of an obstacle that follows a function is computed from its displacement within 0.2 ms.
+        If an obstacle follows a function, its velocity is computed from its displacement within 0.2 ms.
         """
         time = finite_number(time, "MovingScene.at: time", "s")
         if not self._moved:

@@ -1,6 +1,6 @@
 """Obstacles: convex solids with an exact signed distance, its gradient, and a motion.
 
-Here is what all shapes have in common: their checks, their motion, and the distances of one obstacle. The shapes are in
+This module contains the common part of all shapes: checks, motion, and the distances of one obstacle. The shapes are in
 :mod:`~imitarm.scene.shapes`, the distance formulas in :mod:`~imitarm.scene.formulas`.
 """
 
@@ -120,8 +120,8 @@ class Obstacle(ABC):
 
     Attributes:
         velocity: velocity of the shape's centre, in the base frame, shape (3,) [m/s].
-        name: used in messages; a :class:`~imitarm.scene.Scene` falls back on ``"box 1"``.
-        angular_velocity: about the shape's centre, in the base frame, shape (3,) [rad/s].
+        name: name in messages; without a name, a :class:`~imitarm.scene.Scene` uses ``"box 1"``.
+        angular_velocity: angular velocity about the shape's centre, in the base frame, shape (3,) [rad/s].
         covariance: covariance of the position, shape (3, 3) [m^2]; None when it is exact or unknown.
         track_id: number of the obstacle's track in a tracker; None without a tracker.
 
@@ -163,7 +163,7 @@ class Obstacle(ABC):
         return f'{type(self).__name__} "{self.name}"' if self.name else type(self).__name__
 
     def _forget(self) -> None:
-        """Drop the values that were computed for the present pose, in a fresh copy."""
+        """Drop, in a new copy, the values that were computed for the old pose."""
         for key in ("packed", "_single"):
             self.__dict__.pop(key, None)
 
@@ -227,7 +227,7 @@ class Obstacle(ABC):
         """Return the farthest point of the solid in each direction (its support mapping, as used by GJK).
 
         Args:
-            directions: directions of any length but zero, in the base frame, shape (..., 3).
+            directions: directions of any nonzero length, in the base frame, shape (..., 3).
 
         Returns:
             Points of the surface in the base frame, shape (..., 3) [m].
@@ -254,7 +254,7 @@ class Obstacle(ABC):
         Its centre has moved by ``velocity * dt``, and it has rotated about its centre by ``angular_velocity * dt``.
 
         Args:
-            dt: time ahead [s]; negative looks back.
+            dt: time ahead [s]; a negative value gives an earlier pose.
 
         Raises:
             InputError: when ``dt`` is not a finite number.
@@ -278,7 +278,7 @@ class Obstacle(ABC):
                 (3,) [m].
             quaternion: own_to_base rotation wxyz, shape (4,).
             velocity: shape (3,) [m/s].
-            angular_velocity: shape (3,) [rad/s].
+            angular_velocity: angular velocity of the copy, shape (3,) [rad/s].
         """
         before = self.solid()
         stays = (position == before.position).all() and (quaternion == before.quaternion).all()
@@ -320,7 +320,7 @@ def pack(obstacles: tuple[Obstacle, ...], stamp: float) -> PackedObstacles:
 
 @dataclass(frozen=True, eq=False)
 class PosedObstacle(Obstacle):
-    """An obstacle whose shape is described in a frame of its own, at its centre.
+    """An obstacle whose shape is described in a local frame at its centre.
 
     Attributes:
         pose: obstacle_to_base: the centre and the rotation.

@@ -23,15 +23,16 @@ _LISTED = 4  # obstacles that a short repr names
 class Scene:
     """A goal and obstacles at one time, all in the base frame.
 
-    A goal inside an obstacle can be constructed, because a sensor may see such a scene; :meth:`check` refuses it.
+    A goal inside an obstacle is allowed, because a sensor may report such a scene; :meth:`check` rejects it.
 
     Attributes:
-        goal: tool_to_base at the end of the motion; None for the goal that the skill has learned.
-        obstacles: any iterable of obstacles; kept as a tuple.
-        stamp: the time for which the poses of the obstacles hold [s]. For a scene from a sensor this is when it was
-            seen; :meth:`at` predicts from there.
-        fixtures: what the arm stands on and works at, such as floor, pedestal and table. They are part of a simulated
-            world and count for contact; planners keep no distance from them, because a tool must reach its table.
+        goal: tool_to_base at the end of the motion; None: the learned goal of the skill.
+        obstacles: any iterable of obstacles; stored as a tuple.
+        stamp: time for which the poses of the obstacles are valid [s]. For a scene from a sensor, this is the time
+            of the measurement; :meth:`at` predicts from it.
+        fixtures: objects on which the arm stands or works, such as floor, pedestal and table. They are part of a
+            simulated world and cause contacts, but planners keep no distance from them, because a tool must reach its
+            table.
 
     Raises:
         InputError: when ``goal`` is not a pose, an obstacle is not an obstacle, or ``stamp`` is not a finite number.
@@ -56,7 +57,7 @@ class Scene:
         Args:
             seen: the scene from which the shapes, the goal and the fixtures are taken.
             packed: the obstacles of ``seen`` with other poses and velocities.
-            stamp: the time for which they hold [s].
+            stamp: time for which they are valid [s].
         """
         scene = object.__new__(cls)
         scene.__dict__.update(goal=seen.goal, stamp=stamp, fixtures=seen.fixtures, packed=packed, _seen=seen)
@@ -68,10 +69,11 @@ class Scene:
         return pack(self.obstacles, self.stamp)
 
     def at(self, time: float) -> Scene:
-        """Return the scene as predicted for another time; no other code predicts the motion of obstacles.
+        """Return the scene as predicted for another time; only this method predicts the motion of obstacles.
 
         Each obstacle keeps its velocity and its angular velocity; the goal stays. The result has ``stamp = time``;
-        ``packed.stamps`` keep when each obstacle was seen. It takes microseconds: only the packed arrays are moved, and
+        ``packed.stamps`` keeps the time at which each obstacle was seen. It takes microseconds: only the packed arrays
+        are moved, and
         the obstacle objects are built when ``obstacles`` is read.
 
         Args:
@@ -166,7 +168,7 @@ class Scene:
         return distances_and_gradients(self.packed, points)
 
     def clearance(self, points: ArrayLike) -> Array:
-        """Return the signed distance to the nearest obstacle, inf when there is none.
+        """Return the signed distance to the nearest obstacle; inf without obstacles.
 
         Args:
             points: points in the base frame, shape (..., 3) [m].
@@ -180,7 +182,7 @@ class Scene:
         return np.asarray(self.distances(points).min(axis=0, initial=np.inf))
 
     def nearest(self, points: ArrayLike) -> NDArray[np.intp]:
-        """Return the index of the nearest obstacle of every point, -1 when there is none.
+        """Return the index of the obstacle nearest to each point; -1 without obstacles.
 
         Args:
             points: points in the base frame, shape (..., 3) [m].
@@ -213,14 +215,14 @@ class Scene:
         return f"{obstacle.kind} {alike}"
 
     def check(self, tool_radius: float = 0.0) -> None:
-        """Reject a goal that can't be reached without contact.
+        """Raise an error if the goal can't be reached without contact.
 
         Args:
             tool_radius: radius of the sphere around the tool's tip that must stay free [m]; at least 0.
 
         Raises:
-            InputError: when the goal is nearer than ``tool_radius`` to an obstacle or inside it; the message names
-                the obstacle and by how much. The error is also raised when ``tool_radius`` is not a length.
+            InputError: when the goal is closer than ``tool_radius`` to an obstacle or inside it; the message names
+                the obstacle and the overlap. The error is also raised when ``tool_radius`` is not a length.
         """
         tool_radius = finite_number(tool_radius, "Scene.check: tool_radius", "m", at_least=0.0)
         if self.goal is None or not self.obstacles:

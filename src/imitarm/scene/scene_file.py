@@ -1,6 +1,7 @@
-"""Scene files: a goal and obstacles as YAML that a person writes (docs/scene.md).
+"""Scene files: a goal and obstacles in hand-written YAML (docs/scene.md).
 
-The keys of each shape are its fields, so a shape that is added to ``OBSTACLES`` can be read and written at once. Only
+The keys of each shape are its fields, so a shape added to ``OBSTACLES`` can be read and written without further code.
+Only
 plain YAML is read: numbers, text, lists and mappings; nothing in a file is executed.
 """
 
@@ -44,10 +45,10 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     """Read a scene file.
 
     Args:
-        path: a YAML file in the format of docs/scene.md.
+        path: YAML file in the format of docs/scene.md.
 
     Returns:
-        The scene in metres, whatever the file's units.
+        The scene in metres, regardless of the file's units.
 
     Raises:
         InputError: when there is no such file or it can't be read.
@@ -70,10 +71,10 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
 def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     """Write a scene file in metres that :func:`load_scene` reads back to the last digit.
 
-    The text goes to a temporary file first, which is then renamed: an existing file is kept when something fails.
+    The text is written to a temporary file, which is then renamed, so an existing file survives a failure.
 
     Args:
-        scene: of obstacles in ``OBSTACLES``.
+        scene: scene whose obstacles have shapes in ``OBSTACLES``.
         path: the file; its folder must exist.
 
     Raises:
@@ -101,7 +102,7 @@ _INTEGER_TAG, _REAL_TAG = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain YAML in which duplicate keys and numbers that are not plain decimals are refused."""
+    """Plain YAML that rejects duplicate keys and numbers that are not plain decimals."""
 
     yaml_implicit_resolvers = {  # noqa: RUF012 (PyYAML's own attribute)
         first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INTEGER_TAG, _REAL_TAG)]
@@ -119,7 +120,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def number(self, node: yaml.ScalarNode) -> int | float:
-        """Return a number; one with an explicit tag must also be a plain decimal."""
+        """Return a number; a number with an explicit tag must also be a plain decimal."""
         if _INTEGER.match(node.value):
             return int(node.value)
         if _REAL.match(node.value):
@@ -254,7 +255,7 @@ def _shape(kind: object, where: str) -> type[Obstacle]:
 
 
 def _own_keys(shape: type[Obstacle]) -> list[str]:
-    """Return the fields of this shape, without those that all obstacles have."""
+    """Return the fields specific to this shape."""
     return [f.name for f in fields(shape) if f.init and f.name not in (*_COMMON, *_UNWRITTEN)]
 
 
@@ -274,7 +275,7 @@ def _pose(entry: Mapping[Any, Any], where: str, metres: float) -> Pose:
 
 
 def _from_degrees(key: str, value: Any, where: str) -> Any:
-    """Return the quaternion of roll, pitch and yaw about the fixed x, y and z axes, in this order, or of yaw alone."""
+    """Return the quaternion of roll, pitch and yaw about the fixed x, y and z axes, in this order, or of yaw only."""
     numbers = value if isinstance(value, list) else [value]
     plain = all(isinstance(number, float) and math.isfinite(number) for number in numbers)
     if not plain or np.shape(value) != ((3,) if key == "rpy_degrees" else ()):

@@ -1,4 +1,4 @@
-"""The shapes that an obstacle can have: their fields, their checks and how they move."""
+"""The shapes of obstacles: their fields, checks and motion."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Sphere(Obstacle):
     """All points within ``radius`` of ``center``: ``sd(x) = |x - c| - r``.
 
     Attributes:
-        center: in the base frame, shape (3,) [m].
+        center: centre in the base frame, shape (3,) [m].
         radius: [m].
     """
 
@@ -69,11 +69,11 @@ class Capsule(Obstacle):
     """All points within ``radius`` of the segment from ``start`` to ``end``: ``sd(x) = |x - s(x)| - r``.
 
     ``s(x) = a + clip((x - a).u, 0, L) u`` is the nearest point of the segment, with ``u`` its direction and
-    ``L`` its length. The overall length is ``L + 2 r``. With a segment of length zero the capsule is a sphere.
+    ``L`` its length. The overall length is ``L + 2 r``. If the segment has length zero, the capsule is a sphere.
 
     Attributes:
         start: one end of the segment, in the base frame, shape (3,) [m].
-        end: the other end, shape (3,) [m].
+        end: other end, shape (3,) [m].
         radius: [m].
     """
 
@@ -132,7 +132,7 @@ class Cylinder(PosedObstacle):
     Attributes:
         pose: obstacle_to_base, at the middle of the axis; the axis is its z.
         radius: [m].
-        length: from end to end [m].
+        length: length from end to end [m].
     """
 
     kind: ClassVar[str] = "cylinder"
@@ -158,14 +158,14 @@ def _rim(v: Array, radius: float) -> Array:
 class Cone(PosedObstacle):
     """A circular cone with its tip up its own z.
 
-    In the half-plane ``(rho, z)`` it is a triangle: the distance outside is that to the nearer one of two segments,
-    the slant side and the base; inside it is the larger one of the signed distances to their lines.
+    In the half-plane ``(rho, z)`` the cone is a triangle. Outside, the distance is the smaller distance to two
+    segments, the slant side and the base; inside, it is the larger signed distance to their lines.
 
     Attributes:
         pose: obstacle_to_base, on the axis at half the height (as for a cylinder): base at ``z = -height/2``, tip at
             ``z = +height/2``.
         radius: radius of the base [m].
-        height: from base to tip [m].
+        height: height from base to tip [m].
     """
 
     kind: ClassVar[str] = "cone"
@@ -205,7 +205,7 @@ class HalfSpace(Obstacle):
 
     Attributes:
         point: any point ``p`` of the plane, in the base frame, shape (3,) [m].
-        normal: direction ``n`` out of the solid, of any length but zero, shape (3,); it is scaled to length one.
+        normal: direction ``n`` out of the solid, of any nonzero length, shape (3,); it is scaled to length one.
     """
 
     kind: ClassVar[str] = "half_space"
@@ -230,7 +230,7 @@ class HalfSpace(Obstacle):
         raise InputError(f"{self._label}: a half-space is infinite and has no farthest point")
 
     def bounds(self) -> Array:
-        """Return infinite bounds, shape (2, 3) [m], finite only where the plane is across an axis of the base frame."""
+        """Return bounds (2, 3) [m], infinite unless the plane is perpendicular to an axis of the base frame."""
         low, high = np.full(3, -np.inf), np.full(3, np.inf)
         for axis in np.flatnonzero(np.abs(self.normal) > 1.0 - 1e-12):
             (high if self.normal[axis] > 0.0 else low)[axis] = self.point[axis]

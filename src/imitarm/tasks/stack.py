@@ -36,7 +36,7 @@ FAILURES = (
     "not grasped",
     "timeout",
 )
-"""The kinds of failure, in the order in which :meth:`StackTask.evaluate` checks them."""
+"""Kinds of failure, in the order in which :meth:`StackTask.evaluate` checks them."""
 
 _PLACES = np.array([[0.62, 0.0], [0.62, 0.10], [0.62, -0.10], [0.62, -0.20]])  # [m] of cubes 1 to 4
 _MAX_OFFSET, _MAX_ROTATION = 0.004, 0.06  # [m], [rad] largest random change of a cube's place and rotation
@@ -78,11 +78,11 @@ class StackEvaluation:
 
 @dataclass
 class CubeHistory:
-    """What has happened to the cubes so far; :meth:`StackTask.watch` updates it.
+    """The history of the cubes so far; :meth:`StackTask.watch` updates it.
 
     Attributes:
         highest: largest height of each cube's center, shape (4,) [m].
-        tallest: largest number of cubes in the tower while the gripper touched none.
+        tallest: largest number of cubes in the tower while the gripper touched no cube.
         lost: indices of the cubes that left the gripper in the air.
         held: index of the cube in the gripper; None if there is none.
     """
@@ -98,14 +98,15 @@ class StackTask:
     """A Sawyer with a parallel gripper at a table with four 32 mm cubes, numbered 1 to 4 by colour and pips.
 
     Cube 1 stays in its place; cubes 2, 3 and 4 are stacked on it in this order. The task succeeds if the tower stands
-    in the order of the numbers, without support, and each cube is within the tolerance above the one below.
+    in the order of the numbers, without support, and each cube is centred on the cube below to within the tolerance.
 
     Contacts use MuJoCo's elliptic friction cones with ``impratio`` 10, so that a held cube does not slip out of the
     fingers; ``condim`` 4 gives the pads torsional friction.
 
     Attributes:
-        seed: seed of the small random changes of the cubes' places and rotations.
-        tolerance: largest horizontal distance between the centers of a cube and the one below [m], below half a side.
+        seed: seed of the small random changes of the cubes' positions and rotations.
+        tolerance: largest horizontal distance between the centers of a cube and the cube below it [m], less than
+            half a side.
     """
 
     seed: int = 0
@@ -123,7 +124,7 @@ class StackTask:
         return ArmModel.load("sawyer", tool="gripper")
 
     def places(self) -> tuple[Array, Array]:
-        """Return the first places of the cubes, (4, 2) [m], and their rotations about the vertical, (4,) [rad]."""
+        """Return the initial positions of the cubes, (4, 2) [m], and their rotations about the vertical, (4,) [rad]."""
         rng = np.random.default_rng([3035, self.seed])
         return _PLACES + rng.uniform(-_MAX_OFFSET, _MAX_OFFSET, (N_CUBES, 2)), rng.uniform(
             -_MAX_ROTATION, _MAX_ROTATION, N_CUBES
@@ -144,8 +145,8 @@ class StackTask:
 
         Args:
             arm: the arm, if it is loaded already.
-            control: control of the drives; computed torque, the more compliant one, by default, because contacts are
-                expected.
+            control: control of the drives; by default computed torque, which is more compliant, because contacts
+                are expected.
         """
         arm = self.arm() if arm is None else arm
         robot = SimulatedRobot(arm, world=self.world(arm), control=control, q=self.start_posture(arm))
@@ -173,7 +174,7 @@ class StackTask:
         return N_CUBES
 
     def standing(self, robot: SimulatedRobot) -> bool:
-        """Return whether all four stand in order, at rest, and the gripper touches none of them."""
+        """Return whether all four cubes stand in order and at rest, and the gripper touches none of them."""
         speed = max(float(np.linalg.norm(robot.data.body(f"cube/{i + 1}").cvel[3:])) for i in range(N_CUBES))
         return self.stacked(robot) == N_CUBES and speed < _STILL and not any(self.touched(robot))
 
@@ -204,7 +205,7 @@ class StackTask:
 
         The failures, in this order: the robot has made a protective stop; the tower was higher before; a cube left the
         gripper in the air and is not in the tower; a cube was put down outside the tower; a cube that was never lifted
-        has turned over or was pushed; the next cube was never lifted; none of these, but the time is up.
+        has turned over or was pushed; the next cube was never lifted; the time is up without any of these.
         """
         n = self.stacked(robot)
         if self.standing(robot):
@@ -234,7 +235,7 @@ class StackTask:
 
     @staticmethod
     def _level(robot: SimulatedRobot) -> NDArray[np.bool_]:
-        """Return for each cube whether the face that was up at first is up and level."""
+        """Return for each cube whether its initial top face is still on top and level."""
         up = np.array([robot.data.body(f"cube/{i + 1}").xmat[8] for i in range(N_CUBES)])
         return np.asarray(up > _UPRIGHT)
 

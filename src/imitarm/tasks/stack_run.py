@@ -1,6 +1,6 @@
 """run_stack: one run of the stacking task with a simulated person, a camera, a retargeter and the simulated robot.
 
-``IdealFollower`` is the reference: a gripper that moves with the true hand.
+``IdealFollower`` is the reference: a gripper that moves exactly with the true hand.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class RetargeterFactory(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class StackResult:
-    """The result of one run; plain values, so that it can be pickled.
+    """The result of one run, as plain values that can be pickled.
 
     Attributes:
         seed: seed of the person.
@@ -103,7 +103,7 @@ def stack_correspondence(person: Person, lengths: LimbLengths | None = None) -> 
 
 
 def calibrate_limbs(person: Person, camera: SkeletonCamera) -> LimbLengths:
-    """Measure the lengths of a person's arm, which is held before the sensor for 3 s."""
+    """Measure the lengths of a person's arm, which is held in front of the sensor for 3 s."""
     seen, time = [], 0.0
     side = person.shoulder() + np.array([0.35, -0.1, -0.6]) * person.reach
     while time < _CALIBRATION:
@@ -127,17 +127,19 @@ def run_stack(
 ) -> StackResult:
     """Let person number ``seed`` stack the cubes with a retargeter.
 
-    100 times per second the camera's newest skeleton goes to the retargeter, its joint velocity to the robot, and the
-    resulting view of robot and cubes to the person. The person, the places of the cubes and the errors of the camera
-    depend only on ``seed`` and ``repeat``. The loop is closed, so the motion of the person also depends on the
+    100 times per second, the retargeter receives the camera's newest skeleton, the robot receives the retargeter's
+    joint velocity, and the person receives the resulting view of robot and cubes. The person, the positions of the
+    cubes and the errors of the camera depend only on ``seed`` and ``repeat``. The loop is closed, so the motion of the
+    person also depends on the
     retargeter.
 
     Args:
         seed: seed of the person.
         repeat: number of the run of this person.
-        factory: builds the retargeter.
+        factory: function that builds the retargeter.
         arm: the Sawyer with the gripper, if it is loaded already.
-        camera: builds the camera from a seed; the default has 1 to 2 cm of noise and all other errors.
+        camera: function that builds the camera from a seed; the default camera has 1 to 2 cm of noise and all other
+            errors.
         latency: time from exposure until the skeleton arrives [s].
         control: control of the robot's drives; compliant by default, because contacts are expected.
         timeout: longest duration [s].
@@ -216,7 +218,7 @@ class _StackRun:
         self.log.append((time + DT, state.q, state.torque, self.tool, robot.opening))
 
     def view(self, time: float) -> OperatorView:
-        """Return what the operator can see."""
+        """Return the operator's view."""
         robot = self.robot
         following = self.retargeter.latest.state.engaged
         return OperatorView(time, self.tool, robot.opening, self.task.cubes(robot), following)
@@ -268,8 +270,9 @@ class _StackRun:
 class IdealFollower(Retargeter):
     """Moves the tool to its target by inverse kinematics, without filters or corrections.
 
-    It treats every skeleton as exact. With an :func:`ideal_camera` it is like a tool in the person's own hand, with a
-    lag of a few hundredths of a second. The benchmark records people with it and gives the same recording to every
+    It assumes that every skeleton is exact. With an :func:`ideal_camera`, it behaves like a tool in the person's own
+    hand, with a lag of a few hundredths of a second. The benchmark uses it to record people and gives the same
+    recording to every
     retargeter.
     """
 
@@ -284,7 +287,7 @@ class IdealFollower(Retargeter):
         self._velocity = np.zeros(self.arm.n_joints)
 
     def _see(self, skeleton: Skeleton | None) -> ArmEstimate | None:
-        """Return the arm exactly as in the skeleton."""
+        """Return the person's arm exactly as in the skeleton."""
         if skeleton is None:
             return None
         arm = skeleton.arm(self.correspondence.side)
@@ -307,5 +310,5 @@ class IdealFollower(Retargeter):
 
 
 def ideal_camera(seed: int = 0) -> SkeletonCamera:
-    """Return a camera that sees the true skeleton 100 times per second."""
+    """Return a camera that reports the true skeleton 100 times per second."""
     return SkeletonCamera.ideal(rate=100.0)

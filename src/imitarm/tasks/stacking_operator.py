@@ -1,7 +1,8 @@
-r"""SimulatedOperator: a simulated person who stacks cubes with a robot, watching the gripper and the cubes.
+r"""SimulatedOperator: a simulated person who stacks cubes with a robot and watches gripper and cubes.
 
-The model closes the loop around a retargeter. It sees gripper and cubes with delay and noise, and answers with a motion
-of the hand. It does not know the retargeter between its hand and the gripper.
+This model closes the loop around a retargeter. The operator sees gripper and cubes with delay and noise, and reacts
+with
+a motion of the hand. The operator does not know the retargeter between hand and gripper.
 """
 
 from __future__ import annotations
@@ -44,14 +45,14 @@ _REACHABLE = (0.35, 0.85, 0.40)  # [m] smallest x, largest x and largest |y| at 
 
 @dataclass(frozen=True, eq=False)
 class OperatorView:
-    """What the operator can see at one time, in the robot's base frame.
+    """The operator's view at one time, in the robot's base frame.
 
     Attributes:
         time: time [s].
         tool: position of the point between the finger tips, shape (3,) [m].
         opening: distance between the fingers [m].
         cubes: centers of the cubes, shape (4, 3) [m].
-        following: whether the robot shows that it follows the hand.
+        following: whether the robot indicates that it follows the hand.
     """
 
     time: float
@@ -63,10 +64,11 @@ class OperatorView:
 
 @dataclass(frozen=True)
 class Habits:
-    """The differences between people at this task.
+    """Individual habits of a person in this task.
 
     Attributes:
-        delay: time from seeing to the start of the movement that answers it [s]; about 0.2 s for a visual correction.
+        delay: time from seeing an error to the start of the corrective movement [s]; about 0.2 s for a visual
+            correction.
         look_every: time between two looks that may lead to a correction [s].
         gain: fraction of a small error that one correction covers, below 1.
         noise: standard deviation of the seen positions on each axis, drawn at each look [m].
@@ -76,8 +78,8 @@ class Habits:
         tolerance: largest error at which the gripper looks aligned, so that the hand closes or opens [m].
         sense_of_lag: lag of the robot that the person expects [s]; the same for every retargeter.
         dwell: rest after the hand has closed or opened [s].
-        height: additional height over long distances [m].
-        begin: time for which the hand is held still at first, so that the robot can engage [s].
+        height: additional height of movements over long distances [m].
+        begin: initial time for which the hand is held still, so that the robot can engage [s].
     """
 
     delay: float
@@ -115,7 +117,7 @@ class Habits:
 
 
 class Phase(StrEnum):
-    """The parts of stacking one cube."""
+    """The phases of stacking one cube."""
 
     CHOOSE = "choose"
     """Choose the cube to fetch."""
@@ -165,11 +167,11 @@ class StackPlan:
         }
 
     def step(self, view: OperatorView, now: float) -> tuple[Array | None, bool]:
-        """Return the goal of the gripper, shape (3,) [m], or None to keep still; and whether to move carefully.
+        """Return the goal of the gripper, shape (3,) [m], or None to rest, and whether to move carefully.
 
         Args:
-            view: what the operator sees, with delay and noise.
-            now: time at which the answer starts [s].
+            view: the operator's view, with delay and noise.
+            now: time at which the reaction starts [s].
         """
         self._view, self._now = view, now
         self._tool, self._target, self._below = view.tool, view.cubes[self.cube], view.cubes[self.cube - 1]
@@ -270,7 +272,7 @@ class StackPlan:
         return float(np.hypot(*(self._tool - goal)[:2]))
 
     def _above(self, place: Array, height: float, away: float) -> Array:
-        """Return the goal above ``place``; straight up first if the gripper is low and far away."""
+        """Return the goal above ``place``; if the gripper is low and far away, first a goal straight above it."""
         if self._tool[2] < height - 0.03 and away > 0.03:
             return np.array([self._tool[0], self._tool[1], height])
         return np.array([place[0], place[1], height])
@@ -305,7 +307,7 @@ class StackPlan:
         return self._tower_top() + _CLEAR + 0.5 * SIDE + float(self._offset()[2]) + self.habits.height
 
     def _n_stacked(self) -> int:
-        """Return how many cubes look stacked; a cube with another one on it is not corrected."""
+        """Return the number of cubes that look stacked; a cube below another cube is not corrected."""
         cubes, n = self._view.cubes, 1
         while n < N_CUBES:
             away, up = _separation(cubes[n], cubes[n - 1])
@@ -345,11 +347,12 @@ class SimulatedOperator:
 
     *Hand.* The motion of the hand is a sum of sub-movements, :math:`h(t) = h_0 + \sum_i d_i\,\mu((t-t_i)/T_i)`, with
     the minimum-jerk profile :math:`\mu(u) = 10u^3-15u^4+6u^5` (intermittent control: Milner 1992, Burdet and Milner
-    1998). Their lengths scatter by 4 %. Their duration is :math:`T = |d|/v + 0.25` s, with a small speed v near a
+    1998). Their lengths vary by 4 %. Their duration is :math:`T = |d|/v + 0.25` s, with a small speed v near a
     contact. Tremor is added by :class:`~imitarm.capture.person.Person`.
 
-    *Eye.* At each look, about 7 per second, the person reacts to the :class:`OperatorView` of ``delay`` ago, with
-    noise of about a millimetre and a bias. The expected position of the gripper is the seen one plus the displacement
+    *Eye.* About 7 times per second, the person reacts to the :class:`OperatorView` at the time ``delay`` before, with
+    noise of about a millimetre and a bias. The expected position of the gripper is the observed position plus the
+    displacement
     that the hand has commanded since then: :math:`\hat p = p(t-\delta) + \rho\,(h_{end} - h(t-\delta-\lambda))`, with
     the scale :math:`\rho` and the lag :math:`\lambda` that the person expects. The next sub-movement is
     :math:`d = g\,(p_{goal}-\hat p)/\rho`, with a gain g below 1 over short distances and 1 over long ones.
@@ -357,17 +360,17 @@ class SimulatedOperator:
     *Plan.* :class:`StackPlan` chooses the goals. The hand closes or opens when the gripper looks aligned to within the
     person's tolerance, which grows with impatience. A cube that was missed, lost or has fallen is fetched again.
 
-    The hand at a time depends only on what was visible at least ``delay`` before.
+    The hand position depends only on views that are at least ``delay`` old.
 
     Args:
         seed: seed of the person and the habits.
         repeat: number of the run of this person; seeds the differences between runs.
-        scale: scale of the robot's motion relative to the hand's, to which the person is used.
+        scale: robot motion divided by hand motion, as the person expects it.
 
     Attributes:
         person: the person whose arm moves.
-        habits: how this person works.
-        plan: what this person does next.
+        habits: habits of this person.
+        plan: plan of this person's next actions.
     """
 
     def __init__(self, seed: int, repeat: int = 0, *, scale: float = 1.0) -> None:
@@ -389,7 +392,7 @@ class SimulatedOperator:
         return self.plan.finished
 
     def see(self, view: OperatorView) -> None:
-        """Show what is visible now; the person reacts to it ``delay`` later."""
+        """Show the current view; the person reacts to it ``delay`` later."""
         self._views.append(view)
 
     def hand_displacement(self, time: float) -> Array:
@@ -411,7 +414,7 @@ class SimulatedOperator:
         return self.person.skeleton(time, wrist, swivel=self._swivel, closed=self.plan.closed)
 
     def _look(self, now: float) -> None:
-        """React to what was visible ``delay`` ago."""
+        """React to the view at the time ``delay`` before."""
         seen = None
         while self._views and self._views[0].time <= now - self.habits.delay + 1e-9:
             seen = self._views.popleft()

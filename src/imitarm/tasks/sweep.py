@@ -50,10 +50,11 @@ _WOOD, _LEG, _PAN, _DIRT = (
 
 @dataclass(frozen=True)
 class SweepTask:
-    """A Sawyer with a curved brush, dirt on a table, and a dustpan that is let into the table.
+    """A Sawyer with a curved brush, dirt on a table, and a dustpan recessed into the table.
 
-    The brush starts at S, moves to the dirt at T and pushes it to G in the dustpan. It moves just above the table with
-    its open side ahead, so that its two ends hold the crumbs while it deviates to the left or right. The task succeeds
+    The brush starts at S, moves to the dirt at T and pushes it to G in the dustpan. The brush moves just above the
+    table with its open side ahead, so that its two ends hold the crumbs when it deviates to the left or right. The task
+    succeeds
     if the dirt is in the pan and neither the arm nor the brush has touched an obstacle.
 
     Attributes:
@@ -97,16 +98,19 @@ class SweepTask:
 
     @classmethod
     def scenes(cls) -> Mapping[str, Scene]:
-        """Return all packaged scenes by name, the one without obstacles first."""
+        """Return all packaged scenes by name, the scene without obstacles first."""
         return {name: cls.scene(name) for name in SCENES}
 
     def dirt_time(self, trajectory: Trajectory) -> float:
-        """Return when ``trajectory`` is nearest to the dirt [s]: a time at which a path should not be displaced."""
+        """Return the time at which ``trajectory`` is nearest to the dirt [s].
+
+        The path should not be displaced at this time.
+        """
         away = np.linalg.norm(trajectory.positions - self.dirt.position, axis=1)
         return float(trajectory.times[np.argmin(away)])
 
     def crumb_positions(self) -> Array:
-        """Return the first positions of the crumbs, shape (n_crumbs, 2) [m]: without contact, within 16 mm of T."""
+        """Return the initial positions of the crumbs (n_crumbs, 2) [m], within 16 mm of T and without contact."""
         rng = np.random.default_rng(self.seed)
         places: list[Array] = []
         apart = min(2.9 * _CRUMB, 1.2 * _SPREAD / np.sqrt(self.n_crumbs))
@@ -132,7 +136,7 @@ class SweepTask:
         """Return the simulated robot with its brush at S, in ``scene``.
 
         Args:
-            scene: obstacles on the table; None for none.
+            scene: obstacles on the table; None: no obstacles.
             arm: the arm, if it is loaded already.
             control: control of the drives.
         """
@@ -144,7 +148,7 @@ class SweepTask:
         return find_posture(arm, self.start)
 
     def swept(self, robot: SimulatedRobot) -> NDArray[np.bool_]:
-        """Return which crumbs are in the pan now, shape (n_crumbs,)."""
+        """Return whether each crumb is in the pan, shape (n_crumbs,)."""
         crumbs = np.array([robot.data.body(f"crumb/{i}").xpos for i in range(self.n_crumbs)])
         across, along = _PAN_INSIDE
         x, y, z = (crumbs - [self.goal.position[0], self.goal.position[1] - _PAN_BEFORE_GOAL, 0.0]).T

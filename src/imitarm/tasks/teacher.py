@@ -35,11 +35,12 @@ _TREMOR_BAND = (4.0, 9.0)  # [Hz] physiological tremor of a hand
 
 @dataclass(frozen=True, eq=False)
 class Teacher:
-    """How one person sweeps: the path of the hand, its speed and its tremor.
+    """The sweeping motion of one person: the path of the hand, its speed and its tremor.
 
     The hand follows the minimum-jerk path through S, T, G and two points between them: the quintic spline that starts
-    and ends at rest (Flash and Hogan 1985). People differ in the duration and its fraction before T, the sideways
-    displacement of the path, the accuracy at T and G, the height of the brush, the rotation of the wrist, the tremor,
+    and ends at rest (Flash and Hogan 1985). People differ in the duration, the fraction of the duration before T, the
+    sideways displacement of the path, the accuracy at T and G, the height of the brush, the rotation of the wrist, the
+    tremor,
     and the rest before and after.
 
     Attributes:
@@ -102,7 +103,7 @@ class Teacher:
         corresponding poses of the tool.
 
         Args:
-            arm: the Sawyer with the brush, if it is loaded already.
+            arm: the Sawyer with the brush, if it is already loaded.
 
         Raises:
             TaskFailedError: when the dirt is not in the pan at the end.

@@ -1,4 +1,4 @@
-"""Teleoperation: the live loop from a person's skeletons to a robot, in this process or over UDP."""
+"""Teleoperation: the real-time loop from a person's skeletons to a robot, in this process or over UDP."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ _MAX_UNANSWERED = 256  # commands for which the skeleton they were computed from
 
 @dataclass(frozen=True, eq=False)
 class StepInfo:
-    """One control step, as ``on_step`` receives it.
+    """One control step, the argument of ``on_step``.
 
     Attributes:
         time: time since the start [s].
-        skeleton: the newest skeleton that arrived in this step; None: none did.
+        skeleton: newest skeleton that arrived in this step; None if no skeleton arrived.
         command: result of the retargeter.
         state: measured state of the robot.
         engagement: state of the retargeter; None while the robot cannot be controlled.
@@ -69,7 +69,7 @@ class Summary:
         unsafe: number of steps in which no joint velocity kept every limit and clearance.
         speed: largest velocity of the set-point, as a fraction of its limit.
         acceleration: largest acceleration of the set-point, as a fraction of its limit.
-        interruptions: how often control of the robot was lost.
+        interruptions: number of times that control of the robot was lost.
         reason: why the teleoperation has ended; empty while it runs.
         latency: duration of each stage for each skeleton.
     """
@@ -93,10 +93,11 @@ class Summary:
 class Teleoperation:
     """Lets a person move a robot in real time, at the retargeter's control period.
 
-    In each period the newest skeleton goes to the retargeter, its result through the safety filter, and the filtered
-    joint velocity to :meth:`Robot.move <imitarm.robots.robot.Robot.move>`. If the robot could not be controlled for
+    In each period, the retargeter processes the newest skeleton, the safety filter processes the retargeter's result,
+    and the filtered joint velocity is passed to :meth:`Robot.move <imitarm.robots.robot.Robot.move>`. If the robot
+    could not be controlled for
     some time, because it was stopped, slowed down or did not answer, it is first brought to rest. The retargeter then
-    starts again from the arm's position and engages anew, so the arm never jumps.
+    starts from the arm's position and engages again, so the arm never jumps.
 
     Args:
         source: skeletons of one person, live or in real time.
@@ -104,13 +105,14 @@ class Teleoperation:
         robot: robot to control.
         safety: filter for every command, the same for each retargeter; None: a filter that keeps the limits of the
             arm, a distance of 10 mm between its links, and no contact with the obstacles of the retargeter's scene.
-        stream: the stream that feeds ``source``, for the latencies; None: there is none.
-        recorder: receives the robot's motion from the first time at which a person moves the robot.
-        confirm_enable: called in each step in which a served robot cannot be controlled, with the reason and whether
-            the robot is stopped; returns whether the robot may move again. None: it may not.
+        stream: stream from which ``source`` reads, for the latencies; None without a stream.
+        recorder: recorder of the robot's motion, from the first time at which a person moves the robot.
+        confirm_enable: function called in each step in which a served robot cannot be controlled, with the reason
+            and whether
+            the robot is stopped; returns whether the robot may move again. None: it must not move again.
         on_step: called after every step.
-        clock_ns: returns the time [ns], on the same clock as ``stream`` and ``robot``.
-        rate_limiter: starts the control steps; None: in real time.
+        clock_ns: function that returns the time [ns], on the same clock as ``stream`` and ``robot``.
+        rate_limiter: timer that starts the control steps; None: real time.
     """
 
     def __init__(
@@ -183,7 +185,7 @@ class Teleoperation:
 
         Args:
             time: time since the start [s].
-            skeleton: the newest one that has arrived since the last step; None: none has.
+            skeleton: newest skeleton that has arrived since the last step; None if no skeleton has arrived.
         """
         before, summary = self.robot.velocity, self.summary
         problem = self._problem()
@@ -214,7 +216,7 @@ class Teleoperation:
     # --- input
 
     def _newest(self) -> Skeleton | None:
-        """Return the newest skeleton that arrives before the next step is due, and remember how it arrived."""
+        """Return the newest skeleton that arrives before the next step is due, and store its arrival times."""
         newest = None
         for _ in range(_MAX_BACKLOG):
             remaining = self._rate_limiter.remaining

@@ -1,8 +1,8 @@
 """Datagrams: messages encoded as bytes, and decoded with every value checked.
 
 A datagram is a header of 28 bytes and a payload whose size depends only on its kind, little-endian;
-docs/transmission.md has the table. Anything else is refused with a reason. No part of a datagram is executed or used
-as a length, so a hostile datagram can do no more than be counted.
+docs/transmission.md has the table. Anything else is rejected with a reason. No part of a datagram is executed or used
+as a length, so a hostile datagram has no effect except to be counted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 def now_ns() -> int:
-    """Return the time for time stamps [ns]: monotonic, and the same in all processes of this machine.
+    """Return the time for time stamps [ns], from a monotonic clock that all processes of this machine share.
 
     It includes the time during which the machine is suspended, if the system has such a clock. Otherwise every
     datagram sent after a suspension would look delayed.
@@ -95,7 +95,7 @@ def decode(data: bytes) -> tuple[Header, Message]:
     """Return header and message of a datagram.
 
     Args:
-        data: data as received; may be anything.
+        data: received bytes, which may be arbitrary.
 
     Raises:
         DatagramError: when the bytes are not a valid datagram. Its ``reason`` is ``"length"``, ``"magic"``,

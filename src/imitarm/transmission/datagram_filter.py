@@ -31,7 +31,7 @@ DROP_REASONS = {
     "foreign": "another sender while one is active",
     "retired": "a sender that was replaced",
 }
-"""What each reason for dropping a datagram means, by the key under which it is counted."""
+"""Meaning of each reason for dropping a datagram, by the key under which it is counted."""
 
 _HALF = 2**31
 _MASK = 2**32 - 1
@@ -141,7 +141,7 @@ class ClockOffsetEstimator:
             self._confirmed[0] = min(self._confirmed[0], self._unconfirmed.pop().offset)
 
     def _reject_false(self, sent: int, now: int, *, fresh: bool) -> None:
-        """Count a datagram as evidence against the unconfirmed samples, and drop those that it proves false."""
+        """Count a datagram as evidence against the unconfirmed samples, and drop the samples that are proved false."""
         few, kept = len(self._unconfirmed) <= _MAX_REJECTED, []
         for one in self._unconfirmed:
             one.contradictions += sent < one.sent
@@ -154,7 +154,7 @@ class ClockOffsetEstimator:
         self._unconfirmed = kept
 
     def _forget_old_windows(self, now: int) -> None:
-        """Forget samples older than two time windows."""
+        """Drop samples older than two time windows."""
         if self.minimum == math.inf:
             self._window_start = now
         elif now - self._window_start > _WINDOW:
@@ -184,7 +184,7 @@ class DatagramFilter:
             changes the session.
 
     Attributes:
-        session: the accepted session; None: the first that arrives.
+        session: accepted session; None: the first session that arrives.
         n_sessions: number of sessions so far.
         age: delay of the last accepted datagram [s].
         accepted: number of accepted datagrams.
@@ -263,7 +263,7 @@ class DatagramFilter:
         return ""
 
     def _wrong_session(self, header: Header, now: int) -> str:
-        """Return why the datagram's session is not accepted; starts it if the previous one has timed out."""
+        """Return why the datagram's session is not accepted; start the session if the previous one has timed out."""
         if header.session == self.session:
             return ""
         if header.session in self._retired:

@@ -1,4 +1,4 @@
-"""LatencyLog: the time that each stage between a person and a robot takes, for each skeleton."""
+"""LatencyLog: for each skeleton, the duration of each stage between person and robot."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _CHUNK = 1024
 
 
 class LatencyLog:
-    """A table with one row for each skeleton and one column for each stage; nan where it was not measured.
+    """A table with one row for each skeleton and one column for each stage; nan where a duration was not measured.
 
     Args:
         stages: names of the columns.

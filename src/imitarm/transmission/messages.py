@@ -31,7 +31,7 @@ class DatagramError(InputError):
 
 
 class CommandMode(IntEnum):
-    """What a joint command asks for."""
+    """Kinds of joint commands."""
 
     OBSERVE = 0  # an answer only
     MOVE = 1  # move to the commanded joint positions
@@ -40,7 +40,7 @@ class CommandMode(IntEnum):
 
 
 class RobotStatus(IntEnum):
-    """What a robot server does."""
+    """States of a robot server."""
 
     STOPPED = 0  # latched: only ENABLE ends it
     FOLLOWING = 1  # moves to the commanded joint positions
@@ -55,10 +55,10 @@ class SkeletonFrame:
     Attributes:
         time: time of exposure, on the source's clock [s].
         positions: positions of the joints, shape (25, 3) [m], at most 20 m; 0 where lost.
-        tracking: 0 lost, 1 inferred, 2 tracked, shape (25,).
+        tracking: tracking state of each joint: 0 lost, 1 inferred, 2 tracked, shape (25,).
         hands: states of the left and the right hand, 0 to 4.
         person: identifier of the person, u64.
-        waited_ns: time between exposure and sending [ns], at most a minute.
+        waited_ns: time from exposure to sending [ns], at most a minute.
     """
 
     KIND: ClassVar[int] = 1
@@ -95,7 +95,7 @@ class SkeletonFrame:
 
 @dataclass(frozen=True, eq=False)
 class JointCommand:
-    """What a client asks a robot to do.
+    """A command from a client to a robot.
 
     Attributes:
         mode: kind of command.
@@ -143,7 +143,7 @@ class JointState:
     """The state of a robot.
 
     Attributes:
-        status: what the robot does.
+        status: state of the server.
         time: time of the robot [s].
         q: measured joint positions, shape (n_joints,) [rad].
         velocity: measured joint velocities, shape (n_joints,) [rad/s].
@@ -151,12 +151,12 @@ class JointState:
         set_point: joint positions that the drives track, shape (n_joints,) [rad].
         set_velocity: velocity of the set-point, shape (n_joints,) [rad/s].
         arm: fingerprint of the arm.
-        challenge: number that ENABLE must carry; 0 if the robot is not stopped.
-        owner: session of the client whose commands are followed; 0: none.
+        challenge: number that ENABLE must contain; 0 if the robot is not stopped.
+        owner: session of the client whose commands are followed; 0 if there is none.
         opening: opening of the gripper and its maximum [m]; None without a gripper.
         echo: sequence number of the last command that was followed.
-        echo_sent_ns: time at which it was sent, on the client's clock [ns].
-        received_ns: time at which it was received, on the robot's clock [ns].
+        echo_sent_ns: time at which that command was sent, on the client's clock [ns].
+        received_ns: time at which that command was received, on the robot's clock [ns].
         applied_ns: time at which the drives first received a set-point computed from it, on the robot's clock [ns];
             0: not yet.
         reason: why the robot is stopped or faulty; at most 91 bytes of UTF-8.

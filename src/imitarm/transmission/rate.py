@@ -12,12 +12,12 @@ class RateLimiter:
     """Starts control periods at multiples of a fixed time after the first one.
 
     If a period starts a whole period late or more, the missed periods are skipped and counted, and the following ones
-    start on schedule. They are not run later in a burst, which would move an arm faster than intended.
+    start on schedule. Running them later in a burst would move an arm faster than intended.
 
     Args:
         period: length of a period [s].
-        clock_ns: returns the time [ns].
-        sleep: waits for a time [s].
+        clock_ns: function that returns the time [ns].
+        sleep: function that waits for a time [s].
 
     Attributes:
         ticks: number of periods so far, including the missed ones.

@@ -20,8 +20,8 @@ def parse_address(text: str, *, host: str = LOOPBACK) -> Address:
     """Return host and port of ``HOST:PORT`` or ``PORT``.
 
     Args:
-        text: as typed by a user.
-        host: used when only a port is given.
+        text: text typed by a user.
+        host: host to use when only a port is given.
 
     Raises:
         InputError: when the text is neither.
@@ -33,7 +33,7 @@ def parse_address(text: str, *, host: str = LOOPBACK) -> Address:
 
 
 def resolved(address: Address) -> Address:
-    """Return an address with the IP address of the host in place of its name.
+    """Return an address in which the host name is replaced by its IP address.
 
     Raises:
         InputError: when there is no such host.
