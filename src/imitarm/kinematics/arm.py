@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError
 from imitarm.kinematics.arm_file import ArmFile, compiled, read_arm, without_geoms
 from imitarm.kinematics.arm_kinematics import ArmKinematics
-from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_multiply, rotate
 from imitarm.kinematics.spheres import SphereCover
 from imitarm.validation import finite_number, finite_vector, flag, instance, text
 
@@ -165,15 +165,16 @@ class ArmModel(ArmKinematics):
         Users call :meth:`load` instead.
         """
         whole = compiled(file.spec, file.name)
-        # Shapes without mass are left out of the working model: its kinematics then takes a third of the time.
-        model = compiled(without_geoms(file.spec, _massless), file.name)
-        model.dof_armature[:] = 0.0
+        model = _working_model(file, whole)
         posture = np.array(model.qpos0)
         for name, position in file.home.items():
-            posture[model.jnt_qposadr[model.joint(name).id]] = position
+            joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+            if joint >= 0:
+                posture[model.jnt_qposadr[joint]] = position
         super().__init__(file.name, file.joints, model, posture)
         joints = np.array([model.joint(name).id for name in file.joints])
         limited = model.jnt_limited[joints].astype(bool)
+        self._home = dict(file.home)  # of all joints, fingers too
         self._source, self._spec, self._mass_faults, self.notes = source, file.spec, file.mass_faults, file.notes
         self.lower = _frozen(np.where(limited, model.jnt_range[joints, 0], -np.inf))
         self.upper = _frozen(np.where(limited, model.jnt_range[joints, 1], np.inf))
@@ -185,7 +186,7 @@ class ArmModel(ArmKinematics):
         self.tool_to_flange = Pose.identity()
         if self.has_tool:
             self.tool_to_flange = self.forward_kinematics(self.home).inverse() @ self.tool_pose(self.home)
-        self.cover = SphereCover(whole, joints)
+        self.cover = SphereCover(whole, model, file.joints)
         self.sphere_bodies = self.cover.bodies
         self._sealed = True
 
@@ -230,9 +231,7 @@ class ArmModel(ArmKinematics):
         instance(model, mujoco.MjModel, "model")
         qpos = np.array(model.qpos0)
         values = self.home if q is None else self._checked(q, "q")
-        mine = [self._model.joint(joint).name for joint in range(self._model.njnt)]  # fingers too
-        positions = dict(zip(mine, self._posture[self._model.jnt_qposadr].tolist(), strict=True))
-        positions.update(zip(self.joint_names, values.tolist(), strict=True))
+        positions = self._home | dict(zip(self.joint_names, values.tolist(), strict=True))
         for name, position in positions.items():
             joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, text(prefix, "prefix") + name)
             if joint < 0:
@@ -347,6 +346,35 @@ class ArmModel(ArmKinematics):
         mujoco.mj_comVel(self._model, data)
         mujoco.mj_rne(self._model, data, acceleration is not None, memory.force)
         return memory.force[self._dofs].copy()
+
+
+def _working_model(file: ArmFile, whole: mujoco.MjModel) -> mujoco.MjModel:
+    """Return the model that kinematics and dynamics are computed with.
+
+    It has no shapes without mass: its kinematics then takes a third of the time. Joints that are not part of the arm,
+    such as those of fingers, are fixed at their position in ``file.home``: the Jacobians then have no other columns.
+    It has no rotor inertia.
+    """
+    spec = without_geoms(file.spec, _massless)
+    for part in (*spec.actuators, *spec.equalities, *spec.tendons, *spec.sensors):
+        spec.delete(part)
+    carriers = {joint.parent.name for joint in spec.joints if joint.name in file.joints}
+    fixed = [joint for joint in spec.joints if joint.parent.name and joint.parent.name not in carriers]
+    bodies = {joint.parent.name for joint in fixed}
+    for joint in fixed:
+        spec.delete(joint)
+    model, data = compiled(spec, file.name), mujoco.MjData(whole)
+    for name, position in file.home.items():
+        data.qpos[whole.jnt_qposadr[whole.joint(name).id]] = position
+    mujoco.mj_kinematics(whole, data)
+    for name in bodies:
+        body = model.body(name).id
+        parent = model.body_parentid[body]
+        back = quaternion_conjugate(data.xquat[parent])
+        model.body_pos[body] = rotate(back, data.xpos[body] - data.xpos[parent])
+        model.body_quat[body] = quaternion_multiply(back, data.xquat[body])
+    model.dof_armature[:] = 0.0
+    return model
 
 
 def _massless(geom: mujoco.MjsGeom) -> bool:

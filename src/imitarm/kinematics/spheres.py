@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import product
 
 import mujoco
@@ -31,8 +32,15 @@ class SphereCover:
         base_radii: radii of these spheres, shape (b,) [m].
     """
 
-    def __init__(self, model: mujoco.MjModel, joints: NDArray[np.int_]) -> None:
-        """Cover the shapes of ``model``; columns of the Jacobians belong to ``joints``."""
+    def __init__(self, model: mujoco.MjModel, working: mujoco.MjModel, names: Sequence[str]) -> None:
+        """Cover the shapes of a model.
+
+        Args:
+            model: with all shapes.
+            working: with the same bodies; the methods get its data.
+            names: of the joints to which the columns of the Jacobians belong.
+        """
+        joints = np.array([model.joint(name).id for name in names])
         owners: list[int] = []
         centers, radii = [np.zeros((0, 3))], [np.zeros(0)]
         base_centers, base_radii = [np.zeros((0, 3))], [np.zeros(0)]
@@ -52,7 +60,7 @@ class SphereCover:
         self.bodies = tuple(model.body(body).name for body in owners)
         self.radii = np.concatenate(radii)
         self.radii.setflags(write=False)
-        self._joints, self._owners = joints, np.array(owners, dtype=int)
+        self._joints, self._owners = np.array([working.joint(name).id for name in names]), np.array(owners, dtype=int)
         self._centers = np.concatenate(centers)[:, :, None]
         self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
         moves = [[_carries(model, int(model.jnt_bodyid[joint]), body) for joint in joints] for body in owners]
@@ -63,7 +71,7 @@ class SphereCover:
         rows = 3 * self._owners[:, None] + np.arange(3)
         self._picked = rows * len(owners) + np.arange(len(owners))[:, None]
         self._root = int(model.body_rootid[model.jnt_bodyid[joints[0]]])
-        self._dofs = model.jnt_dofadr[joints]
+        self._dofs = working.jnt_dofadr[self._joints]
         self._moved = self._moves[:, 0].copy()
         self.links = self._moves[:, 0].sum(axis=1).astype(int)
         self.follows_last_joint = self._moves[:, 0, -1] > 0.0

@@ -22,6 +22,7 @@ _SLOW = 0.3  # [m/s] faster elbows and wrists are blurred by the camera's exposu
 _LEAST_FRAMES = 5
 _PLAUSIBLE = (0.10, 0.60)  # [m] of an upper arm or forearm
 _POINT = 1e-3  # [m] a shorter bone has no direction
+_ROUNDING = 1e-7  # [m] nearer to its true length than this, a bone needs no further step
 
 
 @dataclass(frozen=True)
@@ -159,22 +160,26 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
     (sx, sy, sz), (ex, ey, ez), (wx, wy, wz) = points.tolist()
     free_s, free_e, free_w = (1.0 / max(c, 1e-3) for c in confidence.tolist())
     m11, m22 = free_s + free_e, free_e + free_w
+    long_u, long_f = lengths.upper_arm, lengths.forearm
     for step in range(rounds + 1):
         ux, uy, uz, fx, fy, fz = ex - sx, ey - sy, ez - sz, wx - ex, wy - ey, wz - ez
         upper, fore = math.sqrt(ux * ux + uy * uy + uz * uz), math.sqrt(fx * fx + fy * fy + fz * fz)
-        ux, uy, uz = _unit(ux, uy, uz, upper)
-        fx, fy, fz = _unit(fx, fy, fz, fore)
-        if step == rounds or min(upper, fore) < _POINT:
+        if upper < _POINT or fore < _POINT:
+            ux, uy, uz = _unit(ux, uy, uz, upper)
+            fx, fy, fz = _unit(fx, fy, fz, fore)
+            break
+        ux, uy, uz, fx, fy, fz = ux / upper, uy / upper, uz / upper, fx / fore, fy / fore, fz / fore
+        r1, r2 = long_u - upper, long_f - fore
+        if step == rounds or -_ROUNDING < r1 < _ROUNDING and -_ROUNDING < r2 < _ROUNDING:
             break
         m12 = -free_e * (ux * fx + uy * fy + uz * fz)
-        r1, r2 = lengths.upper_arm - upper, lengths.forearm - fore
         determinant = m11 * m22 - m12 * m12
         a, b = (m22 * r1 - m12 * r2) / determinant, (m11 * r2 - m12 * r1) / determinant
         at_s, at_e, at_f, at_w = free_s * a, free_e * a, free_e * b, free_w * b
         sx, sy, sz = sx - at_s * ux, sy - at_s * uy, sz - at_s * uz
         ex, ey, ez = ex + at_e * ux - at_f * fx, ey + at_e * uy - at_f * fy, ez + at_e * uz - at_f * fz
         wx, wy, wz = wx + at_w * fx, wy + at_w * fy, wz + at_w * fz
-    long_u, long_f = lengths.upper_arm, lengths.forearm  # the remaining error is removed as in correct_limbs
+    # the remaining error is removed as in correct_limbs
     ex, ey, ez = sx + long_u * ux, sy + long_u * uy, sz + long_u * uz
     return np.array([[sx, sy, sz], [ex, ey, ez], [ex + long_f * fx, ey + long_f * fy, ez + long_f * fz]])
 

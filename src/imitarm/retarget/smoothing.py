@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from operator import sub
 from typing import Any
 
 import numpy as np
@@ -100,23 +99,19 @@ class OneEuro:
 
     def _continue(self, measured: list[list[float]], trust: list[float], period: float) -> None:
         """Filter one sample with plain floats, which is twice as fast as NumPy for a few short vectors."""
-        steady = smoothing_weight(self.derivative_cutoff, period)
+        radians = 2.0 * math.pi * period
+        least, beta, steady = self.min_cutoff, self.beta, smoothing_weight(self.derivative_cutoff, period)
         smooth, speeds = [], []
         for x, last, value, velocity, c in zip(measured, self._last, self._smooth, self._speed, trust, strict=True):
             weight = c * steady
             per_second = weight / period
             kept = 1.0 - weight
-            speed = [kept * v + per_second * d for v, d in zip(velocity, self._difference(x, last))]  # noqa: B905
-            cutoff = self.min_cutoff + self.beta * math.hypot(*speed)
-            smooth.append(self._moved(value, self._difference(x, value), c * smoothing_weight(cutoff, period)))
+            speed = [kept * v + per_second * (a - b) for v, a, b in zip(velocity, x, last)]  # noqa: B905
+            angle = radians * (least + beta * math.hypot(*speed))
+            fraction = c * angle / (1.0 + angle)
+            smooth.append([b + fraction * (a - b) for a, b in zip(x, value)])  # noqa: B905
             speeds.append(speed)
         self._smooth, self._speed = smooth, speeds
-
-    def _difference(self, x: list[float], before: list[float]) -> list[float]:
-        return list(map(sub, x, before))
-
-    def _moved(self, value: list[float], step: list[float], fraction: float) -> list[float]:
-        return [a + fraction * d for a, d in zip(value, step)]  # noqa: B905
 
 
 class OneEuroRotation(OneEuro):
@@ -137,30 +132,42 @@ class OneEuroRotation(OneEuro):
     def _begin(self, measured: list[list[float]]) -> None:
         self._smooth, self._speed = measured, [[0.0, 0.0, 0.0]]
 
-    def _difference(self, x: list[float], before: list[float]) -> list[float]:
-        """Return log(x before^-1)."""
-        (a, b, c, d), (w, i, j, k) = x, before
-        real = a * w + b * i + c * j + d * k
-        u, v, z = b * w - a * i - c * k + d * j, c * w - a * j - d * i + b * k, d * w - a * k - b * j + c * i
-        sine = math.sqrt(u * u + v * v + z * z)
-        factor = 2.0 * math.atan2(sine, abs(real)) / sine if sine > _SMALL else 2.0
-        factor = factor if real >= 0.0 else -factor
-        return [factor * u, factor * v, factor * z]
+    def _continue(self, measured: list[list[float]], trust: list[float], period: float) -> None:
+        weight = trust[0] * smoothing_weight(self.derivative_cutoff, period)
+        kept, per_second = 1.0 - weight, weight / period
+        (p, q, r), (x, y, z) = self._speed[0], _rotation_between(self._last[0], measured[0])
+        p, q, r = kept * p + per_second * x, kept * q + per_second * y, kept * r + per_second * z
+        cutoff = self.min_cutoff + self.beta * math.sqrt(p * p + q * q + r * r)
+        fraction = trust[0] * smoothing_weight(cutoff, period)
+        x, y, z = _rotation_between(self._smooth[0], measured[0])
+        self._smooth, self._speed = [_rotated(self._smooth[0], fraction * x, fraction * y, fraction * z)], [[p, q, r]]
 
-    def _moved(self, value: list[float], step: list[float], fraction: float) -> list[float]:
-        """Return ``exp(fraction step) value``, normalised."""
-        (x, y, z), (w, i, j, k) = step, value
-        half = 0.5 * fraction * math.sqrt(x * x + y * y + z * z)
-        fraction *= 0.5 * math.sin(half) / half if half > _SMALL else 0.5
-        a, b, c, d = math.cos(half), fraction * x, fraction * y, fraction * z
-        w, i, j, k = (
-            a * w - b * i - c * j - d * k,
-            a * i + b * w + c * k - d * j,
-            a * j - b * k + c * w + d * i,
-            a * k + b * j - c * i + d * w,
-        )
-        length = math.sqrt(w * w + i * i + j * j + k * k)
-        return [w / length, i / length, j / length, k / length]
+
+def _rotation_between(before: list[float], after: list[float]) -> tuple[float, float, float]:
+    """Return log(after before^-1), a rotation vector [rad], of two unit quaternions."""
+    (w, i, j, k), (a, b, c, d) = before, after
+    real = a * w + b * i + c * j + d * k
+    u, v, z = b * w - a * i - c * k + d * j, c * w - a * j - d * i + b * k, d * w - a * k - b * j + c * i
+    sine = math.sqrt(u * u + v * v + z * z)
+    factor = 2.0 * math.atan2(sine, abs(real)) / sine if sine > _SMALL else 2.0
+    factor = factor if real >= 0.0 else -factor
+    return factor * u, factor * v, factor * z
+
+
+def _rotated(quaternion: list[float], x: float, y: float, z: float) -> list[float]:
+    """Return a unit quaternion rotated by exp(x, y, z) [rad], normalised."""
+    w, i, j, k = quaternion
+    half = 0.5 * math.sqrt(x * x + y * y + z * z)
+    factor = 0.5 * math.sin(half) / half if half > _SMALL else 0.5
+    a, b, c, d = math.cos(half), factor * x, factor * y, factor * z
+    w, i, j, k = (
+        a * w - b * i - c * j - d * k,
+        a * i + b * w + c * k - d * j,
+        a * j - b * k + c * w + d * i,
+        a * k + b * j - c * i + d * w,
+    )
+    length = math.sqrt(w * w + i * i + j * j + k * k)
+    return [w / length, i / length, j / length, k / length]
 
 
 class Hampel:
@@ -177,25 +184,31 @@ class Hampel:
 
     def __init__(self, window: float = 0.3, least: float = 0.02) -> None:
         self.window, self.least = window, least
-        self._seen: deque[tuple[float, list[float]]] = deque()
+        self._times: deque[float] = deque()
+        self._values: deque[list[float]] = deque()
 
     def reset(self) -> None:
         """Forget the past."""
-        self._seen.clear()
+        self._times.clear()
+        self._values.clear()
 
     def accept(self, time: float, x: Array) -> bool:
         """Add a value (d,) to the window and return whether it is consistent with those before."""
-        seen = self._seen
-        while seen and (time - seen[0][0] > self.window or time <= seen[0][0]):
-            seen.popleft()
-        seen.append((time, x.tolist()))
-        if len(seen) < 4:
+        times, values, value = self._times, self._values, x.tolist()
+        while times and (time - times[0] > self.window or time <= times[0]):
+            times.popleft()
+            values.popleft()
+        times.append(time)
+        values.append(value)
+        if len(times) < 4:
             return True
         # plain floats: for a few short vectors three times as fast as NumPy
-        half = len(seen) // 2
-        middle = [sorted(axis)[half] for axis in zip(*(value for _, value in seen), strict=True)]
-        away = [math.dist(value, middle) for _, value in seen]
-        return away[-1] <= max(4.0 * 1.4826 * sorted(away)[half], self.least)
+        half = len(times) // 2
+        middle = [sorted(axis)[half] for axis in zip(*values, strict=True)]
+        distance = math.dist(value, middle)
+        if distance <= self.least:  # nearly always
+            return True
+        return distance <= 4.0 * 1.4826 * sorted([math.dist(each, middle) for each in values])[half]
 
 
 class TrackingOffsets:
