@@ -78,7 +78,7 @@ class ArmMemory:
             home: positions of all joints, including fingers, shape (nq,).
             positions: indices of the arm's joints in qpos.
             joints: indices of the arm's joints in qvel.
-            landmarks: sites whose Jacobians :meth:`landmark_jacobians` returns.
+            landmarks: sites whose positions :meth:`landmarks` returns, and whose Jacobians :meth:`landmark_jacobians`.
         """
         self.data = mujoco.MjData(model)
         self.data.qpos[:] = home
@@ -93,6 +93,7 @@ class ArmMemory:
         if isinstance(joints, slice):
             self._views = self.jacobian[:, joints], self._stacked[:, joints]
         self._landmarks = list(zip(landmarks, stacked, strict=True))
+        self._landmark_sites = np.array(landmarks, dtype=np.intp)
         self.sites = self.data.site_xpos
         self._qpos = self.data.qpos  # asking MuJoCo for it takes as long as the kinematics of one link
 
@@ -115,6 +116,11 @@ class ArmMemory:
         """Return the Jacobian of a site, shape (6, n), as a view that the next call overwrites."""
         mujoco.mj_jacSite(self._model, self.data, self.linear, self.angular, site)
         return self.jacobian[:, self._joints] if self._views is None else self._views[0]
+
+    def landmarks(self) -> list[list[float]]:
+        """Return the positions of the landmarks in the base frame, three floats each [m]."""
+        positions: list[list[float]] = self.sites.take(self._landmark_sites, axis=0).tolist()
+        return positions
 
     def landmark_jacobians(self) -> Array:
         """Return the Jacobians of the landmarks, one below the other, (3 m, n), as a view that is overwritten."""
@@ -166,14 +172,17 @@ class ArmKinematics:
         Use it in loops that need several results for one posture. It is recomputed only for a new posture, and is valid
         until a method is called with another posture.
         """
-        posture = self._checked(q, "q")
+        # The usual case is decided here: it is on the path of every control step.
+        usual = type(q) is np.ndarray and q.dtype is _FLOAT64 and q.shape == self._shape
+        if not (usual and math.isfinite(sum(q.tolist()))):  # type: ignore[union-attr]
+            q = self._checked(q, "q")
         memory: ArmMemory
         try:
             memory = self._local.memory
         except AttributeError:  # the first time in this thread
             sites = () if self.landmarks is None else self.landmarks.sites
             memory = self._local.memory = ArmMemory(self._model, self._posture, self._qpos, self._dofs, sites)
-        memory.move_to(posture)
+        memory.move_to(q)  # type: ignore[arg-type]
         return memory
 
     def site(self, frame: str) -> int:
@@ -274,10 +283,6 @@ class ArmKinematics:
         return self.landmarks
 
     def _checked(self, values: ArrayLike, what: str) -> Array:
-        # The usual case is decided here: it is on the path of every control step.
-        usual = type(values) is np.ndarray and values.dtype is _FLOAT64 and values.shape == self._shape
-        if usual and math.isfinite(sum(values.tolist())):  # type: ignore[union-attr]
-            return values  # type: ignore[return-value]
         unit = "rad" if what == "q" else "rad/s" if what == "qd" else "rad/s^2"
         return finite_vector(values, self.n_joints, f"{self.name}: {what}", unit)
 

@@ -35,6 +35,7 @@ _ROUNDING = 1e-8  # [rad/s]
 _CLEAR = 1e-3  # squared singular values above this can be factored without losing half of the digits
 _VIOLATED = 1e-9
 _EYE = np.eye(6)
+_FLOAT64 = np.dtype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +163,7 @@ class IKSolver:
         """Return the problem that the methods solve; same arguments and errors as :meth:`solve`."""
         arm = self.arm
         memory = arm.at(q)
-        position = np.asarray(q, dtype=float)
+        position = q if type(q) is np.ndarray and q.dtype is _FLOAT64 else np.asarray(q, dtype=float)
         previous = None if velocity is None else finite_vector(velocity, arm.n_joints, "solve_ik: velocity", "rad/s")
         free = self._free
         problem = IKProblem(arm, memory, position, previous, self.dt, free, [], [], self._max_speed, self._scaled)
@@ -218,11 +219,13 @@ class IKSolver:
         given: Sequence[Rows] = (rows,) if isinstance(rows, Rows) else rows
         checked = []
         n = self.arm.n_joints
-        if not isinstance(given, list | tuple) or not all(isinstance(part, Rows) for part in given):
+        if not isinstance(given, list | tuple):
             raise InputError(f"solve_ik: rows must be Rows(matrix, lower) or several of them, got {rows!r}")
         if self.method != "qp" and len(given):
             raise InputError(f"solve_ik: method {self.method!r} can't keep rows; use method='qp'")
         for part in given:
+            if not isinstance(part, Rows):
+                raise InputError(f"solve_ik: rows must be Rows(matrix, lower) or several of them, got {rows!r}")
             try:
                 matrix, lower = np.asarray(part.matrix, dtype=float), np.asarray(part.lower, dtype=float)
                 fits = lower.ndim == 1 and matrix.shape == (len(lower), n) and part.price > 0.0
@@ -233,10 +236,12 @@ class IKSolver:
                     f"solve_ik: rows need shapes (m, {n}) and (m,) and a price above 0, "
                     f"got {matrix.shape}, {lower.shape} and {part.price}"
                 )
-            if not math.isfinite(float(np.vdot(matrix, matrix)) + sum(lower.tolist())):
+            flat = matrix.ravel()
+            if not math.isfinite(flat.dot(flat) + lower.dot(lower)):  # sums of squares: finite only if every number is
                 raise InputError("solve_ik: rows must be finite numbers")
             if len(lower):
-                checked.append(Rows(matrix, lower, part.price))
+                usual = matrix is part.matrix and lower is part.lower
+                checked.append(part if usual else Rows(matrix, lower, part.price))
         return checked
 
 

@@ -72,7 +72,10 @@ class TwistTask(NamedTuple):
         except TypeError:  # not hashable
             lengths = tuple(finite_vector(rotation_length, 3, "TwistTask: rotation_length", "m").tolist())
             weights, scale, effort, site = _scales(lengths, text(frame, "frame"), problem.arm, problem.scaled)
-        most = problem.max_speed if most is None else finite_number(most, "TwistTask: max_speed", "m/s", at_least=0.0)
+        if most is None:
+            most = problem.max_speed
+        elif not (type(most) is float and 0.0 <= most < math.inf):
+            most = finite_number(most, "TwistTask: max_speed", "m/s", at_least=0.0)
         if type(twist) is not np.ndarray or twist.dtype is not _FLOAT64 or twist.shape != (6,):
             twist = finite_vector(twist, 6, "TwistTask: twist", "m/s, rad/s")
         target = twist * weights
@@ -169,7 +172,8 @@ class ElbowTask(NamedTuple):
         if not problem.tasks:
             raise InputError("ElbowTask: must follow a task for the tool, such as TwistTask, in the list of tasks")
         tool, velocity, memory = problem.tasks[0], problem.velocity, problem.memory
-        shoulder, elbow, wrist = memory.sites.take(_landmark_sites(problem.arm), axis=0).tolist()
+        problem.arm.required_landmarks()
+        shoulder, elbow, wrist = memory.landmarks()
         now = one_angle(shoulder, elbow, wrist, convention)
         if now is None:
             return None
@@ -189,7 +193,8 @@ class ElbowTask(NamedTuple):
                 most = 0.5 * _QUICK * min([width / (part if part > 1e-9 else 1e-9) for width, part in parts])
                 speed = min(max(speed, before - most), before + most)
         root = math.sqrt(weight)
-        return TaskRows(root * direction[None], np.array([root * speed]))
+        direction *= root
+        return TaskRows(direction[None], np.array([root * speed]))
 
 
 def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] | None:
@@ -217,13 +222,8 @@ def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] 
     if square < _LEAST:
         return None
     length = math.sqrt(square)
-    return direction / length, length, by_tool
-
-
-@lru_cache(maxsize=64)
-def _landmark_sites(arm: ArmModel) -> NDArray[np.intp]:
-    """Return the indices of the sites that mark shoulder, elbow and wrist."""
-    return np.array(arm.required_landmarks().sites, dtype=np.intp)
+    direction /= length
+    return direction, length, by_tool
 
 
 def _root(weight: float, task: str) -> float:
