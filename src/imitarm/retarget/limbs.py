@@ -170,7 +170,7 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
             break
         ux, uy, uz, fx, fy, fz = ux / upper, uy / upper, uz / upper, fx / fore, fy / fore, fz / fore
         r1, r2 = long_u - upper, long_f - fore
-        if step == rounds or -_ROUNDING < r1 < _ROUNDING and -_ROUNDING < r2 < _ROUNDING:
+        if step == rounds or (-_ROUNDING < r1 < _ROUNDING and -_ROUNDING < r2 < _ROUNDING):
             break
         m12 = -free_e * (ux * fx + uy * fy + uz * fz)
         determinant = m11 * m22 - m12 * m12
