@@ -1,7 +1,8 @@
-"""Learn a skill: read recordings, check them, align them, learn, save, load, and go to another goal.
+"""Learn a skill: read, check and align recordings, learn, save and load the skill, and move to another goal.
 
-The recordings are those that come with the package: a Sawyer with a brush was led by hand, eight times, through
-sweeping crumbs into a dustpan. A robot of yours records its own; `docs/demonstrations.md` says which files can be read.
+The recordings are part of the package: a simulated teacher guides a simulated Sawyer with a brush eight times to sweep
+crumbs into a dustpan. Use recordings of your own robot instead; `docs/demonstrations.md` lists the formats
+that can be read.
 """
 
 from __future__ import annotations
@@ -15,18 +16,18 @@ from imitarm.tasks import DEMONSTRATIONS
 
 
 def main() -> None:
-    # Read. A folder, a file or several; the content tells the format.
+    # Read a folder, a file or several files; the content determines the format.
     shown = read(DEMONSTRATIONS)
     for one in shown:
         motion = one.trajectory
         print(f"{Path(one.source).name}: {len(one)} poses, {motion.duration:.1f} s, {motion.path_length:.2f} m")
 
-    # Check, before anything is learned. Notes are for information, warnings want a look, errors spoil the result.
+    # Check before learning. Notes are for information, warnings should be inspected, errors spoil the result.
     print("\nlint says:")
     for finding in lint(shown):
         print(f"  {finding.severity} {finding.code}: {finding.message}")
 
-    # What it would say of a recording in which the tool jumps by 8 cm between two samples:
+    # The findings for a recording in which the tool jumps by 8 cm between two samples:
     positions = np.array(shown[0].trajectory.positions)
     positions[150:] += [0.0, 0.08, 0.0]
     damaged = Demonstration(Trajectory(shown[0].trajectory.times, positions), source="damaged.csv")
@@ -34,7 +35,7 @@ def main() -> None:
         if finding.severity == "error":
             print(f"  {finding}")
 
-    # Align. People never show a motion twice at the same pace; averaging at equal times would flatten every bend.
+    # Align. People never repeat a motion at exactly the same speed; averaging at equal times would flatten every bend.
     ready = align(shown)
     before = np.ptp([one.trajectory.duration for one in shown])
     print(f"\naligned to {ready[0].trajectory.duration:.1f} s (durations differed by {before:.1f} s)")
@@ -50,7 +51,7 @@ def main() -> None:
         print(f"  {tried.n_components:2d}  {errors}  {tried.bic:7.0f}{mark}")
     print(skill)
 
-    # How exact must the robot be? As exact as the person was: the covariance at each instant is the tolerance.
+    # The required precision: the robot must be as precise as the person was, so the covariance is the tolerance.
     times = np.linspace(0.0, skill.duration_, 6)
     spread = 1e3 * np.sqrt(np.trace(skill.tolerance(times), axis1=1, axis2=2))
     print(
@@ -65,11 +66,11 @@ def main() -> None:
     np.testing.assert_array_equal(again.generate().positions, skill.generate().positions)
     print(f"\nsaved and loaded {path}, {path.stat().st_size / 1000:.0f} kB; the motion is the same to the last bit")
 
-    # Do it to another goal, and in half the time.
+    # Move to another goal, in half the time.
     goal = again.goal_.position + np.array([0.0, 0.06, 0.0])
     motion = again.generate(goal=goal, duration=0.5 * again.duration_, dt=0.01)
     away = 1e3 * np.linalg.norm(motion.positions[-1] - goal)
-    print(f"to a goal 6 cm further in {motion.duration:.2f} s: {len(motion)} poses, ends {away:.2f} mm from it")
+    print(f"to a goal 6 cm farther in {motion.duration:.2f} s: {len(motion)} poses, ends {away:.2f} mm from it")
 
 
 if __name__ == "__main__":

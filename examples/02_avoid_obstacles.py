@@ -1,6 +1,6 @@
-"""Adapt a learned path to a scene: three methods side by side, forbidden directions, and refusals that say why.
+"""Adapt a learned path to a scene: a comparison of three methods, forbidden directions, and refusals with reasons.
 
-No robot moves here: `adapt` returns a path and the clearance that is certified for it. `03_reproduce_on_an_arm.py`
+No robot moves in this example: `adapt` returns a path and its certified clearance. `03_reproduce_on_an_arm.py`
     executes one.
 """
 
@@ -33,25 +33,26 @@ def main() -> None:
     dirt = task.dirt_time(skill.gmr_.trajectory(1000))
     options = {"tool_radius": task.tool_radius, "clearance": 0.02, "pinned": [dirt]}
 
-    # Obstacles can be moved, turned, named and given a velocity; a scene without a goal keeps the learned one.
+    # Obstacles can have any pose, a name and a velocity; a scene without a goal keeps the learned goal.
     cup = Sphere([0.57, -0.28, 0.03], 0.04, name="cup")
     box = Box(Pose([0.66, 0.14, 0.05], UPRIGHT), [0.08, 0.05, 0.1], name="tin")
     scene = Scene(goal=None, obstacles=[cup, box])
 
     # The thesis pushes each component along its own normal ("literal", as printed; "mapf", corrected) and does not look
-    # at the path between two of them. "certified" chooses a side, moves the components by the least, and proves it.
+    # at the path between two of them. "certified" chooses a side, moves the components as little as possible, and
+    # proves the clearance.
     print("a cup and a tin on the path, brush kept on the table:")
     for method in ("literal", "mapf", "certified"):
         show(adapt(skill, scene, method, forbidden=HORIZONTAL_ONLY, **options))
 
-    # Only what is near an obstacle moves: the rest of the path is the same to the last bit.
+    # Only the parts near an obstacle move: the rest of the path is the same to the last bit.
     print("\nthe tin alone:")
     alone = adapt(skill, Scene(None, [box]), forbidden=HORIZONTAL_ONLY, **options)
     show(alone)
     same = np.all(alone.trajectory.positions == alone.nominal.positions, axis=1)
     print(f"  {same.sum()} of {len(same)} samples of the path are exactly where they were learned")
 
-    # Directions in which nothing may move decide what "around" means: over it, or beside it.
+    # Forbidden directions determine how the path avoids an obstacle: above it, or beside it.
     print("\na low wall across the table:")
     wall = Scene(None, [Box(Pose([0.6, -0.28, 0.02], UPRIGHT), [1.2, 0.02, 0.04], name="low wall")])
     show(adapt(skill, wall, forbidden=HORIZONTAL_ONLY, **options))
@@ -59,13 +60,13 @@ def main() -> None:
     show(over)
     print(f"  where lifting is allowed the brush rises by up to {1e2 * over.displacement[:, 2].max():.0f} cm")
 
-    # A refusal names the obstacle and the reason; what it holds is the best attempt, not to be executed.
+    # A refusal names the obstacle and the reason; its path is the best attempt, which must not be executed.
     print("\na jar on the goal, then one on the dirt:")
     for place in (skill.goal_.position, task.dirt.position):
         jar = Sphere(place, 0.03, name="jar")
         show(adapt(skill, Scene(None, [jar]), forbidden=HORIZONTAL_ONLY, **options))
 
-    # Another goal: the skill's DMP bends the path there, and the components ride on it.
+    # Another goal: the skill first adapts its path to the goal, and the components move with it.
     print("\nthe same scene, goal moved by 5 cm:")
     goal = Pose(skill.goal_.position + np.array([0.05, 0.0, 0.0]), skill.goal_.quaternion)
     moved = adapt(skill, Scene(goal, scene.obstacles), forbidden=HORIZONTAL_ONLY, **options)

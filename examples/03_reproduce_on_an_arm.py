@@ -1,7 +1,7 @@
 """Reproduce a skill on a simulated arm around obstacles, and let the simulator measure the result.
 
-The plan keeps the brush clear. Whether the arm, with its inertias, limits and servos, keeps to the plan, and whether
-its links stay clear as well, is measured by the simulator between its own shapes.
+The plan guarantees the clearance of the brush. The simulator measures, between its own shapes, whether the arm with its
+inertias, limits and servos follows the plan, and whether its links keep the clearance too.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ def main() -> None:
         if step.clearance < 0.05:
             nearest[" to ".join(robot.nearest_pair() or ())] += 1
 
-    # `observe` answers what stands where at a time; here the scene as it is, with whatever moves moved on.
-    # The safety filter lets no link come nearer than this either, whatever the plan of the tool says.
+    # `observe` returns the scene at a given time; here it is the true scene of the simulator.
+    # The safety filter also keeps this clearance for the links, which the plan of the tool does not include.
     rollout = reproduce(
         policy, robot, scene.at, timeout=40.0, safety=SafetyFilter(arm, clearance=CLEARANCE), on_step=watch
     )
-    rollout = task.evaluate(robot, rollout)  # the task's own verdict: is the dirt in the pan?
+    rollout = task.evaluate(robot, rollout)  # the success test of the task: is the dirt in the pan?
 
     adaptation = policy.adaptation
     print(f"{'done' if rollout.success else 'FAILED'}: {rollout.reason}")
@@ -79,7 +79,7 @@ def main() -> None:
     print(f"  largest torque: {100 * effort.max():.0f} % of what {arm.joint_names[int(effort.argmax())]} can give")
     print(f"  commands that a limit changed: {rollout.details['clamped'] or 'none'}")
 
-    # What can't be done is refused before anything moves.
+    # An impossible task is refused before the robot moves.
     jar = Box(Pose(skill.goal_.position, [1.0, 0.0, 0.0, 0.0]), [0.05, 0.05, 0.1], name="jar")
     covered = Scene(None, [*scene.obstacles, jar])
     robot.reset()

@@ -1,4 +1,4 @@
-"""Load an arm of your own from a URDF or MJCF file: kinematics, inverse kinematics, gravity, and a simulated body.
+"""Load your own arm from a URDF or MJCF file: kinematics, inverse kinematics, gravity, and simulation.
 
 The example first writes a URDF file, so that it needs no other file; use your own file instead.
 """
@@ -11,7 +11,8 @@ import numpy as np
 
 from imitarm import ArmModel, Pose, SimulatedRobot, TwistTask, UnreachableError, find_posture, solve_ik
 
-# Six axes: axis of the joint, where it is in the frame of the one before [m], mass [kg], torque [N m], speed [rad/s].
+# Six axes: axis of the joint, its position in the frame of the previous joint [m], mass [kg], torque [N m], speed
+# [rad/s].
 AXES = (
     ("0 0 1", 0.00, 12.0, 250, 2.0),
     ("0 1 0", 0.40, 10.0, 250, 2.0),
@@ -48,7 +49,7 @@ def main() -> None:
     arm = ArmModel.load("six_axis.urdf", tool="gripper")  # a packaged tool, or an MJCF file with a site "tool"
     print(f"{arm.name}: {arm.n_joints} joints, {', '.join(arm.joint_names)}")
     print(f"  torque limits {arm.max_torque} N m, speed limits {arm.max_velocity} rad/s")
-    # A URDF says nothing of accelerations: 10 rad/s^2 is taken. An MJCF file may name them (see ArmModel.load).
+    # A URDF does not define accelerations: 10 rad/s^2 is assumed. An MJCF file can define them (see ArmModel.load).
     print(f"  accelerations {arm.max_acceleration} rad/s^2, tool {arm.tool_to_flange.position} m from the flange")
 
     # A posture for a pose. The tool points down: rotated by 180 degrees about y.
@@ -76,14 +77,14 @@ def main() -> None:
     length = np.linalg.norm(line[-1].position - pose.position)
     print(f"\na line of {100 * length:.1f} cm: at most {1e3 * beside:.2f} mm beside it")
 
-    # What the joints must hold, without and with the gripper, and what that is of their limits.
+    # The gravity torques without and with the gripper, also as a fraction of the torque limits.
     holding = arm.gravity_torque(q)
     print(f"\ngravity torque   {np.round(bare.gravity_torque(q), 1)} N m")
     print(f"  with the tool  {np.round(holding, 1)} N m, {np.round(100 * np.abs(holding) / arm.max_torque)} %")
     torque = arm.inverse_dynamics(q, velocity, np.full(arm.n_joints, 2.0))
     print(f"  at 2 rad/s^2   {np.round(torque, 1)} N m")
 
-    # A body: the simulated drives hold the posture with that torque.
+    # Simulation: the drives hold the posture with this torque.
     robot = SimulatedRobot(arm, q=q)
     for _ in range(100):
         state = robot.move(np.zeros(arm.n_joints), dt)

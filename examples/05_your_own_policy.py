@@ -1,7 +1,7 @@
-"""Write a policy of your own, register it, and let it reproduce a skill under the same conditions as the built-in one.
+"""Write your own policy, register it, and let it reproduce a skill under the same conditions as a built-in policy.
 
-A policy sees an `Observation` (time, state of the arm, pose of the tool, scene) and answers with a `Command`.
-Everything else is the same for all: robot, safety filter, inverse kinematics, and the measured clearance.
+A policy sees an `Observation` (time, state of the arm, pose of the tool, scene) and returns a `Command`. Everything
+else is the same for all policies: robot, safety filter, inverse kinematics, and the measured clearance.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ POLICIES.register("repelled", Repelled)
 
 
 def reaches(start: Pose, goal: Pose, n: int = 5) -> list[Demonstration]:
-    """Generate synthetic demonstrations of a reach along an arch that differs from one to the next."""
+    """Generate synthetic demonstrations of a reach along an arch that varies between demonstrations."""
     rng = np.random.default_rng(0)
     u = np.linspace(0.0, 1.0, 150)[:, None]
     pace = 10 * u**3 - 15 * u**4 + 6 * u**5
@@ -80,8 +80,9 @@ def main() -> None:
     start, goal = Pose(middle - aside, tool.quaternion), Pose(middle + aside, tool.quaternion)
     skill = Skill(n_components=7).fit(reaches(start, goal))
 
-    # Between two balls the pull along the path and the pushes balance: a local minimum, where a field that looks only
-    # at the nearest points stops or touches. ACFRA looks at the whole path.
+    # Between two balls the pull along the path and the pushes balance: a local minimum, where a field that considers
+    # only
+    # the nearest points stops or touches. ACFRA considers the whole path.
     on_path = middle + np.array([0.0, 0.0, 0.05])
     balls = [Sphere(on_path + side * np.array([0.08, 0.0, 0.0]), 0.05) for side in (-1.0, 1.0)]
     scenes = {

@@ -1,4 +1,4 @@
-"""Let a person show a robot what to do: five takes before a camera become demonstrations, a skill, and a motion.
+"""Learn from a person in front of a camera: five recordings become demonstrations, a skill, and a robot motion.
 
 The person and the noisy camera are simulated, so that the example runs anywhere; `open_source("take.csv")` reads a
 recording instead. The true motion is known here, so the errors can be measured.
@@ -32,11 +32,11 @@ from imitarm.policies import ACFRA
 from imitarm.retarget import FACING, Retargeting
 from imitarm.retarget.modern import ModernRetargeter
 
-REST, DURATION = 1.0, 6.0  # [s] with a still hand, so that the robot can take hold; of a take
+REST, DURATION = 1.0, 6.0  # [s] with the hand at rest, so that the robot can engage; duration of a recording
 
 
 def take(number: int) -> SkeletonSource:
-    """One take: the person moves something over an edge from right to left, each time a little differently."""
+    """One recording: the person moves an object over an edge from right to left, with small variations."""
     person = Person.from_seed(4)
     varied = np.random.default_rng(number).normal(0.0, 0.01, (3, 3))
     shoulder = person.shoulder("right", 0.0)
@@ -58,8 +58,8 @@ def following(run: Retargeting) -> slice:
 
 def main() -> None:
     arm = ArmModel.load("sawyer", tool="gripper")
-    # The tool goes as far as the hand does and stays upright; nothing is calibrated, limb lengths are measured
-    # meanwhile.
+    # The tool moves as far as the hand and stays upright; without a calibration, limb lengths are measured
+    # during the run.
     correspondence = Correspondence(side="right", scale=1.0, orientation="fixed")
     begin = arm.tool_pose(arm.home)
     start = find_posture(arm, Pose(begin.position + np.array([0.02, -0.25, 0.0]), begin.quaternion))
@@ -92,7 +92,7 @@ def main() -> None:
     skill = Skill().fit(align(demonstrations))
     print(f"learned {skill.gmr_.n_components_} components from {len(demonstrations)} takes of a person")
 
-    # The robot does it alone, and round a ball that nobody showed it.
+    # The robot reproduces the motion alone, around a ball that was not there in the demonstrations.
     middle = skill.generate(Pose(skill.start_.position, begin.quaternion)).positions
     ball = Sphere(middle[len(middle) // 2] + np.array([0.0, 0.0, 0.02]), 0.03, name="ball")
     for name, scene in {"nothing in the way": Scene(), "a ball on the path": Scene(None, [ball])}.items():

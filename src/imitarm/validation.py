@@ -1,7 +1,7 @@
 """Checks of arguments, shared by all public functions: numbers, vectors, arrays, counts, flags and types.
 
 Each function returns the value in a form that is safe to compute with, or raises :class:`InputError`. The message names
-the argument, its unit, what was expected and what was given. NaN, infinities, text, booleans, complex numbers,
+the argument, its unit, the expected and the given value. NaN, infinities, text, booleans, complex numbers,
 ``None`` and masked entries are never numbers. Arrays of float64 are returned without a copy.
 
 :func:`finite_vector` takes less than a microsecond for an array of float64, so that it may be used in a control loop.
@@ -83,7 +83,8 @@ def finite_points(points: Any) -> Array:
 def real_array(value: Any, shape: tuple[int | EllipsisType | None, ...], what: str, unit: str = "") -> Array:
     """Return ``value`` as an array of numbers of the given shape, float64; NaN and infinities are allowed.
 
-    It is meant for measurements in which NaN marks a missing sample. Arguments are those of :func:`finite_array`.
+    It is meant for measurements in which NaN marks a missing sample. The arguments are the same as in
+    :func:`finite_array`.
 
     Raises:
         InputError: when the value is not an array of numbers, or has another shape.

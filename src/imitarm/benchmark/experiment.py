@@ -196,7 +196,7 @@ class Experiment:
 
 @dataclass(frozen=True)
 class StackingOutcome:
-    """The outcome of one closed-loop trial of stacking; torques are those of the drives, contacts included.
+    """The outcome of one closed-loop trial of stacking; the torques are the drives' torques, including contacts.
 
     Attributes:
         success: whether four cubes stand in order.

@@ -174,7 +174,7 @@ def _times(results: Results, method: str) -> Values:
 
 
 def claims_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return the claims of the thesis, and whether they held: with its corrected method, and with ours."""
+    """Return the claims of the thesis and whether they hold for its corrected method and for our method."""
     rows = []
     for claim, evaluate in CLAIMS:
         cells: list[str] = []
@@ -252,7 +252,7 @@ def _two_leads(results: Results, me: str, tasks: Sequence[str]) -> Verdict:
 
 
 def _farther_from_singular(results: Results, me: str, _: Sequence[str]) -> Verdict:
-    """The smallest singular value at the edge of reach is larger than that of M3, which treats no singularity."""
+    """The smallest singular value at the edge of reach is larger than for M3, which does not treat singularities."""
     if not results.tasks(["edge"]) or "m3" not in results.methods:
         return "–", "not run"
     ours, theirs = (results.values(name, ["edge"], "least_singular") for name in (me, "m3"))

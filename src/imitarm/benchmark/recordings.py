@@ -200,7 +200,7 @@ def _scale(plan: Plan, person: Person) -> float:
 
 
 def _start(plan: Plan, arm: ArmModel, points: Array) -> Array:
-    """Return the first posture: that of the stacking task, else one that corresponds to the person's wrist."""
+    """Return the first posture: that of the stacking task, or one that corresponds to the person's wrist."""
     if plan.kind == "stacking":
         return StackTask().start_posture(arm)
     s, e, w = FACING.apply(points[:3])

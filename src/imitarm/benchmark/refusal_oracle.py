@@ -252,7 +252,7 @@ def _tangent_bound(f0: Array, a: Array, f1: Array, b: Array) -> Array:
 
 
 def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
-    """Return the costs after one more free move to a neighbour along each axis."""
+    """Return the costs when one further move is allowed: a free move to a neighbouring cell along any axis."""
     d = cost.ndim
     result = cost.copy()
     for axis in range(d):

@@ -36,7 +36,7 @@ def run_all(
 ) -> list[Result]:
     """Run experiments in parallel and return their results in the same order.
 
-    Each result is a file of its own in ``folder/runs``, written as soon as the experiment is done. A saved result of
+    Each result is a separate file in ``folder/runs``, written as soon as the experiment is finished. A saved result of
     the same configuration and the same code is read instead of run again. The values do not depend on ``jobs``.
 
     Args:

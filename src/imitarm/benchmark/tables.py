@@ -36,7 +36,7 @@ class Place:
 
     Attributes:
         document: path of the Markdown document.
-        benchmark: its name; the tables stand between the lines ``<!-- imitarm benchmark NAME -->`` and
+        benchmark: its name; the tables are between the lines ``<!-- imitarm benchmark NAME -->`` and
             ``<!-- end -->``.
 
     Raises:

@@ -218,7 +218,7 @@ def _times(view: _View) -> Iterator[RecordingIssue]:
     steps = np.diff(view.times)
     if (steps <= 0.0).any():
         i = int(np.argmax(steps <= 0.0)) + 1
-        message = f"time runs backwards or stands still in {int((steps <= 0.0).sum())} frames, by up to "
+        message = f"time decreases or does not increase in {int((steps <= 0.0).sum())} frames, by up to "
         message += f"{1e3 * max(-float(steps.min()), 0.0):.0f} ms"
         yield view.issue("error", "time-backwards", message, "repair drops these frames", i)
     if len(view.times) < _FEW:

@@ -348,8 +348,8 @@ class MotionCapture:
     def truth(self, person: Person) -> Truth:
         """Return the motion as if ``person`` made it in front of a sensor; the arm keeps its captured bone lengths.
 
-        The arm is interpolated linearly between frames and rests before the first and after the last frame. The rest
-        of the body stands upright at the person's place.
+        The arm is interpolated linearly between frames and rests before the first and after the last frame. The rest of
+        the body stands upright at the person's position.
         """
         to_sensor = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
         points = self.points @ to_sensor.T

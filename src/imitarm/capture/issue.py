@@ -18,7 +18,7 @@ class RecordingIssue:
         severity: ``"error"``: no robot can follow this recording as it is; ``"warning"``: the fault should be
             inspected; ``"note"``: for information.
         code: short name that stays the same from version to version, such as ``"gap"``.
-        message: what is wrong, with figures.
+        message: description of the fault, with figures.
         frame: the first frame concerned, counted from 0; None when the whole recording is concerned.
         time: time of that frame since the first one [s].
         remedy: what to do.

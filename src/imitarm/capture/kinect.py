@@ -127,8 +127,8 @@ _V2_START = 10.0  # [s] within which the first frame must come: a cold camera ta
 class KinectV2Source(BodyCamera):
     """Skeletons of all persons in front of a Kinect v2, with the states of their hands.
 
-    Coordinate frame and joints are those of the SDK. A hand state is used when the SDK reports high confidence. Times
-    are those of the sensor's clock.
+    Coordinate frame and joints are defined by the SDK. A hand state is used when the SDK reports high confidence. Times
+    are on the sensor's clock.
 
     It was written from the documentation of `kinect-next` 3.0 and has not been tested on a device.
 
@@ -211,7 +211,7 @@ class AzureKinectSource(BodyCamera):
 
     The SDK's 32 joints are converted to the 25 of the Kinect v2, and the depth camera's frame (x right, y down,
     millimetres) to that of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK can't tell open from closed hands, so
-    hand states are unknown. Times are those of the device's clock.
+    hand states are unknown. Times are on the device's clock.
 
     `pykinect-azure` ends the program when the SDK fails; this class raises an error instead. Frames are fetched by the
     C functions that it wraps, because these distinguish a late frame from a failure.

@@ -213,8 +213,8 @@ class MediaPipeSource(SkeletonSource):
 
     MediaPipe tracks one person. It runs in another process, in another environment (see
     :mod:`imitarm.capture.mediapipe_environment`), and sends its landmarks as lines of text, which
-    :class:`LandmarkConverter` turns into skeletons. Times are those of the video, from 0 s; for a webcam, the monotonic
-    clock at which an image arrived.
+    :class:`LandmarkConverter` turns into skeletons. Times are video times, from 0 s; for a webcam, times on the
+    monotonic clock at which the images arrived.
 
     Args:
         film: path of a video file, or number of a webcam.

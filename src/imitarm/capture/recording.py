@@ -36,8 +36,8 @@ _GAP: Final = 0.25  # [s] a longer gap in a recording is not filled with frames
 class SkeletonRecording(SkeletonSource):
     """Skeletons in the order in which they were recorded; as a source it replays them once.
 
-    Skeletons are neither checked nor changed: times may run backwards, and there may be several persons.
-    :func:`~imitarm.capture.checks.check` says what is wrong.
+    Skeletons are neither checked nor changed: times may decrease, and there may be several persons.
+        :func:`~imitarm.capture.checks.check` lists the faults.
 
     Args:
         skeletons: skeletons in the order they came.

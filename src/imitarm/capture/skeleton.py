@@ -55,7 +55,7 @@ _ARM_INDEX = {side: np.array([JOINT[f"{part}_{side}"] for part in _ARM_PARTS]) f
 
 
 class Tracking(IntEnum):
-    """Whether a camera sees a joint, infers its position, or has lost it; the numbers are those of the Kinect SDK."""
+    """Whether a camera sees a joint, infers its position, or has lost it; numbered as in the Kinect SDK."""
 
     LOST = 0
     INFERRED = 1
@@ -63,7 +63,7 @@ class Tracking(IntEnum):
 
 
 class HandState(IntEnum):
-    """State of a hand; the numbers are those of the Kinect SDK."""
+    """State of a hand, numbered as in the Kinect SDK."""
 
     UNKNOWN = 0
     NOT_TRACKED = 1

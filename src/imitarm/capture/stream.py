@@ -102,7 +102,7 @@ class UdpSource(SkeletonSource):
 
     Args:
         port: port to listen on; 0: any free port.
-        host: address of this machine to listen on; the default hears this machine only.
+        host: address of this machine to listen on; by default, only this machine can send.
         clock_ns: clock for the time of receiving [ns].
 
     Attributes:
@@ -114,7 +114,7 @@ class UdpSource(SkeletonSource):
     """
 
     argument = "PORT"
-    description = "what 'imitarm capture --send' sends; udp:ADDRESS:PORT hears other machines too"
+    description = "what 'imitarm capture --send' sends; udp:ADDRESS:PORT also accepts other machines"
     live = True
 
     def __init__(self, port: int, host: str = LOOPBACK, *, clock_ns: Callable[[], int] = now_ns) -> None:

@@ -60,10 +60,10 @@ def as_options(text: str) -> str:
 def read_and_lint(
     arguments: argparse.Namespace, arm: ArmModel | None, *, task: str = "", repair: bool = False
 ) -> tuple[list[RawDemonstration], list[Finding]]:
-    """Read every file and check what was read; a file that can't be read is a finding too.
+    """Read and check every file; a file that can't be read is a finding too.
 
     Args:
-        arguments: those of :func:`add_reading_arguments`.
+        arguments: arguments added by :func:`add_reading_arguments`.
         arm: arm that was recorded.
         task: name of the task.
         repair: whether to drop invalid rows before the checks.

@@ -1,6 +1,6 @@
 """Demonstrations: read them, check them, align them.
 
-``read`` turns files into :class:`~imitarm.trajectory.Demonstration` objects, ``lint`` lists what is wrong with them,
+``read`` converts files to :class:`~imitarm.trajectory.Demonstration` objects, ``lint`` lists their faults,
 and ``align`` trims and re-times them so that a skill can be learned. File formats are in the registry ``READERS``.
 """
 

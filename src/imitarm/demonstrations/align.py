@@ -62,15 +62,15 @@ _NOISE_FACTOR = 4.0  # standard deviations of noise that count as standing
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Aligned demonstrations, and what was changed.
+    """Aligned demonstrations, and the changes.
 
     Attributes:
         demonstrations: demonstrations with common times from 0 to ``duration``.
         duration: the median of the trimmed demonstrations' durations [s].
         kept_rows: first and last row of each demonstration that were kept, shape (n_demonstrations, 2).
         durations: duration of each trimmed demonstration before alignment [s], shape (n_demonstrations,).
-        warps: for each sample of the common motion, the fraction of its own trimmed duration that each demonstration
-            has passed, 0 to 1, strictly increasing, shape (n_demonstrations, n).
+        warps: elapsed fraction of each demonstration's own trimmed duration at each sample of the common motion, 0
+            to 1, strictly increasing, shape (n_demonstrations, n).
         method: ``"dtw"`` or ``"resample"``.
     """
 
@@ -88,7 +88,7 @@ class Alignment:
         return np.asarray(np.abs(self.warps - even).max(axis=1) * self.duration)
 
     def notes(self) -> list[str]:
-        """Return what was changed, one line for each demonstration."""
+        """Return the changes, one line for each demonstration."""
         return [
             f"{one.source}: {duration:.2f} s to {self.duration:.2f} s, largest time shift {shift:.2f} s"
             for one, duration, shift in zip(self.demonstrations, self.durations, self.largest_shift, strict=True)
@@ -119,7 +119,7 @@ def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Meth
 
 
 def compute_alignment(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Method = "dtw") -> Alignment:
-    """Align as :func:`align` does, and also return what was changed; arguments and errors are the same."""
+    """Align like :func:`align`, and also return the changes; the arguments and errors are the same."""
     choice(method, METHODS, "method of alignment")
     n = whole_number(n, "align: n", at_least=10, at_most=_MOST_SAMPLES)
     if not sequence(demonstrations, Demonstration, "align: demonstrations"):

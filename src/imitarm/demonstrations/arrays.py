@@ -31,8 +31,9 @@ _FIELDS = ("times", "positions", "quaternions", "joints")
 class NumpyReader(Reader):
     """Arrays of numbers.
 
-    An array (n, columns) is one motion, an array (n_demonstrations, n, columns) is several; the columns are those of a
-    text table without names. An .npz with an array ``positions`` holds one set of motions, and may also hold the arrays
+    An array (n, columns) is one motion, an array (n_demonstrations, n, columns) is several; the columns have the same
+    meaning as in a text table without names. An .npz with an array ``positions`` holds one set of motions, and may also
+    hold the arrays
     ``times``, ``quaternions`` and ``joints``; in any other .npz each array holds motions.
     """
 

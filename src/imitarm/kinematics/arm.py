@@ -77,7 +77,9 @@ class ArmModel(ArmKinematics):
     joints,
     which a simulated arm also has, are not included; their values are in ``spec()``.
 
-    All poses are in the base frame, whose origin is that of the file. Jacobians have the linear rows first. Methods
+    All poses are in the base frame, whose origin is the origin of the file. Jacobians have the linear rows first.
+
+    Methods:
     take one posture ``q`` of shape (n_joints,) and raise :class:`InputError` if its shape is wrong or a number
     is not finite. Several threads can use one model.
 
@@ -206,9 +208,10 @@ class ArmModel(ArmKinematics):
     def spec(self) -> mujoco.MjSpec:
         """Return a fresh copy of the arm and its tool, for composing worlds; the base stands at the origin.
 
-        Names are those of the file; names of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
+        Names are taken from the file; names of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
         The flange is the site ``"flange"``. Geoms of group 3 are used for contact, all others only for drawing; a file
-        without this separation is converted. The arm's joints have no actuators, so that a world adds the ones it needs
+        without this separation is converted. The arm's joints have no actuators, so that a world adds the actuators
+        that it needs
         (joints carry their torque limit as ``actuatorfrcrange``). A gripper has one actuator, ``"tool/opening"``, a
         position servo of its opening [m]. There are no keyframes: use :meth:`posture`.
         """

@@ -174,7 +174,7 @@ def _located(source: str | Path, packaged: Mapping[str, str], kind: str) -> Path
 
 
 def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _Part:
-    """Read ``path``; fixed links of a URDF stay bodies of their own, so that a flange can be found among them."""
+    """Read ``path``; fixed links of a URDF remain separate bodies, so that a flange can be found among them."""
     root = read_xml(path, "an MJCF or URDF file")
     _check_kind(path, root)
     _check_numbers(path, root)

@@ -31,7 +31,7 @@ def usable_posture(
     Args:
         model: a compiled model with a site ``flange``.
         joints: names of the arm's joints.
-        home: positions of all joints of the model by name, those of the arm in the middle of their ranges.
+        home: positions of all joints of the model by name, with the arm's joints in the middle of their ranges.
 
     Returns:
         The posture, shape (n_joints,) [rad], and notes for the user.

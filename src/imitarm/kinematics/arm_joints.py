@@ -250,7 +250,7 @@ def place(path: Path, root: XmlElement, joint: str) -> str:
 def read_limits(
     spec: mujoco.MjSpec, model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root: XmlElement
 ) -> JointLimits:
-    """Return the limits of velocity, acceleration and torque, and check those of position.
+    """Return the velocity, acceleration and torque limits, and check the position limits.
 
     Args:
         spec: the file as MuJoCo has read it.

@@ -213,7 +213,7 @@ class IKSolver:
             if wanted is not None:
                 problem.tasks.append(wanted)
         if not problem.tasks:
-            raise InputError("solve_ik: no task asks for anything; put a TwistTask first")
+            raise InputError("solve_ik: no task has rows; put a TwistTask first")
 
     def _checked_rows(self, rows: Rows | Sequence[Rows]) -> list[Rows]:
         given: Sequence[Rows] = (rows,) if isinstance(rows, Rows) else rows

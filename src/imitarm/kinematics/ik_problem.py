@@ -76,7 +76,7 @@ class IKProblem:
             limited.
         dt: length of the control step [s].
         box: hard bounds of the joint velocity; before the limits are applied, the arm's velocity limits.
-        tasks: rows of the tasks; those of the tool come first.
+        tasks: rows of the tasks; the tool's rows come first.
         rows: soft inequalities.
         max_speed: norm to which a twist is scaled down, for tasks that do not set their own [m/s].
         scaled: whether each joint velocity is counted in units of its velocity limit, as in damped least squares.

@@ -86,7 +86,7 @@ class SelfClearance:
         self._near, self._close = np.float32(clearance + _INFLUENCE), np.float32(clearance + _NEAR)
 
     def _centers(self, q: ArrayLike) -> Array:
-        """Return the centres of all spheres, those of the base last, shape (m, 3) [m]."""
+        """Return the centres of all spheres, with the base's spheres last, shape (m, 3) [m]."""
         return np.concatenate([self.arm.collision_spheres(q)[0], self.arm.cover.base_centers])
 
     @property
@@ -158,7 +158,7 @@ class SelfClearance:
         return PeriodicSelfClearance(self, dt)
 
     def _found(self, q: ArrayLike) -> tuple[Indices, Indices, Array, Array, Array]:
-        """Return the nearest pairs: outer and inner spheres, centres of the outer, normals and distances."""
+        """Return the nearest pairs: outer and inner spheres, centres of the outer spheres, normals and distances."""
         centers = self._centers(q)
         chosen = np.zeros(0, dtype=np.intp)
         if self._groups:
@@ -272,7 +272,7 @@ def _measured(arm: ArmModel, model: mujoco.MjModel) -> NDArray[np.bool_]:
 
 
 def _shapes(arm: ArmModel, model: mujoco.MjModel) -> list[list[int]]:
-    """Return the collision shapes of each link, those of the base first."""
+    """Return the collision shapes of each link, beginning with the base."""
     joints = [model.joint(name).id for name in arm.joint_names]
     carriers = [int(model.jnt_bodyid[joint]) for joint in joints]
     shapes: list[list[int]] = [[] for _ in range(arm.n_joints + 1)]

@@ -94,7 +94,7 @@ class DepthFrame:
         camera_to_base: pose of the camera when the image was taken.
 
     Raises:
-        InputError: when the shape is not that of the camera, a depth is negative, or a number is not finite.
+        InputError: when the shape does not match the camera, a depth is negative, or a number is not finite.
     """
 
     stamp: float

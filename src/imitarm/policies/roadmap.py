@@ -114,7 +114,7 @@ class Roadmap:
         return slots, exists
 
     def _exits(self, obstacle: int, centre: Array, rays: Array) -> Array:
-        """Return where rays (m, 3) leave the inflated obstacle for good, for all spheres, shape (n_layers, m) [m]."""
+        """Return the distance at which rays (m, 3) finally leave the inflated obstacle, shape (n_layers, m) [m]."""
         solid, k = self.tool.obstacles[obstacle], self.tool.n_spheres
         answer = np.zeros((len(centre), len(rays)))
         for sphere in range(k):

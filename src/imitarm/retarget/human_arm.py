@@ -71,7 +71,7 @@ def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: boo
     """Return the frames of the Denavit-Hartenberg chain relative to the shoulder (thesis Eq 3.5).
 
     The thesis prints no table for the arm; :data:`HUMAN_ARM_DH` is a table for this module's chain. Frame 3 is at the
-    elbow, frame 5 at the wrist; frame 7 is that of the hand: x along the hand, z out of its back.
+    elbow, frame 5 at the wrist; frame 7 is the hand frame: x along the hand, z out of its back.
 
     Args:
         angles: shape (7,) [rad].
@@ -132,8 +132,8 @@ def human_arm_angles(upper: ArrayLike, forearm: ArrayLike, hand: ArrayLike, prev
     """Return the seven angles of an arm in closed form.
 
     An angle that is undefined keeps its previous value: the first when the upper arm is along z, the third when the arm
-    is straight, the fifth when the hand is in line with the forearm. Of the two solutions for the wrist the one closer
-    to the previous angles is used.
+    is straight, the fifth when the hand is in line with the forearm. Of the two solutions for the wrist, the function
+    returns the one closer to the previous angles.
 
     Args:
         upper: unit vector from shoulder to elbow, shape (3,).

@@ -258,7 +258,7 @@ class Supervisor:
 
 
 class RobotServer:
-    """Receives commands, moves a robot at a fixed rate, and answers each client that has asked, once per period.
+    """Receives commands, moves a robot at a fixed rate, and answers each request once per period.
 
     It sends nothing without a request, and a :class:`~imitarm.robots.server.Supervisor` checks everything it receives.
     If the machine was too busy and periods were missed, the next step is lengthened by the missed time, up to 20 ms in

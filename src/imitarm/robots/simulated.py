@@ -368,7 +368,7 @@ class Drives:
         return float("nan") if self._gripper is None else float(self._model.actuator_ctrlrange[self._gripper, 1])
 
     def grasp(self, opening: float) -> None:
-        """Move the gripper to ``opening`` [m] at 0.12 m/s; its servo presses with at most its rated force.
+        """Move the gripper to ``opening`` [m] at 0.12 m/s; its servo applies at most its rated force.
 
         Raises:
             InputError: when there is no gripper, or the opening is out of its range.

@@ -133,7 +133,10 @@ class PackedObstacles:
     def placed(
         self, positions: Array, quaternions: Array, velocities: Array, angular_velocities: Array, stamp: float
     ) -> PackedObstacles:
-        """Return the same shapes with other poses, seen at ``stamp`` [s]; the other arguments are the attributes."""
+        """Return the same shapes with other poses, seen at ``stamp`` [s].
+
+        The other arguments are the attributes of these names.
+        """
         moved = self._copy(
             positions=positions,
             quaternions=quaternions,
@@ -254,7 +257,7 @@ def distances_and_gradients(
 ) -> tuple[Array, Array]:
     """Return :func:`distances` and their gradients with respect to the points.
 
-    The arguments and errors are those of :func:`distances`.
+    The arguments and errors are the same as in :func:`distances`.
 
     Returns:
         Distances (n, ...) [m] and unit vectors (n, ..., 3) in the base frame.

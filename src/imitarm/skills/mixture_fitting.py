@@ -205,7 +205,7 @@ def responsibilities_by_segments(features: Array, column: Array, numbers: Sequen
     """Divide time into the K segments that are described best by one Gaussian each, for several K at once.
 
     The range of ``column`` is divided into equal slots. A segment with n of the N samples and covariance Sigma
-    costs ``n (log det Sigma / 2 - log(n / N))``, the negative log-likelihood under a Gaussian of its own, plus a small
+    costs ``n (log det Sigma / 2 - log(n / N))``, the negative log-likelihood under a separate Gaussian, plus a small
     amount for its squared length, so that lengths are equal where the data allow it. Dynamic programming over the slots
     finds the cheapest division for every K up to the largest. The result is deterministic, and EM converges in fewer
     iterations from it than from equal bins.
@@ -334,10 +334,8 @@ def try_numbers_of_components(
     """Evaluate several numbers of components.
 
     For each number, the fit to all demonstrations and the fits without one demonstration run together, as rows of the
-    same matrix products. Only a subset of the samples is used; a longer path uses more of them. For a motion of the
-    rotation
-    alone,
-    errors are those of a point 100 mm from the axis. The search stops when four numbers in a row did not reduce the
+    same matrix products. Only a subset of the samples is used; a longer path uses more of them. For a pure rotation,
+    errors are computed for a point 100 mm from the axis. The search stops when four numbers in a row did not reduce the
     held-out error by 0.5 %, and one number meets both conditions of :func:`choose`.
 
     Args:

@@ -4,8 +4,8 @@ Layout: ``format``, ``version``, the meaning of the numbers (``units``, ``frames
 ``provenance``), the numbers (``gmr``, ``dmp``, ``fit``), and last a ``checksum``: SHA-256 of everything else in
 canonical form (sorted keys, no spaces), so a change of any digit is detected, while a change of layout is accepted.
 Floats
-are written with all their digits and come back exactly. The classes below are the schema: they define what is written
-and what is accepted.
+are written with all their digits and come back exactly. The classes below are the schema: they define the content that
+is written and accepted.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class StackEvaluation:
     """The evaluation of a stacking run.
 
     Attributes:
-        success: whether all four cubes stand in order, without support.
+        success: whether all four cubes are stacked in order, without support.
         failure: one of :data:`FAILURES`; empty on success.
         stacked: number of cubes in the tower, counted from cube 1.
         reason: explanation.

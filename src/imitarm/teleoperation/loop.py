@@ -261,7 +261,7 @@ class Teleoperation:
             self._started = True
 
     def _follow(self, skeleton: Skeleton | None) -> None:
-        """Make one step with the retargeter and send it to the robot."""
+        """Make one step with the retargeter and send the result to the robot."""
         robot, retargeter = self.robot, self.retargeter
         before, taken = retargeter.latest.q, self._clock_ns()
         retargeter.step(skeleton, robot.state().q)

@@ -167,7 +167,7 @@ class ClockOffsetEstimator:
 
 
 class DatagramFilter:
-    """Accepts the datagrams of one session, each newer than the one before and delayed by at most ``max_age``.
+    """Accepts the datagrams of one session, each newer than the previous one and delayed by at most ``max_age``.
 
     *Order.* A sequence number is newer when it is ahead by less than half of all numbers, so it may wrap around.
 

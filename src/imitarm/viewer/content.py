@@ -209,7 +209,7 @@ class Report:
         summary: one or two sentences that introduce the page.
         learning: demonstrations and result of learning.
         provenance: facts needed to repeat the run (command, seed, platform, versions, ...), by name; values that
-            are mappings become tables of their own.
+            are mappings become separate tables.
 
     Raises:
         InputError: when two scenes have the same name.

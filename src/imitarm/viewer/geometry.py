@@ -1,7 +1,7 @@
 """Triangle meshes of MuJoCo's geoms, with few triangles, sharp edges and smooth round surfaces.
 
-Renderers average the normals of triangles that share a vertex. Faces that meet at a sharp edge therefore get vertices
-of their own, and the faces of a round surface share vertices.
+Renderers average the normals of triangles that share a vertex. Faces that meet at a sharp edge therefore get separate
+vertices, and the faces of a round surface share vertices.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ def render(
         header: the first part of the page.
         data: the page's numbers in SI units, ready for JSON; the reader can save them.
         data_name: file name under which they are saved.
-        provenance: facts needed to repeat the run, by name; values that are mappings become cards of their own.
+        provenance: facts needed to repeat the run, by name; values that are mappings become separate cards.
         words: explanations of the technical terms on the page.
         shared: beginning and end of every 3-D player, see :func:`shared_players`; None without players.
         context: further data for the template.

@@ -95,7 +95,7 @@ class PersonMark:
 
         Args:
             skeletons: at least one skeleton, in the order of their times. After 0.25 s without a skeleton the person is
-                not drawn; after the last one the person stands still.
+                not drawn; after the last skeleton the person does not move.
             times: times of the frames to draw, counted from the first skeleton, shape (n_frames,) [s].
             sensor_to_base: pose of the sensor in the base frame; only its rotation is used.
             side: side of the arm that is followed.

@@ -134,7 +134,7 @@ class AdaptiveLaw:
     symbols, for which
     :math:`C(q, a)\,b = \tfrac12\,(h(a+b) - h(a) - h(b))` with :math:`h(v) = C(q, v)\,v`.
 
-    The law is that of Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet, in discrete form; we chose the gains.
+    The law follows Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet, in discrete form; we chose the gains.
     For
     small errors :math:`\gamma = a` and :math:`Q_K \gamma = 1`: the stiffness falls back to :math:`K_{min}` within one
     period. We set :math:`K_{min} = K_{max}(h)/2`, which the sources do not specify, so that the hand still has an
@@ -224,8 +224,8 @@ class AdaptiveControl(BaselineRetargeter):
 
     The thesis refers to Liang et al. 2016, of which only the abstract was available to us. It describes an arm
     configuration computed from Kinect vectors, a stiffness index from the hand's gesture, and a biomimetic controller
-    in discrete time on a simulated Baxter. The
-    equations are those of the human-like controllers of Yang et al. 2011 and Li and Burdet 2016, made discrete.
+    in discrete time on a simulated Baxter. The equations are the discrete form of the human-like controllers of Yang et
+    al. 2011 and Li and Burdet 2016.
 
     The person's joint angles, held between frames, pass a first-order low-pass filter at 3 Hz, :math:`q_r \leftarrow
     q_r + (1 - e^{-2\pi f T})(q_h - q_r)`. An :class:`AdaptiveLaw` computes torques within the rated limits, which drive

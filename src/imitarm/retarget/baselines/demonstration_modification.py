@@ -84,8 +84,8 @@ class DemonstrationModification(BaselineRetargeter):
     3. each of them, extended by 0.2 s on both sides, is changed by the first correction that makes it feasible: slower,
        wrist closer, elbow rotated; otherwise its key frames are repaired
        (:class:`SegmentCorrector`);
-    4. steps 2 and 3 are repeated up to five times; what is infeasible after that is counted, and clipped to the joint
-       ranges.
+    4. steps 2 and 3 are repeated up to five times; samples that remain infeasible are counted and clipped to the
+       joint ranges.
 
     :meth:`step` is only the mapping of step 1, clipped to the joint ranges, for live use.
 

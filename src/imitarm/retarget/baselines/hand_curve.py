@@ -198,7 +198,7 @@ class DelayedCurve:
         self._clock, self._ahead = 0.0, -math.inf
 
     def add(self, sample: HandSample) -> None:
-        """Add a frame that is later than the one before."""
+        """Add a frame that is later than the previous one."""
         ahead = sample.time - self._clock
         off = ahead - self._ahead
         self._ahead = ahead if off > 0.0 or off < -_RESTART else self._ahead + _LATE * off

@@ -64,7 +64,7 @@ class JointMapping:
         self.start(arm.home)
 
     def start(self, q: Array) -> None:
-        """Start anew with the robot at ``q``, shape (7,) [rad]."""
+        """Restart with the robot at ``q``, shape (7,) [rad]."""
         self._q = np.array(q, dtype=float)
         self._person: Array | None = None  # angles of the last frame
         self._origin: tuple[Array, Array] | None = None  # robot's joints and person's angles when engaged
@@ -163,7 +163,7 @@ class Approach:
 
 
 def continued(angles: Array, before: Array) -> Array:
-    """Return angles plus multiples of 360 degrees so that each is closest to the one before, shape (n,) [rad]."""
+    """Return angles plus multiples of 360 degrees so that each is closest to the previous one, shape (n,) [rad]."""
     return np.asarray(before + (angles - before + np.pi) % (2.0 * np.pi) - np.pi)
 
 

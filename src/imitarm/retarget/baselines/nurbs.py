@@ -413,7 +413,7 @@ def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
     r"""Return weights w (n,), mean 1, by least squares, reweighted by the last denominator.
 
     :math:`\sum_k \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is quadratic in
-    both. X is eliminated; among equally good w, the one closest to all ones is taken.
+    X and in w. X is eliminated; among equally good w, the one closest to all ones is taken.
     """
     n = problem.n_control
     basis = np.zeros((len(problem.first), n))
