@@ -80,7 +80,7 @@ def test_a_made_up_person_for_some_seconds(tmp_path):
         (["--out", "{}/wave.csv", "--force"], "is also the file of SOURCE"),
         (["--out", "{}", "--force"], "is a folder; name a file in it"),
         (["--seconds", "0"], "--seconds must be above 0"),
-        (["--trim", "3", "1"], "--trim must be two times"),
+        (["--trim", "3", "1"], "--trim must be two increasing times"),
         (["--trim", "7", "9"], "no frame between 7 and 9 s"),
     ],
 )

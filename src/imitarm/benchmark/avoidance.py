@@ -137,7 +137,7 @@ def success_table(
         seeds: scenes in each family.
         first: first seed; 2000 and on are the test seeds.
         methods: names in :data:`imitarm.policies.adaptation.ADAPTERS`.
-        on_done: called with the number of finished rows and the total number.
+        on_done: function called with the number of finished rows and the total number.
     """
     rows: list[tuple[str, ...]] = []
     planned = [(planar, *learn(planar=planar)) for planar in (True, False)]

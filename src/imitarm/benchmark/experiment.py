@@ -61,7 +61,7 @@ class Method:
 
 
 MAIN: Mapping[str, Method] = {name: Method(name) for name in RETARGETERS}
-"""Every registered method with its default options. The built-in ones are those of thesis Table 3.1 and Figs 3.6 to
+"""Every registered method with its default options. The built-in methods appear in thesis Table 3.1 and Figs 3.6 to
 3.8: ``thesis`` is its method Me with the equations corrected, M1 to M3 are our interpretation of its baselines;
 ``modern`` is
 this library's own. Methods of other packages are added by entry points."""

@@ -197,7 +197,7 @@ def run_placements(
         setups: skills with their arms.
         seeds: seeds of the placements.
         jobs: processes.
-        progress: called with the number of finished placements and the total number.
+        progress: function called with the number of finished placements and the total number.
 
     Raises:
         InputError: when a skill or an arm can't be loaded, or several processes are requested without joblib.

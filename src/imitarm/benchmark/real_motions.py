@@ -62,7 +62,7 @@ def real_motions(data: Path, videos: Sequence[str] = ()) -> Iterator[Motion]:
 
     Args:
         data: the folder of real recordings.
-        videos: videos of a person, or recordings of one.
+        videos: videos or recordings of a person.
 
     Raises:
         InputError: when a file is missing or can't be read, or MediaPipe is needed but not installed.

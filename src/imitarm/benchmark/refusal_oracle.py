@@ -1,6 +1,6 @@
 """An oracle that decides whether a path exists, to check refusals. It shares no code with the library's search.
 
-It looks at displacements of the nominal path, one grid of them for each of many times (layers), and gives one of three
+It considers displacements of the nominal path, on one grid for each of many times (layers), and gives one of three
 answers:
 
 * **impossible**: a proof. A box of the grid counts as free if any of its points may be free at any time of an interval.

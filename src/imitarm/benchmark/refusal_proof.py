@@ -243,7 +243,7 @@ def _touching(cells: _Cells, window: tuple[tuple[int, int], ...], point: Array) 
 
 
 def _shifted(values: Bools, old: tuple[tuple[int, int], ...], new: tuple[tuple[int, int], ...]) -> Bools:
-    """Return the values of boxes in another window; False outside the old one."""
+    """Return the values of boxes in another window; False outside the old window."""
     answer = np.zeros([b - a for a, b in new], dtype=bool)
     low = [max(a, c) for (a, _), (c, _) in zip(old, new, strict=True)]
     high = [min(b, e) for (_, b), (_, e) in zip(old, new, strict=True)]

@@ -119,7 +119,7 @@ def refusal_table(
         n_scenes: how many.
         first: seed of the first scene.
         files: skill files used in addition to the two packaged skills.
-        on_done: called with the number of finished scenes and the total number.
+        on_done: function called with the number of finished scenes and the total number.
     """
     skills = skills_to_adapt(files)
     verdicts = []

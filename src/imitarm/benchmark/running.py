@@ -48,7 +48,7 @@ def run_all(
             names its code.
         backend: a backend of joblib: ``"loky"`` (local processes), or one whose workers see the same folder, such as
             ``"dask"`` or ``"ray"``.
-        on_done: called with the progress.
+        on_done: function called with the progress.
 
     Raises:
         InputError: when the folder can't be written to, or the backend does not exist.

@@ -159,7 +159,7 @@ class SkeletonCamera:
         return cls(0, sigma=0.0, rate=rate, jitter=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
 
     def next_time(self, time: float) -> float:
-        """Return the time of the frame that follows the one at ``time`` [s]."""
+        """Return the time of the next frame after ``time`` [s]."""
         period = 1.0 / self.rate
         if self.faultless:
             return time + period

@@ -388,7 +388,7 @@ def _sides(view: _View) -> Iterator[RecordingIssue]:
     turned = seen & (across < 0.0)
     if seen.any() and turned.sum() > max(_TURNED * seen.sum(), len(view.swapped)):
         message = (
-            f"the left shoulder is where the right one should be in {100 * turned.sum() / seen.sum():.0f} % of the "
+            f"left and right shoulder are at each other's positions in {100 * turned.sum() / seen.sum():.0f} % of the "
         )
         message += "frames: the person has the back to the sensor, or the image is mirrored"
         yield view.issue("warning", "turned-away", message, "face the sensor; do not mirror", int(np.argmax(turned)))

@@ -161,7 +161,7 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     body; then the hands, with or without elbows (v = 4 m/s), decide about arms that were exchanged while the rest of
     the body was not.
     Hands that meet are too close to each other to fulfil the inequality and are not exchanged. If one joint of a pair
-    is lost, only the other one is used.
+    is lost, only the other joint is used.
 
     Args:
         skeleton: as the camera reports it.
@@ -281,7 +281,9 @@ class SideFilter(SkeletonSource):
 
 
 class RealtimeSource(SkeletonSource):
-    """Delays a source so that it runs in real time: it returns no skeleton earlier than its time since the first one.
+    """Delays a source so that it runs in real time.
+
+    It returns no skeleton earlier than its time since the first skeleton.
 
     Args:
         source: source that returns skeletons as fast as they are read.

@@ -199,7 +199,7 @@ def _skeletons(
 
     Args:
         table: table that was read, for messages.
-        times: shape (n,) [s].
+        times: time stamps, shape (n,) [s].
         joints: x, y, z [m] and tracking state of each joint, shape (n, 25, 4).
         hands: state of the left and of the right hand, shape (n, 2); None: not in the file.
         persons: number of each person; None: not in the file.
@@ -288,7 +288,7 @@ class MotionCapture:
     """A right arm recorded by optical motion capture, in axes x forward, y left, z up.
 
     Attributes:
-        times: shape (n,) [s].
+        times: time stamps, shape (n,) [s].
         points: shoulder, elbow, wrist, hand tip, thumb, shape (n, 5, 3) [m].
         source: the file.
     """

@@ -20,7 +20,7 @@ class RecordingIssue:
         code: short name that stays the same from version to version, such as ``"gap"``.
         message: description of the fault, with figures.
         frame: the first frame concerned, counted from 0; None when the whole recording is concerned.
-        time: time of that frame since the first one [s].
+        time: time of that frame since the first frame [s].
         remedy: what to do.
     """
 

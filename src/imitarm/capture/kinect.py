@@ -80,7 +80,7 @@ class BodyCamera(SkeletonSource):
         return self._waiting.popleft() if self._waiting and not self._over else None
 
     def _take(self, timeout: float) -> bool:
-        """Fetch the next frame; return whether there was one."""
+        """Fetch the next frame; return whether a frame was available."""
         bodies = self._frame(timeout)
         if bodies is None:
             return False
@@ -280,7 +280,7 @@ class AzureKinectSource(BodyCamera):
             self._k4abt.k4abt_frame_release(frame)
 
     def _give(self, wait: int) -> bool:
-        """Give the next image to the tracker; return whether there was one in time."""
+        """Pass the next image to the tracker; return whether an image arrived in time."""
         capture = self._k4a.k4a_capture_t()
         result = self._k4a.k4a_device_get_capture(self._device.handle(), capture, wait)
         if not self._came(result, "get an image; is the camera still plugged in?"):

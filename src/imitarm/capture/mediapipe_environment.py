@@ -50,7 +50,7 @@ _TRIAL = "import cv2, mediapipe; mediapipe.solutions.pose.Pose(model_complexity=
 
 
 def find_python() -> Path:
-    """Return the Python that has MediaPipe: ``IMITARM_MEDIAPIPE_PYTHON``, or one in :func:`folders`.
+    """Return the Python with MediaPipe: ``IMITARM_MEDIAPIPE_PYTHON``, or a Python in :func:`folders`.
 
     Raises:
         InputError: when no such Python is found; the message says how to create the environment.
@@ -72,7 +72,7 @@ def find_python() -> Path:
 def folders() -> list[Path]:
     """Return the folders searched: in a checkout, then in the user's data folder.
 
-    A new environment is created in the first one.
+    A new environment is created in the first folder.
     """
     checkout = Path(__file__).resolve().parents[3]
     beside = [checkout / ".venv-mediapipe"] if (checkout / "pyproject.toml").is_file() else []
@@ -167,7 +167,7 @@ class LineProcess:
     Args:
         command: command with all its arguments.
         keep: largest number of unread lines.
-        newest: whether to drop the oldest unread line, but never the very first one, when there would be more;
+        newest: whether to drop the oldest unread line (but never the very first line) when the limit is exceeded;
             otherwise the program waits.
         chatter: regular expression of lines on its standard error to leave out of :meth:`ended`.
 

@@ -86,7 +86,7 @@ def axes_that_fit(positions: Array) -> tuple[str, str] | None:
     In the sensor's frame the spine points up (y), and the trunk is in front of the sensor (z above 0). Of all axes in
     which both hold, the function proposes those in which the person also faces the sensor: the right shoulder has a
         larger x
-    than the left one. A right-handed choice is preferred to a mirrored one.
+    than the left one. A right-handed choice is preferred to a mirrored choice.
     """
     spine = _median(_mean(positions[:, _UPPER]) - _mean(positions[:, _LOWER]))
     trunk = _median(_mean(positions[:, _TRUNK]))
@@ -159,7 +159,7 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
     """Return how fast the faster hand moves [m/s]: the 90th percentile over three frames, without spikes.
 
     Args:
-        times: shape (n,) [s], increasing.
+        times: time stamps, shape (n,) [s], increasing.
         positions: shape (n, 25, 3) [m].
         spikes: whether each joint is in a spike, shape (n, 25).
 
@@ -185,7 +185,7 @@ def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
     of more than 0.3 m faster than 10 m/s is enough.
 
     Args:
-        times: shape (n,) [s], increasing.
+        times: time stamps, shape (n,) [s], increasing.
         positions: shape (n, 25, 3) [m].
 
     Returns:

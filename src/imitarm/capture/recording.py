@@ -221,7 +221,7 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
 
 
 class SkeletonRecorder:
-    """Writes skeletons to ``PATH.part``, one whole line each, and renames it to ``PATH`` when it is closed.
+    """Writes each skeleton as a line of ``PATH.part``, and renames the file to ``PATH`` when the recorder is closed.
 
     Each line is handed to the operating system before :meth:`write` returns: a program that is killed loses at most
     the frame it was writing, and :func:`read_recording` reads ``PATH.part``. An older file ``PATH`` stays intact until

@@ -49,7 +49,7 @@ class SensorNoise:
         n_frames: number of skeletons.
         median_interval: median time between frames [s].
         jitter: standard deviation of the intervals without the late ones [s].
-        late: fraction of the intervals that are longer than 1.4 times the median one.
+        late: fraction of the intervals that are longer than 1.4 times the median interval.
         longest_interval: [s].
         at_rest: white noise of each joint while it is slower than 0.1 m/s, root mean square over the axes, shape
             (25,) [m]; nan if the joint was not slow for long enough.

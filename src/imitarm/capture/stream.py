@@ -114,7 +114,7 @@ class UdpSource(SkeletonSource):
     """
 
     argument = "PORT"
-    description = "what 'imitarm capture --send' sends; udp:ADDRESS:PORT also accepts other machines"
+    description = "skeletons from 'imitarm capture --send'; udp:ADDRESS:PORT also accepts other machines"
     live = True
 
     def __init__(self, port: int, host: str = LOOPBACK, *, clock_ns: Callable[[], int] = now_ns) -> None:

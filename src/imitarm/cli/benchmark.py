@@ -109,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     people.add_argument(
         "data", type=Path, metavar="DATA", help="folder of real recordings, with kinect_gestures and mocap_arm"
     )
-    people.add_argument("videos", nargs="*", metavar="VIDEO", help="videos of a person, or recordings of one")
+    people.add_argument("videos", nargs="*", metavar="VIDEO", help="videos or recordings of a person")
     _add_fill(people)
     people.set_defaults(benchmark=_people)
 

@@ -112,7 +112,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
         raise InputError(f"--seconds must be above 0, got {arguments.seconds!r}")
     if arguments.trim is not None and not 0.0 <= arguments.trim[0] < arguments.trim[1] < np.inf:
-        raise InputError(f"--trim must be two times, the first one earlier, got {arguments.trim}")
+        raise InputError(f"--trim must be two increasing times, got {arguments.trim}")
     check_outputs([("--out", arguments.out)], [("SOURCE", arguments.source)], force=arguments.force)
 
 

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the findings; return 2 when one is an error."""
+    """Print the findings; return 2 if any finding is an error."""
     raw, findings = read_and_lint(arguments, load_optional_robot(arguments))
     show_findings(raw, findings, every=arguments.all)
     return 2 if any(finding.severity == "error" for finding in findings) else 0

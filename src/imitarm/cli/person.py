@@ -84,7 +84,7 @@ def gather(
         what: text of the progress bar, for example ``"capturing"``.
         live: whether the source runs until it is stopped.
         total: expected duration, if known without ``seconds`` [s].
-        on_skeleton: called with each skeleton.
+        on_skeleton: function called with each skeleton.
 
     Returns:
         The skeletons, and whether the user stopped the reading.

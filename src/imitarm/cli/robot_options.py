@@ -80,5 +80,5 @@ def load_optional_robot(arguments: argparse.Namespace) -> ArmModel | None:
 
 
 def robot_files(arguments: argparse.Namespace) -> list[tuple[str, str | None]]:
-    """Return the options that may name a file, with their values, for checking that no output overwrites one."""
+    """Return the options that may name a file, with their values, to check that no output overwrites these files."""
     return [("--robot", arguments.robot), ("--tool", arguments.tool)]

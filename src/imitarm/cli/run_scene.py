@@ -62,7 +62,7 @@ def run_scene(
         demonstrations: aligned demonstrations for measuring the deviation.
         evaluate: success test of the task; returns the rollout with its verdict.
         caption: one sentence that describes the scene.
-        progress: called with the fraction of the motion that is done, 0 to 1.
+        progress: function called with the fraction of the motion that is done, 0 to 1.
 
     Returns:
         The result. If the policy refuses, it has a reason but no rollout.

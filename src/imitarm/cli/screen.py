@@ -41,7 +41,7 @@ def show_table(
     """Print a table to stdout.
 
     Args:
-        columns: headings; one that ends in ``>`` is right-aligned.
+        columns: headings; a column whose heading ends in ``>`` is right-aligned.
         rows: the cells.
         title: title above the table.
         styles: one colour for each row; empty: no colours.

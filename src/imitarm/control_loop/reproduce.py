@@ -74,8 +74,8 @@ def reproduce(
         timeout: longest duration [s].
         safety: safety filter; None: a filter for this arm that keeps its limits, keeps links 10 mm apart and touches no
             obstacle. The filter's ``dt`` must equal this ``dt``.
-        on_step: called after each step, for progress or drawing; an exception in it stops the robot and is raised
-            again.
+        on_step: function called after each step, for progress or drawing; an exception in it stops the robot and is
+            raised again.
 
     Returns:
         The measured motion from rest to rest. ``success`` means that the motion finished in time, touched nothing, and

@@ -292,8 +292,8 @@ def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, In
     """Match the samples of motions ``a`` with those of motions ``b``, pair by pair.
 
     Args:
-        a: shape (pairs, n, d).
-        b: shape (pairs, n, d), same n.
+        a: first motions, shape (pairs, n, d).
+        b: second motions, shape (pairs, n, d), same n.
         band: largest allowed |i - j|, in samples.
         price: cost of a step that is not diagonal, in units of the cost.
 

@@ -49,7 +49,7 @@ class ReadOptions:
         rate: samples per second [Hz], for files without time stamps.
         quaternion_order: ``"wxyz"`` or ``"xyzw"``, for quaternion columns without names; None: as the file says, else
             wxyz.
-        task: name of the task; used where the file does not give one.
+        task: name of the task; used if the file does not state a task.
 
     Raises:
         InputError: when a value is invalid.
@@ -258,7 +258,7 @@ def read(
         quaternion_order: ``"wxyz"`` or ``"xyzw"``, for quaternion columns without names; None: as the file says, else
             wxyz.
         arm: arm that was recorded, with its tool; needed for files that contain only joint angles.
-        task: name of the task; used where the file does not give one.
+        task: name of the task; used if the file does not state a task.
         repair: whether to drop rows that are not finite or not later than the previous row, with a remark in
             ``source``.
         thin: whether to drop rows that only repeat the previous value (:meth:`RawDemonstration.held`).

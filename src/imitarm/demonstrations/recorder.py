@@ -60,7 +60,7 @@ class DemonstrationRecorder:
         return "\n".join([*(f"# {key}: {value}" for key, value in remarks.items()), ",".join(names), ""])
 
     def write(self, time: float, q: Array) -> None:
-        """Add a sample. A sample that is not later than the last one is ignored.
+        """Add a sample. A sample that is not later than the last sample is ignored.
 
         Args:
             time: [s].

@@ -57,7 +57,7 @@ class Execution:
         limited: frames in which a limit of the robot changed a command.
         clearance: smallest distance of the arm to an obstacle [m]; inf without obstacles.
         touched: names of the obstacles that were touched.
-        fault: reason of a protective stop; empty without one.
+        fault: reason of a protective stop; empty without a protective stop.
         duration: time until the protective stop, or duration of the whole motion [s].
     """
 
@@ -81,7 +81,7 @@ def execute_on_robot(
     Args:
         run: run of a method.
         scene: obstacles, as solid bodies.
-        progress: called with the finished fraction, 0 to 1.
+        progress: function called with the finished fraction, 0 to 1.
     """
     robot = SimulatedRobot(run.arm, scene=scene, q=run.joints[0])
     dt, n = float(run.times[1] - run.times[0]), len(run.times)

@@ -73,7 +73,7 @@ class MappingMetrics:
         mean_motion_torque: mean absolute torque without the part for holding the weight [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
         gravity_effort: ``effort`` of the torques for holding the weight [N^2 m^2 s].
-        peak_torque_ratio: largest torque relative to the rated one.
+        peak_torque_ratio: largest torque relative to the rated torque.
         position_violations: frames in which a joint is outside its range; all violations are computed by finite
             differences of the positions alone.
         velocity_violations: frames in which a joint moved too fast.

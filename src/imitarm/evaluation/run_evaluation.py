@@ -81,7 +81,7 @@ class TargetTracking:
 
     @property
     def near(self) -> bool:
-        """Whether the tool was near its target while it had one."""
+        """Whether the tool was near its target whenever there was a target."""
         return self.rms <= FAR and self.far_fraction <= FAR_FRACTION
 
     @property

@@ -37,9 +37,9 @@ class TrueArm:
 
     Attributes:
         times: times of the samples of the run with which it is compared, shape (n,) [s]; non-decreasing.
-        shoulder: shape (n, 3) [m].
-        elbow: shape (n, 3) [m].
-        wrist: shape (n, 3) [m].
+        shoulder: position of the shoulder, shape (n, 3) [m].
+        elbow: position of the elbow, shape (n, 3) [m].
+        wrist: position of the wrist, shape (n, 3) [m].
         hand: rotation of the hand, quaternions wxyz, shape (n, 4).
     """
 
@@ -69,7 +69,7 @@ class TrueArm:
         """Convert an arm's points over time.
 
         Args:
-            times: shape (n,) [s].
+            times: time stamps, shape (n,) [s].
             points: shoulder, elbow, wrist, hand, hand tip, thumb, in the sensor's frame, shape (n, 6, 3) [m].
             correspondence: correspondence with the pose of the sensor.
         """
@@ -301,7 +301,7 @@ def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, res
     """Return the time at which a point came within ``radius`` [m] of its mean position in the last ``rest`` seconds.
 
     Args:
-        times: shape (n,) [s].
+        times: time stamps, shape (n,) [s].
         positions: shape (n, 3) [m].
         radius: [m].
         rest: [s].
@@ -320,7 +320,7 @@ def settling_time(
     Args:
         times: evenly spaced times, shape (n,) [s].
         positions: shape (n, 3) [m].
-        goal: shape (3,) [m].
+        goal: goal position, shape (3,) [m].
         end: time at which the motion towards the goal ended [s].
         radius: [m].
         stay: [s].

@@ -126,7 +126,7 @@ def _limbs(body: mujoco.MjsBody, before: tuple[str, ...], hand: frozenset[str], 
 
 
 def _last_fixed(body: mujoco.MjsBody) -> mujoco.MjsBody:
-    """Follow fixed links from the last moving link as long as there is only one, or one named tool0 or flange."""
+    """Follow fixed links from the last moving link while there is only one, or one is named tool0 or flange."""
     while True:
         fixed = [child for child in body.bodies if not list(child.joints)]
         named = [child for child in fixed if _END_LINK.search(child.name)]

@@ -22,8 +22,8 @@ class Box(NamedTuple):
     """Bounds of each joint velocity, ``lower <= v <= upper``; always kept.
 
     Attributes:
-        lower: shape (n_joints,) [rad/s].
-        upper: shape (n_joints,) [rad/s].
+        lower: lower bounds, shape (n_joints,) [rad/s].
+        upper: upper bounds, shape (n_joints,) [rad/s].
     """
 
     lower: Array
@@ -40,8 +40,8 @@ class Rows(NamedTuple):
         or one another.
 
     Attributes:
-        matrix: shape (m, n_joints).
-        lower: shape (m,).
+        matrix: coefficients of the inequalities, shape (m, n_joints).
+        lower: lower bounds, shape (m,).
         price: penalty weight of a violation.
     """
 
@@ -54,8 +54,8 @@ class TaskRows(NamedTuple):
     """The rows of a task at one step: ``jacobian @ v`` should equal ``target``; both are already weighted.
 
     Attributes:
-        jacobian: shape (m, n_joints).
-        target: shape (m,).
+        jacobian: Jacobian of the task, shape (m, n_joints).
+        target: target velocity of the task, shape (m,).
         effort: factor of the cost of joint motion; smaller for a task with small weights.
     """
 

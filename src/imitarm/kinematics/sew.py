@@ -65,9 +65,9 @@ def sew_angle(
     increase when the elbow rotates right-handed about the direction to the wrist.
 
     Args:
-        shoulder: shape (..., 3) [m], in a frame with x ahead and z up.
-        elbow: shape (..., 3) [m].
-        wrist: shape (..., 3) [m].
+        shoulder: position of the shoulder, shape (..., 3) [m], in a frame with x ahead and z up.
+        elbow: position of the elbow, shape (..., 3) [m].
+        wrist: position of the wrist, shape (..., 3) [m].
         convention: ``"stereographic"`` or ``"conventional"``.
 
     Returns:

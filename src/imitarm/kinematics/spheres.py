@@ -25,7 +25,7 @@ class SphereCover:
 
     Attributes:
         bodies: name of the body that carries each sphere.
-        radii: shape (m,) [m].
+        radii: radii of the spheres, shape (m,) [m].
         links: number of the arm's joints that move each sphere, shape (m,).
         follows_last_joint: True for spheres that move rigidly with the flange, shape (m,).
         base_centers: centers of the spheres that cover the base, which never moves, shape (b, 3) [m].
@@ -94,7 +94,7 @@ class SphereCover:
 
         Args:
             data: the kinematics of a posture.
-            spheres: shape (k,).
+            spheres: indices of the spheres, shape (k,).
             centers: centers of these spheres, shape (3, k) [m].
             normals: the directions, unit vectors, shape (3, k).
         """

@@ -46,7 +46,7 @@ def least_norm(rows: Array, lower: Array, upper: Array) -> Array | None:
     """Solve ``min |y|^2`` under ``lower <= rows @ y <= upper`` by an exact active-set method (daqp).
 
     Args:
-        rows: shape (m, n).
+        rows: coefficients of the inequalities, shape (m, n).
         lower: lower bounds, shape (m,), or (n + m,) when the first n bound y itself.
         upper: upper bounds, of the same shape as ``lower``.
 
@@ -166,7 +166,7 @@ class _Cuts:
     Attributes:
         lever: influence of the components, shape (m, n_components).
         direction: unit rows, shape (m, 3).
-        bound: shape (m,) [m].
+        bound: upper bounds, shape (m,) [m].
     """
 
     lever: Array

@@ -74,7 +74,7 @@ def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: boo
     elbow, frame 5 at the wrist; frame 7 is the hand frame: x along the hand, z out of its back.
 
     Args:
-        angles: shape (7,) [rad].
+        angles: joint angles, shape (7,) [rad].
         lengths: lengths of this person.
         as_printed: whether to use the second row as printed in the thesis; the result is not a rotation.
 

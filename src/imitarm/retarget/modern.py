@@ -61,8 +61,8 @@ class ModernRetargeter(Retargeter):
        harder, and the target does not run away from the blocked tool.
 
     The robot's elbow angle changes by as much as the person's has changed since the person began to lead:
-    :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. Its weight decreases when the camera sees the person's elbow poorly
-    and when either arm is nearly straight.
+    :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of this task decreases when the camera sees the person's
+    elbow poorly and when either arm is nearly straight.
 
     When the person is lost, the arm coasts for 0.1 s, holds its target until 0.3 s, then stops. Once the person has
     been seen again for half a second, the motion restarts from the current poses of hand and tool, so that nothing

@@ -304,7 +304,7 @@ class Retargeting:
     Attributes:
         method: name of the method.
         arm: the robot's arm.
-        times: shape (n,) [s], from 0.
+        times: time stamps, shape (n,) [s], from 0.
         joints: joint positions, shape (n, n_joints) [rad].
         velocities: commanded joint velocities, shape (n, n_joints) [rad/s].
         targets: target positions (n, 3) [m] and quaternions wxyz (n, 4) of the tool; nan while nobody led.

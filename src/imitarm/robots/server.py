@@ -274,8 +274,8 @@ class RobotServer:
             on a network only if everyone on it may move the robot.
         rate: control periods per second, 100 to 1000 [Hz]; the period of a simulated robot must be a multiple of its
             timestep.
-        on_event: called with a text when the robot is enabled, slows or stops.
-        clock_ns: returns the time [ns].
+        on_event: function called with a text when the robot is enabled, slows or stops.
+        clock_ns: function that returns the time [ns].
         wait: function that waits until a datagram arrives, at most for a number of seconds, and returns whether one
             has arrived; a simulated clock advances here.
 
@@ -333,7 +333,7 @@ class RobotServer:
 
         Args:
             seconds: duration [s]; None: unlimited.
-            on_step: called after every period.
+            on_step: function called after every period.
 
         Raises:
             InputError: when the duration is not positive.

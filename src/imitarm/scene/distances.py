@@ -71,9 +71,9 @@ class PackedObstacles:
         kinds: index of each shape in :data:`KINDS`, shape (n,).
         positions: origin of the local frame in the base frame, shape (n, 3) [m].
         quaternions: own_to_base rotations wxyz, shape (n, 4).
-        sizes: shape (n, 3) [m]. Sphere: radius; box: full edge lengths; capsule and cylinder: radius, length of the
-            axis; cone: radius, height; ellipsoid: semi-axes; convex hull: half extents; half-space: nothing.
-            Unused entries are 0.
+        sizes: sizes of the shapes, shape (n, 3) [m]. Sphere: radius; box: full edge lengths; capsule and cylinder:
+            radius, length of the axis; cone: radius, height; ellipsoid: semi-axes; convex hull: half extents;
+            half-space: nothing. Unused entries are 0.
         velocities: velocities of the local frame's origin, shape (n, 3) [m/s].
         angular_velocities: angular velocities about that origin, in the base frame, shape (n, 3) [rad/s].
         covariances: covariances of the positions, shape (n, 3, 3) [m^2]; 0 when unknown.

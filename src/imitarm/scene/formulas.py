@@ -41,7 +41,7 @@ def rounds(q: Array, gradient: bool, radius: Array, half: Array | None) -> tuple
     Args:
         q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
-        radius: shape (...) [m].
+        radius: radius of the shape, shape (...) [m].
         half: half of the segment's length, shape (...) [m], 0 for a sphere; None when all are spheres.
     """
     if half is not None:
@@ -74,7 +74,7 @@ def slabs(
     Args:
         q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
-        half: shape (3, ...) [m].
+        half: half edge lengths, shape (3, ...) [m].
         rounding: radius of the rounding, shape (...) [m]; None: 0.
         turned: whether each shape is a cylinder, shape (...); None: no cylinders.
     """
@@ -136,7 +136,7 @@ def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor:
     Args:
         q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
-        semi_axes: shape (3, ...) [m].
+        semi_axes: lengths of the semi-axes, shape (3, ...) [m].
         beyond: ``g_j^2 - min g^2``, shape (3, ...) [m^2].
         floor: smallest value of the coordinate along the shortest axis, 0 along the other axes, shape (3, ...) [m].
     """
@@ -181,7 +181,7 @@ def cones(
         q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
         radius: radius of the base, shape (...) [m].
-        height: shape (...) [m].
+        height: height of the cone, shape (...) [m].
         slant: length of the side, shape (...) [m].
         side: outward normal of the side in ``(rho, z)``, shape (2, ...).
     """

@@ -277,7 +277,7 @@ class Obstacle(ABC):
             position: position of the local frame's origin, see :class:`~imitarm.scene.distances.PackedObstacles`, shape
                 (3,) [m].
             quaternion: own_to_base rotation wxyz, shape (4,).
-            velocity: shape (3,) [m/s].
+            velocity: velocity of the obstacle, shape (3,) [m/s].
             angular_velocity: angular velocity of the copy, shape (3,) [rad/s].
         """
         before = self.solid()

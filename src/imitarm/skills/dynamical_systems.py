@@ -140,8 +140,8 @@ class Propagator(NamedTuple):
     part is at most 1/200 of the duration, and at most a fifth of the distance between two basis functions.
 
     Attributes:
-        transition: shape (2, 2).
-        drive: shape (2, 2 m + 1).
+        transition: transition matrix, shape (2, 2).
+        drive: drive matrix, shape (2, 2 m + 1).
         push: change of z due to a constant acceleration of 1 (in units of the duration) during the step, shape (2,).
         instants: times at which the target is needed, as fractions of the duration since the start of the step, shape
             (2 m + 1,).

@@ -81,8 +81,8 @@ class GaussianMixture:
 
     Attributes:
         weights_: priors, shape (K,).
-        means_: shape (K, d).
-        covariances_: shape (K, d, d).
+        means_: means of the components, shape (K, d).
+        covariances_: covariances of the components, shape (K, d, d).
         lower_bound_: mean log-likelihood per sample of the fitted data.
         converged_: whether the last change of ``lower_bound_`` was below ``tol``.
         n_iter_: number of iterations.

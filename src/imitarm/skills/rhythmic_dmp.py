@@ -75,7 +75,7 @@ class RhythmicDMP:
 
     Attributes:
         gains_: stiffness and damping.
-        weights_: shape (N, D), D = 3, or 6 with rotation.
+        weights_: weights of the basis functions, shape (N, D), D = 3, or 6 with rotation.
         center_: g, shape (D,).
         period_: learned [s].
         reference_: mean rotation; None when the demonstration had no quaternions.

@@ -110,7 +110,7 @@ class Teleoperation:
         confirm_enable: function called in each step in which a served robot cannot be controlled, with the reason
             and whether
             the robot is stopped; returns whether the robot may move again. None: it must not move again.
-        on_step: called after every step.
+        on_step: function called after every step.
         clock_ns: function that returns the time [ns], on the same clock as ``stream`` and ``robot``.
         rate_limiter: timer that starts the control steps; None: real time.
     """

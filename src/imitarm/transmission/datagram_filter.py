@@ -135,7 +135,7 @@ class ClockOffsetEstimator:
         return offset - self.minimum
 
     def _confirm(self, offset: int) -> None:
-        """Confirm a sample, and with it each unconfirmed one near it."""
+        """Confirm a sample and all unconfirmed samples near it."""
         self._confirmed[0] = min(self._confirmed[0], offset)
         while self._unconfirmed and self._unconfirmed[-1].offset >= min(self._confirmed) - self._tolerance:
             self._confirmed[0] = min(self._confirmed[0], self._unconfirmed.pop().offset)

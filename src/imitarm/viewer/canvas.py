@@ -63,7 +63,7 @@ class Canvas:
         self.svg = ""
 
     def axes(self, left: float, bottom: float, right: float, top: float, **options: Any) -> Any:
-        """Return axes within ``left`` and ``bottom`` to ``right`` and ``top`` [inch], from the lower left corner."""
+        """Return axes whose edges have these distances [inch] from the lower left corner of the figure."""
         width, height = self.size
         return self.figure.add_axes(
             (left / width, bottom / height, (right - left) / width, (top - bottom) / height), **options

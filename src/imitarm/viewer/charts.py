@@ -26,10 +26,10 @@ def clearance(times: ArrayLike, distances: ArrayLike, required: float, *, name: 
     """Draw the measured and the required clearance over time.
 
     Args:
-        times: shape (n_steps,) [s].
+        times: time stamps, shape (n_steps,) [s].
         distances: smallest distance between the arm, with its tool, and any obstacle, shape (n_steps,) [m].
         required: required clearance [m].
-        name: unique in the page.
+        name: name, unique in the page.
 
     Returns:
         An SVG element; an empty string when no distance is finite, because there was no obstacle.
@@ -82,11 +82,11 @@ def torques(
     """Draw the torque of each joint over time, with its rated torque.
 
     Args:
-        times: shape (n_steps,) [s].
+        times: time stamps, shape (n_steps,) [s].
         values: torques, shape (n_steps, n_joints) [N m].
         limits: rated torque, shape (n_joints,) [N m].
         joint_names: names shown above the charts; by default, joints are numbered.
-        name: unique in the page.
+        name: name, unique in the page.
 
     Returns:
         An SVG element.
@@ -107,7 +107,7 @@ def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacem
     Args:
         lengths: lengths of the displacements, in the order of time, shape (n_components,) [m].
         moved: which components were moved, shape (n_components,).
-        name: unique in the page.
+        name: name, unique in the page.
 
     Returns:
         An SVG element.
@@ -156,7 +156,7 @@ def selection(
         aic: Akaike information criterion, lower is better, shape (n,); may be empty.
         held_out_error: root mean square distance to held-out demonstrations, shape (n,) [m]; may be empty.
         chosen: number that was chosen.
-        name: unique in the page.
+        name: name, unique in the page.
 
     Returns:
         An SVG element.
@@ -211,10 +211,10 @@ def small_multiples(name: str, description: str, unit: str, times: Array, curves
     """Draw one small chart for each joint, each between its own limits.
 
     Args:
-        name: unique in the page.
+        name: name, unique in the page.
         description: description for screen readers.
         unit: label of the vertical axis.
-        times: shape (n_steps,) [s].
+        times: time stamps, shape (n_steps,) [s].
         curves: curves to draw, one for each joint.
 
     Returns:

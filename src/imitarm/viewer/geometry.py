@@ -29,7 +29,7 @@ class Mesh:
     """A triangle mesh.
 
     Attributes:
-        vertices: shape (n_vertices, 3) [m].
+        vertices: positions of the vertices, shape (n_vertices, 3) [m].
         faces: vertex indices, counter-clockwise seen from outside, shape (n_faces, 3).
     """
 

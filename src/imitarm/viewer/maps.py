@@ -73,7 +73,7 @@ def drawn_map(
     """Yield axes that show ``corners`` (2, 2) [m] in a figure of suitable height, then convert it to SVG.
 
     Args:
-        name: unique in the page.
+        name: name, unique in the page.
         text: description of the figure, for screen readers.
         view: the axes to show.
         corners: lower and upper corner of the area that must be visible.
@@ -164,7 +164,7 @@ def demonstrations(
         means: means of the components' positions, shape (n_components, 3) [m].
         covariances: covariances of the components' positions, shape (n_components, 3, 3) [m^2].
         predicted: the learned path.
-        name: unique in the page.
+        name: name, unique in the page.
 
     Returns:
         An SVG element.
@@ -286,7 +286,7 @@ def adaptation(
         displacement: displacement of the components, shape (n_components, 3) [m].
         moved: which components were displaced, shape (n_components,).
         measured: the measured path of the robot's tool.
-        name: unique in the page.
+        name: name, unique in the page.
 
     Returns:
         An SVG element.

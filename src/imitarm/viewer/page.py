@@ -111,7 +111,7 @@ def render(
         template: file in ``templates/`` that extends ``page.html``.
         header: the first part of the page.
         data: the page's numbers in SI units, ready for JSON; the reader can save them.
-        data_name: file name under which they are saved.
+        data_name: file name for saving these numbers.
         provenance: facts needed to repeat the run, by name; values that are mappings become separate cards.
         words: explanations of the technical terms on the page.
         shared: beginning and end of every 3-D player, see :func:`shared_players`; None without players.

@@ -154,8 +154,8 @@ class _Piece:
         mesh: mesh in the frame of the piece.
         colour: ``"#rrggbb"``.
         position: positions, shape (n_frames, 3) [m]; NaN where unknown.
-        wxyz: shape (n_frames, 4).
-        tracking: shape (n_frames,).
+        wxyz: quaternions, shape (n_frames, 4).
+        tracking: tracking states, shape (n_frames,).
     """
 
     name: str

@@ -80,7 +80,7 @@ class DemonstratedMotion:
     def at(self, where: Array) -> DemonstratedMotion:
         """Return the motion at fractional sample numbers, shape (m,).
 
-        It is slower where the numbers are closer together.
+        The motion is slower where the numbers are closer together.
         """
         n = np.arange(len(self))
         near = tuple(self.closed[int(i)] for i in np.clip(where.astype(int), 0, len(self) - 1))
@@ -249,7 +249,7 @@ def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
     """Return the runs of True, extended by 0.2 s on both sides and merged where they touch, as (first, past the last).
 
     Args:
-        found: shape (n,).
+        found: result of the search, shape (n,).
         dt: sampling period [s].
     """
     wide = round(DILATION / dt)
