@@ -256,7 +256,8 @@ def clearance_of(obstacles, polyline, *, radius=0.0, offset=None, bow=0.0):
     """Distances of one sphere to obstacles along a polyline, with any offsets of its centre."""
     n = len(polyline)
     offsets = tuple(None if offset is None else offset[None] for _ in obstacles)
-    tool = ToolAmongObstacles(tuple(obstacles), np.array([radius]), offsets, np.full((1, n - 1), bow), radius)
+    spheres = np.array([[0.0, 0.0, 0.0, radius]])
+    tool = ToolAmongObstacles(tuple(obstacles), spheres, spheres[:, 3], offsets, np.full((1, n - 1), bow))
     return tool.clearance_of(polyline)
 
 

@@ -5,6 +5,7 @@ All three are frozen, and their arrays are read-only copies.
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 from collections.abc import Mapping
@@ -154,6 +155,17 @@ class Trajectory:
         n = whole_number(n, "Trajectory.resample: n", at_least=2, at_most=_MOST_SAMPLES)
         times = np.linspace(self.times[0], self.times[-1], n)
         return Trajectory(times, *self.at(times))
+
+    def with_positions(self, positions: ArrayLike) -> Trajectory:
+        """Return a motion with the same times and rotations and other positions, shape (n, 3) [m].
+
+        Raises:
+            InputError: when the shape is another one, or a number is not finite.
+        """
+        moved = copy.copy(self)  # times and rotations have been checked
+        name = f"{type(self).__name__} positions"
+        object.__setattr__(moved, "positions", _frozen(positions, (len(self), 3), name, "m"))
+        return moved
 
     def from_zero(self) -> Trajectory:
         """Return the same motion with its first time at 0 s."""

@@ -4,7 +4,8 @@
 """
 
 from imitarm.policies.acfra import ACFRA
-from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, Adaptation, PathAdapter, adapt
+from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, Adaptation, adapt
+from imitarm.policies.least_detour import PathAdapter
 from imitarm.policies.policy import Observation, Policy
 from imitarm.registry import Registry
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,15 +13,18 @@ from imitarm.errors import InputError
 from imitarm.html_table import html_table
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
-from imitarm.policies.certificate import PathClearance, ToolAmongObstacles
+from imitarm.policies.certificate import ToolAmongObstacles
+from imitarm.policies.certified import CERTIFIED
 from imitarm.policies.component_path import STILL, ComponentPath
 from imitarm.policies.least_detour import (
     MAX_DISPLACEMENT,
     MAX_JERK_RATIO,
     MAX_STEP_RATIO,
     AllowedDirections,
+    AvoidanceProblem,
     Detour,
     LeastDetour,
+    PathAdapter,
 )
 from imitarm.registry import Registry
 from imitarm.scene.scene import Scene
@@ -35,45 +36,6 @@ Array = NDArray[np.float64]
 
 HORIZONTAL_ONLY = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))  # stay in the plane of the table: 2-D avoidance
 NOT_DOWN = ((0.0, 0.0, -1.0),)  # never into the table
-
-
-@dataclass(frozen=True, eq=False)
-class AvoidanceProblem:
-    """The problem that a method of adaptation solves.
-
-    Attributes:
-        path: the nominal path and its components.
-        nominal: clearance of the tool along the nominal path, to every obstacle.
-        clearance: required [m].
-        allowed: directions in which components may move.
-    """
-
-    path: ComponentPath
-    nominal: PathClearance
-    clearance: float
-    allowed: AllowedDirections
-
-    def evaluated(self, displacement: Array) -> Detour:
-        """Return the path with its certificate when the components move by ``displacement`` (n_components, 3) [m]."""
-        there = self.nominal.tool.clearance_of(self.path.displaced(displacement))
-        return LeastDetour(self.path, self.nominal.tool, self.clearance, self.allowed).evaluate(displacement, there)
-
-
-class PathAdapter(ABC):
-    """One method of adapting a path.
-
-    To add a method, write one file and register it in ``ADAPTERS`` or by an entry point.
-
-    Attributes:
-        refuses: whether the method detects that it can't keep the clearance. ``ACFRA`` then refuses to move. The
-            paths of other methods are always followed, for comparison.
-    """
-
-    refuses: ClassVar[bool] = False
-
-    @abstractmethod
-    def detour(self, problem: AvoidanceProblem) -> Detour:
-        """Return a displaced path with its certificate; :meth:`AvoidanceProblem.evaluated` computes both."""
 
 
 ADAPTERS: Registry[PathAdapter] = Registry(
@@ -223,7 +185,7 @@ def adapt(
         InputError: when not exactly one of the three tool arguments is given, or an argument is not valid.
     """
     began = time.perf_counter()
-    adapter = ADAPTERS[text(method, "method")]
+    adapter = CERTIFIED if method == "certified" else ADAPTERS[text(method, "method")]  # no package replaces it
     instance(skill, Skill, "skill")
     instance(scene, Scene, "scene")
     if start is not None:
@@ -244,9 +206,9 @@ def adapt(
     used = detour.path
     return Adaptation(
         nominal=path.nominal,
-        trajectory=Trajectory(path.nominal.times, detour.clearance.positions, path.nominal.quaternions),
+        trajectory=path.nominal.with_positions(detour.clearance.positions),
         displacement=detour.displacement,
-        moved=np.linalg.norm(detour.displacement, axis=1) > STILL,
+        moved=np.einsum("kd,kd->k", detour.displacement, detour.displacement) > STILL**2,
         means=used.means,
         covariances=used.covariances,
         responsibilities=used.responsibilities,

@@ -67,20 +67,20 @@ class ToolAmongObstacles:
 
     Attributes:
         obstacles: convex obstacles; a rotating obstacle is replaced by a sphere that contains it.
+        spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
         radii: radii of the spheres, shape (n_spheres,) [m].
         offsets: for each obstacle and sample, the vectors from the tip to the centres of the spheres, minus the
             displacement of the obstacle since time 0, in the base frame, shape (n_spheres, n, 3) [m]; None when all of
             them are zero.
-        reach: radius of the sphere about the tip that contains all spheres [m].
         bows: largest distance of a centre from the straight line between two samples while the tool rotates, shape
             (n_spheres, n - 1) [m].
     """
 
     obstacles: tuple[Obstacle, ...]
+    spheres: Array
     radii: Array
     offsets: tuple[Array | None, ...]
     bows: Array
-    reach: float
 
     @classmethod
     def along(cls, nominal: Trajectory, spheres: Array, obstacles: Sequence[Obstacle]) -> ToolAmongObstacles:
@@ -112,13 +112,17 @@ class ToolAmongObstacles:
             travelled = nominal.times[:, None] * obstacle.velocity
             moved = np.zeros((len(spheres), n, 3)) if centres is None else centres
             offsets.append(moved - travelled)
-        reach = float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]))
-        return cls(solids, np.ascontiguousarray(spheres[:, 3]), tuple(offsets), bows, reach)
+        return cls(solids, spheres, np.ascontiguousarray(spheres[:, 3]), tuple(offsets), bows)
 
     @property
     def n_spheres(self) -> int:
         """Number of spheres."""
         return len(self.radii)
+
+    @property
+    def reach(self) -> float:
+        """Radius of the sphere about the tip that contains all spheres [m]."""
+        return float(np.max(np.linalg.norm(self.spheres[:, :3], axis=1) + self.spheres[:, 3]))
 
     @property
     def n_pairs(self) -> int:
@@ -139,6 +143,11 @@ class ToolAmongObstacles:
         obstacle, sphere = divmod(pair, self.n_spheres)
         offset = self.offsets[obstacle]
         return positions if offset is None else positions + offset[sphere, samples]
+
+    def distance(self, pair: int, positions: Array, samples: Index) -> Array:
+        """Return the distance (..., m) [m] of a pair; the arguments are those of :meth:`centres`."""
+        obstacle, sphere = divmod(pair, self.n_spheres)
+        return self.obstacles[obstacle].signed_distance(self.centres(pair, positions, samples)) - self.radii[sphere]
 
     def distance_and_normal(self, pair: int, centres: Array) -> tuple[Array, Array]:
         """Return the distance (...) [m] from a sphere's surface to the obstacle, and its gradient (..., 3)."""
@@ -181,26 +190,6 @@ class ToolAmongObstacles:
             if np.all((gap < tolerance) | (lift <= 0.0)):
                 break
         return lift
-
-    def distances(self, positions: Array, samples: Index | slice = slice(None)) -> Array:
-        """Return the distance of every pair.
-
-        Args:
-            positions: positions of the tip, shape (..., m, 3) [m].
-            samples: the m samples of the path to which the positions belong.
-
-        Returns:
-            Distances from the surfaces of the spheres to the obstacles, shape (n_pairs, ..., m) [m].
-        """
-        answer = np.empty((self.n_pairs, *positions.shape[:-1]))
-        for o, obstacle in enumerate(self.obstacles):
-            rows = answer[o * self.n_spheres : (o + 1) * self.n_spheres]
-            offset = self.offsets[o]
-            for s in range(self.n_spheres) if offset is not None else range(1):
-                centres = positions if offset is None else positions + offset[s, samples]
-                rows[s if offset is not None else slice(None)] = obstacle.signed_distance(centres)
-            rows -= self.radii.reshape((-1, *[1] * (positions.ndim - 1)))
-        return answer
 
     def clearance_of(self, positions: Array) -> PathClearance:
         """Return the distances and normals of every pair along a path of the tip (n, 3)."""
@@ -348,7 +337,7 @@ def crossing_of_tangents(f0: Array, a: Array, f1: Array, b: Array, length: Array
         length: length of the interval.
     """
     inside = (a < 0.0) & (b > 0.0)
-    s = np.clip((f1 - f0 - b * length) / np.where(inside, a - b, -1.0), 0.0, length)
+    s = np.minimum(np.maximum((f1 - f0 - b * length) / np.where(inside, a - b, -1.0), 0.0), length)
     low = np.where(a >= 0.0, f0, f1)  # rising from the start, or falling until the end
     crossing = np.maximum(f0 + a * s, f1 + b * (s - length))
     return np.where(inside, crossing, low), np.where(inside, s, np.where(a >= 0.0, 0.0, length))

@@ -24,15 +24,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.policies.adaptation import AvoidanceProblem, PathAdapter
 from imitarm.policies.certificate import PathClearance
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.least_detour import (
     NEGLIGIBLE_LEVER,
     UNBOUNDED,
     AllowedDirections,
+    AvoidanceProblem,
     Detour,
     LeastDetour,
+    PathAdapter,
     best_of,
     least_norm,
 )
@@ -48,9 +49,9 @@ _RING = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # directions tried
 _IDENTITY = np.eye(3)
 _OTHERS = ([1, 2], [0, 2], [0, 1])
 _MAX_CHOICES = 4  # of a side, before all times are searched together
+_HARDLY_CHEAPER = 0.7  # times the cost of the choice before
 _MAX_ROUTES = 3  # through the roadmap
 _ALMOST = 0.003  # [m] an attempt that lacks less clearance than this is tried again with narrower components
-_HOPELESS = 0.012  # [m] a cheapest route that lacks more clearance than this leads to no detour
 _MAX_ROWS = 12  # violated samples that vote on a direction; the least detour then respects all of them
 _REFINED = 2  # directions whose amplitudes are minimised; the others wait with a rougher answer
 _VIOLATION_COST = 1e3  # [1/m] price of violated clearance against the style cost
@@ -87,18 +88,22 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
     Returns:
         The detour; when it is not feasible, the best attempt with its bounds.
     """
-    search = _SideSearch(path, nominal, clearance, allowed)
-    best = search.run(_MAX_CHOICES)
+    tool, search = nominal.tool, _SideSearch(path, nominal, clearance, allowed)
+    best = search.run(while_cheaper=allowed.dimension < 3)
+    roadmap: Roadmap | None = None
+    if best is None:  # in a plane the roadmap costs no more than further sides, and often shows that there is no path
+        roadmap = Roadmap(path, tool, clearance, allowed)
+        best = search.best() if roadmap.is_hopeless else search.run()
+    assert best is not None
     if best.feasible or not allowed.dimension:
         return best
-    tool = nominal.tool
     divided = LeastDetour(path.divided, tool, clearance, allowed, exact=True)
     if best.lowest > clearance - _ALMOST:
         best = best_of((best, divided.shrink(best.clearance))) or best
         if best.feasible:
             return best
-    roadmap = Roadmap(path, tool, clearance, allowed)
-    if roadmap.violation() > _HOPELESS:
+    roadmap = roadmap or Roadmap(path, tool, clearance, allowed)
+    if roadmap.is_hopeless:
         return best
     learned = LeastDetour(path, tool, clearance, allowed, exact=True)
     for route in roadmap.routes(_MAX_ROUTES):
@@ -127,34 +132,47 @@ class _SideSearch:
         self.clearance, self.allowed = clearance, allowed
         self.least = LeastDetour(path, self.tool, clearance, allowed)
         self.target = self.least.target
+        self._heap = [_Node(np.inf, 0, np.zeros((path.n_components, 3)))]
+        self._tried: list[Array] = []
+        self._best: Detour | None = None
+        self._order, self._choices, self._cost = 0, 0, np.inf
 
-    def run(self, max_choices: int) -> Detour:
-        """Follow the cheapest choice of sides until a path is feasible, starting at the nominal path."""
-        heap = [_Node(0.0, 0, np.zeros((self.path.n_components, 3)))]
-        tried: list[Array] = []
-        best: Detour | None = None
-        order = expanded = 0
-        while heap:
-            node = heapq.heappop(heap)
-            if any(np.abs(node.displacement - other).max() < _SAME for other in tried):
+    def run(self, *, while_cheaper: bool = False) -> Detour | None:
+        """Follow the cheapest choice of sides until a path is feasible, starting at the nominal path.
+
+        A second call goes on where the first one stopped.
+
+        Args:
+            while_cheaper: stop as soon as another choice is hardly cheaper than the one before; the answer is None.
+        """
+        while self._heap:
+            if while_cheaper and 1 < self._choices < _MAX_CHOICES and self._heap[0].cost > _HARDLY_CHEAPER * self._cost:
+                return None
+            node = heapq.heappop(self._heap)
+            if any(np.abs(node.displacement - other).max() < _SAME for other in self._tried):
                 continue
-            tried.append(node.displacement)
+            self._tried.append(node.displacement)
             here = self.nominal
             if node.order > 0:
                 here = self.tool.clearance_of(self.path.displaced(node.displacement))
             if here.lowest >= self.target - _REPAIRABLE and node.displacement.any():
                 detour = self.least.shrink(here, np.flatnonzero(node.displacement.any(axis=1)))
-                best = best_of((best, detour))
-                if best is not None and best.feasible:
-                    return best
-            if expanded >= max_choices or not self.allowed.dimension:
+                self._best = best_of((self._best, detour))
+                if self._best is not None and self._best.feasible:
+                    return self._best
+            if self._choices >= _MAX_CHOICES or not self.allowed.dimension:
                 break
-            expanded += 1
+            self._choices += 1
+            self._cost = node.cost
             for cost, displacement in self._children(node.displacement, here):
-                order += 1
-                heapq.heappush(heap, _Node(cost, order, displacement))
-        nothing = np.zeros((self.path.n_components, 3))
-        return best_of((best, self.least.evaluate(nothing, self.nominal))) or best  # type: ignore[return-value]
+                self._order += 1
+                heapq.heappush(self._heap, _Node(cost, self._order, displacement))
+        return self.best()
+
+    def best(self) -> Detour:
+        """Return the best path so far, at worst the nominal one."""
+        still = np.zeros((self.path.n_components, 3))
+        return best_of((self._best, self.least.evaluate(still, self.nominal)))  # type: ignore[return-value]
 
     def _children(self, displacement: Array, here: PathClearance) -> list[tuple[float, Array]]:
         """Return (cost, displacement) for each direction around the obstacle with the largest violation."""
@@ -170,13 +188,13 @@ class _SideSearch:
         affected = self._affected(rows, worst, here)
         lever = self.path.basis[np.ix_(rows, affected)]
         lifts = self._exits(worst, here.positions, rows, directions)
-        children, costs, entered = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
+        children, costs, entered = self._rated(displacement, lever, lifts, directions, affected, worst, here)
         if entered:  # the best exit from this obstacle enters another one: also try to go beyond all of them
             near = distance[:, rows].min(axis=1) < self.target + MAX_LIFT
             for i in np.flatnonzero(near).tolist():
                 if i != worst:
                     lifts = np.maximum(lifts, self._exits(i, here.positions, rows, directions))
-            more, prices, _ = self._rated(displacement, lever, lifts, directions, affected, worst, distance)
+            more, prices, _ = self._rated(displacement, lever, lifts, directions, affected, worst, here)
             children, costs = children + more, costs + prices
         return list(zip(costs, children, strict=True))
 
@@ -188,7 +206,7 @@ class _SideSearch:
         directions: Array,
         affected: Index,
         worst: int,
-        distance: Array,
+        here: PathClearance,
     ) -> tuple[list[Array], list[float], bool]:
         """Convert lifts (m, p) along directions (m, 3) to displacements with their costs.
 
@@ -203,8 +221,10 @@ class _SideSearch:
         lifts, directions, uniform = lifts[affordable], directions[affordable], uniform[affordable]
         children = np.repeat(displacement[None], len(uniform), axis=0)
         children[:, affected] += (uniform[:, None] * directions)[:, None, :]
-        costs, _ = self._costs(children)
-        best = np.argsort(costs)[:_REFINED]
+        costs, best = np.zeros(len(children)), np.arange(len(children))
+        if len(children) > _REFINED or self.tool.n_pairs == 1:
+            costs, _ = self._costs(children, here)
+            best = np.argsort(costs)[:_REFINED]
         for i in best:
             amplitude = self._amplitudes(lever, lifts[i], directions[i], affected)
             if amplitude is not None:
@@ -212,23 +232,31 @@ class _SideSearch:
                 children[i, affected] += amplitude[:, None] * directions[i]
         if self.tool.n_pairs == 1:  # nothing else to run into, and the cheapest direction stays the cheapest
             return list(children), costs.tolist(), False
-        costs[best], violation = self._costs(children[best])
-        before = np.maximum(0.0, self.target - distance[:, ::_THINNED]).sum(axis=1)
+        costs[best], violation = self._costs(children[best], here)
+        before = np.maximum(0.0, self.target - here.distance[:, ::_THINNED]).sum(axis=1)
         after = violation[:, np.argmin(costs[best])]
         nearer = after > before
         nearer[worst] = False
         return list(children), costs.tolist(), bool(nearer.any())
 
-    def _costs(self, displacements: Array) -> tuple[Array, Array]:
+    def _costs(self, displacements: Array, here: PathClearance) -> tuple[Array, Array]:
         """Rate displacements (c, n_components, 3) by their size and the remaining violation.
+
+        A distance changes by at most one metre per metre, so only samples near an obstacle can violate its clearance.
 
         Returns:
             Costs (c,), and for each pair the violation summed over every third sample (n_pairs, c) [m].
         """
         style = np.einsum("ckd,kde,cke->c", displacements, self.path.precisions, displacements)
         sampled = self.path.nominal.positions[::_THINNED] + self.path.basis[::_THINNED] @ displacements
-        distances = self.tool.distances(sampled, slice(None, None, _THINNED))
-        violation = np.maximum(0.0, self.target - distances).sum(axis=-1)
+        moved = sampled - here.positions[::_THINNED]
+        farthest = np.sqrt(np.einsum("csd,csd->cs", moved, moved).max(axis=0))
+        near = here.distance[:, ::_THINNED] < self.target + farthest
+        violation = np.zeros((self.tool.n_pairs, len(displacements)))
+        for pair in np.flatnonzero(near.any(axis=1)).tolist():
+            samples = np.flatnonzero(near[pair])
+            distance = self.tool.distance(pair, sampled.take(samples, axis=1), _THINNED * samples)
+            violation[pair] = np.maximum(0.0, self.target - distance).sum(axis=1)
         return _STYLE_COST * style + _THINNED * _VIOLATION_COST * violation.sum(axis=0), violation
 
     def _directions(self, positions: Array, normal: Array, at: int) -> Array:
@@ -275,7 +303,7 @@ class _SideSearch:
         Returns:
             Amplitudes (k,) [m].
         """
-        spread = np.sqrt(np.einsum("d,kde,e->k", u, self.path.yields[affected], u))
+        spread = np.sqrt(self.path.yields[affected] @ u @ u)
         upper = np.concatenate([2.0 * MAX_LIFT / spread, np.full(len(lift), UNBOUNDED)])
         lower = np.concatenate([np.zeros(len(spread)), lift])
         z = least_norm(lever * spread, lower, upper)

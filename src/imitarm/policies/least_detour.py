@@ -8,8 +8,11 @@ renewing the planes stays in the feasible set, and never increases the cost.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
 
 import daqp
 import numpy as np
@@ -74,7 +77,11 @@ class AllowedDirections:
 
     @classmethod
     def without(cls, forbidden: Array) -> AllowedDirections:
-        """Build from forbidden directions, unit rows (m, 3)."""
+        """Build from forbidden directions, unit rows (m, 3); the last ones are kept, because scenes share them."""
+        return _allowed(forbidden.tobytes())
+
+    @classmethod
+    def _without(cls, forbidden: Array) -> AllowedDirections:
         if not len(forbidden):
             return cls(forbidden, np.eye(3), np.empty((0, 3)))
         opposite = (forbidden @ forbidden.T).min(axis=1) < -1.0 + 1e-12
@@ -108,7 +115,14 @@ class AllowedDirections:
         allowed = self.enforced(candidates @ self.axes) if len(self.forbidden) else candidates
         length = np.sqrt(np.einsum("md,md->m", allowed, allowed))
         allowed = allowed[length > 0.25] / length[length > 0.25, None]
-        return np.unique(np.round(allowed, 9) + 0.0, axis=0) if len(self.forbidden) else allowed
+        if not len(self.forbidden):
+            return allowed
+        return np.array(sorted(set(map(tuple, (np.round(allowed, 9) + 0.0).tolist())))).reshape(-1, 3)
+
+
+@lru_cache(maxsize=16)
+def _allowed(forbidden: bytes) -> AllowedDirections:
+    return AllowedDirections._without(np.frombuffer(forbidden).reshape(-1, 3))
 
 
 def _complement(axes: Array) -> Array:
@@ -182,7 +196,8 @@ class _Cuts:
         return _Cuts(*(np.concatenate(pair) for pair in pairs))
 
 
-def _longest_step(positions: Array) -> float:
+def largest_step(positions: Array) -> float:
+    """Return the longest distance between neighbouring positions (n, 3) [m]."""
     step = positions[1:] - positions[:-1]
     return float(np.sqrt(np.einsum("nd,nd->n", step, step).max()))
 
@@ -205,7 +220,7 @@ class LeastDetour:
         exact: bool = False,
     ) -> None:
         self.path, self.tool, self.clearance, self.allowed = path, tool, clearance, allowed
-        step = self._longest_step = _longest_step(path.nominal.positions)
+        step = self._longest_step = largest_step(path.nominal.positions)
         # Round an edge, the centre of a sphere passes on an arc of this radius; its chord sags by step^2 / 8 radius.
         # It only saves rounds: segments that are too close get rows of their own.
         radius = clearance + float(tool.radii.min())
@@ -231,7 +246,7 @@ class LeastDetour:
         bounds, close = clearance.certified(self.clearance)
         away = clearance.positions - self.path.nominal.positions
         out = bool(np.sqrt(np.einsum("nd,nd->n", away, away).max()) > MAX_DISPLACEMENT) or (
-            _longest_step(clearance.positions) > MAX_STEP_RATIO * self._longest_step
+            largest_step(clearance.positions) > MAX_STEP_RATIO * self._longest_step
         )
         proven = bounds.min(axis=1, initial=np.inf)
         feasible = bool(proven.min(initial=np.inf) >= self.clearance) and not out
@@ -242,10 +257,10 @@ class LeastDetour:
     ) -> Detour | None:
         """Return the least detour that the tangents along a path allow, or the best attempt; None without an attempt.
 
-        Where a segment is too close although its samples are not, the closest point adds a row. Requiring
-        more at
-        the samples instead does not work: with longer steps around the edge, the samples can be farther out while the
-            path still cuts the edge; and next to a fixed time, a small additional distance needs a huge displacement.
+        Where a segment is too close although its samples are not, the closest point adds a row. Requiring more
+        at the samples instead does not work: with longer steps around the edge, the samples can be farther out
+        while the path still cuts the edge; and next to a fixed time, a small additional distance needs a huge
+        displacement.
 
         Args:
             start: clearance along the path at which the tangents are taken; this path need not be a sum of the
@@ -271,12 +286,7 @@ class LeastDetour:
             if displacement is None:
                 break
             detour = self.evaluate(displacement, here)
-            if best is None or (detour.feasible, not detour.out_of_limits, detour.lowest) > (
-                best.feasible,
-                not best.out_of_limits,
-                best.lowest,
-            ):
-                best = detour
+            best = best_of((best, detour))
             if detour.feasible:
                 break
             still = self.clearance - here.lowest
@@ -307,10 +317,6 @@ class LeastDetour:
             if less < ratio:
                 best, ratio = trial, less
         return best, ratio
-
-    def cost(self, displacement: Array) -> float:
-        """Return ``sum_k Delta_k^T Y_k^-1 Delta_k``."""
-        return float(np.einsum("kd,kde,ke->", displacement, self.path.precisions, displacement))
 
     def _scale(self, moved: Index, smoothness: float | None) -> Array:
         """Return the matrix G (m d, m d) with ``delta = G y``, so that the cost of ``delta`` is ``|y|^2``.
@@ -395,6 +401,45 @@ class LeastDetour:
         displacement[moved] = self.allowed.enforced((scale @ y).reshape(-1, d))
         displacement[np.einsum("kd,kd->k", displacement, displacement) < STILL**2] = 0.0
         return displacement, float(y @ y)
+
+
+@dataclass(frozen=True, eq=False)
+class AvoidanceProblem:
+    """The problem that a method of adaptation solves.
+
+    Attributes:
+        path: the nominal path and its components.
+        nominal: clearance of the tool along the nominal path, to every obstacle.
+        clearance: required [m].
+        allowed: directions in which components may move.
+    """
+
+    path: ComponentPath
+    nominal: PathClearance
+    clearance: float
+    allowed: AllowedDirections
+
+    def evaluated(self, displacement: Array) -> Detour:
+        """Return the path with its certificate when the components move by ``displacement`` (n_components, 3) [m]."""
+        there = self.nominal.tool.clearance_of(self.path.displaced(displacement))
+        return LeastDetour(self.path, self.nominal.tool, self.clearance, self.allowed).evaluate(displacement, there)
+
+
+class PathAdapter(ABC):
+    """One method of adapting a path.
+
+    To add a method, write one file and register it in ``ADAPTERS`` or by an entry point.
+
+    Attributes:
+        refuses: whether the method detects that it can't keep the clearance. ``ACFRA`` then refuses to move. The
+            paths of other methods are always followed, for comparison.
+    """
+
+    refuses: ClassVar[bool] = False
+
+    @abstractmethod
+    def detour(self, problem: AvoidanceProblem) -> Detour:
+        """Return a displaced path with its certificate; :meth:`AvoidanceProblem.evaluated` computes both."""
 
 
 def best_of(detours: Iterable[Detour | None]) -> Detour | None:

@@ -11,14 +11,15 @@ once. A route is only a proposal: the least detour takes its tangents along it.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.policies.certificate import ToolAmongObstacles, crossing_of_tangents
 from imitarm.policies.component_path import ComponentPath
-from imitarm.policies.least_detour import MAX_DISPLACEMENT, MAX_STEP_RATIO, AllowedDirections
+from imitarm.policies.least_detour import MAX_DISPLACEMENT, MAX_STEP_RATIO, AllowedDirections, largest_step
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -35,6 +36,7 @@ _APART = (0.0, 0.02, 0.06, 0.12)  # [m] least distance of a node from the one be
 _VIOLATION_COST = 1e5  # [1/m] price of clearance that the tangents of an edge do not prove
 _CHANGE_SCALE = 0.02  # [m] a displacement that changes by this much between layers costs as much as one sigma
 _DIFFERENT = 0.04  # [m] two routes differ when they are this far apart where the first one failed
+_HOPELESS = 0.012  # [m] a cheapest route with an edge that lacks more clearance than this leads to no detour
 _BLOCKED = 1e9
 
 
@@ -51,7 +53,7 @@ class Roadmap:
     ) -> None:
         self.path, self.tool, self.clearance = path, tool, clearance + _JUST_OUTSIDE
         self.layers = self._layers()
-        rays = allowed.unit_directions(_spread_directions(allowed))
+        rays, self.pairs_of_nodes = _graph(allowed)
         radii, free = self._radii(rays)
         n_layers, n_rays = len(self.layers), len(rays)
         self.nodes = np.zeros((n_layers, 1 + n_rays * _SLOTS, 3))
@@ -59,8 +61,7 @@ class Roadmap:
         fixed = np.isin(self.layers, path.fixed)
         self.exists = np.ones(self.nodes.shape[:2], dtype=bool)
         self.exists[:, 1:] = free.reshape(n_layers, -1) & ~fixed[:, None]
-        self.pairs_of_nodes = _edges(rays, _NEIGHBOURS.get(allowed.dimension, 1))
-        self.edge_costs, self.violations = self._edges_between_layers()
+        self.keys, self.costs, self.violations = self._edges_between_layers()
 
     def routes(self, n: int) -> Iterator[Array]:
         """Yield up to ``n`` routes as displacements of the tip at all samples (n_samples, 3) [m], cheapest first.
@@ -100,10 +101,7 @@ class Roadmap:
             exits = np.minimum(self._exits(obstacle, centre, rays), 2.0 * MAX_DISPLACEMENT) + _JUST_OUTSIDE
             candidates += [exits + more for more in _FARTHER]
         radius = np.sort(np.stack(candidates, axis=-1), axis=-1)
-        points = centre[:, None, None, :] + radius[..., None] * rays[None, :, None, :]
-        spread = np.moveaxis(points, 0, -2)  # the layers last but one, as distances() wants them
-        free = np.moveaxis(self.tool.distances(spread, self.layers).min(axis=0), -1, 0) >= self.clearance
-        free &= radius <= MAX_DISPLACEMENT
+        free = self._free(centre, rays, radius)
         slots, exists, last = np.zeros((*shape, _SLOTS)), np.zeros((*shape, _SLOTS), dtype=bool), np.full(shape, -1.0)
         for s in range(_SLOTS):
             fits = free & (radius > (last + _APART[s])[..., None])
@@ -112,6 +110,19 @@ class Roadmap:
             found = np.take_along_axis(radius, first[..., None], axis=-1)[..., 0]
             slots[..., s] = last = np.where(exists[..., s], found, np.maximum(last, 0.0))
         return slots, exists
+
+    def _free(self, centre: Array, rays: Array, radius: Array) -> NDArray[np.bool_]:
+        """Return which points at radii (n_layers, n_rays, n_radii) [m] on the rays keep the clearance."""
+        left = np.flatnonzero(radius <= MAX_DISPLACEMENT)
+        points = centre[:, None, None, :] + radius[..., None] * rays[:, None, :]
+        points, layer = points.reshape(-1, 3).take(left, axis=0), left // (radius.shape[1] * radius.shape[2])
+        for pair in range(self.tool.n_pairs):
+            kept = np.flatnonzero(self.tool.distance(pair, points, self.layers[layer]) >= self.clearance)
+            if len(kept) < len(left):
+                left, layer, points = left.take(kept), layer.take(kept), points.take(kept, axis=0)
+        free = np.zeros(radius.shape, dtype=bool)
+        free.reshape(-1)[left] = True
+        return free
 
     def _exits(self, obstacle: int, centre: Array, rays: Array) -> Array:
         """Return the distance at which rays (m, 3) finally leave the inflated obstacle, shape (n_layers, m) [m]."""
@@ -126,55 +137,62 @@ class Roadmap:
                 answer[near] = np.maximum(answer[near], lift.T)
         return answer
 
-    def _edges_between_layers(self) -> tuple[Array, Array]:
-        """Return the cost and the missing (unproven) clearance [m] of every edge, shapes (n_layers - 1, n_edges)."""
+    def _edges_between_layers(self) -> tuple[Index, Array, Array]:
+        """Return the key, the cost and the missing (unproven) clearance [m] of every existing edge, each (n_edges,).
+
+        The key of an edge from node ``i`` of layer ``l`` to node ``j`` of the next one is ``(l n + i) n + j`` with n
+        nodes in a layer; the keys are sorted.
+        """
         start, end = self.pairs_of_nodes
+        n = self.exists.shape[1]
+        layer, edge = np.nonzero(self.exists[:-1].take(start, axis=1) & self.exists[1:].take(end, axis=1))
+        first, last = layer * n + start.take(edge), (layer + 1) * n + end.take(edge)  # as columns of all nodes
         positions = self.path.nominal.positions[self.layers][:, None, :] + self.nodes
+        length = _changes(_columns(positions), first, last)
+        length = np.sqrt(np.einsum("ke,ke->e", length, length))
+        longest = MAX_STEP_RATIO * largest_step(self.path.nominal.positions)
+        slow = np.flatnonzero(length <= (longest * np.diff(self.layers)).take(layer))
+        first, last, length = first.take(slow), last.take(slow), length.take(slow)
+        violation = np.zeros(len(first))
         spread = np.swapaxes(positions, 0, 1)  # (n_nodes, n_layers, 3)
-        violation = np.zeros((len(self.layers) - 1, len(start)))
         for pair in range(self.tool.n_pairs):
-            centres = np.swapaxes(self.tool.centres(pair, spread, self.layers), 0, 1)
-            d, n = self.tool.distance_and_normal(pair, centres)
-            if d.min() > self.clearance + 2.0 * MAX_DISPLACEMENT:
-                continue
-            own = np.einsum("lkd,lkd->lk", n, centres)
-            a = (n[:-1] @ np.swapaxes(centres[1:], 1, 2))[:, start, end] - own[:-1, start]
-            b = own[1:, end] - (centres[:-1] @ np.swapaxes(n[1:], 1, 2))[:, start, end]
-            low = crossing_of_tangents(d[:-1, start], a, d[1:, end], b, 1.0)[0]
-            np.maximum(violation, self.clearance - _JUST_OUTSIDE - low, out=violation)
-        change = self.nodes[1:, end] - self.nodes[:-1, start]
-        cost = np.einsum("led,led->le", change, change) / _CHANGE_SCALE**2 + _VIOLATION_COST * violation
-        step = positions[1:, end] - positions[:-1, start]
-        steps = np.diff(self.path.nominal.positions, axis=0)
-        longest = MAX_STEP_RATIO * float(np.sqrt(np.einsum("nd,nd->n", steps, steps).max()))
-        too_fast = np.einsum("led,led->le", step, step) > (longest * np.diff(self.layers)[:, None]) ** 2
-        missing = ~(self.exists[:-1, start] & self.exists[1:, end])
-        return np.where(too_fast | missing, _BLOCKED, cost), violation
+            centres = np.ascontiguousarray(np.swapaxes(self.tool.centres(pair, spread, self.layers), 0, 1))
+            distance, normal = self.tool.distance_and_normal(pair, centres)
+            f0, f1 = distance.take(first), distance.take(last)
+            offset = self.tool.offsets[pair // self.tool.n_spheres]
+            travelled = length
+            if offset is not None:
+                shift = np.diff(offset[pair % self.tool.n_spheres, self.layers], axis=0)
+                travelled = length + np.sqrt(np.einsum("ld,ld->l", shift, shift)).take(first // n)
+            # The distance changes by at most one metre per metre: an edge as far away as this keeps the clearance.
+            near = np.flatnonzero(f0 + f1 - travelled < 2.0 * self.clearance)
+            if len(near):
+                i, j, normals = first.take(near), last.take(near), _columns(normal)
+                step = _changes(_columns(centres), i, j)
+                a = np.einsum("ke,ke->e", normals.take(i, axis=1), step)
+                b = np.einsum("ke,ke->e", normals.take(j, axis=1), step)
+                low = crossing_of_tangents(f0.take(near), a, f1.take(near), b, 1.0)[0]
+                violation[near] = np.maximum(violation.take(near), self.clearance - _JUST_OUTSIDE - low)
+        change = _changes(_columns(self.nodes), first, last)
+        cost = np.einsum("ke,ke->e", change, change) / _CHANGE_SCALE**2 + _VIOLATION_COST * violation
+        return first * n + last % n, cost, violation
 
     def _sweep(self, *, forward: bool) -> tuple[Array, Index]:
         """Return the lowest cost from the start to each node (or from it to the goal), and the adjacent node."""
         precisions = np.linalg.inv(self.path.tolerance[self.layers] + 0.005**2 * np.eye(3))
-        style = np.einsum("lkd,lde,lke->lk", self.nodes, precisions, self.nodes) * (
+        style = np.einsum("lkd,lkd->lk", self.nodes @ precisions, self.nodes) * (
             self.path.n_components / len(self.layers)
         )
         n_layers, n_nodes = self.exists.shape
-        start, end = self.pairs_of_nodes if forward else self.pairs_of_nodes[::-1]
-        order = np.argsort(end, kind="stable")
-        first = np.searchsorted(end[order], np.arange(n_nodes))
+        edges = np.full((n_layers - 1, n_nodes, n_nodes), _BLOCKED)
+        edges.reshape(-1)[self.keys] = self.costs
         cost, via = np.full((n_layers, n_nodes), _BLOCKED), np.zeros((n_layers, n_nodes), dtype=np.intp)
-        layers = range(n_layers) if forward else range(n_layers - 1, -1, -1)
-        before: int | None = None
-        for layer in layers:
-            if before is None:
-                cost[layer, 0] = 0.0
-            else:
-                edges = self.edge_costs[before if forward else layer][order]
-                total = cost[before][start[order]] + edges
-                least = np.minimum.reduceat(total, first)
-                is_least = np.flatnonzero(total == least[end[order]])
-                via[layer, end[order][is_least]] = start[order][is_least]
-                cost[layer] = least + style[layer]
-            before = layer
+        order = range(n_layers) if forward else range(n_layers - 1, -1, -1)
+        cost[order[0], 0] = 0.0
+        for before, layer in pairwise(order):
+            total = cost[before] + (edges[before].T if forward else edges[layer])
+            via[layer] = total.argmin(axis=1)
+            cost[layer] = total[np.arange(n_nodes), via[layer]] + style[layer]
         if not forward:  # the style of a node must not count twice
             cost = cost - style
         return cost, via
@@ -197,26 +215,26 @@ class Roadmap:
     def _backward(self) -> tuple[Array, Index]:
         return self._sweep(forward=False)
 
-    def violation(self) -> float:
-        """Return the largest missing clearance of an edge of the cheapest route [m]; inf when there is no route."""
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether there is no route, or an edge of the cheapest one lacks so much clearance that it leads nowhere."""
         if not self._forward[0][-1, 0] < _BLOCKED:
-            return np.inf
+            return True
         edges = self._edges_of(self._through(len(self.layers) - 1, 0))
-        return float(self.violations[np.arange(len(edges)), edges].max())
+        return bool(self.violations[edges].max() > _HOPELESS)
 
     def _edges_of(self, chosen: Index) -> Index:
-        """Return the index of the edge that a route takes from each layer to the next."""
+        """Return the index of the edge that a route of existing edges takes from each layer to the next."""
         n = self.nodes.shape[1]
-        keys = self.pairs_of_nodes[0] * n + self.pairs_of_nodes[1]  # sorted
-        return np.asarray(np.searchsorted(keys, chosen[:-1] * n + chosen[1:]), dtype=np.intp)
+        keys = (np.arange(len(chosen) - 1) * n + chosen[:-1]) * n + chosen[1:]
+        return np.asarray(np.searchsorted(self.keys, keys), dtype=np.intp)
 
     def _worst_layer(self, chosen: Index) -> int:
         """Return the layer at which a route costs most.
 
         When all of its edges are free, the layer with the largest displacement.
         """
-        edges = self._edges_of(chosen)
-        costs = self.edge_costs[np.arange(len(edges)), edges]
+        costs = self.costs[self._edges_of(chosen)]
         if costs.max() > 1.0:
             return int(np.clip(np.argmax(costs), 1, len(self.layers) - 2))
         away = np.linalg.norm(self.nodes[np.arange(len(chosen)), chosen], axis=1)
@@ -225,6 +243,25 @@ class Roadmap:
     def _at_samples(self, route: Array) -> Array:
         samples = np.arange(len(self.path.nominal))
         return np.stack([np.interp(samples, self.layers, column) for column in route.T], axis=1)
+
+
+def _columns(vectors: Array) -> Array:
+    """Return vectors (..., 3) as contiguous columns (3, m), from which gathering is several times as fast."""
+    return np.ascontiguousarray(vectors.reshape(-1, 3).T)
+
+
+def _changes(columns: Array, first: Index, last: Index) -> Array:
+    """Return the differences (3, e) of two selections of columns (3, m)."""
+    change = columns.take(last, axis=1)
+    change -= columns.take(first, axis=1)
+    return change
+
+
+@lru_cache(maxsize=8)
+def _graph(allowed: AllowedDirections) -> tuple[Array, tuple[Index, Index]]:
+    """Return the rays (m, 3), and the start and end node of every edge between two layers."""
+    rays = allowed.unit_directions(_spread_directions(allowed))
+    return rays, _edges(rays, _NEIGHBOURS.get(allowed.dimension, 1))
 
 
 def _spread_directions(allowed: AllowedDirections) -> Array:

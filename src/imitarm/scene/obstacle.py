@@ -164,7 +164,7 @@ class Obstacle(ABC):
 
     def _forget(self) -> None:
         """Drop, in a new copy, the values that were computed for the old pose."""
-        for key in ("packed", "_single"):
+        for key in ("packed", "_single", "vertices"):
             self.__dict__.pop(key, None)
 
     def _set(self, **values: object) -> None:

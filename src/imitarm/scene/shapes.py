@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -286,7 +287,7 @@ class ConvexHull(Obstacle):
         half = 0.5 * np.ptp(self._polytope.vertices, axis=0)
         return Solid(self.kind, self._center, self._quaternion, half, self._polytope)
 
-    @property
+    @cached_property
     def vertices(self) -> Array:
         """The corners of the hull, a subset of ``points``, shape (v, 3) [m]."""
         return rotate(self._quaternion, self._polytope.vertices) + self._center

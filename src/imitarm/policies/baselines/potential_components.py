@@ -22,9 +22,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.policies.adaptation import AvoidanceProblem, PathAdapter
 from imitarm.policies.component_path import ComponentPath
-from imitarm.policies.least_detour import Detour
+from imitarm.policies.least_detour import AvoidanceProblem, Detour, PathAdapter
 from imitarm.scene.obstacle import Obstacle
 
 Array = NDArray[np.float64]
