@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import os
+import resource
+import time
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,6 +25,61 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if " at 0x" in item.nodeid:
             raise pytest.UsageError(f"{item.nodeid}: this name is another one in every process; give the values ids")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add ``--cpu-times``."""
+    parser.addoption(
+        "--cpu-times", type=int, default=0, metavar="N", help="at the end print the N tests that take most CPU time"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Measure where it is asked for; in each worker of pytest-xdist too."""
+    if config.getoption("--cpu-times"):
+        config.pluginmanager.register(CpuTimes(config.getoption("--cpu-times")))
+
+
+class CpuTimes:
+    """A pytest plugin: the CPU time (s) of each test with its fixtures and the processes that it waits for.
+
+    Unlike the time on the clock, it hardly depends on what else the machine does. What several tests share, like a
+    fixture of the session or the first import of a library, counts for the first test that needs it.
+    """
+
+    PROPERTY = "CPU time"
+
+    def __init__(self, count: int) -> None:
+        self.count, self.mark = count, 0.0
+        self.seconds: Counter[str] = Counter()
+
+    def spent(self) -> float:
+        """Return the CPU time (s) since it was last asked for: of this process and of its children that ended."""
+        children = resource.getrusage(resource.RUSAGE_CHILDREN)
+        now = time.process_time() + children.ru_utime + children.ru_stime
+        self.mark, before = now, self.mark
+        return now - before
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self, item: pytest.Item) -> Iterator[None]:
+        """Write into the report of set-up, call and tear-down what it has taken: reports also come from workers."""
+        report = yield
+        report.user_properties.append((self.PROPERTY, self.spent()))
+        return report
+
+    def pytest_collection_finish(self) -> None:
+        """Do not count starting and collecting for the first test."""
+        self.spent()
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Add up."""
+        self.seconds[report.nodeid] += dict(report.user_properties)[self.PROPERTY]
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Print the tests that take most, and the sum of all."""
+        terminalreporter.section(f"CPU time: {self.seconds.total():.1f} s in {len(self.seconds)} tests")
+        for name, seconds in self.seconds.most_common(self.count):
+            terminalreporter.write_line(f"{seconds:8.2f} s  {name}")
 
 
 @pytest.fixture(scope="session")
