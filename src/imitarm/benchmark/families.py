@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,24 +74,49 @@ SIMPLE = ("sphere", "box")  # the shapes with the simplest distances
 KINDS = (*SIMPLE, "capsule", "cylinder", "ellipsoid", "convex hull")
 
 
+class _Draft(NamedTuple):
+    """A random obstacle before it is built, which takes much longer than to draw its numbers.
+
+    ``outer`` is the radius of a sphere about ``centre`` that holds it, ``inner`` the distance from ``centre`` to a
+    point of it [m].
+    """
+
+    build: Callable[[], Obstacle]
+    inner: float
+    outer: float
+
+
 def random_obstacle(
     rng: np.random.Generator, centre: Array, *, planar: bool, kinds: tuple[str, ...] = KINDS
 ) -> Obstacle:
     """Make an obstacle of a random kind, 2 to 10 cm across; in a planar scene it stands upright on the table."""
+    return _draft(rng, centre, planar, kinds).build()
+
+
+def _draft(rng: np.random.Generator, centre: Array, planar: bool, kinds: tuple[str, ...]) -> _Draft:
     radius = rng.uniform(0.02, 0.05)
     turn = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]) if planar else rng.normal(size=3)
-    pose = Pose(centre, quaternion_exp(turn))
     half = rng.uniform(0.015, 0.045, size=3)
-    along = pose.rotation[:, 0] * half[0]
-    make: dict[str, Callable[[], Obstacle]] = {
-        "sphere": lambda: Sphere(centre, radius),
-        "box": lambda: Box(pose, 2.0 * half),
-        "capsule": lambda: Capsule(centre - along, centre + along, 0.6 * radius),
-        "cylinder": lambda: Cylinder(pose, radius, 4.0 * half[2]),
-        "ellipsoid": lambda: Ellipsoid(pose, half),
-        "convex hull": lambda: ConvexHull(centre + rng.normal(size=(12, 3)) * 0.02),
-    }
-    return make[kinds[int(rng.integers(len(kinds)))]]()
+    kind = kinds[int(rng.integers(len(kinds)))]
+    if kind == "sphere":
+        return _Draft(lambda: Sphere(centre, radius), 0.0, radius)
+    if kind == "convex hull":
+        corners = rng.normal(size=(12, 3)) * 0.02
+        away = np.linalg.norm(corners, axis=1)
+        return _Draft(lambda: ConvexHull(centre + corners), float(away.min()), float(away.max()))
+
+    def build() -> Obstacle:
+        pose = Pose(centre, quaternion_exp(turn))
+        if kind == "box":
+            return Box(pose, 2.0 * half)
+        if kind == "cylinder":
+            return Cylinder(pose, radius, 4.0 * half[2])
+        if kind == "ellipsoid":
+            return Ellipsoid(pose, half)
+        along = pose.rotation[:, 0] * half[0]
+        return Capsule(centre - along, centre + along, 0.6 * radius)
+
+    return _Draft(build, 0.0, radius + 2.0 * float(np.linalg.norm(half)))
 
 
 def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, kinds: tuple[str, ...] = KINDS) -> Case:
@@ -106,16 +132,22 @@ def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, ki
         kinds: shapes from which to choose.
     """
     rng = np.random.default_rng([11, n_obstacles, planar, seed])
-    ends = path[[0, -1]]
+    ends, free = path[[0, -1]], TOOL_RADIUS + _FREE_ENDS
     chosen: list[Obstacle] = []
     centres: list[Array] = []
     while len(chosen) < n_obstacles:
         off = _OFF_PATH * rng.normal(size=3) * ([1.0, 1.0, 0.0] if planar else [1.0, 1.0, 1.0])
         centre = path[rng.integers(len(path))] + off
-        obstacle = random_obstacle(rng, centre, planar=planar, kinds=kinds)
-        if obstacle.signed_distance(ends).min() < TOOL_RADIUS + _FREE_ENDS:
+        draft = _draft(rng, centre, planar, kinds)
+        to_end = float(np.linalg.norm(ends - centre, axis=1).min())
+        if to_end + draft.inner < free:
             continue
-        if all(np.linalg.norm(centre - other) >= _APART for other in centres):
+        apart = all(np.linalg.norm(centre - other) >= _APART for other in centres)
+        if apart or to_end - draft.outer < free:
+            obstacle = draft.build()
+            if obstacle.signed_distance(ends).min() < free:
+                continue
+        if apart:
             chosen.append(obstacle)
             centres.append(centre)
         elif rng.random() < 0.02:  # painted into a corner: begin again

@@ -210,38 +210,46 @@ def _layer(
                 continue
             distance, gradient = obstacle.distance_and_gradient(flat + centre)
             free &= (distance >= need).reshape(shape)
+            value, slopes = distance.reshape(shape), gradient.reshape((*shape, 3))
             for axis in range(d):
-                along = (gradient @ axes[axis] * h).reshape(shape)
-                value = distance.reshape(shape)
                 first, last = halves(axis, d)
-                low = _tangent_bound(value[first], along[first], value[last], along[last])
-                sides[axis][first] &= low >= need
-            if previous is not None:
+                sides[axis][first] &= _keeps(need, value[first], value[last], slopes[first], slopes[last], h * axes[axis])
+            if previous is not None and np.isfinite(previous[pair][0][0]):
                 before, slope = previous[pair]
-                if np.isfinite(before[0]):
-                    if from_fixed and not to_fixed:
-                        steps, centre_row = step + flat, len(flat) // 2
-                        start = np.einsum("nd,d->n", steps, slope[centre_row])
-                        low = _tangent_bound(
-                            np.full(len(flat), before[centre_row]),
-                            start,
-                            distance,
-                            np.einsum("nd,nd->n", gradient, steps),
-                        )
-                    elif to_fixed and not from_fixed:
-                        steps, centre_row = step - flat, len(flat) // 2
-                        low = _tangent_bound(
-                            before,
-                            np.einsum("nd,nd->n", slope, steps),
-                            np.full(len(flat), distance[centre_row]),
-                            steps @ gradient[centre_row],
-                        )
-                    else:
-                        low = _tangent_bound(before, slope @ step, distance, gradient @ step)
-                    ahead &= (low >= need).reshape(shape)
+                if from_fixed == to_fixed:
+                    kept = _keeps(need, before, distance, slope, gradient, step)
+                else:
+                    row = len(flat) // 2
+                    steps = step + flat if from_fixed else step - flat
+                    starts = np.full(len(flat), before[row]) if from_fixed else before
+                    ends = distance if from_fixed else np.full(len(flat), distance[row])
+                    a = steps @ slope[row] if from_fixed else np.einsum("nd,nd->n", slope, steps)
+                    b = np.einsum("nd,nd->n", gradient, steps) if from_fixed else steps @ gradient[row]
+                    kept = _tangent_bound(starts, a, ends, b) >= need
+                ahead &= kept.reshape(shape)
             here.append((distance, gradient))
             pair += 1
     return here, sides, ahead, free
+
+
+def _keeps(need: float, f0: Array, f1: Array, slope0: Array, slope1: Array, step: Array) -> Bools:
+    """Return whether :func:`_tangent_bound` is at least ``need`` [m] along a step.
+
+    A distance changes by at most the length of the step. So the bound decides only where both ends keep the distance
+    and neither keeps more than the length of the step beyond it.
+
+    Args:
+        need: required distance [m].
+        f0: distances at the beginning, shape (...) [m].
+        f1: distances at the end, shape (...) [m].
+        slope0: gradients at the beginning, shape (..., 3).
+        slope1: gradients at the end, shape (..., 3).
+        step: shape (3,) [m].
+    """
+    kept = np.asarray(np.minimum(f0, f1) >= need)
+    near = kept & (np.maximum(f0, f1) < need + float(np.linalg.norm(step)) + 1e-9)
+    kept[near] = _tangent_bound(f0[near], slope0[near] @ step, f1[near], slope1[near] @ step) >= need
+    return kept
 
 
 def _tangent_bound(f0: Array, a: Array, f1: Array, b: Array) -> Array:

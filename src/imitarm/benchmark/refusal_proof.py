@@ -26,6 +26,7 @@ _PROOF_SIZES = {1: (0.004, 0.002, 0.0005), 2: (0.008, 0.0004, 0.0025), 3: (0.025
 _PROOF_INTERVALS = {1: 400, 2: 150, 3: 80}
 _MAX_FRAMES = 3
 _DENSE = 4000
+_ROUNDING = 1e-9  # [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +118,26 @@ class _Cells:
         low = np.floor((self.frame @ centre - MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         high = np.ceil((self.frame @ centre + MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         return tuple((max(a, 0), min(b, n)) for a, b, n in zip(low, high, self.counts, strict=True))
+
+    def within(
+        self, window: tuple[tuple[int, int], ...], obstacle: Obstacle, shift: Array, need: float
+    ) -> tuple[tuple[int, int], ...] | None:
+        """Return the part of a window whose boxes fit between the faces of an obstacle's bounding box.
+
+        Only these boxes can have all corners, moved by ``shift`` (3,) [m], within ``need`` [m] of the obstacle.
+
+        Returns:
+            The first and the past-the-last index along each edge; None when no box fits.
+        """
+        part = []
+        for axis, (a, b), low, size in zip(self.frame, window, self.lowest, self.size, strict=True):
+            ticks = low + size * np.arange(a, b + 1) + axis @ shift
+            least, most = obstacle.support(-axis) @ axis - need, obstacle.support(axis) @ axis + need
+            fits = np.flatnonzero((ticks >= least - _ROUNDING) & (ticks <= most + _ROUNDING))
+            if len(fits) < 2:
+                return None
+            part.append((a + int(fits[0]), a + int(fits[-1])))
+        return tuple(part)
 
     def corners(self, window: tuple[tuple[int, int], ...], centre: Array) -> Array:
         """Return the corners of the boxes in a window, (n_0 + 1, ..., 3) [m], in the plane through ``centre``."""
@@ -282,16 +303,19 @@ def _maybe_free(
 ) -> Bools:
     """Return whether each box may be free."""
     d = len(cells.frame)
-    corners = cells.corners(window, tip)
     blocked = np.zeros([b - a for a, b in window], dtype=bool)
     for i, obstacle in enumerate(question.obstacles):
         for j, sphere in enumerate(question.spheres):
             shift = relative[j] - time * obstacle.velocity
-            inside = obstacle.signed_distance(corners + shift) + slack[i, j] < question.clearance + sphere[3]
+            need = question.clearance + sphere[3] - slack[i, j]
+            part = cells.within(window, obstacle, shift, need)
+            if part is None:
+                continue
+            inside = obstacle.signed_distance(cells.corners(part, tip) + shift) < need
             for axis in range(d):
                 first, last = halves(axis, d)
                 inside = inside[first] & inside[last]
-            blocked |= inside
+            blocked[tuple(slice(a - c, b - c) for (a, b), (c, _) in zip(part, window, strict=True))] |= inside
     return ~blocked
 
 
