@@ -194,10 +194,12 @@ class ClearanceGauge:
         self._link[self._arm] = 0 if links is None else links
         self._by_design: set[tuple[int, int]] = set()
         self._from_to = np.zeros(6)
+        self._in_contact: tuple[bytes, set[tuple[int, int]]] = b"", set()  # geoms in contact, and what touching gives
 
     def ignore_present_self_contacts(self, data: mujoco.MjData) -> None:
         """Ignore the pairs of links that touch now, because the models of neighbouring links overlap in some files."""
         self._by_design = {(first, second) for _, first, second in self._self_contacts(data)}
+        self._in_contact = b"", set()
 
     def measure(self, data: mujoco.MjData) -> tuple[float, tuple[int, int] | None]:
         """Return the smallest signed distance [m], negative in contact, and the ids of the two geoms.
@@ -231,11 +233,14 @@ class ClearanceGauge:
         if not data.ncon:
             return set()
         geoms = data.contact.geom
-        pairs: set[tuple[int, int]] = set()
-        for first, second in (geoms.T, geoms.T[::-1]):
-            hits = (self._link[first] >= 0) & self._other[second]
-            pairs.update(zip(first[hits].tolist(), second[hits].tolist(), strict=True))
-        return pairs | {(first, second) for _, first, second in self._self_contacts(data)}
+        now = geoms.tobytes()
+        if now != self._in_contact[0]:  # from one step to the next, few contacts begin or end
+            pairs: set[tuple[int, int]] = set()
+            for first, second in (geoms.T, geoms.T[::-1]):
+                hits = (self._link[first] >= 0) & self._other[second]
+                pairs.update(zip(first[hits].tolist(), second[hits].tolist(), strict=True))
+            self._in_contact = now, pairs | {(first, second) for _, first, second in self._self_contacts(data)}
+        return self._in_contact[1]
 
     def _self_contacts(self, data: mujoco.MjData) -> list[tuple[float, int, int]]:
         """Return depth (negative) [m] and geoms of each contact between two links of the arm."""
