@@ -213,7 +213,9 @@ def _layer(
             value, slopes = distance.reshape(shape), gradient.reshape((*shape, 3))
             for axis in range(d):
                 first, last = halves(axis, d)
-                sides[axis][first] &= _keeps(need, value[first], value[last], slopes[first], slopes[last], h * axes[axis])
+                sides[axis][first] &= _keeps(
+                    need, value[first], value[last], slopes[first], slopes[last], h * axes[axis]
+                )
             if previous is not None and np.isfinite(previous[pair][0][0]):
                 before, slope = previous[pair]
                 if from_fixed == to_fixed:

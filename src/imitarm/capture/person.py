@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.capture.skeleton import JOINT, JOINTS, SIDES, HandState, Skeleton
+from imitarm.capture.skeleton import ARM_JOINTS, JOINT, JOINTS, SIDES, HandState, Skeleton
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.validation import finite_number, finite_vector, real_array, whole_number
 
@@ -35,7 +35,7 @@ _HEIGHTS = {
     "foot": 0.01,
 }
 _HALF_HIPS, _FOOT = 0.0955, 0.10
-_FORWARD = np.array([0.0, 0.0, -1.0])
+_FORWARD, _UP, _DOWN = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, -1.0, 0.0])
 _TO_HAND, _TO_TIP, _TO_THUMB = (
     0.45,
     0.85,
@@ -123,9 +123,7 @@ class Person:
         Raises:
             UnknownNameError: when ``side`` is neither left nor right.
         """
-        return self._middle(time) + np.array(
-            [_outwards(side) * _HALF_SHOULDERS * self.stature, _SHOULDER_HEIGHT * self.stature - SENSOR_HEIGHT, 0.0]
-        )
+        return self._middle(time) + _to_shoulder(self.stature, side)
 
     def skeleton(
         self,
@@ -159,26 +157,28 @@ class Person:
             finite_number(swivel, "Person.skeleton: swivel", "rad")
         if hand is not None and not _is_rotation(real_array(hand, (3, 3), "Person.skeleton: hand")):
             raise InputError(f"Person.skeleton: hand must be a rotation of shape (3, 3), got {hand!r}")
-        points = self._body(time)
+        middle = self._middle(time)
+        points = _standing(self.stature) + middle
         other = "left" if side == "right" else "right"
-        hanging = self.shoulder(other, time) + np.array([_outwards(other) * 0.06, -0.97 * self.reach, -0.05])
-        self._place_arm(points, other, time, hanging, None, None)
+        shoulder = middle + _to_shoulder(self.stature, other)
+        hanging = shoulder + np.array([_outwards(other) * 0.06, -0.97 * self.reach, -0.05])
+        self._place_arm(points, other, shoulder, hanging, None, None)
         amplitude, frequency, phase = self.tremor
         shake = (amplitude * np.sin(frequency * time + phase)).sum(axis=0)
-        self._place_arm(points, side, time, wanted + shake, swivel, hand)
+        self._place_arm(points, side, middle + _to_shoulder(self.stature, side), wanted + shake, swivel, hand)
         states = {side: HandState.CLOSED if closed else HandState.OPEN, other: HandState.OPEN}
         return Skeleton(time, points, hand_states=(states["left"], states["right"]))
 
     def elbow(self, shoulder: Array, wrist: Array, swivel: float, side: str = "right") -> tuple[Array, Array]:
         """Return elbow and wrist (3,) [m]: the wrist moved into reach, the elbow on its circle at ``swivel`` [rad]."""
         to_wrist = wrist - shoulder
-        distance = float(np.linalg.norm(to_wrist))
-        along = to_wrist / distance if distance > 1e-6 else np.array([0.0, 0.0, -1.0])
+        distance = math.sqrt(to_wrist @ to_wrist)
+        along = to_wrist / distance if distance > 1e-6 else _FORWARD
         nearest = abs(self.upper_arm - self.forearm) + 0.03
-        r = float(np.clip(distance, nearest, self.reach))
+        r = min(max(distance, nearest), self.reach)
         a = (self.upper_arm**2 + r * r - self.forearm**2) / (2.0 * r)
         h = math.sqrt(max(self.upper_arm**2 - a * a, 0.0))
-        down = _rotated(np.array([0.0, -1.0, 0.0]), along)
+        down = _rotated(_DOWN, along)
         out = _cross(down, along) if side == "right" else _cross(along, down)
         return shoulder + a * along + h * (math.cos(swivel) * down + math.sin(swivel) * out), shoulder + r * along
 
@@ -187,26 +187,28 @@ class Person:
         x, z = self.position + amplitude * np.sin(frequency * time + phase)
         return np.array([x, 0.0, z])
 
-    def _body(self, time: float) -> Array:
-        return _standing(self.stature) + self._middle(time)
-
     def _place_arm(
-        self, points: Array, side: str, time: float, wrist: Array, swivel: float | None, hand: ArrayLike | None
+        self, points: Array, side: str, shoulder: Array, wrist: Array, swivel: float | None, hand: ArrayLike | None
     ) -> None:
-        shoulder = self.shoulder(side, time)
         psi = self.swivel + self.lift * max(float(wrist[1] - shoulder[1]) + 0.3, 0.0) if swivel is None else swivel
         elbow, at = self.elbow(shoulder, wrist, psi, side)
         rotation = _hand_along(at - elbow) if hand is None else np.asarray(hand, dtype=float)
-        long, thumb_long, thumb_wide = _TO_TIP, *_TO_THUMB
-        for name, point in (
-            ("shoulder", shoulder),
-            ("elbow", elbow),
-            ("wrist", at),
-            ("hand", at + _TO_HAND * self.hand * rotation[:, 0]),
-            ("hand_tip", at + long * self.hand * rotation[:, 0]),
-            ("thumb", at + self.hand * (thumb_long * rotation[:, 0] + thumb_wide * rotation[:, 1])),
-        ):
-            points[JOINT[f"{name}_{side}"]] = point
+        along, across = rotation[:, 0], rotation[:, 1]
+        thumb_long, thumb_wide = _TO_THUMB
+        points[ARM_JOINTS[side]] = (
+            shoulder,
+            elbow,
+            at,
+            at + _TO_HAND * self.hand * along,
+            at + _TO_TIP * self.hand * along,
+            at + self.hand * (thumb_long * along + thumb_wide * across),
+        )
+
+
+@lru_cache(maxsize=64)
+def _to_shoulder(stature: float, side: str) -> Array:
+    """Return the position of a shoulder relative to the point on the floor between the feet, shape (3,) [m]."""
+    return np.array([_outwards(side) * _HALF_SHOULDERS * stature, _SHOULDER_HEIGHT * stature - SENSOR_HEIGHT, 0.0])
 
 
 @lru_cache(maxsize=64)
@@ -240,8 +242,8 @@ def _is_rotation(matrix: Array) -> bool:
 
 def _hand_along(forearm: Array) -> Array:
     """Return the rotation of a hand in line with the forearm; the thumb is up when the forearm points forward."""
-    x = forearm / np.linalg.norm(forearm)
-    y = _rotated(np.array([0.0, 1.0, 0.0]), x)
+    x = forearm / math.sqrt(forearm @ forearm)
+    y = _rotated(_UP, x)
     return np.array([x, y, _cross(x, y)]).T
 
 
@@ -261,4 +263,4 @@ def _rotated(vector: Array, direction: Array) -> Array:
     square = float(both @ both)
     rotated = vector - (2.0 * float(direction @ vector) / square) * both if square > 1e-12 else -vector
     rotated = rotated - float(direction @ rotated) * direction
-    return np.asarray(rotated / np.sqrt(rotated @ rotated))
+    return np.asarray(rotated / math.sqrt(rotated @ rotated))

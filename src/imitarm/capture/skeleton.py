@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,8 @@ JOINT = {name: index for index, name in enumerate(JOINTS)}
 SIDES = ("left", "right")
 FARTHEST = 20.0  # [m] beyond the range of any skeleton camera: a joint farther away was not measured
 _ARM_PARTS = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
-_ARM_INDEX = {side: np.array([JOINT[f"{part}_{side}"] for part in _ARM_PARTS]) for side in SIDES}
+ARM_JOINTS = {side: np.array([JOINT[f"{part}_{side}"] for part in _ARM_PARTS]) for side in SIDES}
+"""Indices of shoulder, elbow, wrist, hand, hand tip and thumb of each side."""
 
 
 class Tracking(IntEnum):
@@ -60,6 +61,9 @@ class Tracking(IntEnum):
     LOST = 0
     INFERRED = 1
     TRACKED = 2
+
+
+_LOST = int(Tracking.LOST)  # quicker to look up than a member
 
 
 class HandState(IntEnum):
@@ -146,18 +150,23 @@ class Skeleton:
         time = finite_number(self.time, "Skeleton: time", "s")
         person = whole_number(self.person, "Skeleton: person")
         positions = np.array(real_array(self.positions, (n, 3), "Skeleton: positions", "m"))
-        tracking = real_array(self.tracking, (n,), "Skeleton: tracking")
+        tracking: NDArray[Any] = self.tracking
+        if type(tracking) is not np.ndarray or tracking.dtype != np.int8 or tracking.shape != (n,):
+            tracking = real_array(tracking, (n,), "Skeleton: tracking")
         if not ((tracking == 0) | (tracking == 1) | (tracking == 2)).all():
             raise InputError(f"Skeleton: tracking must be 0, 1 or 2 (lost, inferred, tracked), got {tracking}")
         try:
-            left, right = (HandState(state) for state in self.hand_states)
+            left, right = (state if type(state) is HandState else HandState(state) for state in self.hand_states)
         except (TypeError, ValueError) as error:
             raise InputError(f"Skeleton: hand_states must be two of 0 to 4, got {self.hand_states!r}") from error
         tracking = tracking.astype(np.int8)
         with np.errstate(invalid="ignore"):
-            measured = (np.abs(positions) <= FARTHEST).all(axis=1)
-        tracking[~measured] = Tracking.LOST
-        positions[tracking == Tracking.LOST] = np.nan
+            measured = np.abs(positions) <= FARTHEST
+        if not measured.all():
+            tracking[~measured.all(axis=1)] = Tracking.LOST
+        lost = tracking == _LOST
+        if lost.any():
+            positions[lost] = np.nan
         positions.setflags(write=False)
         tracking.setflags(write=False)
         object.__setattr__(self, "time", time)
@@ -182,9 +191,9 @@ class Skeleton:
         Raises:
             UnknownNameError: when ``side`` is neither left nor right.
         """
-        if not isinstance(side, str) or side not in _ARM_INDEX:
+        if not isinstance(side, str) or side not in ARM_JOINTS:
             raise UnknownNameError.among("side", side, SIDES)
-        index = _ARM_INDEX[side]
+        index = ARM_JOINTS[side]
         return Arm(
             self.time,
             self.positions.take(index, axis=0),  # three times as fast as [index]
