@@ -20,6 +20,7 @@ from imitarm import ACFRA, ArmModel, Scene, SimulatedRobot, Skill, Sphere, Twist
 from imitarm.control_loop import reproduce
 from imitarm.demonstrations import align, lint, read
 from imitarm.policies import adapt
+from imitarm.policies.component_path import ComponentPath
 from imitarm.safety import SafetyFilter
 from imitarm.tasks.sweep import DEMONSTRATIONS
 
@@ -50,7 +51,7 @@ def jobs() -> dict[str, Callable[[], object]]:
     skill = Skill(8).fit(align(read(DEMONSTRATIONS)))
     path = skill.generate().positions
     middle = path[len(path) // 2]
-    scene = Scene(None, [Sphere(middle, 0.04)])
+    scene, decomposed = Scene(None, [Sphere(middle, 0.04)]), ComponentPath.of_skill(skill)
     spheres = [[0.0, 0.0, 0.0, 0.02]]
 
     def motion() -> None:
@@ -63,7 +64,7 @@ def jobs() -> dict[str, Callable[[], object]]:
 
     return {
         "one IK solve": lambda: solve_ik(arm, arm.home, TwistTask(np.full(6, 0.01)), velocity=np.zeros(7)),
-        "one adaptation": lambda: adapt(skill, scene, tool_spheres=spheres),
+        "one adaptation": lambda: adapt(decomposed, scene, tool_spheres=spheres),
         "from a file to a reproduced motion": motion,
     }
 

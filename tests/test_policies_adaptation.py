@@ -90,6 +90,25 @@ def test_a_goal_that_moved_is_reached_and_the_components_ride_along(spatial):
     assert np.linalg.norm(adaptation.means[0] - learnt.means[0]) < 0.01
 
 
+def test_a_decomposed_path_is_adapted_as_the_skill_is(spatial):
+    skill, path = spatial
+    scene = Scene(None, [Sphere(path[len(path) // 2], 0.03)])
+    whole = adapt(skill, scene, tool_radius=0.03, pinned=[1.0], n_samples=150)
+    parts = ComponentPath.of_skill(skill, pinned=[1.0], n_samples=150)
+    np.testing.assert_array_equal(
+        adapt(parts, scene, tool_radius=0.03).trajectory.positions, whole.trajectory.positions
+    )
+    goal = Pose(np.add(skill.goal_.position, [0.05, -0.08, 0.04]), [1, 0, 0, 0])
+    elsewhere = Scene(goal, scene.obstacles)
+    moved = adapt(parts.between(skill, None, goal), elsewhere, tool_radius=0.03)
+    np.testing.assert_allclose(moved.trajectory.positions[-1], goal.position, atol=1e-9)
+    with pytest.raises(InputError, match="does not end at the scene's goal"):
+        adapt(parts, elsewhere, tool_radius=0.03)
+    for given in ({"start": skill.start_}, {"pinned": [1.0]}, {"n_samples": 150}):
+        with pytest.raises(InputError, match="has its own start, pinned times and samples"):
+            adapt(parts, scene, tool_radius=0.03, **given)
+
+
 def test_fitting_again_forgets_the_path_that_was_kept():
     skill, _ = learn(planar=False)
     first = ComponentPath.of_skill(skill)

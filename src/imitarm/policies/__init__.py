@@ -3,13 +3,12 @@
 ``POLICIES`` is the registry: a new method is one file and one line here.
 """
 
-from imitarm.policies.acfra import ACFRA
 from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, Adaptation, adapt
 from imitarm.policies.least_detour import PathAdapter
-from imitarm.policies.policy import Observation, Policy
+from imitarm.policies.policy import ACFRA, Observation, Policy
 from imitarm.registry import Registry
 
-POLICIES: Registry[type[Policy]] = Registry("policy", "imitarm.policies", {"acfra": "imitarm.policies.acfra:ACFRA"})
+POLICIES: Registry[type[Policy]] = Registry("policy", "imitarm.policies", {"acfra": "imitarm.policies.policy:ACFRA"})
 """All policies by name."""
 
 __all__ = [

@@ -49,6 +49,16 @@ ADAPTERS: Registry[PathAdapter] = Registry(
 )
 
 
+def adapter_named(method: str) -> PathAdapter:
+    """Return a member of ``ADAPTERS``; the default needs no search for other packages.
+
+    Raises:
+        UnknownNameError: when there is no such method.
+        InputError: when the name is not text.
+    """
+    return CERTIFIED if text(method, "method") == "certified" else ADAPTERS[method]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Adaptation:
     """The path of a skill, adapted to a scene.
@@ -141,7 +151,7 @@ class Adaptation:
 
 
 def adapt(
-    skill: Skill,
+    skill: Skill | ComponentPath,
     scene: Scene,
     method: str = "certified",
     *,
@@ -152,7 +162,7 @@ def adapt(
     forbidden: ArrayLike = (),
     pinned: Sequence[float] = (),
     start: Pose | None = None,
-    n_samples: int = 200,
+    n_samples: int | None = None,
 ) -> Adaptation:
     """Adapt the whole path of a skill to the obstacles of a scene.
 
@@ -164,7 +174,9 @@ def adapt(
     The motion begins at time 0, when the obstacles have the poses of the scene; then they move with their velocities.
 
     Args:
-        skill: a fitted skill.
+        skill: a fitted skill, or its decomposed path (``ComponentPath.of_skill``), which can be adapted to many scenes.
+            A decomposed path has its own ends, pinned times and samples: ``pinned``, ``start`` and ``n_samples`` must
+            be left out, and it must end at the goal of the scene, if there is one.
         scene: goal (None: the learned one) and obstacles.
         method: a name in ``ADAPTERS``: ``"certified"``, ``"mapf"``, ``"literal"`` or a registered method.
         tool_radius: the tool as one sphere of this radius about its tip [m]; 0 for a point.
@@ -175,7 +187,7 @@ def adapt(
         forbidden: directions in which no component may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
         pinned: times [s] at which the path must not move, for example contact points.
         start: start of the motion; None: the learned start.
-        n_samples: samples along the path.
+        n_samples: samples along the path; None: 200.
 
     Returns:
         The adaptation; check ``feasible`` before executing it.
@@ -185,15 +197,12 @@ def adapt(
         InputError: when not exactly one of the three tool arguments is given, or an argument is not valid.
     """
     began = time.perf_counter()
-    adapter = CERTIFIED if method == "certified" else ADAPTERS[text(method, "method")]  # no package replaces it
-    instance(skill, Skill, "skill")
+    adapter = adapter_named(method)
     instance(scene, Scene, "scene")
-    if start is not None:
-        instance(start, Pose, "start")
     clearance = finite_number(clearance, "clearance", "m", at_least=0.0)
-    spheres = _spheres(skill, tool_radius, tool_spheres, arm)
+    path = _decomposed(skill, scene.goal, start, pinned, n_samples)
+    spheres = _spheres(path, tool_radius, tool_spheres, arm)
     allowed = AllowedDirections.without(_unit_rows(forbidden))
-    path = ComponentPath.of_skill(skill, n_samples=n_samples, start=start, goal=scene.goal, pinned=pinned)
     tool = ToolAmongObstacles.along(path.nominal, spheres, scene.obstacles)
     problem = AvoidanceProblem(path, tool.clearance_of(path.nominal.positions), clearance, allowed)
     detour = _detour(problem, adapter)
@@ -228,7 +237,24 @@ def adapt(
     )
 
 
-def _spheres(skill: Skill, radius: float | None, spheres: ArrayLike | None, arm: ArmModel | None) -> Array:
+def _decomposed(
+    skill: Skill | ComponentPath, goal: Pose | None, start: Pose | None, pinned: Sequence[float], n_samples: int | None
+) -> ComponentPath:
+    """Return the path to adapt, from the start to the goal."""
+    if isinstance(skill, ComponentPath):
+        if start is not None or n_samples is not None or np.size(pinned):
+            raise InputError("adapt: a decomposed path has its own start, pinned times and samples; leave them out")
+        if goal is not None and np.abs(goal.position - skill.nominal.positions[-1]).max() > STILL:
+            raise InputError("adapt: the decomposed path does not end at the scene's goal; decompose it with that goal")
+        return skill
+    instance(skill, Skill, "skill")
+    if start is not None:
+        instance(start, Pose, "start")
+    n_samples = 200 if n_samples is None else n_samples
+    return ComponentPath.of_skill(skill, n_samples=n_samples, start=start, goal=goal, pinned=pinned)
+
+
+def _spheres(path: ComponentPath, radius: float | None, spheres: ArrayLike | None, arm: ArmModel | None) -> Array:
     """Return the tool as rows x y z r, shape (n, 4) [m]."""
     ways = {"tool_radius": radius, "tool_spheres": spheres, "arm": arm}
     given = [name for name, value in ways.items() if value is not None]
@@ -245,7 +271,7 @@ def _spheres(skill: Skill, radius: float | None, spheres: ArrayLike | None, arm:
         rows = finite_array(spheres, (None, 4), "tool_spheres (rows x y z r)", "m")
         if not len(rows) or rows[:, 3].min() < 0.0:
             raise InputError("tool_spheres: give at least one row x y z r with r >= 0 m")
-    if not skill.gmr_.has_orientation_ and rows[:, :3].any():
+    if path.nominal.quaternions is None and rows[:, :3].any():
         raise InputError(
             "tool spheres away from the tip need the tool's orientation, which was not learned: "
             "record quaternions, or give tool_radius"

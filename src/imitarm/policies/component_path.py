@@ -112,13 +112,21 @@ class ComponentPath:
         for pin in pins:
             if not 0.0 <= pin <= duration:
                 raise InputError(f"pinned: {pin:g} s is outside the motion (0 to {duration:g} s)")
-        learned = _learned(skill.gmr_, n_samples, (0.0, *pins, duration))
+        return _learned(skill.gmr_, n_samples, (0.0, *pins, duration)).between(skill, start, goal)
+
+    def between(self, skill: Skill, start: Pose | None, goal: Pose | None) -> ComponentPath:
+        """Return the path of ``skill``, decomposed with its learned ends, between another start or goal.
+
+        Args:
+            skill: the skill whose path this is.
+            start: start of the motion; None: the learned start.
+            goal: end of the motion; None: the learned goal.
+        """
         if start is None and goal is None:
-            return learned
-        times = learned.nominal.times
-        moved = skill.nominal(times, start, goal)
-        shift = moved.positions - learned.nominal.positions
-        return replace(learned, nominal=moved, means=learned.means + shift[learned.centres])
+            return self
+        moved = skill.nominal(self.nominal.times, start, goal)
+        shift = moved.positions - self.nominal.positions
+        return replace(self, nominal=moved, means=self.means + shift[self.centres])
 
     @property
     def n_components(self) -> int:

@@ -1,23 +1,36 @@
-"""The interface of every policy: it observes an arm and its scene, and returns a command."""
+"""The interface of every policy, and ACFRA, the built-in one.
+
+A policy observes an arm and its scene, and returns a command. ACFRA (adaptive collision-free reaching, thesis Chapter
+4) adapts the whole learned path, then follows it.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.command import Command
-from imitarm.errors import InputError
+from imitarm.command import Command, Status
+from imitarm.errors import InfeasibleError, InputError
 from imitarm.kinematics.arm import ArmState
-from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply
+from imitarm.policies.adaptation import Adaptation, adapt, adapter_named
+from imitarm.policies.component_path import ComponentPath
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
+from imitarm.trajectory import Trajectory
 from imitarm.validation import finite_array, finite_number, instance
 
 Array = NDArray[np.float64]
+
+_LEAST_PATIENCE = 5e-3  # [m] no robot follows more closely than this at all times
+_SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learned one is the learned one
+_STANDS = 0.05  # speed of the phase below which the motion is said to wait
+_DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,3 +122,176 @@ class Policy(ABC):
     @abstractmethod
     def finished(self, observation: Observation) -> bool:
         """Return whether the motion has arrived."""
+
+
+class ACFRA(Policy):
+    r"""Adapt the whole path once, then follow it (thesis Chapter 4).
+
+    The constructor decomposes the learned path. ``reset`` adapts it to the observed scene, and raises an error when the
+    clearance can't be kept. ``step`` follows the adapted path with its own velocity plus feedback::
+
+        twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
+
+    so the phase ``s`` waits for a robot that lags, for example at its speed limits or when a hand holds it. If ``e_0``
+    is the required clearance, the tool cuts no corner by more than half of it: each point of the straight line back is
+    within ``e_0 / 2`` of the tool or of its target, and both are clear.
+
+    Among moving obstacles the plan is valid only at the planned times, so the phase follows the clock and does not
+    wait. When the tool is farther than ``e_0 / 2`` from its planned position, the plan is no longer valid: the arm
+    brakes and stays at rest.
+
+    Only ``"certified"`` refuses in advance when it can't keep the clearance. The paths of the thesis's potential fields
+    (``"mapf"``, ``"literal"``) are always followed, for comparison.
+
+    Args:
+        skill: skill to reproduce.
+        method: name in :data:`~imitarm.policies.ADAPTERS`.
+        tool_radius: radius of one sphere about the tool's tip [m]; use it instead of ``tool_spheres``.
+        tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m].
+        clearance: required distance of the tool to every obstacle [m].
+        forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
+        pinned: times at which the path must not move [s].
+        gain: K [1/s].
+        patience: e_0 [m]; None: the clearance, at least 5 mm.
+        arrival: distance to the end of the path at which the motion counts as arrived [m].
+        allowance: margin added to the clearance in planning, if possible, because a robot has tracking errors [m].
+
+    Attributes:
+        adaptation: result of the last ``reset``.
+    """
+
+    def __init__(
+        self,
+        skill: Skill,
+        *,
+        method: str = "certified",
+        tool_radius: float | None = None,
+        tool_spheres: ArrayLike | None = None,
+        clearance: float = 0.02,
+        forbidden: ArrayLike = (),
+        pinned: Sequence[float] = (),
+        gain: float = 8.0,
+        patience: float | None = None,
+        arrival: float = 0.003,
+        allowance: float = 0.002,
+    ) -> None:
+        super().__init__(skill, tool_spheres=tool_spheres, clearance=clearance, forbidden=forbidden)
+        self._refuses = adapter_named(method).refuses
+        self._options = {
+            "method": method,
+            "tool_radius": tool_radius,
+            "tool_spheres": tool_spheres,
+            "forbidden": forbidden,
+        }
+        self._path = ComponentPath.of_skill(skill, pinned=pinned)
+        self._gain = finite_number(gain, "ACFRA: gain", "1/s", above=0.0)
+        self._arrival = finite_number(arrival, "ACFRA: arrival", "m", above=0.0)
+        self._allowance = finite_number(allowance, "ACFRA: allowance", "m", at_least=0.0)
+        self._patience = max(self.clearance, _LEAST_PATIENCE)
+        if patience is not None:
+            self._patience = finite_number(patience, "ACFRA: patience", "m", above=0.0)
+        self.adaptation: Adaptation | None = None
+        self._phase, self._void = 0.0, ""
+
+    def reset(self, observation: Observation) -> None:
+        """Adapt the path to the scene, starting at the measured pose of the tool.
+
+        Raises:
+            InfeasibleError: when the clearance can't be kept, with the obstacle and the reason.
+        """
+        away = observation.tool_to_base.error_to(self.skill.start_)
+        if not self.skill.gmr_.has_orientation_:
+            away = away[:3]
+        start = observation.tool_to_base if np.linalg.norm(away) > _SAME_PLACE else None
+        self.adaptation = self._adapted(observation.scene.now(observation.time), start)
+        if not self.adaptation.feasible and self._refuses:
+            raise InfeasibleError(self.adaptation.reason)
+        path = self.adaptation.trajectory
+        velocity = np.gradient(path.positions, path.times, axis=0)
+        rotation = np.zeros((len(path), 3))
+        if path.quaternions is not None:
+            step = quaternion_multiply(path.quaternions[1:], quaternion_conjugate(path.quaternions[:-1]))
+            rotation[:-1] = quaternion_log(step) / np.diff(path.times)[:, None]
+        self._twists = np.concatenate([velocity, rotation], axis=1)
+        self._displaced = np.linalg.norm(path.positions - self.adaptation.nominal.positions, axis=1)
+        self._hold = observation.tool_to_base
+        self._began = observation.time
+        self._phase, self._void = 0.0, ""
+
+    def _adapted(self, scene: Scene, start: Pose | None) -> Adaptation:
+        """Plan with the allowance if that is feasible, otherwise without it."""
+        plan, path = None, self._path.between(self.skill, start, scene.goal)
+        for allowance in sorted({self._allowance if self._refuses else 0.0, 0.0}, reverse=True):
+            clearance = self.clearance + allowance
+            plan = adapt(path, scene, clearance=clearance, **self._options)  # type: ignore[arg-type]
+            if plan.feasible:
+                break
+        assert plan is not None
+        return plan
+
+    @property
+    def plan(self) -> Adaptation | None:
+        """The result of the last adaptation, for drawing in a report."""
+        return self.adaptation
+
+    @property
+    def phase(self) -> float:
+        """The phase of the motion, as a time in the demonstrated motion [s]."""
+        return self._phase
+
+    def step(self, observation: Observation, dt: float) -> Command:
+        """Return the command that follows the adapted path.
+
+        Raises:
+            InputError: when ``reset`` was not called.
+        """
+        if self.adaptation is None:
+            raise InputError("ACFRA.step: call reset(observation) first")
+        path = self.adaptation.trajectory
+        end = float(path.times[-1])
+        on_schedule = self.adaptation.only_on_schedule
+        if on_schedule:
+            self._phase = min(observation.time - self._began, end)
+        target = self._target(path)
+        error = observation.tool_to_base.error_to(target)
+        lag = float(np.linalg.norm(error[:3]))
+        if on_schedule and lag > 0.5 * self._patience:
+            self._void = self._void or (
+                f"the plan is valid only at the planned times, but the tool is {1e3 * lag:.0f} mm from its planned "
+                f"position at {observation.time:.2f} s: the arm brakes; plan again from here"
+            )
+        if self._void:
+            return Command(np.zeros(6), progress=self._phase / end, status=Status.BRAKING, reason=self._void)
+        speed = 1.0 if on_schedule else max(0.0, 1.0 - (lag / self._patience) ** 2)
+        forward = np.array([np.interp(self._phase, path.times, column) for column in self._twists.T])
+        if self._phase >= end:
+            speed = 0.0
+        elif not on_schedule:
+            self._phase = min(self._phase + speed * dt, end)
+        return self._command(speed * forward + self._gain * error, speed, lag, end)
+
+    def _command(self, twist: Array, speed: float, lag: float, end: float) -> Command:
+        assert self.adaptation is not None
+        progress = self._phase / end
+        if (speed < _STANDS and self._phase < end) or (self._phase >= end and lag > self._arrival):
+            what = "behind its path" if self._phase < end else "from the end of its path"
+            reason = f"the tool is {1e3 * lag:.0f} mm {what}"
+            return Command(twist, progress=progress, status=Status.WAITING, reason=reason)
+        displaced = float(np.interp(self._phase, self.adaptation.trajectory.times, self._displaced))
+        if displaced > _DISPLACED:
+            reason = f"the path is moved by {1e3 * displaced:.0f} mm here"
+            return Command(twist, progress=progress, status=Status.AVOIDING, reason=reason)
+        return Command(twist, progress=progress)
+
+    def _target(self, path: Trajectory) -> Pose:
+        """Return the desired pose at the current phase; without a learned orientation, the tool's rotation is kept."""
+        positions, quaternions = path.at([self._phase])
+        return Pose(positions[0], self._hold.quaternion if quaternions is None else quaternions[0])
+
+    def finished(self, observation: Observation) -> bool:
+        """Return whether the end of the path is reached within ``arrival``."""
+        if self.adaptation is None or self._void:
+            return False
+        path = self.adaptation.trajectory
+        away = np.linalg.norm(observation.tool_to_base.position - path.positions[-1])
+        return self._phase >= path.times[-1] and bool(away < self._arrival)
