@@ -1,7 +1,7 @@
 """The errors that imitarm raises; one base class, so that one ``except`` catches them all.
 
-Every message says what is wrong, where, and what to do about it.
-Errors are raised at construction or reading, not inside a control loop.
+Every message says what is wrong, where, and what to do about it. Errors are raised at construction or reading, not
+inside a control loop.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from __future__ import annotations
 class ImitarmError(Exception):
     """Base class of all errors that imitarm raises deliberately.
 
-    The command line shows only the message and exits with ``exit_status``:
-    2 for bad input, 1 for a task that was understood but could not be done.
+    The command line shows only the message and exits with ``exit_status``: 2 for bad input, 1 for a task that was
+    understood but could not be done.
     """
 
     exit_status = 2

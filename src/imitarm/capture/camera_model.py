@@ -79,19 +79,18 @@ _SHAPE = (len(JOINTS), 3)
 class SkeletonCamera:
     r"""A simulated skeleton camera with the errors of a real one.
 
-    Docs/capture.md describes how these errors were measured.
+    The page docs/capture.md describes how these errors were measured.
 
     A joint at x is measured at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma`` on each
-    axis
-    across the line of sight and 1.4 times that along it; both are 1.5 times as large for finger tips and thumbs. It is
-    a Matern process of order 3/2 over time t and path length :math:`|dx|` together,
+    axis across the line of sight and ``1.4 sigma`` along it; both are 1.5 times as large for finger tips and thumbs. It
+    is a Matern process of order 3/2 over time t and path length :math:`|dx|` together,
 
     .. math:: du = dt / 5\,\mathrm{s} + |dx| / 8\,\mathrm{cm}, \qquad
               \mathrm{E}\,[c(0)\,c(u)] = \sigma^2 (1 + u)\,e^{-u},
 
     because in recordings of a Kinect v2 the length of a bone hardly changes while the arm is at rest, and changes by 1
-    to 2 cm while the joint moves by 10 to 20 cm. ``M`` correlates the errors of neighbouring joints: the length of a
-    forearm varies less than that of an upper arm. ``n`` is white noise and grows with the joint's speed: for elbow and
+    to 2 cm while the joint moves by 10 to 20 cm. ``M`` correlates the errors of neighbouring joints: a forearm's length
+    varies less than an upper arm's. ``n`` is white noise and grows with the joint's speed: for elbow and
     wrist and ``sigma`` of 12 mm, it is 0.2 mm at rest plus 5 mm per m/s. ``b`` is a bias of the elbow's depth.
 
     * Frames arrive at ``rate`` with ``jitter``; 3 % of the intervals are twice as long, and 1 % of the frames show
@@ -168,10 +167,10 @@ class SkeletonCamera:
         return time + period + self.jitter * float(np.clip(self._rng.normal(), -2.7, 2.7))
 
     def see(self, truth: Skeleton) -> Skeleton | None:
-        """Return the skeleton the camera reports, or None when it reports none.
+        """Return the skeleton that the camera reports, or None if it reports no skeleton.
 
         Args:
-            truth: the true skeleton, later than that of the previous call.
+            truth: the true skeleton, later than the skeleton of the previous call.
         """
         period = max(truth.time - self._time, 0.0) if math.isfinite(self._time) else 0.0
         error = self._error(truth.positions, period)

@@ -77,9 +77,8 @@ def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]
     """Fix the faults that can be fixed without guessing, and report each change.
 
     If there are several persons, the one with the most frames is kept. A frame is dropped when it is not later than the
-    previous
-    frame or repeats it exactly. Joints in a spike count as lost, and so do the joints of an arm that is frozen while
-    the body moves. If left and right were exchanged from one frame to the next, they are exchanged back.
+    previous frame or repeats it exactly. Joints in a spike count as lost, and so do the joints of an arm that is frozen
+    while the body moves. If left and right were exchanged from one frame to the next, they are exchanged back.
 
     Returns:
         The repaired recording, and one line for each kind of change; no lines if nothing was changed.
@@ -96,7 +95,7 @@ def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]
         if not kept or skeleton.time > kept[-1].time:
             kept.append(skeleton)
     if len(kept) < len(frames):
-        notes.append(f"dropped {len(frames) - len(kept)} frames that were not later than the one before")
+        notes.append(f"dropped {len(frames) - len(kept)} frames that were not later than the previous frame")
     kept = _without_repeats(kept, notes)
     memory = SideMemory()
     right = [memory.update(skeleton) for skeleton in kept]
@@ -147,7 +146,7 @@ def _with_lost(skeleton: Skeleton, joints: Mask) -> Skeleton:
 
 
 class _View:
-    """The person with the most frames, as arrays."""
+    """The recording of the person with the most frames, as arrays."""
 
     def __init__(self, recording: SkeletonRecording, side: str) -> None:
         everybody = [skeleton.person for skeleton in recording.skeletons]
@@ -207,7 +206,7 @@ def _people(recording: SkeletonRecording) -> Iterator[RecordingIssue]:
         yield RecordingIssue(
             "warning",
             "several-persons",
-            f"{len(recording.persons)} persons: {shown}; all other issues are about the one seen most",
+            f"{len(recording.persons)} persons: {shown}; all other issues are about the person seen most",
             second,
             recording.skeletons[second].time - recording.skeletons[0].time,
             "choose one by --person, or .person(number)",
@@ -288,7 +287,9 @@ def _frozen(view: _View) -> Iterator[RecordingIssue]:
     fraction = whole.sum() / len(view.times)
     if fraction > _REPEATED and view.period > 0.0:
         rate = (1.0 - fraction) / view.period
-        message = f"{100 * fraction:.0f} % of the frames repeat the one before: {rate:.1f} different frames a second"
+        message = (
+            f"{100 * fraction:.0f} % of the frames repeat the previous frame: {rate:.1f} different frames per second"
+        )
         yield view.issue("warning", "frozen", message, "repair drops these frames", int(np.argmax(whole)) + 1)
 
 

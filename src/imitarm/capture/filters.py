@@ -22,11 +22,10 @@ _TORSO = np.array([JOINT[name] for name in ("spine_shoulder", "spine_mid", "neck
 class PersonFilter(SkeletonSource):
     """Selects one person of a source that may see several.
 
-    The first person seen is followed until they have been out of view for more than ``patience`` on the source's
-    clock; everybody else is ignored. Another person is followed only after that time; by then every retargeter has
-    stopped and must engage again. A source that tracks only one person may give the next person the same number.
-    Therefore, a person who
-    appears farther away than the followed person can have walked is ignored too.
+    The first person seen is followed until they have been out of view for more than ``patience`` on the source's clock;
+    everybody else is ignored. Another person is followed only after that time; by then every retargeter has stopped and
+    must engage again. A source that tracks only one person may give the next person the same number. Therefore, a
+    person who appears farther away than the followed person can have walked is ignored too.
 
     Args:
         source: the source to filter.
@@ -150,18 +149,15 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     r"""Return the skeleton with left and right assigned as in the previous frame.
 
     Let :math:`l, r` be the positions of a left and a right joint and :math:`l', r'` those in the previous frame, a time
-    t
-    earlier. The sides are exchanged back when this shortens the motion since the previous frame by more than limbs can
-    move:
+    t earlier. The sides are exchanged back when this shortens the motion since the previous frame by more than limbs
+    can move:
 
     .. math:: \sum_j |l_j - l'_j| + |r_j - r'_j| > \sum_j |l_j - r'_j| + |r_j - l'_j| + n\,\max(0.15, v t)
 
     summed over the n pairs of joints that are visible in both frames. Shoulders and hips (v = 0.5 m/s) decide about the
-    whole
-    body; then the hands, with or without elbows (v = 4 m/s), decide about arms that were exchanged while the rest of
-    the body was not.
-    Hands that meet are too close to each other to fulfil the inequality and are not exchanged. If one joint of a pair
-    is lost, only the other joint is used.
+    whole body; then the hands, with or without elbows (v = 4 m/s), decide about arms that were exchanged while the rest
+    of the body was not. Hands that meet are too close to each other to fulfil the inequality and are not exchanged. If
+    one joint of a pair is lost, only the other joint is used.
 
     Args:
         skeleton: as the camera reports it.

@@ -154,8 +154,7 @@ def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[R
     """Read a table of 101 columns: time in units of 100 ns, then x, y, z [m] and state of 25 joints in SDK order.
 
     Times are counted from the first frame. Such a file contains neither person numbers nor hand states. A comma at the
-    end of
-    a line is accepted.
+    end of a line is accepted.
 
     Args:
         path: path for messages.
@@ -253,16 +252,16 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
 
 
 def is_motion_capture(head: bytes) -> bool:
-    """Return whether a file begins like an export of motion capture by QTM: a table of markers with tabs."""
+    """Return whether a file begins like a motion capture export of QTM, a tab-separated table of markers."""
     return head.startswith(b"NO_OF_FRAMES\t") and b"\nMARKER_NAMES\t" in head
 
 
 def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]]:
-    """Read markers as :meth:`MotionCapture.load` does, and add a body to the arm.
+    """Read markers like :meth:`MotionCapture.load`, and add a body to the arm.
 
     The right arm is the captured arm with its measured bone lengths, and is marked as tracked. The rest of the body was
-    not captured. It is
-    synthesised as an average person who stands upright in front of a sensor, and is marked as inferred.
+    not captured. It is synthesised as an average person who stands upright in front of a sensor, and is marked as
+    inferred.
 
     Args:
         path: path of the file.

@@ -17,9 +17,9 @@ class RecordingIssue:
     Attributes:
         severity: ``"error"``: no robot can follow this recording as it is; ``"warning"``: the fault should be
             inspected; ``"note"``: for information.
-        code: short name that stays the same from version to version, such as ``"gap"``.
+        code: short name that does not change between versions, such as ``"gap"``.
         message: description of the fault, with figures.
-        frame: the first frame concerned, counted from 0; None when the whole recording is concerned.
+        frame: first affected frame, counted from 0; None when the whole recording is affected.
         time: time of that frame since the first frame [s].
         remedy: what to do.
     """

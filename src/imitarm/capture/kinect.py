@@ -17,8 +17,8 @@ from imitarm.capture.skeleton import JOINTS, SIDES, HandState, Skeleton, Skeleto
 from imitarm.errors import InputError, TaskFailedError
 
 INSTEAD = (
-    "without it: record elsewhere as a table of the Kinect SDK and open the file, receive udp:PORT from a machine that "
-    "has the camera, or use webcam:NUMBER or video:FILE"
+    "alternatives: record elsewhere as a table of the Kinect SDK and open the file, receive udp:PORT from a machine "
+    "that has the camera, or use webcam:NUMBER or video:FILE"
 )
 """Alternatives when a camera can't be opened."""
 
@@ -209,9 +209,9 @@ _FROM = _joint_indices()
 class AzureKinectSource(BodyCamera):
     """Skeletons of all persons in front of an Azure Kinect.
 
-    The SDK's 32 joints are converted to the 25 of the Kinect v2, and the depth camera's frame (x right, y down,
-    millimetres) to that of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK can't tell open from closed hands, so
-    hand states are unknown. Times are on the device's clock.
+    The SDK's 32 joints are converted to the 25 joints of the Kinect v2, and the depth camera's frame (x right, y down,
+    millimetres) to the frame of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK can't tell open from closed hands,
+    so hand states are unknown. Times are on the device's clock.
 
     `pykinect-azure` ends the program when the SDK fails; this class raises an error instead. Frames are fetched by the
     C functions that it wraps, because these distinguish a late frame from a failure.

@@ -213,7 +213,7 @@ class MediaPipeSource(SkeletonSource):
 
     MediaPipe tracks one person. It runs in another process, in another environment (see
     :mod:`imitarm.capture.mediapipe_environment`), and sends its landmarks as lines of text, which
-    :class:`LandmarkConverter` turns into skeletons. Times are video times, from 0 s; for a webcam, times on the
+    :class:`LandmarkConverter` converts to skeletons. Times are video times, from 0 s; for a webcam, times on the
     monotonic clock at which the images arrived.
 
     Args:
@@ -270,7 +270,7 @@ class MediaPipeSource(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether the video is over, or the source closed."""
+        """Whether the video has ended or the source is closed."""
         return self._over
 
     def close(self) -> None:
@@ -279,7 +279,7 @@ class MediaPipeSource(SkeletonSource):
         self._process.close()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton, or None when none came within ``timeout`` seconds or the source is over."""
+        """Return the next skeleton, or None when none arrived within ``timeout`` seconds or the source has ended."""
         until = clock.monotonic() + timeout
         while not self._over:
             if self._next is None:

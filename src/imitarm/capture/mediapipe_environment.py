@@ -5,7 +5,7 @@ Find it, create it, and run MediaPipe in it as a process that writes lines of te
 MediaPipe 0.10.21, the last version that includes its models, needs numpy below 2; imitarm needs numpy 2. MediaPipe is
 therefore installed in another environment, without imitarm::
 
-    python -m imitarm.capture.mediapipe_environment            # makes it where imitarm looks for it
+    python -m imitarm.capture.mediapipe_environment            # creates it where imitarm looks for it
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ class LineProcess:
         keep: largest number of unread lines.
         newest: whether to drop the oldest unread line (but never the very first line) when the limit is exceeded;
             otherwise the program waits.
-        chatter: regular expression of lines on its standard error to leave out of :meth:`ended`.
+        chatter: regular expression for lines of the standard error to leave out of :meth:`ended`.
 
     Raises:
         OSError: when the program can't be started.
@@ -270,7 +270,7 @@ class _Lines:
 
 
 def _finish(process: subprocess.Popen[bytes], lines: _Lines, thread: threading.Thread, errors: IO[bytes]) -> None:
-    """End a process, first by request, then by force, and release everything that belongs to it."""
+    """End a process, first by request, then by force, and release its resources."""
     lines.stop()
     with contextlib.suppress(OSError):
         assert process.stdin is not None

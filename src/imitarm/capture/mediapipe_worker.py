@@ -73,7 +73,7 @@ def _imported(name: str) -> Any:
 
 
 def _pose(mediapipe: Any) -> Any:
-    """Return the tracker; model 1 is in the package, 0 and 2 would be downloaded."""
+    """Return the tracker with model 1, which is in the package; models 0 and 2 would be downloaded."""
     if not hasattr(mediapipe, "solutions"):
         version = getattr(mediapipe, "__version__", "of unknown version")
         raise StopError(f"mediapipe {version} has no module 'solutions' with the models; version 0.10.21 is needed")

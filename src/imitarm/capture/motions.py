@@ -43,7 +43,7 @@ def reaching(person: Person, seed: int, *, duration: float = 12.0, kind: str = "
     Args:
         person: who moves.
         seed: seed of the points and the speeds.
-        duration: [s]; the hand is still during the first second.
+        duration: duration of the motion [s]; the hand is at rest during the first second.
         kind: ``"inside"``: reaches well within the workspace. ``"edge"``: every second reach stretches the arm fully
             and stays there for some time, at or beyond the reach of a robot of the same proportions.
 
@@ -122,7 +122,7 @@ def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "c
     Args:
         person: who moves.
         seed: seed of position, size and period of the shape.
-        duration: [s]; the hand is still during the first second.
+        duration: duration of the motion [s]; the hand is at rest during the first second.
         kind: shape, one of :data:`DRAWINGS`.
 
     Raises:

@@ -47,10 +47,10 @@ _TO_HAND, _TO_TIP, _TO_THUMB = (
 class Person:
     r"""A synthetic person who faces a sensor, upright, in the sensor's frame (x left, y up, z away).
 
-    An arm is two straight bones, of lengths :math:`L_U` and :math:`L_F`. For a given shoulder S and wrist W the elbow E
-    lies on a circle about the line from S to W. With :math:`\hat w` along that line, and :math:`\hat d` (down) and
-    :math:`\hat o` (outwards) perpendicular to it (both rotate with the arm from their directions for an arm that points
-    forward), the elbow is at
+    An arm consists of two straight bones with lengths :math:`L_U` and :math:`L_F`. For a given shoulder S and wrist W
+    the elbow E lies on a circle about the line from S to W. With :math:`\hat w` along that line, and :math:`\hat d`
+    (down) and :math:`\hat o` (outwards) perpendicular to it (both rotate with the arm from their directions for an arm
+    that points forward), the elbow is at
 
     .. math:: E = S + a\,\hat w + h\,(\cos\psi\,\hat d + \sin\psi\,\hat o), \qquad
               a = \frac{L_U^2 + r^2 - L_F^2}{2r},\quad h = \sqrt{L_U^2 - a^2},\quad r = |W - S| .

@@ -45,8 +45,8 @@ def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
     """Return the unit in which time stamps give a plausible frame rate.
 
     Args:
-        rate: frame rate when the stamps are read in ``unit`` [Hz].
-        unit: the unit in which the stamps were read [s].
+        rate: frame rate if the time stamps are in ``unit`` [Hz].
+        unit: unit in which the time stamps were read [s].
 
     Returns:
         the name of the unit, and the factor by which the times must be multiplied. The result is None when no other
@@ -149,14 +149,14 @@ def runs(repeated: Mask) -> list[tuple[int, int]]:
 
 
 def joint_steps(times: Array, positions: Array) -> tuple[Array, Array]:
-    """Return how far [m] and how fast [m/s] each joint moves from each frame to the next, shape (n - 1, 25)."""
+    """Return the distance [m] and speed [m/s] of each joint from each frame to the next, shape (n - 1, 25)."""
     step = np.linalg.norm(np.diff(positions, axis=0), axis=2)
     period = np.diff(times)[:, None]
     return step, np.where(period > 0.0, step / np.where(period > 0.0, period, 1.0), 0.0)
 
 
 def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
-    """Return how fast the faster hand moves [m/s]: the 90th percentile over three frames, without spikes.
+    """Return the speed of the faster hand [m/s]: the 90th percentile over three frames, without spikes.
 
     Args:
         times: time stamps, shape (n,) [s], increasing.
@@ -181,8 +181,7 @@ def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
     A joint is in a spike when it is more than 0.2 m from the straight line between the frames before and after, these
     two are less than half as far apart, and one of two conditions holds: the joint moves there and back faster than 10
     m/s, or an arm bone that ends at the joint is more than 0.12 m longer or shorter than in those two frames. At both
-    ends of a recording, a jump
-    of more than 0.3 m faster than 10 m/s is enough.
+    ends of a recording, a jump of more than 0.3 m faster than 10 m/s is enough.
 
     Args:
         times: time stamps, shape (n,) [s], increasing.

@@ -34,13 +34,13 @@ _GAP: Final = 0.25  # [s] a longer gap in a recording is not filled with frames
 
 
 class SkeletonRecording(SkeletonSource):
-    """Skeletons in the order in which they were recorded; as a source it replays them once.
+    """Skeletons in the order in which they were recorded; used as a source, a recording is replayed once.
 
     Skeletons are neither checked nor changed: times may decrease, and there may be several persons.
         :func:`~imitarm.capture.checks.check` lists the faults.
 
     Args:
-        skeletons: skeletons in the order they came.
+        skeletons: skeletons in the order of arrival.
         name: name for messages, for example the file's name.
         realtime: whether to replay at the recorded speed; otherwise as fast as skeletons are read.
         issues: issues found while reading.
@@ -93,7 +93,7 @@ class SkeletonRecording(SkeletonSource):
 
     @property
     def rate(self) -> float:
-        """Frames per second, from the median time between frames [Hz]; 0 when there are fewer than two."""
+        """Frames per second, from the median time between frames [Hz]; 0 with fewer than two frames."""
         steps = np.diff(np.unique([skeleton.time for skeleton in self.skeletons]))
         return float(1.0 / np.median(steps)) if len(steps) else 0.0
 
@@ -223,8 +223,8 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
 class SkeletonRecorder:
     """Writes each skeleton as a line of ``PATH.part``, and renames the file to ``PATH`` when the recorder is closed.
 
-    Each line is handed to the operating system before :meth:`write` returns: a program that is killed loses at most
-    the frame it was writing, and :func:`read_recording` reads ``PATH.part``. An older file ``PATH`` stays intact until
+    Each line is handed to the operating system before :meth:`write` returns: a program that is killed loses at most the
+    frame that it was writing, and :func:`read_recording` reads ``PATH.part``. An older file ``PATH`` stays intact until
     the new one is complete.
 
     Args:

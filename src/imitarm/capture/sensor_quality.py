@@ -48,7 +48,7 @@ class SensorNoise:
     Attributes:
         n_frames: number of skeletons.
         median_interval: median time between frames [s].
-        jitter: standard deviation of the intervals without the late ones [s].
+        jitter: standard deviation of the intervals, excluding late frames [s].
         late: fraction of the intervals that are longer than 1.4 times the median interval.
         longest_interval: [s].
         at_rest: white noise of each joint while it is slower than 0.1 m/s, root mean square over the axes, shape

@@ -123,7 +123,7 @@ class Skeleton:
     """The joints of a person at one time, as a camera reports them.
 
     The coordinate frame is that of the Kinect v2: origin in the sensor, x to the sensor's left, y up, z away from the
-    sensor, right-handed. The right hand of a person who faces the sensor has a larger x than the left one.
+    sensor, right-handed. The right hand of a person who faces the sensor has a larger x than the left hand.
 
     A position that can't have been measured (not finite, or farther than 20 m) counts as lost. Every lost position
     is nan, so that it can't be used by mistake.
@@ -236,7 +236,7 @@ class SkeletonSource(ABC):
         name: name for messages and for recordings, for example the file's name.
         argument: text that a user writes after the colon, for example ``"SEED"``; empty if there is no colon.
         description: description in one line for ``--help``.
-        live: whether the source goes on until it is stopped.
+        live: whether the source runs until it is stopped.
         has_realtime: whether :meth:`open` implements ``realtime``; if not, the commands delay its skeletons.
     """
 

@@ -106,7 +106,7 @@ class UdpSource(SkeletonSource):
         clock_ns: clock for the time of receiving [ns].
 
     Attributes:
-        gate: filter that selects the datagrams to use, and counts the dropped ones.
+        gate: filter that selects the datagrams to use, and counts the dropped datagrams.
         arrival: how the last skeleton arrived; None before the first.
 
     Raises:
@@ -150,7 +150,7 @@ class UdpSource(SkeletonSource):
         self._socket.close()
 
     def flush(self) -> None:
-        """Discard all skeletons that have arrived, so that the next one read is new."""
+        """Discard all skeletons that have arrived, so that the next skeleton is new."""
         for _ in waiting(self._socket):
             pass
 

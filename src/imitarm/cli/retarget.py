@@ -48,7 +48,8 @@ examples:
   imitarm retarget synthetic:7 --method all --report compare.html
   imitarm learn wave_*.csv --task wave --out wave.json
 
-The robot starts at its home posture, or with --fit at one from which the whole recorded motion is within reach. It
+The robot starts at its home posture, or with --fit at a posture from which the whole recorded motion is within reach.
+It
 waits until the person has been seen for half a second, then its tool follows the hand. The demonstration contains only
 the time in which the person led. The first line of the output says whether the tool followed its target: it did not if
 it was more than {100 * FAR:.0f} cm away (RMS), or that far for more than {100 * FAR_FRACTION:.0f} % of the time.
@@ -60,7 +61,7 @@ PERIOD = 0.01  # [s] control period
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what the command takes."""
+    """Add the command's arguments."""
     add_source(parser)
     add_robot_options(parser)
     parser.add_argument("--method", choices=(*RETARGETERS, "all"), default="modern", help="default: modern")

@@ -1,9 +1,8 @@
 """Align demonstrations: trim idle ends, and bring matching parts of all motions to the same time.
 
 People never repeat a motion at exactly the same speed. If demonstrations are averaged at equal times, a bend that
-occurs early in one demonstration
-and late in another is smeared: the mean cuts corners and flattens peaks. Alignment changes when a demonstration reaches
-each point, never the points.
+occurs early in one demonstration and late in another is smeared: the mean cuts corners and flattens peaks. Alignment
+changes when a demonstration reaches each point, never the points.
 
 Time is warped by dynamic time warping within a band. For two motions ``a``, ``b`` of n samples, the cheapest monotone
 path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` obeys
@@ -11,9 +10,8 @@ path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` obeys
     D(i, j) = c(i, j) + min(D(i-1, j-1) + c(i, j), D(i-1, j) + p, D(i, j-1) + p)
 
 (Sakoe and Chiba 1978, symmetric form, in which a diagonal step counts twice). The price ``p`` of a step that is not
-diagonal keeps
-noise from distorting time; |i - j| stays within the band. All cells of one anti-diagonal are computed together, for all
-pairs of motions.
+diagonal keeps noise from distorting time; |i - j| stays within the band. All cells of one anti-diagonal are computed
+together, for all pairs of motions.
 """
 
 from __future__ import annotations
@@ -194,9 +192,8 @@ def moving_rows(times: Array, positions: Array, quaternions: Array | None = None
 
     The motion begins at the last row within 0.1 mm of the start before the tool is 0.5 mm away from it. The speed is
     not used, so a slow motion is never mistaken for rest. The end is found in the same way, from the last row
-    backwards; 0.1
-    s more is kept on both sides. With noisy samples, both distances are at least 4 standard deviations of the averaged
-    noise. Rotation without displacement counts as motion.
+    backwards; 0.1 s more is kept on both sides. With noisy samples, both distances are at least 4 standard deviations
+    of the averaged noise. Rotation without displacement counts as motion.
 
     Args:
         times: strictly increasing, shape (n,) [s].
@@ -351,8 +348,7 @@ def features(trajectories: Sequence[Trajectory]) -> Array:
     """Return the features by which motions are compared, shape (n_demonstrations, n, 3), or 6 with rotations [m].
 
     Each path is moved to the common start and goal, because a motion that began at another position did not begin
-    earlier.
-    Rotations count as rotation vectors from their mean, times a lever of 0.1 m.
+    earlier. Rotations count as rotation vectors from their mean, times a lever of 0.1 m.
     """
     parts = [to_common_ends(np.stack([trajectory.positions for trajectory in trajectories]))]
     if trajectories[0].quaternions is not None:

@@ -92,7 +92,7 @@ def reach(arm: ArmModel, *, n_samples: int = 400, seed: int = 0) -> tuple[Array,
     Args:
         arm: arm with its tool.
         n_samples: number of random postures; ascent starts from the best four.
-        seed: of these postures.
+        seed: seed of these postures.
 
     Returns:
         Shoulder position in the base frame, shape (3,) [m], and largest distance [m].

@@ -33,8 +33,7 @@ class NumpyReader(Reader):
 
     An array (n, columns) is one motion, an array (n_demonstrations, n, columns) is several; the columns have the same
     meaning as in a text table without names. An .npz with an array ``positions`` holds one set of motions, and may also
-    hold the arrays
-    ``times``, ``quaternions`` and ``joints``; in any other .npz each array holds motions.
+    hold the arrays ``times``, ``quaternions`` and ``joints``; in any other .npz each array holds motions.
     """
 
     suffixes = (".npy", ".npz")

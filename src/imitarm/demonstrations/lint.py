@@ -390,8 +390,7 @@ def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | N
     """Return one of two groups as a mask (m,), and the gap between the groups; None when there is only one group.
 
     The gap is the longest link of the minimum spanning tree. The gap must exceed ``floor``, and the next longest link
-    by a
-    factor, so that neighbours within the groups are much closer.
+    by a factor, so that neighbours within the groups are much closer.
     """
     m = len(distance)
     nearest, inside, links = distance[0].copy(), np.arange(m) == 0, []

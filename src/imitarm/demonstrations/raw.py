@@ -240,7 +240,8 @@ class RawDemonstration:
 
         Args:
             arm: arm that was recorded; needed when only joints were recorded.
-            repair: drop rows that are not finite or not later than the row before, and say so in ``source``.
+            repair: whether to drop rows that are not finite or not later than the previous row, with a remark in
+                ``source``.
 
         Raises:
             FileFormatError: when a row is invalid; the message names file, line and remedy.

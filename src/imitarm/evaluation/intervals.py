@@ -138,13 +138,12 @@ def compare(ours: Values, theirs: Values) -> Comparison:
 def rate_interval(outcomes: Values) -> Interval:
     r"""Return a success rate, the mean of the persons' rates, with its 95 % interval.
 
-    It is Wilson's interval with :math:`N / D` trials instead of the N actual ones (Rao and Scott, Biometrics 1992):
-    trials of one person are similar, and the design effect :math:`D = 1 + (m - 1) \rho` is the factor by which m trials
-    of one person count less than trials of m persons. :math:`\rho` is their correlation, estimated from how much the
-    persons' rates differ beyond chance. The estimate from a few persons is poor, so it is averaged with a prior
-    correlation of 0.3 that counts as two persons. If all trials had the same result, or there is only one person, the
-    correlation is 0.3. N / D
-    lies between the number of persons and N.
+    The interval is Wilson's, with :math:`N / D` trials instead of N (Rao and Scott, Biometrics 1992), because trials of
+    one person are similar. :math:`D = 1 + (m - 1) \rho` is the design effect of m trials per person. :math:`\rho` is
+    the correlation of the trials of one person, estimated from the differences between the persons' rates beyond
+    chance. The estimate from a few persons is poor, so it is averaged with a prior correlation of 0.3 that counts as
+    two persons. If all trials had the same result, or there is only one person, the correlation is 0.3. N / D lies
+    between the number of persons and N.
 
     Failures of only one person indicate that persons differ; an additional failure of another person indicates that
     they do not. Therefore, an additional failure could narrow the interval. To prevent this, the lower end is the

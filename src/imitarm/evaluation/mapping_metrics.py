@@ -43,8 +43,7 @@ class MappingMetrics:
 
     The reference of tool and elbow is the clutch's law applied to the *true* hand since the person began to lead; each
     engagement has a new reference. Errors are averaged over the frames in which the person led, so compare them
-    together with
-    ``engaged_fraction``; ``tool_rms_from_first`` includes all frames after the first engagement.
+    together with ``engaged_fraction``; ``tool_rms_from_first`` includes all frames after the first engagement.
 
     Attributes:
         duration: duration of the robot's motion [s].

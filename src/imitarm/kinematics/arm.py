@@ -74,14 +74,11 @@ class ArmModel(ArmKinematics):
     .. math:: M(q) \ddot q + C(q, \dot q) \dot q + g(q) = \tau
 
     where :math:`M` is the rigid-body inertia. Rotor inertia (``armature``), viscous damping and dry friction of the
-    joints,
-    which a simulated arm also has, are not included; their values are in ``spec()``.
+    joints, which a simulated arm also has, are not included; their values are in ``spec()``.
 
     All poses are in the base frame, whose origin is the origin of the file. Jacobians have the linear rows first.
-
-    Methods:
-    take one posture ``q`` of shape (n_joints,) and raise :class:`InputError` if its shape is wrong or a number
-    is not finite. Several threads can use one model.
+    All methods take one posture ``q`` of shape (n_joints,) and raise :class:`InputError` if its shape is wrong or a
+    number is not finite. Several threads can use one model.
 
     Attributes:
         name: for example ``"sawyer"``.
@@ -211,9 +208,8 @@ class ArmModel(ArmKinematics):
         Names are taken from the file; names of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
         The flange is the site ``"flange"``. Geoms of group 3 are used for contact, all others only for drawing; a file
         without this separation is converted. The arm's joints have no actuators, so that a world adds the actuators
-        that it needs
-        (joints carry their torque limit as ``actuatorfrcrange``). A gripper has one actuator, ``"tool/opening"``, a
-        position servo of its opening [m]. There are no keyframes: use :meth:`posture`.
+        that it needs (joints carry their torque limit as ``actuatorfrcrange``). A gripper has one actuator,
+        ``"tool/opening"``, a position servo of its opening [m]. There are no keyframes: use :meth:`posture`.
         """
         return self._spec.copy()
 
@@ -354,9 +350,9 @@ class ArmModel(ArmKinematics):
 def _working_model(file: ArmFile, whole: mujoco.MjModel) -> mujoco.MjModel:
     """Return the model that kinematics and dynamics are computed with.
 
-    It has no shapes without mass: its kinematics then takes a third of the time. Joints that are not part of the arm,
-    such as those of fingers, are fixed at their position in ``file.home``: the Jacobians then have no other columns.
-    It has no rotor inertia.
+    It has no shapes without mass, which reduces the time of its kinematics to a third. Joints that are not part of the
+    arm, such as those of fingers, are fixed at their position in ``file.home``: the Jacobians then have no other
+    columns. It has no rotor inertia.
     """
     spec = without_geoms(file.spec, _massless)
     for part in (*spec.actuators, *spec.equalities, *spec.tendons, *spec.sensors):

@@ -90,7 +90,7 @@ class _HomeSearch:
 
         It is the smallest singular value of the flange's Jacobian, whose rotations are weighted by 0.3 m, and of its
         linear part: an arm with few joints may lose a direction while it can still rotate. Singular values that are 0
-        in every posture do not count: an arm of three joints can't move its flange in all directions.
+        in every posture are ignored: an arm with three joints can't move its flange in all directions.
         """
         return min(float(values[rank - 1]) for values, rank in zip(self._singular_values(q), self._ranks, strict=True))
 

@@ -166,7 +166,7 @@ def _is_short_slide(name: str, body: mujoco.MjsBody) -> bool:
 
 
 def _parallel_mimics(spec: mujoco.MjSpec, owners: Mapping[str, mujoco.MjsBody]) -> set[str]:
-    """Return each group of coupled joints in which at least two joints are parallel branches, as fingers are."""
+    """Return each group of coupled joints in which at least two joints are parallel branches, like fingers."""
     groups: list[set[str]] = []
     for follower, leader in mimics(spec):
         touched = [group for group in groups if group & {follower, leader}]
@@ -253,7 +253,7 @@ def read_limits(
     """Return the velocity, acceleration and torque limits, and check the position limits.
 
     Args:
-        spec: the file as MuJoCo has read it.
+        spec: content of the file as read by MuJoCo.
         model: the compiled ``spec``.
         joints: names of the arm's joints.
         path: path of the file, for messages.
@@ -294,7 +294,7 @@ def read_limits(
 
 
 def _urdf_limits(joint: XmlElement, where: str) -> tuple[float, float]:
-    """Return a URDF joint's limits of velocity, nan where it has none, and of effort, inf where it has none.
+    """Return the limits of a URDF joint: velocity (nan if missing) and effort (inf if missing).
 
     A velocity or effort of 0 counts as missing, because exporters write 0 for values that were not filled in.
     """
@@ -368,7 +368,10 @@ def _listed(names: list[str]) -> str:
 
 
 def take_keyframe(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[dict[str, float], str]:
-    """Return positions by joint of the keyframe ``home``, else of the first one, and its name; remove all keyframes."""
+    """Return positions by joint of the keyframe ``home``, else of the first keyframe, and its name.
+
+    Remove all keyframes.
+    """
     keys = list(spec.keys)
     home: dict[str, float] = {}
     index = next((i for i, key in enumerate(keys) if key.name == "home"), 0)

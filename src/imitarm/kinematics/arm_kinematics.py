@@ -43,7 +43,7 @@ class Landmarks:
 
     @classmethod
     def find(cls, model: mujoco.MjModel, joints: NDArray[np.int_]) -> Landmarks | None:
-        """Return the landmarks of a model whose arm has ``joints``; None if a site or its joint is missing."""
+        """Return the landmarks of a model whose arm has ``joints``; None if a site or joint is missing."""
         sites = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) for name in _LANDMARKS]
         if min(sites) < 0:
             return None
@@ -98,7 +98,7 @@ class ArmMemory:
         self._qpos = self.data.qpos  # asking MuJoCo for it takes as long as the kinematics of one link
 
     def move_to(self, q: Array) -> None:
-        """Compute the kinematics at ``q``, shape (n,), unless it was computed for this posture last."""
+        """Compute the kinematics at ``q``, shape (n,), unless the last computation was for this posture."""
         posture = q.tobytes()
         if posture != self._posture:
             self._qpos[self._positions] = q

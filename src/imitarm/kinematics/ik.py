@@ -65,25 +65,23 @@ class IKSolver:
 
     where each task has a Jacobian :math:`J_i` and a target :math:`t_i`, :math:`v_p` is the previous velocity, and the
     rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite price are kept
-    whenever the boxes
-    allow it. If the boxes do not allow it, the sum of the squared violations, in rad/s along each row, is minimised
-    first, and the tasks have second priority. The other methods take one :class:`~imitarm.kinematics.tasks.TwistTask`,
-    optionally one
-    :class:`~imitarm.kinematics.tasks.PostureTask`, and boxes:
+    whenever the boxes allow it. If the boxes do not allow it, the sum of the squared violations, in rad/s along each
+    row, is minimised first, and the tasks have second priority. The other methods take one
+    :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one :class:`~imitarm.kinematics.tasks.PostureTask`, and
+    boxes:
 
     * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9): in joints scaled by their velocity limits
       :math:`v = J^T (J J^T+\lambda^2)^{-1} t`, with :math:`\lambda=0` for :math:`s_{min}\ge d`,
       :math:`\lambda^2=s_{min}(d-s_{min})` for :math:`d/2\le s_{min}<d` and :math:`\lambda=d/2` below, :math:`d=|t|`.
       This keeps the norm of the scaled velocity at most 1.
-    * ``"dls_small_angle"``: the same with half the least singular value subtracted from d, as the thesis prints
+    * ``"dls_small_angle"``: the same with half of the smallest singular value subtracted from d, as the thesis prints
       after Eq 3.9; this weakens the damping and is kept for comparison.
     * ``"svd"``, numerical filtering (Maciejewski and Klein 1988):
       :math:`v=\sum_i s_i/(s_i^2+\lambda_i^2)\, v_i u_i^T t` with :math:`\lambda_i^2=0.06^2(1-(s_i/0.06)^2)` where
       :math:`s_i<0.06`.
 
     These three methods scale the whole velocity down when a joint would be too fast, then clip it to the box. A solver
-    keeps no
-    state between steps and can be used by several threads.
+    keeps no state between steps and can be used by several threads.
 
     Args:
         arm: the arm.
@@ -429,7 +427,7 @@ def damped_with_small_angle(problem: IKProblem) -> Array:
 
 
 def _damped(problem: IKProblem, squares: Array, basis: Array, threshold: float) -> Array:
-    """Solve with the squared singular values and left singular vectors, damped where one is below the threshold."""
+    """Solve with the squared singular values and left singular vectors; damp values below the threshold."""
     scaled, target, _ = problem.tasks[0]
     least = math.sqrt(max(float(squares[0]), 0.0))
     if least >= threshold:

@@ -78,9 +78,9 @@ class IKProblem:
         box: hard bounds of the joint velocity; before the limits are applied, the arm's velocity limits.
         tasks: rows of the tasks; the tool's rows come first.
         rows: soft inequalities.
-        max_speed: norm to which a twist is scaled down, for tasks that do not set their own [m/s].
+        max_speed: largest norm of a twist, for tasks without their own limit [m/s].
         scaled: whether each joint velocity is counted in units of its velocity limit, as in damped least squares.
-        posture: drift in the null space, shape (n_joints,) [rad/s], for the damped methods; None: none.
+        posture: drift in the null space, shape (n_joints,) [rad/s], for the damped methods; None: no drift.
     """
 
     arm: ArmModel

@@ -49,10 +49,9 @@ class JointLimits(Limit):
 
     .. math:: v_b(D) = -a\,dt + \sqrt{a^2 dt^2 + 2 a D},
 
-    the solution of :math:`v^2/(2a) + v\,dt = D`. The upper bound is
-    :math:`\min(v_{max},\; v_p + a\,dt,\; \max(v_b(D),\, v_p - a\,dt))` where :math:`v_p` is the previous velocity; the
-    lower bound is its mirror image. If :math:`v_p` met this bound one step ago, braking with a meets it now, so the box
-    is never empty.
+    the solution of :math:`v^2/(2a) + v\,dt = D`. The upper bound is :math:`\min(v_{max},\; v_p + a\,dt,\;
+    \max(v_b(D),\, v_p - a\,dt))` where :math:`v_p` is the previous velocity; the lower bound is its mirror image. If
+    :math:`v_p` met this bound one step ago, braking with a meets it now, so the box is never empty.
 
     The bound assumes that the joint moves by :math:`v\,dt` in one step. A robot with constant acceleration moves by
     :math:`(v_p + v)\,dt/2`; ``imitarm.robots.limit_velocity`` therefore evaluates this box at :math:`q + v_p\,dt/2`.
@@ -179,11 +178,11 @@ class ElbowSingularityLimit(Limit):
 class WristSingularityLimit(Limit):
     r"""Softly keeps the wrist joint at least 0.1 rad away from its singular positions.
 
-    The wrist is singular where the axes before and after its joint are parallel, at every multiple of pi. With D the
-    distance to 0.1 rad from the nearest of them, the joint's velocity away from it must be at least
-    :math:`-v_b(D)` (see :class:`JointLimits`), or 5/s times the missing distance once it is closer than that. The price
-    of a violation
-    is low, so that the wrist can rotate through a singular position if necessary.
+    The wrist is singular where the axes before and after its joint are parallel, at every multiple of pi. If the joint
+    is farther than 0.1 rad from the nearest such multiple, let D be the excess. The joint's velocity away from the
+    multiple must be at least :math:`-v_b(D)` (see :class:`JointLimits`), or 5/s times the missing distance if the joint
+    is closer than 0.1 rad. The price of a violation is low, so that the wrist can rotate through a singular position if
+    necessary.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.

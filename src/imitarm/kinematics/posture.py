@@ -91,7 +91,7 @@ def _error(arm: ArmModel, q: Array, pose: Pose, frame: str) -> Array:
 
 
 def _descend(arm: ArmModel, start: Array, pose: Pose, frame: str) -> tuple[Array, float]:
-    """Return the posture that was reached and its weighted error [m]."""
+    """Return the final posture and its weighted error [m]."""
     weights = np.array([1.0, 1.0, 1.0, ROTATION_LENGTH, ROTATION_LENGTH, ROTATION_LENGTH])
     q, best, least, since = start, start, math.inf, 0
     for _ in range(_STEPS):

@@ -181,7 +181,7 @@ class SelfClearance:
         return outer, inner, outer_centers, between / lengths[:, None], lengths - self._sums.take(chosen)
 
     def _coarse_distances(self, centers: Array) -> NDArray[np.float32]:
-        """Return the distances of all checked pairs in single precision, enough to find the near ones."""
+        """Return the distances of all checked pairs in single precision, which suffices for finding near pairs."""
         points = centers.astype(np.float32)
         squares = (points * points).sum(axis=1)
         products = points @ (-2.0 * points).T
@@ -218,7 +218,7 @@ class PeriodicSelfClearance:
         self._at: Array = np.zeros(0)
 
     def rows(self, q: Array, *, may_search: bool = True) -> Rows | None:
-        """Return inequalities on the joint velocity as ``SelfClearance.rows`` does; None when nothing is near.
+        """Return inequalities on the joint velocity like ``SelfClearance.rows``; None when no pair is near.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
@@ -238,10 +238,9 @@ def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
     """Return for every pair of links whether they can touch within the limits of the joints between them.
 
     Link 0 is the base; link k is moved by k joints. Neighbouring links are always reported as not meeting. For links
-    with two
-    or three joints between them, the distance of their exact shapes is measured in 512 postures that fill the ranges
-    of these joints evenly (a Sobol sequence); links that never touch are reported as not meeting. Links with more
-    joints between them are always reported as meeting.
+    with two or three joints between them, the distance of their exact shapes is measured in 512 postures that fill the
+    ranges of these joints evenly (a Sobol sequence); links that never touch are reported as not meeting. Links with
+    more joints between them are always reported as meeting.
 
     Args:
         arm: the arm with its tool.

@@ -101,8 +101,8 @@ def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereogr
     """Return the angle of an arm in one posture and its Jacobian.
 
     Args:
-        points: of shoulder, elbow and wrist, shape (3, 3) [m], as from ``ArmModel.sew_points``.
-        jacobians: of these points, shape (3, 3, n), as from ``ArmModel.sew_jacobians``.
+        points: positions of shoulder, elbow and wrist, shape (3, 3) [m], for example from ``ArmModel.sew_points``.
+        jacobians: Jacobians of these points, shape (3, 3, n), for example from ``ArmModel.sew_jacobians``.
         convention: see :func:`sew_angle`.
 
     Returns:
@@ -138,7 +138,7 @@ def one_angle(
 
 
 def _stereographic(m: Any, e: Vector, w: Vector) -> SewAngle:
-    """Value and derivatives; with e_t = -x and e_r = z many of the products are single terms."""
+    """Return value and derivatives; for e_t = -x and e_r = z, many products are single terms."""
     # written out without _dot and _cross, whose calls would take a third of the time
     (e0, e1, e2), (w0, w1, w2) = e, w
     length = m.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
@@ -168,7 +168,7 @@ def _stereographic(m: Any, e: Vector, w: Vector) -> SewAngle:
 
 
 def _conventional(m: Any, e: Vector, w: Vector) -> SewAngle:
-    """Value and derivatives of the conventional angle, which is measured from a fixed direction."""
+    """Return value and derivatives of the conventional angle, which is measured from a fixed direction."""
     length = m.sqrt(_dot(w, w))
     along = _times(1.0 / length, w)
     to_wrist, to_up = _dot(along, e), _dot(along, UP)

@@ -37,8 +37,8 @@ class SphereCover:
 
         Args:
             model: with all shapes.
-            working: with the same bodies; the methods get its data.
-            names: of the joints to which the columns of the Jacobians belong.
+            working: model with the same bodies, whose data are passed to the methods.
+            names: names of the joints to which the columns of the Jacobians belong.
         """
         joints = np.array([model.joint(name).id for name in names])
         owners: list[int] = []
@@ -120,7 +120,8 @@ class SphereCover:
 
         Args:
             data: the kinematics of a posture.
-            outer: indices of the spheres farther from the base, shape (k,); all joints of the inner ones move them.
+            outer: indices of the spheres farther from the base, shape (k,); all joints that move the inner spheres
+                also move the outer spheres.
             inner: indices of the spheres nearer to the base, shape (k,); indices of the base's spheres come after all
                 others.
             centers: centers of the outer spheres, shape (k, 3) [m].
@@ -164,8 +165,8 @@ def _carries(model: mujoco.MjModel, carrier: int, body: int) -> bool:
 def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:
     """Cover one geom with equal spheres: every point of the geom is inside one of them.
 
-    Round bars (capsule, cylinder, ellipsoid) get a row of spheres, everything else (box, the bounding box of a mesh)
-    a grid of them.
+    Round bars (capsule, cylinder, ellipsoid) are covered by a row of spheres, all other shapes (box, bounding box of a
+    mesh) by a grid of spheres.
 
     Args:
         model: the compiled model.

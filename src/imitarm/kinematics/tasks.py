@@ -56,7 +56,7 @@ class TwistTask(NamedTuple):
             achieve the whole twist [m].
             With a smaller value, the rotation error becomes larger and the position error smaller. Three numbers
             apply to rotations about the base's x, y and z axes.
-        max_speed: the twist is scaled down to this weighted norm [m/s]; None: the default of the solver's method.
+        max_speed: largest weighted norm of the twist [m/s]; None: the default of the solver's method.
     """
 
     twist: ArrayLike
@@ -130,7 +130,7 @@ class PostureTask(NamedTuple):
 
 
 class ElbowTask(NamedTuple):
-    r"""Rotate the elbow to an SEW angle while the tool does its task.
+    r"""Rotate the elbow to an SEW angle without affecting the task of the tool.
 
     The elbow moves by the self-motion: the unit vector n along :math:`(I - J^+ J) J_\psi^T`, which does not move the
     tool (the first task, with Jacobian J and target e). The task adds :math:`\tfrac{w}2\,(n^T v - s)^2` with
@@ -145,8 +145,8 @@ class ElbowTask(NamedTuple):
 
     Attributes:
         angle: desired SEW angle :math:`\psi_h` [rad].
-        weight: w; the weight of the tool's task is 1 [m^2]; 0 leaves the self-motion free.
-        confidence: c, 0 to 1: certainty of the desired angle; 0: the elbow is not moved.
+        weight: weight w [m^2]; the weight of the tool's task is 1; 0 leaves the self-motion free.
+        confidence: certainty c of the desired angle, 0 to 1; 0: the elbow is not moved.
         gain: k [1/s].
         max_rate: limit of the desired rate of the angle [rad/s].
         convention: convention that defines the angle.
@@ -234,7 +234,7 @@ def _root(weight: float, task: str) -> float:
 def _scales(
     rotation_length: float | tuple[float, float, float], frame: str, arm: ArmModel, scaled: bool
 ) -> tuple[Array, Array, float, int]:
-    """Return weights of a twist (6,), factors of its Jacobian (6, n_joints) and of the effort, and the site."""
+    """Return the weights of a twist (6,), the factors of its Jacobian (6, n_joints) and of the effort, and the site."""
     try:
         lengths = np.broadcast_to(np.asarray(rotation_length, dtype=float), 3)
         usable = bool(np.isfinite(lengths).all() and lengths.min() > 0.0)

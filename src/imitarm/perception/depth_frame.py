@@ -20,9 +20,8 @@ class Intrinsics:
     """A pinhole camera without distortion.
 
     The point ``(x, y, z)`` in the camera's frame is projected to column ``u = fx x/z + cx`` and row ``v = fy y/z +
-    cy``. The
-    frame has its origin at the pinhole, x to the right of the image, y down and z forward. The centre of the first
-    pixel is at ``u = v = 0``.
+    cy``. The frame has its origin at the pinhole, x to the right of the image, y down and z forward. The centre of the
+    first pixel is at ``u = v = 0``.
 
     Attributes:
         width: number of columns.

@@ -255,11 +255,9 @@ class PathClearance:
         """Bound the distance on each segment, and refine the bound where it is below a clearance.
 
         Near a corner of an obstacle, the two tangents cross at least twice as deep as the chord. The distance is
-        therefore
-        measured where they cross. If the distance is too small there, the path really is too close. Otherwise the
-        tangent at
-        that point replaces one of the two tangents: the one from whose side the distance decreases towards the point.
-        So the minimum stays between two tangents that converge to it.
+        therefore measured where they cross. If the distance is too small there, the path really is too close. Otherwise
+        the tangent at that point replaces one of the two tangents: the one from whose side the distance decreases
+        towards the point. So the minimum stays between two tangents that converge to it.
 
         Args:
             clearance: required clearance [m].

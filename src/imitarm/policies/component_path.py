@@ -45,8 +45,7 @@ class ComponentPath:
 
     Time-driven GMR gives ``x0(t) = sum_k h_k(t) m_k(t)`` (thesis Eq 2.6 with its responsibilities). The
     responsibilities ``h_k(t)`` depend only on time. Therefore, moving the mean of component ``k`` by ``Delta_k``
-    changes the
-    path by an affine, smooth amount::
+    changes the path by an affine, smooth amount::
 
         x(t) = x0(t) + w(t) sum_k h_k(t) Delta_k  =  x0(t) + basis(t) @ Delta
 

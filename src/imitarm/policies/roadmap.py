@@ -1,8 +1,7 @@
 """A roadmap of displacements over time: possible positions of the tool at each time, and connections between them.
 
 At some times along the nominal path (layers), rays start at the nominal position. On each ray, the points just outside
-the
-inflated obstacles are the nodes. Edges lead from each node to the nodes of the next layer on the same and on
+the inflated obstacles are the nodes. Edges lead from each node to the nodes of the next layer on the same and on
 neighbouring rays. The cost of an edge is the change of the displacement, plus a large amount where the two tangents at
 its ends do not prove the clearance. Dynamic programming from both ends gives the cheapest route through every node at
 once. A route is only a proposal: the least detour takes its tangents along it.

@@ -21,7 +21,8 @@ RETARGETERS: Registry[type[Retargeter]] = Registry(
         "m3": "imitarm.retarget.baselines.incremental_ik:IncrementalIK",
     },
 )
-"""All methods by name. Another package adds its own under the entry-point group ``imitarm.retargeters``; they then
+"""All methods by name. Other packages add methods under the entry-point group ``imitarm.retargeters``; these methods
+then
 appear in ``imitarm retarget``, ``imitarm teleoperate``, ``imitarm benchmark mapping`` and in the reports."""
 
 __all__ = [

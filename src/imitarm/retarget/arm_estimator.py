@@ -75,8 +75,8 @@ class ArmEstimator:
         smoothing: whether to apply the One-Euro filter and remove jumps due to a change of tracking
             (:class:`~imitarm.retarget.smoothing.TrackingOffsets`); otherwise the corrected points are returned
             unfiltered.
-        limbs: how bone lengths are corrected: ``"fit"`` by the smallest change of all three points, ``"direction"`` as
-            in the thesis, from the shoulder outwards.
+        limbs: correction of bone lengths: ``"fit"``: the smallest change of all three points; ``"direction"``: from the
+            shoulder outwards, as in the thesis.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Engagement: the state machine that decides when a person leads the robot; the same one for every method."""
+"""Engagement: the state machine that decides when a person leads the robot; all methods use the same one."""
 
 from __future__ import annotations
 

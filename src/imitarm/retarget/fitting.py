@@ -121,7 +121,7 @@ class _Search:
 
         Args:
             centre: centre of the motion, shape (3,) [m].
-            near: a posture near it, shape (n_joints,) [rad].
+            near: posture near the centre, shape (n_joints,) [rad].
             begin: start of the motion relative to its centre, shape (3,) [m].
             outermost: the outermost points relative to the centre, shape (k, 3) [m].
         """
@@ -147,7 +147,7 @@ class _Search:
                 yield centre, q
 
     def _posture(self, position: Array, near: Array, smallest: float) -> Array | None:
-        """Return a posture near another one, shape (n_joints,).
+        """Return a posture near a given posture, shape (n_joints,).
 
         None if no such posture is far enough from singularities.
         """

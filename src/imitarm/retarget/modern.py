@@ -57,8 +57,8 @@ class ModernRetargeter(Retargeter):
        limits are the joint limits of position, velocity and acceleration, bounds that keep elbow and wrist away from
        their
        singularities, and the distances of the links to each other and to the scene. While nobody leads, the arm rests;
-    4. limit the jerk (:class:`JerkLimiter`) and check all limits again. If something blocks the arm, it does not press
-       harder, and the target does not run away from the blocked tool.
+    4. limit the jerk (:class:`JerkLimiter`) and check all limits again. If something blocks the arm, the arm does
+       not push harder, and the target stays near the blocked tool.
 
     The robot's elbow angle changes by as much as the person's has changed since the person began to lead:
     :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of this task decreases when the camera sees the person's
@@ -75,15 +75,16 @@ class ModernRetargeter(Retargeter):
         scene: obstacles to avoid.
         gain: K [1/s].
         lead: fraction of the hand's velocity that is fed forward, 0 to 1.
-        rotation_length: length [m] that one radian of the tool's rotation counts as, when the joints can't achieve
-            position and rotation both; about the base's x, y and z. None: 0.1 when the tool rotates with the hand,
+        rotation_length: length [m] with the same weight as one radian of the tool's rotation, about the base's x, y
+            and z; it matters when the joints can't achieve both position and rotation. None: 0.1 when the tool rotates
+            with the hand,
             because a camera measures this rotation poorly; 0.3 when the tool keeps its rotation; when the tool stays
             upright, 0.2 about x and y (tilt) and 0.05 about z.
         elbow: weight of the elbow's motion relative to the tool's [m^2]; 0 leaves the elbow free.
         clearance: required distance from the scene [m].
         own_clearance: required distance between links [m]; None: not checked.
-        max_speed: the twist is scaled down to this norm [m/s], with 1 rad counted as ``rotation_length``.
-        max_lead: how far a joint's command may be ahead of its measured position [rad]; a robot with a longer delay
+        max_speed: largest norm of the twist [m/s], with 1 rad counted as ``rotation_length``.
+        max_lead: largest lead of a joint's command over its measured position [rad]; a robot with a longer delay
             needs a larger value.
 
     Raises:
@@ -223,7 +224,7 @@ class ModernRetargeter(Retargeter):
         """Move the clutch's origin while the hand moves the target away from a tool that is blocked and at rest.
 
         Otherwise the tool would jump to the target, and against any object on its path, as soon as it is free. A robot
-        that merely responds late keeps moving, so it is not mistaken for a blocked one.
+        that merely responds late keeps moving, so it is not mistaken for a blocked robot.
         """
         at = self.arm.tool_pose(measured).position
         moved, offset = at - self._held_at, target.position - at
@@ -262,17 +263,16 @@ class JerkLimiter:
 
     A critically damped follower with feed-forward, :math:`a_d = \omega^2 (q_r - q) + 2\omega (v_r - v)`. Its
     acceleration is clipped to :math:`|a| \le a_{max}` and to :math:`|a - a_p| \le j\,dt`, where :math:`a_p` is the
-    previous one. The resulting velocity :math:`v + a\,dt` is then clipped so that the joint can still stop before its
-    limit. With D the distance to the limit, and a position that changes by the mean of two successive velocities, the
-    highest such velocity is
+    previous acceleration. The resulting velocity :math:`v + a\,dt` is then clipped so that the joint can still stop
+    before its limit. With D the distance to the limit, and a position that changes by the mean of two successive
+    velocities, the highest such velocity is
 
     .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a D'}, \qquad D' = D - \tfrac12 v\,dt,
 
     and :math:`2 D'/dt` where D' is negative.
 
     A joint that has met this bound once can meet it in all later steps by braking with a_max. Near a limit the last
-    clipping may
-    exceed the jerk limit; position, velocity and acceleration are always kept.
+    clipping may exceed the jerk limit; position, velocity and acceleration are always kept.
 
     A blocked arm falls behind its commands, and its drives push harder as the error grows. Therefore, a command that
     leads the measured joint by more than half of ``max_lead`` brakes: ``max_lead`` acts as an additional position

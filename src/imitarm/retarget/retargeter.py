@@ -71,13 +71,13 @@ class Goal(NamedTuple):
 
 
 class Retargeter(ABC):
-    """Converts a person's arm motion, seen as skeletons, into joint positions of a robot arm.
+    """Converts a person's arm motion, given as skeletons, to joint positions of a robot arm.
 
     :meth:`start` puts the robot at rest at a posture. :meth:`step` is then called once per control period ``dt`` with
     the skeleton that arrived since the last call, or None: cameras give 30 frames per second and a robot takes 100
     commands per second, so most calls get None. Every step has the same parts for all methods:
 
-    1. ``_see`` turns a new skeleton into an estimate of the person's arm;
+    1. ``_see`` computes an estimate of the person's arm from a new skeleton;
     2. the :class:`~imitarm.retarget.engagement.Engagement` decides whether the person leads;
     3. if so, ``_hand`` and ``_target`` compute the desired pose of the tool;
     4. ``_advance`` returns the joint positions of the next period: **this is the method**.
@@ -110,7 +110,7 @@ class Retargeter(ABC):
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: correspondence between the person's arm and the robot's; None: the default one.
+        correspondence: correspondence between the person's arm and the robot's; None: the default correspondence.
         dt: control period [s].
         scene: obstacles; None: no obstacles.
 
@@ -261,7 +261,7 @@ class Retargeter(ABC):
         return None if skeleton is None else self._estimator.update(skeleton)
 
     def _hand(self) -> tuple[Array, Array]:
-        """Return the wrist (3,) [m] and the hand's quaternion (4,) wxyz to follow now, in the base frame."""
+        """Return the current target wrist (3,) [m] and hand quaternion (4,) wxyz in the base frame."""
         assert self._estimate is not None
         return self._estimate.wrist, self._estimate.hand
 
@@ -299,7 +299,7 @@ class Retargeter(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Retargeting:
-    """The motion of a robot that a method made from a recording, sampled at the control period.
+    """The robot motion that a method computed from a recording, sampled at the control period.
 
     Attributes:
         method: name of the method.

@@ -68,12 +68,12 @@ class OneEuro:
         self.velocity: Array = np.zeros(0)
 
     def filter(self, time: float, x: Array, confidence: float | Array = 1.0) -> Array:
-        """Process measured vectors and return the smoothed ones, same shape; ``velocity`` is their derivative.
+        """Process measured vectors and return the smoothed vectors, same shape; ``velocity`` is their derivative.
 
         Args:
             time: time of the measurement [s]; if it is not later than the previous one, the previous result is
                 returned.
-            x: a vector, shape (d,), or several, each with its own speed, shape (k, d).
+            x: one vector, shape (d,), or several vectors with separate speeds, shape (k, d).
             confidence: confidence from 0 to 1; for several vectors one number or shape (k, 1).
         """
         period = time - self._time
@@ -193,7 +193,7 @@ class Hampel:
         self._values.clear()
 
     def accept(self, time: float, x: Array) -> bool:
-        """Add a value (d,) to the window and return whether it is consistent with those before."""
+        """Add a value (d,) to the window and return whether it is consistent with the previous values."""
         times, values, value = self._times, self._values, x.tolist()
         while times and (time - times[0] > self.window or time <= times[0]):
             times.popleft()
@@ -215,23 +215,22 @@ class TrackingOffsets:
     r"""Compensates for jumps due to a change of tracking.
 
     A camera infers the position of a hidden joint, with an error that is several times larger and different from the
-    error before. The step from the last tracked to the first inferred position is mostly due to this difference, as is
-    the step back. Therefore, when a joint becomes inferred, its offset o is set so that the motion continues,
+    previous error. The step from the last tracked to the first inferred position is mostly due to this difference, as
+    is the step back. Therefore, when a joint becomes inferred, its offset o is set so that the motion continues,
 
     .. math:: o = x_p + v\,\Delta t - \tilde x, \qquad x = \tilde x + o
 
     where :math:`x_p` is the previous position and v its velocity. While the joint is inferred, the offset is constant:
-    the
-    joint's motion is used, but not its absolute position. When the joint is tracked again, a new offset is set in the
-    same way; while the joint is tracked, the offset decays with time and with the distance that the joint moves,
+    the joint's motion is used, but not its absolute position. When the joint is tracked again, a new offset is set in
+    the same way; while the joint is tracked, the offset decays with time and with the distance that the joint moves,
 
     .. math:: o \leftarrow o\,\exp(-\Delta t / T - |\Delta x| / L).
 
     A person who watches the robot does not notice the decay, but would notice a robot that jumps away and back.
 
     A joint that flickers between tracked and inferred keeps one offset for each of the two, for up to 0.12 s. Otherwise
-    the
-    measured position would never have an effect, and the estimate would drift away. An offset is at most 0.2 m long.
+    the measured position would never have an effect, and the estimate would drift away. An offset is at most 0.2 m
+    long.
 
     Args:
         time: T [s].
@@ -294,7 +293,10 @@ class TrackingOffsets:
         return points + np.array(offsets)
 
     def _changed(self, joint: int, confidence: float, continued: list[float]) -> list[float]:
-        """Return the offset of a joint whose tracking has changed: its recent one for this tracking, or a new one."""
+        """Return the offset of a joint whose tracking has changed.
+
+        The recent offset for this tracking state, or a new one.
+        """
         when, offset = self._kept.get((joint, confidence), (-math.inf, continued))
         if self._clock - when > _FLICKER:
             offset = continued

@@ -72,8 +72,7 @@ class Supervisor:
               e = q_c + \dot q_c\, s - q
 
     where k is the gain, a the maximum acceleration, s the time for which the command is extrapolated, and f the
-    fraction
-    of its velocity: 1 for the first 30 ms, then decreasing to 0 at 100 ms. :meth:`Robot.move
+    fraction of its velocity: 1 for the first 30 ms, then decreasing to 0 at 100 ms. :meth:`Robot.move
     <imitarm.robots.robot.Robot.move>` limits this velocity again. No sequence of datagrams can therefore move the
     set-point beyond the limits of position, velocity and acceleration.
 
@@ -263,8 +262,7 @@ class RobotServer:
     It sends nothing without a request, and a :class:`~imitarm.robots.server.Supervisor` checks everything it receives.
     If the machine was too busy and periods were missed, the next step is lengthened by the missed time, up to 20 ms in
     total, so that the robot keeps up with the commands. The limits still hold, because they are computed from the
-    length of
-    the step. Missed time beyond 20 ms is skipped.
+    length of the step. Missed time beyond 20 ms is skipped.
 
     Args:
         robot: robot to serve.

@@ -205,8 +205,7 @@ class ClearanceGauge:
         """Return the smallest signed distance [m], negative in contact, and the ids of the two geoms.
 
         For a self-contact, the distance is minus its depth. Without obstacles, or when all are farther than 100 m, the
-        result is inf
-        and None.
+        result is inf and None.
         """
         smallest, pair = _FAR, None
         for depth, first, second in self._self_contacts(data):

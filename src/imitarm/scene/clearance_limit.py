@@ -27,9 +27,8 @@ class ClearanceLimit:
 
     lets this distance shrink at most exponentially, so that it stays positive. h can still become negative, because
     links move on arcs and control steps are finite. In this case it must grow, with ``retreat_rate`` instead of
-    :math:`\xi`.
-    Every sphere within ``influence`` of an obstacle has a row; none is left out. The spheres contain the shapes they
-    cover, so the true distance is never smaller than the distance of the spheres.
+    :math:`\xi`. Every sphere within ``influence`` of an obstacle has a row; none is left out. The spheres contain the
+    shapes they cover, so the true distance is never smaller than the distance of the spheres.
 
     Args:
         arm: arm with its tool.

@@ -247,9 +247,7 @@ class Polytope:
 
     If ``n_i.x = b_i`` are the planes of its faces, the distance inside is ``sd = max_i (n_i.x - b_i)``. Outside, this
     maximum is a lower bound of the distance. The bound is exact if the foot point ``x - sd n_i`` is on the face;
-    otherwise
-    the nearest point is on an edge or
-    at a corner, and the distance is the smallest distance to an edge.
+    otherwise the nearest point is on an edge or at a corner, and the distance is the smallest distance to an edge.
 
     Attributes:
         vertices: corners of the hull, shape (v, 3) [m].

@@ -73,8 +73,7 @@ class Scene:
 
         Each obstacle keeps its velocity and its angular velocity; the goal stays. The result has ``stamp = time``;
         ``packed.stamps`` keeps the time at which each obstacle was seen. It takes microseconds: only the packed arrays
-        are moved, and
-        the obstacle objects are built when ``obstacles`` is read.
+        are moved, and the obstacle objects are built when ``obstacles`` is read.
 
         Args:
             time: time on the clock of ``stamp`` [s].

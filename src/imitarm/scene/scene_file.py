@@ -1,8 +1,7 @@
 """Scene files: a goal and obstacles in hand-written YAML (docs/scene.md).
 
 The keys of each shape are its fields, so a shape added to ``OBSTACLES`` can be read and written without further code.
-Only
-plain YAML is read: numbers, text, lists and mappings; nothing in a file is executed.
+Only plain YAML is read: numbers, text, lists and mappings; nothing in a file is executed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Skills: motions learned from demonstrations. Nothing here knows of obstacles; policies do."""
+"""Skills: motions learned from demonstrations. Skills are independent of obstacles; policies handle them."""
 
 from __future__ import annotations
 

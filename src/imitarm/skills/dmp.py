@@ -52,8 +52,9 @@ class DMPState(NamedTuple):
         fraction: elapsed fraction of the duration on the primitive's own clock; the phase is ``exp(-alpha
             fraction)``.
         target: start, goal and duration of the motion.
-        rotation: state of the rotation; None when none was learned.
-        steps: length of the steps so far, as a fraction of the duration, and their number; None when they differed.
+        rotation: state of the rotation; None when no rotation was learned.
+        steps: common length of the steps so far, as a fraction of the duration, and their number; None if the
+            lengths differ.
         checked: the ``motion`` array that is known to be finite; None before a check. A step checks only states
             that the caller changed, not the state that the previous step returned.
     """
@@ -87,7 +88,7 @@ class DMPState(NamedTuple):
 
     @property
     def quaternion(self) -> Array | None:
-        """Rotation wxyz (4,), or None when none was learned."""
+        """Rotation wxyz (4,), or None when no rotation was learned."""
         return None if self.rotation is None else self.rotation.quaternion
 
 
@@ -100,8 +101,7 @@ class DMP:
         f(s) &= \frac{\sum_i w_i \psi_i(s) s}{\sum_i \psi_i(s)}, \quad \psi_i(s) = \exp(-h_i (s - c_i)^2)
 
     It replaces thesis Eqs 2.8 to 2.12, in which the force is scaled by g - x_0 and fails for an axis that does not
-    move. tau
-    is the duration, so K and D have no unit: ``"critical"`` gains have D = 2 sqrt(K); the ``"thesis"`` gains
+    move. tau is the duration, so K and D have no unit: ``"critical"`` gains have D = 2 sqrt(K); the ``"thesis"`` gains
     K = 139.26, D = 28 have a damping ratio of 1.186. Equivalently, the spring follows a moving target ``y(s) = g - (g -
     x_0) s + f(s)`` that ends at the goal.
 
@@ -117,7 +117,7 @@ class DMP:
       needs no special treatment for an axis without motion.
     * ``"hoffmann"``: w as learned, the published form. The change of start and goal is added as fast as the spring
       allows.
-    * ``"rotodilatation"``: w rotated and stretched as g - x_0 is (Ginesi et al. 2019), for a shape that scales.
+    * ``"rotodilatation"``: w is rotated and stretched like g - x_0 (Ginesi et al. 2019), so the shape scales.
 
     **Integration.** The integration is exact for a target that is a parabola within each 1/200 of the duration.
     Therefore ``step`` and ``generate`` agree, and the path and its end do not depend on the step length.

@@ -112,7 +112,7 @@ class Gains(NamedTuple):
 
         Args:
             gains: a name in ``GAINS``, or stiffness and damping.
-            what: name of the class that uses them, for messages.
+            what: name of the class that uses the gains, for messages.
 
         Raises:
             UnknownNameError: when there are no gains of that name.
@@ -136,8 +136,8 @@ class Propagator(NamedTuple):
 
     The step is divided into m equal parts, and the target ``y`` is given at the beginning, middle and end of each. The
     integration over a part is exact if the target is a parabola within it, so the error falls with the fourth power of
-    the part's length. A
-    part is at most 1/200 of the duration, and at most a fifth of the distance between two basis functions.
+    the part's length. A part is at most 1/200 of the duration, and at most a fifth of the distance between two basis
+    functions.
 
     Attributes:
         transition: transition matrix, shape (2, 2).
@@ -337,16 +337,15 @@ def fit_weights(
 
     The motion is linear in ``d_i = w_i - (g - x_0)``. With the responses R of the spring to a start, a rate, a goal and
     each basis function, ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression compares
-    forces
-    (such as ``tau v' + D v``) and needs measured accelerations. Here the spring itself filters both sides,
-    which converts forces to positions. Therefore noise is not differentiated, the samples may have any times, and the
+    forces (such as ``tau v' + D v``) and needs measured accelerations. Here the spring itself filters both sides, which
+    converts forces to positions. Therefore noise is not differentiated, the samples may have any times, and the
     regression minimises the error of the reproduction in metres.
 
     The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. If noise
-    moves one of them more than 0.1 mm away from the path that fits all samples, the end of this path is used instead,
-    because a motion forced through a noisy sample would jerk there. ``exact_ends`` turns this off. The last drive is 0,
-    so that the target is the goal when the duration is over. (The regression hardly determines the last drive; without
-    this condition, it can pull the tool decimetres away from the goal after the end.)
+    moves one of these samples more than 0.1 mm away from the path that fits all samples, the end of this path is used
+    instead, because a motion forced through a noisy sample would jerk there. ``exact_ends`` turns this off. The last
+    drive is 0, so that the target is the goal when the duration is over. (The regression hardly determines the last
+    drive; without this condition, it can pull the tool decimetres away from the goal after the end.)
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).
@@ -429,8 +428,8 @@ def _progress(rate: Array) -> tuple[Array, float]:
 def start_rate(fraction: Array, x: Array, part: float = _START) -> Array:
     """Return the velocity at the first sample, in m per duration, shape (3,).
 
-    It is the slope of a parabola through the first samples. It is 0 unless it exceeds three standard errors and a tenth
-    of the mean speed: a motion that begins at rest begins exactly at rest.
+    The velocity is the slope of a parabola through the first samples. It is 0 unless it exceeds three standard errors
+    and a tenth of the mean speed: a motion that begins at rest begins exactly at rest.
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).

@@ -1,4 +1,4 @@
-"""How well a skill fits its demonstrations: the distance to each of them, and the bias of the fit."""
+"""How well a skill fits its demonstrations: the distance to each demonstration, and the bias of the fit."""
 
 from __future__ import annotations
 

@@ -35,8 +35,7 @@ def ellipsoid_scale(probability: float, n_dims: int) -> float:
 
     The squared Mahalanobis distance of a Gaussian in ``n_dims`` dimensions has a chi-square distribution with
     ``n_dims`` degrees of freedom. The semi-axes are therefore ``scale * sqrt(eigenvalue)`` with the scale 1.960, 2.448,
-    2.796
-    for 95 % in 1, 2, 3 dimensions. The factor 1.960 for one dimension contains only 85 % in the plane and 72 % in
+    2.796 for 95 % in 1, 2, 3 dimensions. The factor 1.960 for one dimension contains only 85 % in the plane and 72 % in
     space.
 
     Raises:
@@ -71,7 +70,7 @@ class GaussianMixture:
     Args:
         n_components: number K of Gaussians.
         reg_covar: smallest eigenvalue of a covariance, relative to the variances of the columns.
-        n_init: number of starts; the best fit is kept. All but the first start from k-means++ seeds.
+        n_init: number of starts; the best fit is kept. All starts except the first use k-means++ seeds.
         init: method for the first start: ``"time"`` (segments of column 0) or ``"kmeans++"``.
         min_std: smallest standard deviation of a column [the column's unit] that counts as motion, one number or one
             per column. A constant column is given this standard deviation.
@@ -221,7 +220,7 @@ class GaussianMixture:
         return self._normalised(self._checked(X, "predict_proba"))[0].T
 
     def predict(self, X: ArrayLike) -> NDArray[np.intp]:
-        """Return the most responsible component of each sample of ``X`` (n, d), shape (n,)."""
+        """Return the component with the largest responsibility for each sample of ``X`` (n, d), shape (n,)."""
         return np.argmax(self.predict_proba(X), axis=1)
 
     @property

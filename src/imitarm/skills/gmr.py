@@ -198,7 +198,7 @@ class GMR:
         converged: bool = True,
         lower_bound: float = np.nan,
     ) -> GMR:
-        """Build from a mixture that was learned before.
+        """Build a regression from a mixture that was learned before.
 
         The arguments are the attributes of the class. Without ``ends``, the start and the goal of the mixture's mean
         are used.
@@ -315,7 +315,7 @@ class GMR:
 
         Returns:
             Quaternions wxyz (n, 4), and covariance (n, 3, 3) [rad^2] of the small rotation, in the base frame, from the
-            mean rotation to a demonstrated one.
+            mean rotation to a demonstrated rotation.
 
         Raises:
             InputError: when the demonstrations had no quaternions.
@@ -354,7 +354,7 @@ class GMR:
             b(u) = 1 - 10 u^3 + 15 u^4 - 6 u^5
 
         The widths :math:`w_1 = \mu_1^t` and :math:`w_K = T - \mu_K^t` reach from the ends to the centres of the first
-        and the last Gaussian; they are at least a twentieth of the duration. The correction depends on time alone, so
+        and the last Gaussian; they are at least a twentieth of the duration. The correction depends only on time, so
         moving the mean of Gaussian k by :math:`\Delta_k` still moves the path by :math:`h_k(t) \Delta_k`.
 
         Returns:

@@ -4,7 +4,7 @@ The logarithm of a weighted Gaussian is linear in the quadratic features ``phi(z
 
     log pi_k N(z; mu_k, Sigma_k) = theta_k . phi(z)
 
-so all log-densities are one matrix product ``theta @ phi``, and all sufficient statistics are another one,
+so all log-densities are one matrix product, ``theta @ phi``, and all sufficient statistics are a second matrix product,
 ``responsibilities @ phi^T``. There is no loop over components or samples. Written as a symmetric matrix M, the
 statistics of one component are the second moments of ``[1; z]``. The inverse of M contains all parts of ``theta_k``
 (``P = Sigma^-1``)::
@@ -282,7 +282,8 @@ class Candidate:
         n_components: the number K.
         bic: Bayes' information criterion; lower is better.
         aic: Akaike's information criterion; lower is better.
-        held_out_rmse_mm: distance between a demonstration and the mean learned from all the others, root mean square
+        held_out_rmse_mm: distance between a demonstration and the mean learned from all other demonstrations, root
+            mean square
             over the samples and over all choices of that demonstration [mm]; NaN with one demonstration.
         bias_rmse_mm: distance between the learned mean and the average of the demonstrations at the same times, root
             mean square [mm].
@@ -300,15 +301,14 @@ def choose(candidates: Sequence[Candidate]) -> int:
 
     It is the smallest K
 
-    * whose held-out error is within 2 % (or 0.1 mm) of the smallest, so it generalises as well as any, and
-    * whose bias is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small beside the
+    * whose held-out error is within 2 % (or 0.1 mm) of the smallest, so it generalises as well as any other K, and
+    * whose bias is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small compared with the
       differences between demonstrations. The held-out error alone hardly shows a bias, because the squared bias is
       added to much larger squared differences.
 
     If no K meets both conditions, the result is the smallest K that meets the first one and whose bias is at most a
     tenth above the smallest bias among those. BIC alone selects ever larger K for time series, because neighbouring
-    samples are not independent. BIC
-    decides only when there is one demonstration, because then none can be left out.
+    samples are not independent. BIC decides only when there is one demonstration, because then none can be left out.
     """
     ordered = sorted(candidates, key=lambda c: c.n_components)
     if any(np.isnan(c.held_out_rmse_mm) for c in ordered):

@@ -232,7 +232,7 @@ class RhythmicDMP:
         return state._replace(motion=motion, periods=state.periods + h)
 
     def quaternion(self, state: RhythmicDMPState) -> Array | None:
-        """Return the rotation wxyz (4,), or None when none was learned.
+        """Return the rotation wxyz (4,), or None when no rotation was learned.
 
         Raises:
             InputError: when not fitted, or ``state`` is not valid.

@@ -45,7 +45,7 @@ _END_WEIGHT = 100.0  # the first and the last sample count so much more than the
 
 @dataclass(frozen=True, eq=False)
 class RotationReference:
-    """A reference rotation, fixed or moving with time, in whose tangent space other rotations are vectors.
+    """A reference rotation, fixed or moving, relative to which other rotations are represented as vectors.
 
     A rotation ``R`` near the reference ``R_ref(t)`` has the rotation vector ``r = log(R R_ref(t)^T)`` [rad] in the base
     frame. A fixed reference suffices if all rotations are well within 180 degrees of it. A longer rotation needs a
@@ -138,7 +138,7 @@ class RotationReference:
 def left_jacobian(vectors: Array) -> Array:
     """Return ``J`` (n, 3, 3) with ``exp(r + d) = exp(J d) exp(r)`` to first order, for rotation vectors (n, 3) [rad].
 
-    It transforms a covariance of rotation vectors to one of small rotations in the base frame, ``J Sigma J^T``.
+    ``J Sigma J^T`` is then the covariance of small rotations in the base frame.
     """
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     small = angle < 1e-4
@@ -159,8 +159,8 @@ class RotationState(NamedTuple):
         offset: [r; T r'] with T the duration and r the rotation vector from the target to the rotation, in the base
             frame, shape (2, 3) [rad]. It differs from 0 only because of a coupling.
         fraction: elapsed fraction of the duration.
-        start_change: rotation vector (3,) [rad] from the learned start to the new one, in the base frame.
-        goal_change: rotation vector (3,) [rad] from the learned goal to the new one, in the base frame.
+        start_change: rotation vector (3,) [rad] from the learned start to the new start, in the base frame.
+        goal_change: rotation vector (3,) [rad] from the learned goal to the new goal, in the base frame.
     """
 
     quaternion: Array
@@ -182,10 +182,9 @@ class QuaternionDMP:
     where c is an external angular acceleration. The logarithm is taken only of ``r``, the rotation from the target,
     never of the rotation to the goal. Therefore a rotation by 270 degrees, or by three full revolutions, is reproduced
     as demonstrated. (Forms that use log(q_goal conj(q)) rotate in the opposite direction beyond 180 degrees.) The
-    target is a
-    cubic spline through quaternions with continuous signs, normalised. Another start or goal rotates the target in the
-    base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both changes rotate by
-    at most 180 degrees.
+    target is a cubic spline through quaternions with continuous signs, normalised. Another start or goal rotates the
+    target in the base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both
+    changes rotate by at most 180 degrees.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
@@ -358,7 +357,7 @@ def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, go
 
     Args:
         quaternions: R, the learned rotations wxyz, shape (n, 4).
-        fraction: fraction of the duration at each of them, shape (n,).
+        fraction: fraction of the duration at each rotation, shape (n,).
         start_change: d_start, rotation vector in the base frame, shape (3,) [rad].
         goal_change: d_goal, rotation vector in the base frame, shape (3,) [rad].
     """

@@ -37,7 +37,7 @@ class Skill:
     A :class:`~imitarm.skills.gmr.GMR` learns the mean motion and its covariance, which shows how much the
     demonstrations differ at each time. A :class:`~imitarm.skills.dmp.DMP` is trained on the nominal path: it can change
     the start, the goal and the duration of the motion. The covariance is the tolerance: the robot must be precise where
-    the person was precise. A skill knows nothing of obstacles; policies do.
+    the person was precise. A skill is independent of obstacles; policies handle them.
 
     The nominal path and the primitive start and end exactly at the means of the demonstrated starts and goals.
 
@@ -53,13 +53,13 @@ class Skill:
         dmp_: the primitive.
         task_: name of the demonstrated task, for example ``"sweep"``.
         duration_: learned duration [s].
-        start_: learned start, tool_to_base; its rotation is the identity when none was learned.
+        start_: learned start, tool_to_base; its rotation is the identity when no rotation was learned.
         goal_: learned goal, tool_to_base.
         n_demonstrations_: number of demonstrations.
-        fit_quality_: the distance to each demonstration, and whether the skill is faithful to them; None in a skill
-            from a file that does not contain it.
+        fit_quality_: distance to each demonstration, and whether the skill reproduces them; None if the skill's
+            file does not contain it.
         provenance_: origin of the skill: ``"imitarm"`` (version that learned it), ``"sources"`` (one per
-            demonstration), ``"notes"`` (for example what lint found), and ``"date"`` when one was given.
+            demonstration), ``"notes"`` (for example findings of lint), and ``"date"`` if a date was given.
 
     Raises:
         InputError: when an option is out of range.
@@ -118,7 +118,7 @@ class Skill:
         return self
 
     def _primitive(self, gmr: GMR) -> DMP:
-        """Train the first primitive that follows the nominal path, or the last one."""
+        """Train primitives of increasing size until one follows the nominal path, and keep it (or the largest one)."""
         for dmp in self._primitives:
             nominal = gmr.trajectory(max(_SAMPLES, _SAMPLES_PER_BASIS * dmp.n_basis))
             dmp.fit(nominal, exact_ends=True)

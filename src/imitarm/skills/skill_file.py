@@ -3,9 +3,8 @@
 Layout: ``format``, ``version``, the meaning of the numbers (``units``, ``frames``), their origin (``task``,
 ``provenance``), the numbers (``gmr``, ``dmp``, ``fit``), and last a ``checksum``: SHA-256 of everything else in
 canonical form (sorted keys, no spaces), so a change of any digit is detected, while a change of layout is accepted.
-Floats
-are written with all their digits and come back exactly. The classes below are the schema: they define the content that
-is written and accepted.
+Floats are written with all digits and are read back exactly. The classes below are the schema: they define the content
+that is written and accepted.
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ class SelectionFields(msgspec.Struct, omit_defaults=True):
 
 
 class GmrFields(msgspec.Struct, omit_defaults=True):
-    """A :class:`GMR`: its attributes without their underscore."""
+    """The attributes of a :class:`GMR`, without the trailing underscore."""
 
     duration: float
     n_demonstrations: Count
@@ -93,7 +92,7 @@ class OrientationFields(msgspec.Struct):
 
 
 class DmpFields(msgspec.Struct, omit_defaults=True):
-    """A :class:`DMP`: its attributes without their underscore."""
+    """The attributes of a :class:`DMP`, without the trailing underscore."""
 
     duration: float
     stiffness: float
@@ -108,7 +107,7 @@ class DmpFields(msgspec.Struct, omit_defaults=True):
 
 
 class FitFields(msgspec.Struct, omit_defaults=True):
-    """A :class:`FitQuality`; a row of distances for each source [m]."""
+    """The attributes of a :class:`FitQuality`, with a row of distances for each source [m]."""
 
     distances: Table = msgspec.field(name="rms, largest, start, goal")
     extent: float

@@ -272,8 +272,7 @@ class IdealFollower(Retargeter):
 
     It assumes that every skeleton is exact. With an :func:`ideal_camera`, it behaves like a tool in the person's own
     hand, with a lag of a few hundredths of a second. The benchmark uses it to record people and gives the same
-    recording to every
-    retargeter.
+    recording to every retargeter.
     """
 
     name: ClassVar[str] = "ideal"

@@ -1,8 +1,7 @@
 r"""SimulatedOperator: a simulated person who stacks cubes with a robot and watches gripper and cubes.
 
 This model closes the loop around a retargeter. The operator sees gripper and cubes with delay and noise, and reacts
-with
-a motion of the hand. The operator does not know the retargeter between hand and gripper.
+with a motion of the hand. The operator does not know the retargeter between hand and gripper.
 """
 
 from __future__ import annotations

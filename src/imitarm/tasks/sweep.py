@@ -54,8 +54,7 @@ class SweepTask:
 
     The brush starts at S, moves to the dirt at T and pushes it to G in the dustpan. The brush moves just above the
     table with its open side ahead, so that its two ends hold the crumbs when it deviates to the left or right. The task
-    succeeds
-    if the dirt is in the pan and neither the arm nor the brush has touched an obstacle.
+    succeeds if the dirt is in the pan and neither the arm nor the brush has touched an obstacle.
 
     Attributes:
         seed: seed of the positions of the crumbs.

@@ -40,8 +40,7 @@ class Teacher:
     The hand follows the minimum-jerk path through S, T, G and two points between them: the quintic spline that starts
     and ends at rest (Flash and Hogan 1985). People differ in the duration, the fraction of the duration before T, the
     sideways displacement of the path, the accuracy at T and G, the height of the brush, the rotation of the wrist, the
-    tremor,
-    and the rest before and after.
+    tremor, and the rest before and after.
 
     Attributes:
         seed: seed of all these differences.

@@ -95,9 +95,8 @@ class Teleoperation:
 
     In each period, the retargeter processes the newest skeleton, the safety filter processes the retargeter's result,
     and the filtered joint velocity is passed to :meth:`Robot.move <imitarm.robots.robot.Robot.move>`. If the robot
-    could not be controlled for
-    some time, because it was stopped, slowed down or did not answer, it is first brought to rest. The retargeter then
-    starts from the arm's position and engages again, so the arm never jumps.
+    could not be controlled for some time, because it was stopped, slowed down or did not answer, it is first brought to
+    rest. The retargeter then starts from the arm's position and engages again, so the arm never jumps.
 
     Args:
         source: skeletons of one person, live or in real time.

@@ -1,8 +1,7 @@
 r"""ACFRA as printed in the thesis: push the components' means by a repulsive potential (thesis Eqs 4.2-4.8).
 
 The same descent is used for two potentials. With ``d`` the distance from an obstacle to the component's ellipse, ``n``
-the
-outward normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the obstacle:
+the outward normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the obstacle:
 
 * ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The last term does not depend on the
   position, so it drops out of the force: the spread has no effect.

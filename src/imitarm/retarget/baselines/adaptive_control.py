@@ -36,7 +36,7 @@ _GRIP = 0.2  # [s] in which the closure follows a closing hand
 
 
 class JointPlant:
-    """The arm on which a joint controller is simulated: in MuJoCo, with gravity, without contacts.
+    """The arm in a simulation of a joint controller, in MuJoCo with gravity and without contacts.
 
     It includes rotor inertia, viscous damping and dry friction of the joints, which ``ArmModel`` leaves out. A
     controller that uses an ``ArmModel`` therefore does not know these effects.
@@ -128,14 +128,12 @@ class AdaptiveLaw:
         D \leftarrow [D + Q_D(\varepsilon\dot e - \gamma D)]_0^{D_{max}}
 
     where the forgetting factor is :math:`\gamma = a/(1 + b|\varepsilon|^2)`. A closed hand (h = 1) raises the
-    stiffness:
-    :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. M, C and G are those of the rigid arm, from ``ArmModel``; F, K and
-    D compensate for effects that the model leaves out (rotor inertia, friction). C is the matrix of Christoffel
-    symbols, for which
-    :math:`C(q, a)\,b = \tfrac12\,(h(a+b) - h(a) - h(b))` with :math:`h(v) = C(q, v)\,v`.
+    stiffness: :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. M, C and G are those of the rigid arm, from
+    ``ArmModel``; F, K and D compensate for effects that the model leaves out (rotor inertia, friction). C is the matrix
+    of Christoffel symbols, for which :math:`C(q, a)\,b = \tfrac12\,(h(a+b) - h(a) - h(b))` with :math:`h(v) = C(q,
+    v)\,v`.
 
-    The law follows Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet, in discrete form; we chose the gains.
-    For
+    The law follows Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet, in discrete form; we chose the gains. For
     small errors :math:`\gamma = a` and :math:`Q_K \gamma = 1`: the stiffness falls back to :math:`K_{min}` within one
     period. We set :math:`K_{min} = K_{max}(h)/2`, which the sources do not specify, so that the hand still has an
     effect.
@@ -169,7 +167,7 @@ class AdaptiveLaw:
         self._before: Array | None = None  # reference one period ago
 
     def torques(self, q: ArrayLike, velocity: ArrayLike, reference: ArrayLike, closure: float) -> Torques:
-        """Return the torques of one period, and adapt.
+        """Return the torques of one period, and update the adapted values.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
@@ -233,7 +231,7 @@ class AdaptiveControl(BaselineRetargeter):
     joints: the tool is not where the hand is.
 
     Only the torque limits the joint velocity. ``notes`` has ``"saturated"``, the number of joints and steps at the
-    rated torque; ``"peak_torque"``, the largest torque relative to the rated one before it is limited; and
+    rated torque; ``"peak_torque"``, the largest torque before limiting, relative to the rated torque; and
     ``"rms_torque"`` [N m] over all joints and steps.
 
     Args:
@@ -243,8 +241,8 @@ class AdaptiveControl(BaselineRetargeter):
         scene: ignored.
         velocity_scaling: whether to scale every step of the reference and of the command so that no joint exceeds
             its limit.
-        relative: map the change of the person's joint angles since the person began to lead; otherwise the angles
-            themselves, approached at limited speed. See
+        relative: whether to map the change of the person's joint angles since the person began to lead; otherwise
+            the angles themselves are mapped and approached at limited speed. See
             :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
 
     Attributes:

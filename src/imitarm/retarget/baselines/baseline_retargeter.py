@@ -40,7 +40,7 @@ class BaselineRetargeter(Retargeter):
         correspondence: correspondence between the person's arm and the robot's.
         dt: control period [s].
         scene: ignored.
-        velocity_scaling: scale every step as a whole so that no joint exceeds its velocity limit.
+        velocity_scaling: whether to scale every step as a whole so that no joint exceeds its velocity limit.
 
     Attributes:
         counts: the counts of ``notes`` since :meth:`start`, by name.

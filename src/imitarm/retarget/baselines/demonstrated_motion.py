@@ -135,7 +135,7 @@ class Constraint(Protocol):
     """A condition on the tool, such as a teacher annotates."""
 
     def __call__(self, positions: Array, rotations: Array, /) -> Mask:
-        """Return whether it holds, shape (n,), for positions (n, 3) [m] and rotations (n, 3, 3) in the base frame."""
+        """Return whether the condition holds, shape (n,), for positions (n, 3) [m] and rotations (n, 3, 3)."""
         ...
 
 
@@ -235,21 +235,20 @@ class FeasibilityCheck:
 
 
 def stretch(joints: Array) -> Array:
-    r"""Return how far the arm is stretched: distance shoulder to wrist over reach, (n,), for joints (n, n_joints).
+    r"""Return the stretch of the arm: shoulder-wrist distance divided by reach, (n,), for joints (n, n_joints).
 
     The stretch is measured on the person's arm, to which the joints belong: upper arm and forearm along the joint axes
-    and
-    equally long (Sawyer's are 0.412 and 0.411 m), so it is :math:`|\cos(q_3/2)|`. The robot's own distance from
+    and equally long (Sawyer's are 0.412 and 0.411 m), so it is :math:`|\cos(q_3/2)|`. The robot's own distance from
     shoulder to wrist is largest with a bent elbow, because of the offsets between its links.
     """
     return np.asarray(np.abs(np.cos(0.5 * joints[:, ELBOW])))
 
 
 def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
-    """Return the runs of True, extended by 0.2 s on both sides and merged where they touch, as (first, past the last).
+    """Return the runs of True, extended by 0.2 s on both sides and merged where they touch, as (first, end).
 
     Args:
-        found: result of the search, shape (n,).
+        found: mask of the samples to group, shape (n,) bool.
         dt: sampling period [s].
     """
     wide = round(DILATION / dt)

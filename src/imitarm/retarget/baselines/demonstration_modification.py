@@ -2,8 +2,8 @@
 
 Four corrections replace the teacher's advice: slow the motion down, move the wrist closer, rotate the elbow, or repair
 key frames. Each changes one segment of a :class:`~imitarm.retarget.baselines.demonstrated_motion.DemonstratedMotion` by
-a
-weight that is 1 where the change is needed and decays to 0 at the segment's ends, so that the motion stays continuous.
+a weight that is 1 where the change is needed and decays to 0 at the segment's ends, so that the motion stays
+continuous.
 """
 
 from __future__ import annotations
@@ -251,12 +251,12 @@ class DemonstrationModification(BaselineRetargeter):
 def slowed(
     motion: DemonstratedMotion, first: int, past: int, weight: Array, factor: float
 ) -> tuple[DemonstratedMotion, int]:
-    r"""Slow a segment down: its time passes :math:`1 + w\,(s - 1)` times as slowly.
+    r"""Slow a segment down by the factor :math:`1 + w\,(s - 1)`.
 
     Args:
         motion: motion with joint positions.
         first: first sample of the segment.
-        past: sample after the last one of the segment.
+        past: index of the sample after the segment.
         weight: weight w of each sample, shape (past - first,).
         factor: s, at least 1.
 
@@ -352,7 +352,7 @@ def repaired(
     Args:
         joints: joint positions of the whole motion, shape (n, n_joints) [rad].
         first: first sample of the segment.
-        past: sample after the last one of the segment.
+        past: index of the sample after the segment.
         check: the feasibility check.
         rng: random generator for the samples.
 

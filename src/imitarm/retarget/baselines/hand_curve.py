@@ -45,7 +45,7 @@ class RotationCurve:
     vectors: NURBS
 
     def evaluate(self, t: ArrayLike) -> Array:
-        """Return the quaternions wxyz at times (k,), shape (k, 4); of a single number, shape (4,)."""
+        """Return the quaternions wxyz at times (k,), shape (k, 4); for a single time, shape (4,)."""
         return quaternion_multiply(self.reference, quaternion_exp(self.vectors.evaluate(t)))
 
 
@@ -112,8 +112,8 @@ class HandSample:
 
     Attributes:
         time: time on the source's clock [s].
-        wrist: position in the base frame, shape (3,) [m].
-        hand: rotation in the base frame, quaternion wxyz, shape (4,).
+        wrist: wrist position in the base frame, shape (3,) [m].
+        hand: hand rotation in the base frame, quaternion wxyz, shape (4,).
         confidence: confidence of the position and of the rotation, 0 to 1.
     """
 

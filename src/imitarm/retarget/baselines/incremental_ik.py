@@ -1,4 +1,4 @@
-"""IncrementalIK: baseline M3, resolved-rate control with feedback of the error; singularities are not treated."""
+"""IncrementalIK: baseline M3, resolved-rate control with error feedback; singularities are not handled."""
 
 from __future__ import annotations
 
@@ -23,20 +23,17 @@ _RCOND = 1e-6  # ignores only singular values that are numerically zero
 class IncrementalIK(BaselineRetargeter):
     r"""Baseline M3: our interpretation of "incremental inverse kinematics" in the thesis.
 
-    The thesis cites Ijspeert et al. 2002 for it, which is the paper on movement primitives; its abstract has no
-    incremental inverse kinematics. This is therefore not a published method, but an interpretation of the name. Once
-    per frame
-    it computes
+    The thesis cites Ijspeert et al. 2002, the paper on movement primitives, whose abstract does not mention incremental
+    inverse kinematics. This is therefore not a published method, but an interpretation of the name. Once per frame it
+    computes
 
     .. math:: \Delta q = J^+ \left(\Delta x_d + K\,e\right), \qquad e = \log(T_d\,T(q)^{-1}),
 
     where :math:`\Delta x_d` is the displacement of the target since the last frame and e the error relative to the last
-    target. The
-    step is spread evenly over the control steps of one frame. The pseudo-inverse is undamped: it inverts even the
-    smallest singular value, so the step grows without bound near the edge of the workspace. Each joint is limited to
-    its own velocity,
-    which changes the direction of the tool's motion, and then to its range. ``notes`` counts how often: ``"caps"``
-    joints and steps, ``"capped_steps"`` steps.
+    target. The step is spread evenly over the control steps of one frame. The pseudo-inverse is undamped: it inverts
+    even the smallest singular value, so the step grows without bound near the edge of the workspace. Each joint is
+    limited to its own velocity, which changes the direction of the tool's motion, and then to its range. ``notes``
+    counts how often: ``"caps"`` joints and steps, ``"capped_steps"`` steps.
 
     The movement primitives of the cited paper are left out. They belong to the learned skill and can be used with every
     method; including them would compare primitives instead of mappings.
@@ -49,7 +46,7 @@ class IncrementalIK(BaselineRetargeter):
         velocity_scaling: whether to scale every step as a whole so that no joint exceeds its limit, instead of
             limiting each
             joint.
-        gain: K, fraction of the error that is corrected per frame.
+        gain: gain K, the fraction of the error that is corrected per frame.
 
     Raises:
         InputError: when the gain is not in (0, 1].

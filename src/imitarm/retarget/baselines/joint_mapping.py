@@ -17,7 +17,7 @@ from imitarm.validation import flag
 Array = NDArray[np.float64]
 
 _STRETCHED = ((0.0,) * 7, (0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0))
-"""Postures in which an arm may be stretched forward: Sawyer's zero posture; that of the Panda, which points up at zero;
+"""Postures in which an arm may be stretched forward: Sawyer's zero posture; the Panda's, which points up at zero;
 its mirror image."""
 _ALIGNED = 0.999  # smallest cosine between a joint's axis and the person's
 _ANY = LimbLengths(0.3, 0.26)  # where only rotations matter
@@ -97,7 +97,7 @@ class JointMapping:
         return self.zero, np.zeros(7)
 
     def angles(self, upper: Array, forearm: Array, hand: Array) -> Array:
-        """Return the person's angles, continued from the last ones, shape (7,) [rad].
+        """Return the person's angles, continuous with the previous angles, shape (7,) [rad].
 
         Args:
             upper: vector from shoulder to elbow, shape (3,), of any length.
@@ -163,12 +163,12 @@ class Approach:
 
 
 def continued(angles: Array, before: Array) -> Array:
-    """Return angles plus multiples of 360 degrees so that each is closest to the previous one, shape (n,) [rad]."""
+    """Return angles plus multiples of 360 degrees, each closest to the previous angle, shape (n,) [rad]."""
     return np.asarray(before + (angles - before + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def _whole_turn_inside(angles: Array, lower: Array, upper: Array) -> Array:
-    """Add 360 degrees to angles beyond their limits where that brings them inside, shape (n,) [rad]."""
+    """Shift angles beyond their limits by 360 degrees if this brings them inside, shape (n,) [rad]."""
     turned = angles - 2.0 * np.pi * np.sign(angles)
     helps = ((angles < lower) | (angles > upper)) & (turned >= lower) & (turned <= upper)
     return np.where(helps, turned, angles)

@@ -70,8 +70,7 @@ class NURBS:
     .. math:: C(u) = \frac{\sum_i N_{i,p}(u)\, w_i P_i}{\sum_i N_{i,p}(u)\, w_i}
 
     The functions are those of :func:`basis_functions` over the knots :math:`\{a, \dots, a, u_{p+1}, \dots, u_{m-p-1},
-    b,
-    \dots, b\}`, a and b repeated p + 1 times. For a curve fitted to a motion the parameter is the time [s].
+    b, \dots, b\}`, a and b repeated p + 1 times. For a curve fitted to a motion the parameter is the time [s].
 
     Attributes:
         knots: shape (n + degree + 1,).
@@ -131,8 +130,8 @@ class NURBS:
     def derivative(self, u: ArrayLike, order: int = 1) -> Array:
         r"""Return a derivative with respect to the parameter at ``u`` (k,), shape (k, d).
 
-        With :math:`A = \sum N_i w_i P_i` and :math:`W = \sum N_i w_i`:
-        :math:`C^{(r)} = \frac1W \bigl(A^{(r)} - \sum_{j=1}^r \binom rj W^{(j)} C^{(r-j)}\bigr)`.
+        With :math:`A = \sum N_i w_i P_i` and :math:`W = \sum N_i w_i`: :math:`C^{(r)} = \frac1W \bigl(A^{(r)} -
+        \sum_{j=1}^r \binom rj W^{(j)} C^{(r-j)}\bigr)`.
 
         Args:
             u: parameters; a single number gives shape (d,). Beyond the ends, the derivative at the end is returned.
@@ -234,18 +233,17 @@ def fit_nurbs(
         \qquad R_{ik} = \frac{N_i(t_k)\, w_i}{\sum_j N_j(t_k)\, w_j}
 
     where D are the second differences of :func:`bends`. The parameter is the time, not the chord length, because the
-    speed
-    is part of the motion. The normal equations are banded with width p, so the time grows linearly with the number of
-    samples; ``"gcv"`` takes longer because it needs the inverse.
+    speed is part of the motion. The normal equations are banded with width p, so the time grows linearly with the
+    number of samples; ``"gcv"`` takes longer because it needs the inverse.
 
     Args:
         times: strictly increasing, shape (k,) [s].
-        points: Q, shape (k, d); arbitrary where the confidence is 0, also nan.
+        points: sample points Q, shape (k, d); any value, including nan, where the confidence is 0.
         confidence: c, 0 to 1, shape (k,); None: all 1.
         degree: p.
         n_control: number of control points; None: k/4 + p.
-        smoothing: :math:`\mu`, or ``"gcv"``: by generalised cross validation, which assumes independent errors, or
-            ``"morozov"``: such that the residual equals ``sigma``.
+        smoothing: the number :math:`\mu`; ``"gcv"`` chooses it by generalised cross validation, which assumes
+            independent errors; ``"morozov"`` chooses it so that the residual equals ``sigma``.
         sigma: standard deviation of a sample on each axis, in the points' unit; None: from the residuals.
         robust: whether to reduce the weight of samples farther than 2.5 sigma from the curve (Huber), in three passes.
         rational: whether to fit the weights w too, between 0.2 and 5, with mean 1; otherwise all are 1. This is
@@ -329,7 +327,7 @@ def bends(knots: Array, degree: int) -> Array:
     the ends. There, plain differences :math:`P_{j+1} - 2 P_j + P_{j-1}` would not vanish for a straight uniform motion
     and would slow it down. For this reason they are divided differences, :math:`h (\frac{P_{j+1} - P_j}{g_{j+1} - g_j}
     - \frac{P_j
-    - P_{j-1}}{g_j - g_{j-1}})` with h the mean distance; for uniform knots they equal the plain ones.
+    - P_{j-1}}{g_j - g_{j-1}})` with h the mean distance; for uniform knots they equal the plain differences.
     """
     means = np.convolve(knots[1:-1], np.full(degree, 1.0 / degree), "valid")
     apart = np.diff(means)
@@ -413,7 +411,7 @@ def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
     r"""Return weights w (n,), mean 1, by least squares, reweighted by the last denominator.
 
     :math:`\sum_k \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is quadratic in
-    X and in w. X is eliminated; among equally good w, the one closest to all ones is taken.
+    X and in w. X is eliminated; among equally good weights w, the function returns those closest to 1.
     """
     n = problem.n_control
     basis = np.zeros((len(problem.first), n))

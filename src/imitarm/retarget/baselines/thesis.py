@@ -182,8 +182,8 @@ class ThesisRetargeter(Retargeter):
     At each control step the tool moves towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
     3.9). The length of every step is limited, because otherwise the damping stops the arm. Joint positions and
     velocities stay within their limits. Accelerations, the elbow, obstacles and tracking losses are not handled,
-    because the thesis
-    does not handle them: when the person is lost, the target stays, and it jumps when the person returns.
+    because the thesis does not handle them: when the person is lost, the target stays, and it jumps when the person
+    returns.
 
     Args:
         arm: the robot's arm with its tool.
