@@ -70,7 +70,7 @@ def test_time_that_runs_backwards_or_stands_still():
     assert finding.severity == "error" and finding.frame == 30 and "by up to 467 ms" in finding.message
     assert "time-backwards" in found([*frames[:30], frames[29], *frames[30:]])
     mended, notes = repaired(SkeletonRecording(back))
-    assert notes == ["dropped 15 frames that were not later than the one before"]
+    assert notes == ["dropped 15 frames that were not later than the previous frame"]
     assert "time-backwards" not in found(mended.skeletons)
 
 
