@@ -186,7 +186,7 @@ def test_frames_that_all_come_twice_are_a_warning_with_the_true_rate():
     frames = [s for s in skeletons(60, rate=15.0) for _ in range(2)]
     frames = [changed(s, time=i / 30.0) for i, s in enumerate(frames)]
     issue = issues(frames)["frozen"]
-    assert issue.severity == "warning" and "15.0 different frames a second" in issue.message
+    assert issue.severity == "warning" and "15.0 different frames per second" in issue.message
 
 
 # --- spikes and jumps
