@@ -60,7 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--repeats", type=int, metavar="N", help="closed-loop trials of each person; default: 5, with --quick 1"
     )
     mapping.add_argument("--quick", action="store_true", help="use a few short recordings, for a quick test")
-    mapping.add_argument("--methods", nargs="+", choices=METHODS, metavar="NAME", help=f"of {', '.join(METHODS)}")
+    mapping.add_argument(
+        "--methods", nargs="+", choices=METHODS, metavar="NAME", help=f"methods to compare: {', '.join(METHODS)}"
+    )
     mapping.add_argument("--kinds", nargs="+", choices=KINDS, metavar="KIND", help=f"recordings: {', '.join(KINDS)}")
     mapping.add_argument(
         "--seconds", type=float, metavar="S", help="approximate duration of a recording; default: 10, with --quick 5"
@@ -69,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sigma", type=float, metavar="MM", help="standard deviation of the camera's error; default: 10 to 20 mm"
     )
     mapping.add_argument("--no-live", action="store_true", help="use recordings only, without the closed loop")
-    mapping.add_argument("--no-replay", action="store_true", help="closed loop only")
+    mapping.add_argument("--no-replay", action="store_true", help="use only the closed loop, without recordings")
     mapping.add_argument("--data", type=Path, metavar="DIR", help="folder of real recordings: adds a captured arm")
     mapping.add_argument("--out", type=Path, metavar="DIR", help="folder of the results; default: benchmark-mapping")
     mapping.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
@@ -78,11 +80,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument(
         "--reuse", action="store_true", help="use saved results of the same configuration even if other code made them"
     )
-    mapping.add_argument("--jobs", type=int, metavar="N", help="processes; default: one for each processor")
+    mapping.add_argument("--jobs", type=int, metavar="N", help="number of processes; default: one for each processor")
     mapping.add_argument("--backend", default=LOCAL, metavar="NAME", help="backend of joblib: loky (local), dask, ray")
     mapping.set_defaults(benchmark=_mapping)
     other = parsers.add_parser("avoidance", help="measure how often a method keeps its clearance in seeded scenes")
-    other.add_argument("--seeds", type=int, default=200, metavar="N", help="scenes in each family; default: 200")
+    other.add_argument(
+        "--seeds", type=int, default=200, metavar="N", help="number of scenes in each family; default: 200"
+    )
     other.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000, the test seeds")
     other.add_argument("--methods", nargs="+", choices=ADAPTERS, default=list(ADAPTERS))
     _add_fill(other)
@@ -98,9 +102,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     placed.add_argument("--skill", type=Path, metavar="FILE", help="default: the packaged sweep, Sawyer and brush")
     placed.add_argument("--policies", nargs="+", choices=POLICIES, default=["acfra"], metavar="NAME")
-    placed.add_argument("--seeds", type=int, default=50, metavar="N", help="placements; default: 50")
+    placed.add_argument("--seeds", type=int, default=50, metavar="N", help="number of placements; default: 50")
     placed.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
-    placed.add_argument("--jobs", type=int, default=1, metavar="N", help="processes; default: 1")
+    placed.add_argument("--jobs", type=int, default=1, metavar="N", help="number of processes; default: 1")
     placed.add_argument("--list", action="store_true", help="also list each placement in which a policy did not arrive")
     add_robot_options(placed)
     _add_fill(placed)

@@ -49,7 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--components", type=_components, default="auto", metavar="K", help="number of Gaussians; default: auto"
     )
     output = parser.add_argument_group("output")
-    output.add_argument("--out", type=Path, default=Path("skill.json"), metavar="FILE", help="default: skill.json")
+    output.add_argument(
+        "--out", type=Path, default=Path("skill.json"), metavar="FILE", help="skill file to write; default: skill.json"
+    )
     output.add_argument("--force", action="store_true", help="replace an existing skill file")
 
 

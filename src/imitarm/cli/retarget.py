@@ -49,10 +49,9 @@ examples:
   imitarm learn wave_*.csv --task wave --out wave.json
 
 The robot starts at its home posture, or with --fit at a posture from which the whole recorded motion is within reach.
-It
-waits until the person has been seen for half a second, then its tool follows the hand. The demonstration contains only
-the time in which the person led. The first line of the output says whether the tool followed its target: it did not if
-it was more than {100 * FAR:.0f} cm away (RMS), or that far for more than {100 * FAR_FRACTION:.0f} % of the time.
+It waits until the person has been seen for half a second; then its tool follows the hand. The demonstration contains
+only the time in which the person led. The first line of the output says whether the tool followed its target: it did
+not if it was more than {100 * FAR:.0f} cm away (RMS), or that far for more than {100 * FAR_FRACTION:.0f} % of the time.
 The files are then written all the same, with a warning. The exit status is 1 when the person was never seen for long
 enough to lead.
 """
@@ -64,7 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add_source(parser)
     add_robot_options(parser)
-    parser.add_argument("--method", choices=(*RETARGETERS, "all"), default="modern", help="default: modern")
+    parser.add_argument(
+        "--method", choices=(*RETARGETERS, "all"), default="modern", help="retargeting method; default: modern"
+    )
     parser.add_argument(
         "--drive", action="store_true", help="let the simulated robot execute the motion, and measure it"
     )
