@@ -59,7 +59,7 @@ class Change:
     """How the time of a row differs between two checkouts.
 
     Attributes:
-        name: of the row.
+        name: name of the row.
         before: median CPU time in the other checkout [s]; nan when it could not be measured.
         after: median CPU time in this checkout [s]; nan when it could not be measured.
         ratio: after over before; None when it could not be measured.
@@ -79,7 +79,7 @@ class Checkout:
     """A process that runs the rows of a checkout with the checkout's code.
 
     Args:
-        folder: of the checkout.
+        folder: folder of the checkout.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -34,7 +34,7 @@ def skeleton_to_command() -> Row:
         """Go on to the next tick with a skeleton while following, and return how long it took [s]."""
         nonlocal steps
         while True:
-            if steps % len(frames) == 0:  # the recording begins anew
+            if steps % len(frames) == 0:  # the recording begins again
                 retargeter.start(arm.home)
             steps += 1
             skeleton, q = next(endless), retargeter.latest.q

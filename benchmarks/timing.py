@@ -66,7 +66,7 @@ class Ratio:
     """A ratio of times.
 
     Attributes:
-        median: of the paired ratios.
+        median: median of the paired ratios.
         low: lower end of its 95 % confidence interval.
         high: upper end.
     """
@@ -93,11 +93,11 @@ class Measurement:
     """The result of a row.
 
     Attributes:
-        name: of the row.
-        ours: median time of ours [s]; nan when it could not be measured.
+        name: name of the row.
+        ours: median time of our code [s]; nan when it could not be measured.
         reference: median time of the reference [s]; nan when it could not be measured.
-        reference_name: of the row.
-        ratio: in the direction of the target; None when it could not be measured.
+        reference_name: name of the reference row.
+        ratio: ratio in the direction of the target; None when it could not be measured.
         target: in words.
         passed: whether the whole interval of the ratio meets the target, and the results are good; None when it could
             not be measured.

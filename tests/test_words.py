@@ -44,6 +44,15 @@ HOUSE_WORDS = {
     r"does it whole\b": "completely",
     r"came of (?:it|one|a)\b": "result",
     r"(?:whence|thereof|therein|hitherto|lest)\b": "a plain word",
+    r"anew\b": "again",
+    r"(?:is|are) ours\b": "we chose",
+    r"our reading\b": "our interpretation",
+    r"own frames?\b": "local frame",
+    r"made discrete\b": "in discrete form",
+    r"None: none\b": "None: no obstacles, no tool, ...",
+    r"blanks\b": "spaces",
+    r"(?:is|are) not said\b": "not stated",
+    r"present (?:pose|poses|scene|obstacles|phase|observation)\b": "current",
     r"(?:quarternion|jacobean|covarience|gausian|accelaration|trajectorys|demostration|effecter)": "its spelling",
 }
 TEXT = re.compile("|".join(rf"(?P<g{i}>\b(?:{pattern}))" for i, pattern in enumerate(HOUSE_WORDS)), re.IGNORECASE)
@@ -83,6 +92,10 @@ def house_names(path: Path) -> Iterator[tuple[int, str]]:
             yield line, name
 
 
+# an argument or attribute in a docstring that is described without a noun: "seed: of the samples"
+NO_NOUN = re.compile(r"^ +(\w+): of (?!each of)", re.MULTILINE)
+
+
 def faults(text: str) -> list[str]:
     """Return the house words in a text, each with what to write instead."""
     found = []
@@ -106,6 +119,16 @@ def test_pages_use_the_words_of_the_field(path: Path) -> None:
 def test_docstrings_comments_and_messages_use_the_words_of_the_field(path: Path) -> None:
     found = [f"{place(path)}:{line}: {fault}" for line, text in texts(path) for fault in faults(text)]
     assert found == []
+
+
+@pytest.mark.parametrize("path", CODE, ids=place)
+def test_arguments_are_described_by_a_noun(path: Path) -> None:
+    found = [
+        (node, ast.get_docstring(node))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
+    assert [match[1] for _, text in found for match in NO_NOUN.finditer(text or "")] == []
 
 
 @pytest.mark.parametrize("path", CODE, ids=place)
@@ -133,6 +156,7 @@ def test_the_help_of_every_command_uses_the_words_of_the_field() -> None:
         ("the moment of inertia, and the learned skill", 0),
         ("thesis Eq 3.1, see METHODS D.2.5", 1),
         ("the share of samples that was judged", 2),
+        ("our reading of the law, made discrete; the gains are ours", 3),
         ("the arm is told to stop, then each of them turns", 0),
     ],
 )

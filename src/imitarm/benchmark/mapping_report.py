@@ -32,7 +32,7 @@ _WORDS: Final = {
     "From first hold": "The distance between the tool and its true target from the first engagement to the end, "
     "including the time in which the method does not follow.",
     "SPARC": "Spectral arc length of the speed: the closer to 0, the smoother the motion.",
-    "Our reading": "The thesis describes its baselines only in words. These methods implement that description.",
+    "Our interpretation": "The thesis describes its baselines only in words. These methods implement that description.",
 }
 
 

@@ -56,7 +56,7 @@ def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIs
     """Return all faults of a recording, errors first.
 
     Args:
-        recording: as read or captured.
+        recording: recording as read or captured.
         side: side of the arm that a robot is to follow.
 
     Raises:
@@ -165,7 +165,7 @@ class _View:
         later = np.concatenate([[True], self.times[1:] > np.maximum.accumulate(self.times)[:-1]])
         self.later = np.flatnonzero(later)  # frames whose times increase
         memory = SideMemory()
-        right, self.swapped = [], []  # with left and right kept apart; frames in which they were exchanged
+        right, self.swapped = [], []  # with corrected sides; frames in which the sides were exchanged
         for i, skeleton in enumerate(self.skeletons):
             right.append(memory.update(skeleton).positions)
             self.swapped += [i] if right[-1] is not skeleton.positions else []

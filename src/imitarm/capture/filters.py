@@ -160,7 +160,7 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     one joint of a pair is lost, only the other joint is used.
 
     Args:
-        skeleton: as the camera reports it.
+        skeleton: skeleton as the camera reports it.
         before: previous frame, with correct sides.
 
     Returns:

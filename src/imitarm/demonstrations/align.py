@@ -371,7 +371,7 @@ def to_common_ends(values: Array) -> Array:
 
 
 def medoid(values: Array) -> int:
-    """Return the index of the motion that is nearest to all others, of (n_demonstrations, n, d)."""
+    """Return the index of the motion nearest to all others; ``values`` has shape (n_demonstrations, n, d)."""
     flat = values.reshape(len(values), -1)
     squares = np.sum(flat**2, axis=1)
     distance = np.sqrt(np.maximum(squares[:, None] + squares - 2.0 * flat @ flat.T, 0.0))

@@ -315,7 +315,7 @@ class ImitarmReader(Reader):
 
 
 class TextTableReader(Reader):
-    """Any text table of numbers, separated by comma, semicolon, tab or blanks, with or without column names.
+    """Any text table of numbers, separated by comma, semicolon, tab or spaces, with or without column names.
 
     A remark ``# units: cm`` before the numbers, or a name such as ``x [cm]``, specifies the unit. Recordings of joint
     angles, such as those of Rethink's ``joint_recorder.py`` (``time,right_j0,...,right_j6``), are tables too.

@@ -88,7 +88,7 @@ class ArmMemory:
         self._model, self._positions, self._joints, self._posture = model, positions, joints, b""
         stacked = np.zeros((len(landmarks), 3, model.nv))
         self._stacked = stacked.reshape(-1, model.nv)
-        # Views, where the joints stand side by side: making them anew takes as long as the computation itself.
+        # Views, where the joints are side by side: creating them again takes as long as the computation itself.
         self._views = None
         if isinstance(joints, slice):
             self._views = self.jacobian[:, joints], self._stacked[:, joints]

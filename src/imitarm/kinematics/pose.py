@@ -255,7 +255,7 @@ class Pose:
 
         Args:
             position: shape (3,) [m]; from now on read-only.
-            quaternion: of length one, shape (4,) wxyz; from now on read-only.
+            quaternion: unit quaternion wxyz, shape (4,); from now on read-only.
         """
         pose = object.__new__(cls)
         position.setflags(write=False)

@@ -36,7 +36,7 @@ class SphereCover:
         """Cover the shapes of a model.
 
         Args:
-            model: with all shapes.
+            model: model with all shapes.
             working: model with the same bodies, whose data are passed to the methods.
             names: names of the joints to which the columns of the Jacobians belong.
         """

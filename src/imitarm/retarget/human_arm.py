@@ -79,7 +79,7 @@ def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: boo
         as_printed: whether to use the second row as printed in the thesis; the result is not a rotation.
 
     Returns:
-        shape (8, 4, 4), the shoulder's own frame first.
+        shape (8, 4, 4), beginning with the shoulder's frame.
     """
     offset, alpha = HUMAN_ARM_DH
     along = np.array([0.0, 0.0, lengths.upper_arm, 0.0, lengths.forearm, 0.0, 0.0])

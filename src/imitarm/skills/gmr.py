@@ -83,8 +83,8 @@ class GMR:
         n_demonstrations_: number of demonstrations.
         has_orientation_: whether rotations were learned.
         weights_: priors, shape (K,).
-        means_: of [t; x], shape (K, 1 + D), D = 3 or 6.
-        covariances_: of [t; x], shape (K, 1 + D, 1 + D).
+        means_: means of [t; x], shape (K, 1 + D), D = 3 or 6.
+        covariances_: covariances of [t; x], shape (K, 1 + D, 1 + D).
         reference_: the reference of the rotation vectors; None without rotations.
         ends_: mean start and mean goal of the demonstrations, as x (position, rotation vector), shape (2, D).
         degenerate_axes_: constant columns of x: 0 to 2 for x, y, z, 3 to 5 for rotations.

@@ -97,7 +97,7 @@ class Skill:
             date: date of learning; omitted when None, so that the same input gives the same file.
 
         Raises:
-            InputError: as :meth:`GMR.fit` and :meth:`DMP.fit`.
+            InputError: for the same reasons as :meth:`GMR.fit` and :meth:`DMP.fit`.
 
         Warns:
             PoorFitWarning: when the skill does not reproduce the motion, see ``fit_quality_``.

@@ -119,7 +119,7 @@ class RetargetReport:
 
     Attributes:
         title: title of the page.
-        methods: at least one method; the header is about the first one.
+        methods: at least one method; the header describes the first method.
         skeletons: skeletons of the person, as the methods received them.
         correspondence: mapping from the person's motion to the robot's motion.
         verdict: the result in one line.
