@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import IKSolver
 from imitarm.kinematics.limits import JointLimits, singularity_limits
-from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.tasks import ElbowTask, Task, TwistTask
 from imitarm.scene import Scene, Sphere
-from imitarm.scene.clearance_limit import ClearanceLimit
+from imitarm.scene.clearance import ClearanceLimit, SelfClearance
 from timing import Row
 from yardsticks import DT, MinkStep, mink_step, named
 

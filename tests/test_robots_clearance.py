@@ -75,7 +75,7 @@ def test_the_measured_distance_agrees_with_coal(kind):
         target = model.geom("obstacle/0").id
         shape, placement = coal_shape(obstacle)
         for _ in range(25):
-            places = [obstacle.packed.positions[0] + rng.normal(size=3) * 0.4 for _ in probes]
+            places = [obstacle.solid().position + rng.normal(size=3) * 0.4 for _ in probes]
             for i, place in enumerate(places):
                 turn = rng.normal(size=4)
                 data.mocap_pos[i], data.mocap_quat[i] = place, turn / np.linalg.norm(turn)

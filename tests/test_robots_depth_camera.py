@@ -59,8 +59,8 @@ def test_every_point_is_on_a_surface(arm):
     assert seen[len(scene.obstacles)] > 0  # the floor
     # and no surface hides: the centre of each obstacle in sight is seen at most at its own depth
     for obstacle in scene.obstacles:
-        u, v = np.round(CAMERA.project(pose.inverse().apply(obstacle.packed.positions[0]))).astype(int)
-        assert frame.depth[v, u] < pose.inverse().apply(obstacle.packed.positions[0])[2]
+        u, v = np.round(CAMERA.project(pose.inverse().apply(obstacle.solid().position))).astype(int)
+        assert frame.depth[v, u] < pose.inverse().apply(obstacle.solid().position)[2]
 
 
 def test_it_sees_moving_obstacles_and_the_arm(arm):

@@ -11,10 +11,9 @@ from imitarm.command import Command, Status
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.limits import JointLimits
-from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.safety import SafetyFilter
 from imitarm.scene import HalfSpace, Scene, Sphere
-from imitarm.scene.clearance_limit import ClearanceLimit
+from imitarm.scene.clearance import ClearanceLimit, SelfClearance
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
 DT = 0.01

@@ -12,7 +12,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.tasks import TwistTask
 from imitarm.scene import HalfSpace, Scene, Sphere
-from imitarm.scene.clearance_limit import ClearanceLimit
+from imitarm.scene.clearance import ClearanceLimit
 from scene_shapes import KINDS, random_obstacle
 
 
@@ -41,7 +41,7 @@ def near_scene(arm, q, rng, kinds=KINDS, **more):
     obstacles = []
     for kind in kinds:
         obstacle = random_obstacle(kind, rng)
-        way = arm.tool_pose(q).position + 0.25 * rng.normal(size=3) - obstacle.packed.positions[0]
+        way = arm.tool_pose(q).position + 0.25 * rng.normal(size=3) - obstacle.solid().position
         there = dataclasses.replace(obstacle, velocity=way).after(1.0)
         velocity = 0.2 * rng.normal(size=3)
         obstacles.append(type(there)(**{**fields_of(there), "velocity": velocity, **more}))
@@ -58,7 +58,7 @@ def all_rows(arm, q, scene, clearance, rate, influence):
     jacobians = arm.sphere_jacobians(q)
     matrix, lower = [], []
     for obstacle in scene.obstacles:
-        middle = obstacle.packed.positions[0]
+        middle = obstacle.solid().position
         for center, radius, jacobian in zip(centers, radii, jacobians, strict=True):
             distance, n = obstacle.distance_and_gradient(center)
             room = float(distance) - radius - clearance

@@ -80,7 +80,7 @@ def test_a_rotating_obstacle_turns_about_its_centre():
     for kind in KINDS:
         spin, velocity = rng.normal(size=3), rng.normal(size=3)
         obstacle = random_obstacle(kind, rng, velocity=velocity, angular_velocity=spin)
-        middle = obstacle.packed.positions[0]
+        middle = obstacle.solid().position
         points = middle + rng.normal(size=(20, 3)) * 0.3
         dt = 1e-5
         riding = points + dt * (velocity + np.cross(spin, points - middle))

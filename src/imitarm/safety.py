@@ -14,9 +14,8 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import IKSolver
 from imitarm.kinematics.ik_problem import Rows
 from imitarm.kinematics.limits import Limit
-from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, Task, TwistTask
-from imitarm.scene.clearance_limit import ClearanceLimit
+from imitarm.scene.clearance import ClearanceLimit, SelfClearance
 from imitarm.scene.scene import Scene
 from imitarm.validation import finite_number, finite_vector, instance
 
@@ -51,8 +50,8 @@ class SafetyFilter:
 
     * inside the position, velocity and acceleration limits of the joints, always;
     * so that no part of the arm approaches an obstacle faster than
-      :class:`~imitarm.scene.clearance_limit.ClearanceLimit` allows, and no link another link faster than
-      :class:`~imitarm.kinematics.self_clearance.SelfClearance` allows.
+      :class:`~imitarm.scene.clearance.ClearanceLimit` allows, and no link another link faster than
+      :class:`~imitarm.scene.clearance.SelfClearance` allows.
 
     Where these rows contradict the joint limits, no safe motion exists: the velocity violates the rows as little as
         possible, which moves the arm away from objects that are too close, and ``safe`` is False.

@@ -19,10 +19,10 @@ from imitarm.evaluation.execution import execute_on_robot
 from imitarm.evaluation.mapping_metrics import measure
 from imitarm.evaluation.tracking import seen_arm, target_lag
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import RETARGETERS, Correspondence
 from imitarm.retarget.engagement import SEEN_FOR
 from imitarm.retarget.fitting import fit_motion
+from imitarm.scene.clearance import SelfClearance
 
 SPEEDS = (1.0, 0.5)
 _PERIOD = 0.01  # [s]

@@ -14,8 +14,8 @@ from imitarm.capture.skeleton import Skeleton
 from imitarm.evaluation.mapping_metrics import MappingMetrics, measure
 from imitarm.evaluation.tracking import TrueArm, rms, seen_arm, target_lag
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_multiply
-from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.retarget import Correspondence, Retargeting
+from imitarm.scene.clearance import SelfClearance
 
 Array = NDArray[np.float64]
 

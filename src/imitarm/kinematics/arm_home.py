@@ -8,7 +8,6 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from imitarm.kinematics.spheres import COLLISION_GROUP
 
@@ -82,6 +81,8 @@ class _HomeSearch:
 
     def candidates(self) -> Array:
         """Return postures that fill the ranges evenly (a Sobol sequence), shape (n, n_joints)."""
+        from scipy.stats import qmc  # noqa: PLC0415  takes half a second to import
+
         fractions = qmc.Sobol(len(self._low), scramble=False).random(_SAMPLES)
         return np.asarray(self._low + (0.1 + 0.8 * fractions) * (self._high - self._low))
 

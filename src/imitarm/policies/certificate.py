@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import rotate
+from imitarm.scene.edged import HalfSpace
 from imitarm.scene.obstacle import Obstacle
-from imitarm.scene.shapes import HalfSpace, Sphere
+from imitarm.scene.rounded import Sphere
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]

@@ -26,8 +26,8 @@ from imitarm.kinematics.ik_problem import ROTATION_LENGTH
 from imitarm.kinematics.limits import JointLimits, singularity_limits
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.posture import find_posture
-from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.tasks import TwistTask
+from imitarm.scene.clearance import SelfClearance
 from imitarm.validation import finite_number, instance, real_array
 
 Array = NDArray[np.float64]

@@ -15,7 +15,6 @@ from imitarm.kinematics.ik import IKSolver
 from imitarm.kinematics.ik_problem import ROTATION_LENGTH, Rows
 from imitarm.kinematics.limits import JointLimits, singularity_limits
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
-from imitarm.kinematics.self_clearance import SelfClearance
 from imitarm.kinematics.sew import one_angle
 from imitarm.kinematics.tasks import ElbowTask, Task, TwistTask
 from imitarm.retarget.arm_estimator import ArmEstimate
@@ -23,7 +22,7 @@ from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.engagement import EngagementRule
 from imitarm.retarget.retargeter import Goal, Retargeter
 from imitarm.scene import Scene
-from imitarm.scene.clearance_limit import ClearanceLimit
+from imitarm.scene.clearance import ClearanceLimit, SelfClearance
 from imitarm.validation import finite_number, finite_numbers
 
 Array = NDArray[np.float64]

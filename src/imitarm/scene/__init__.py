@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
+from imitarm.scene.convex_hull import ConvexHull
+from imitarm.scene.edged import Box, Cone, Cylinder, HalfSpace
 from imitarm.scene.motion import MovingScene, Track
 from imitarm.scene.obstacle import Obstacle
+from imitarm.scene.rounded import Capsule, Ellipsoid, Sphere
 from imitarm.scene.scene import Scene
 from imitarm.scene.scene_file import load_scene, save_scene
-from imitarm.scene.shapes import (
-    Box,
-    Capsule,
-    Cone,
-    ConvexHull,
-    Cylinder,
-    Ellipsoid,
-    HalfSpace,
-    Sphere,
-)
 
 OBSTACLES: dict[str, type[Obstacle]] = {
     shape.kind: shape for shape in (Sphere, Box, Capsule, Cylinder, Cone, Ellipsoid, ConvexHull, HalfSpace)

@@ -1,7 +1,6 @@
-"""Signed distances from points to all obstacles of a scene, as packed arrays.
+"""Distances to all obstacles of a scene, as packed arrays.
 
-``Scene.clearance`` and :class:`~imitarm.scene.clearance_limit.ClearanceLimit` use them. A single obstacle has its own
-``Obstacle.signed_distance``. The formulas of both are in :mod:`~imitarm.scene.formulas`.
+A single obstacle has its own ``Obstacle.signed_distance``. The distance formulas are with the shapes.
 """
 
 from __future__ import annotations
@@ -17,32 +16,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply, quaternion_to_matrix
-from imitarm.scene.formulas import DEPTH, FAMILIES, ROUNDS, SLABS, Formula, Parameters, Polytope
+from imitarm.scene.convex_hull import Polytope
+from imitarm.scene.edged import CONES, DEPTH, SLABS
+from imitarm.scene.obstacle import Formula, Obstacle, Parameters
+from imitarm.scene.rounded import ELLIPSOIDS, ROUNDS
 from imitarm.validation import finite_array, finite_points
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 KINDS = ("sphere", "box", "capsule", "cylinder", "cone", "ellipsoid", "convex_hull", "half_space")
+FAMILIES = (ROUNDS, SLABS, ELLIPSOIDS, CONES)
 _OF_THE_POSE = frozenset(("positions", "_frames", "_ahead", "_shapes"))
-
-
-class Solid(NamedTuple):
-    """The geometry of one obstacle, in the form that :class:`PackedObstacles` stacks.
-
-    Attributes:
-        kind: one of :data:`KINDS`.
-        position: origin of the obstacle's local frame in the base frame, shape (3,) [m].
-        quaternion: own_to_base rotation wxyz, shape (4,).
-        size: see ``PackedObstacles.sizes``, shape (3,) [m].
-        polytope: faces and edges of a convex hull in its local frame; None for other kinds.
-    """
-
-    kind: str
-    position: Array
-    quaternion: Array
-    size: Sequence[float] | Array
-    polytope: Polytope | None = None
 
 
 class _Members(NamedTuple):
@@ -56,7 +41,7 @@ class _Members(NamedTuple):
 class _Frames(NamedTuple):
     """The local frames of the obstacles, grouped by family, in the order of ``PackedObstacles._sorted``."""
 
-    to_own: Array  # rotation of base vectors into each local frame, shape (n, 3, 3)
+    to_local: Array  # rotation of base vectors into each local frame, shape (n, 3, 3)
     rows: Array  # the same, axis first, for one product with many points, shape (3 n, 3)
     center: Array  # of each obstacle, in its own rotation, shape (3, n, 1) [m]
     velocity: Array  # of each obstacle, in its own rotation, shape (3, n, 1) [m/s]
@@ -70,7 +55,7 @@ class PackedObstacles:
     Attributes:
         kinds: index of each shape in :data:`KINDS`, shape (n,).
         positions: origin of the local frame in the base frame, shape (n, 3) [m].
-        quaternions: own_to_base rotations wxyz, shape (n, 4).
+        quaternions: local_to_base rotations wxyz, shape (n, 4).
         sizes: sizes of the shapes, shape (n, 3) [m]. Sphere: radius; box: full edge lengths; capsule and cylinder:
             radius, length of the axis; cone: radius, height; ellipsoid: semi-axes; convex hull: half extents;
             half-space: nothing. Unused entries are 0.
@@ -94,27 +79,20 @@ class PackedObstacles:
     polytopes: tuple[Polytope | None, ...]
 
     @classmethod
-    def of(
-        cls,
-        solids: Sequence[Solid],
-        velocities: ArrayLike,
-        angular_velocities: ArrayLike,
-        covariances: ArrayLike,
-        stamps: ArrayLike,
-        track_ids: ArrayLike,
-    ) -> PackedObstacles:
-        """Stack ``solids``; the other arguments are the attributes of these names."""
-        n = len(solids)
+    def of(cls, obstacles: Sequence[Obstacle], stamp: float) -> PackedObstacles:
+        """Stack ``obstacles``; ``stamp`` [s] is the time at which they have these poses."""
+        n, zero = len(obstacles), np.zeros((3, 3))
+        solids = [obstacle.solid() for obstacle in obstacles]
         return cls(
             np.array([KINDS.index(solid.kind) for solid in solids], dtype=np.int8),
-            np.array([solid.position for solid in solids], dtype=float).reshape(n, 3),
-            np.array([solid.quaternion for solid in solids], dtype=float).reshape(n, 4),
+            np.array([solid.position for solid in solids]).reshape(n, 3),
+            np.array([solid.quaternion for solid in solids]).reshape(n, 4),
             np.array([solid.size for solid in solids], dtype=float).reshape(n, 3),
-            np.array(velocities, dtype=float).reshape(n, 3),
-            np.array(angular_velocities, dtype=float).reshape(n, 3),
-            np.array(covariances, dtype=float).reshape(n, 3, 3),
-            np.array(stamps, dtype=float).reshape(n),
-            np.array(track_ids, dtype=np.int64).reshape(n),
+            np.array([obstacle.velocity for obstacle in obstacles]).reshape(n, 3),
+            np.array([obstacle.angular_velocity for obstacle in obstacles]).reshape(n, 3),
+            np.array([zero if o.covariance is None else o.covariance for o in obstacles]).reshape(n, 3, 3),
+            np.full(n, stamp),
+            np.array([-1 if o.track_id is None else o.track_id for o in obstacles], dtype=np.int64),
             tuple(solid.polytope for solid in solids),
         )
 
@@ -214,12 +192,12 @@ class PackedObstacles:
             frames: _Frames = earlier._frames
             return frames._replace(center=frames.center + dt * frames.velocity)
         order = self._sorted[0]
-        to_own = np.ascontiguousarray(quaternion_to_matrix(self.quaternions[order]).transpose(0, 2, 1))
-        rows = np.ascontiguousarray(to_own.transpose(1, 0, 2)).reshape(-1, 3)
-        center, velocity = (np.einsum("nij,nj->in", to_own, v[order]) for v in (self.positions, self.velocities))
+        to_local = np.ascontiguousarray(quaternion_to_matrix(self.quaternions[order]).transpose(0, 2, 1))
+        rows = np.ascontiguousarray(to_local.transpose(1, 0, 2)).reshape(-1, 3)
+        center, velocity = (np.einsum("nij,nj->in", to_local, v[order]) for v in (self.positions, self.velocities))
         center[2, self.kinds[order] == KINDS.index("half_space")] -= DEPTH
         upright = not self.quaternions[:, 1:].any()
-        return _Frames(to_own, rows, center[..., None], velocity[..., None], upright)
+        return _Frames(to_local, rows, center[..., None], velocity[..., None], upright)
 
     @cached_property
     def _kept(self) -> list[tuple[Array, Array]]:
@@ -324,7 +302,7 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
         place, point, distance = place.take(near), point.take(near), distance.take(near)
         normal = normal.take(near, axis=1)
     if not frames.upright:
-        normal = np.einsum("jk,kji->ik", normal, frames.to_own.take(place, axis=0))
+        normal = np.einsum("jk,kji->ik", normal, frames.to_local.take(place, axis=0))
     return NearPairs(packed._sorted[0][place], point, distance, normal)
 
 
@@ -365,13 +343,17 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
         q -= frames.center
     else:
         q.reshape(3, n, len(times), m // len(times))[...] -= (frames.center + frames.velocity * times)[..., None]
+    families = packed._sorted[1]
+    if len(families) == 1 and not gradient:  # in their own order
+        formula, _, parameters = families[0]
+        return formula(q, False, *_every(parameters))
     distance, gradients = np.empty((n, m)), np.empty((n, m, 3)) if gradient else None
     for formula, places, parameters in packed._sorted[1]:
         part, normal = formula(q[:, places], gradient, *_every(parameters))
         distance[packed._sorted[0][places]] = part
         if gradients is not None and normal is not None:
             for i, place in enumerate(range(places.start, places.stop)):
-                np.dot(normal[:, i].T, frames.to_own[place], out=gradients[packed._sorted[0][place]])
+                np.dot(normal[:, i].T, frames.to_local[place], out=gradients[packed._sorted[0][place]])
     return distance, gradients
 
 

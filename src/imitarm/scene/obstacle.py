@@ -1,17 +1,19 @@
 """Obstacles: convex solids with an exact signed distance, its gradient, and a motion.
 
-This module contains the common part of all shapes: checks, motion, and the distances of one obstacle. The shapes are in
-:mod:`~imitarm.scene.shapes`, the distance formulas in :mod:`~imitarm.scene.formulas`.
+This module contains the common part of all shapes: checks, motion, and the distances of one obstacle. The shapes and
+their distance formulas are in :mod:`~imitarm.scene.rounded`, :mod:`~imitarm.scene.edged` and
+:mod:`~imitarm.scene.convex_hull`.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,17 +26,22 @@ from imitarm.kinematics.pose import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
-from imitarm.scene.distances import PackedObstacles, Solid
-from imitarm.scene.formulas import DEPTH, FAMILIES, Formula
 from imitarm.validation import finite_array, finite_number, finite_points, finite_vector, whole_number
 
+if TYPE_CHECKING:
+    from imitarm.scene.convex_hull import Polytope
+
 Array = NDArray[np.float64]
+Formula = Callable[..., tuple[Array, Any]]  # distances, and normals where requested
+Parameters = tuple[Array | None, ...]
 
 MAX_SIZE = 10.0  # [m] nothing within reach of an arm is larger: a larger number is in the wrong unit
 MAX_COORDINATE = 100.0  # [m] nor farther away
 MAX_SPEED = 100.0  # [m/s] nor faster
 MAX_RATE = 100.0  # [rad/s]
+TINY = 1e-9  # [m] a direction shorter than this is mostly rounding error; a fixed direction replaces it
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+ONES = np.ones(3)
 
 
 def checked_vector(value: object, what: str, *, limit: float, unit: str = "") -> Array:
@@ -64,43 +71,105 @@ def checked_lengths(value: object, what: str) -> Array:
     return values
 
 
+def lengths(vectors: Array) -> Array:
+    """Return the length (...) of each column of ``vectors`` (3, ...)."""
+    squares = vectors * vectors
+    if squares.ndim > 2:
+        return np.sqrt(np.add.reduce(squares, axis=0))
+    total: Array = ONES.dot(squares)  # takes a third of the time of a sum
+    return np.sqrt(total, out=total)
+
+
+def below(values: Array, bound: float) -> bool:
+    """Return whether any of ``values`` (...), of which none is nan, is below ``bound``."""
+    return values.size > 0 and values.item(values.argmin()) < bound
+
+
+def rotation_from_z(axis: Array) -> Array:
+    """Return a quaternion wxyz (4,) that rotates z into the direction of ``axis`` (3,)."""
+    x, y, z = axis.tolist()
+    across = math.hypot(x, y)
+    if across < 1e-12 * abs(z):
+        return UPRIGHT if z >= 0.0 else np.array([0.0, 1.0, 0.0, 0.0])
+    half = 0.5 * math.atan2(across, z)
+    sine = math.sin(half) / across
+    return np.array([math.cos(half), -sine * y, sine * x, 0.0])
+
+
+class Solid(NamedTuple):
+    """The geometry of one obstacle, as the distances need it.
+
+    Attributes:
+        kind: one of :data:`~imitarm.scene.distances.KINDS`.
+        position: origin of the obstacle's local frame in the base frame, shape (3,) [m].
+        quaternion: local_to_base rotation wxyz, shape (4,).
+        size: see :class:`~imitarm.scene.distances.PackedObstacles`, shape (3,) [m].
+        polytope: faces and edges of a convex hull in its local frame; None for other kinds.
+    """
+
+    kind: str
+    position: Array
+    quaternion: Array
+    size: Sequence[float] | Array
+    polytope: Polytope | None = None
+
+
+class Family(NamedTuple):
+    """Shapes that share a distance formula.
+
+    The formula works in the obstacle's local frame, for any number of obstacles and points. It takes points ``q``
+    (3, ...), a flag for normals, and the parameters of its shapes, which broadcast against ``q``. It returns signed
+    distances (...) [m] and outward unit normals (3, ...), or None. It may overwrite ``q``.
+
+    Attributes:
+        kinds: names of the shapes.
+        formula: see above.
+        prepare: makes the parameters (..., n) from the kinds (n,) and sizes (n, 3) of n obstacles.
+    """
+
+    kinds: tuple[str, ...]
+    formula: Formula
+    prepare: Callable[[Sequence[str], Array], Parameters]
+
+
 class _Single(NamedTuple):
     """One obstacle, prepared for distance queries."""
 
     formula: Formula
-    to_own: Array | None  # rotation of base vectors into the local frame, shape (3, 3); None when there is none
+    to_local: Array | None  # rotation of base vectors into the local frame, shape (3, 3); None when there is none
     center: Array  # of the obstacle, in its own rotation, shape (3, 1) [m]
-    parameters: list[Array | None]  # of the formula
+    parameters: list[Any]  # of the formula, numbers where they are not vectors
 
     @classmethod
-    def of(cls, solid: Solid) -> _Single:
-        """Prepare ``solid``."""
-        to_own = quaternion_to_matrix(solid.quaternion).T if solid.quaternion[1:].any() else None
-        center = np.array((solid.position if to_own is None else to_own @ solid.position)[:, None])
-        if solid.polytope is not None:
-            return cls(solid.polytope.formula, to_own, center, [])
-        if solid.kind == "half_space":
-            center[2] -= DEPTH
-        family = next(family for family in FAMILIES if solid.kind in family.kinds)
+    def of(cls, obstacle: Obstacle) -> _Single:
+        """Prepare ``obstacle``."""
+        solid, family = obstacle.solid(), obstacle.family
+        to_local = quaternion_to_matrix(solid.quaternion).T if solid.quaternion[1:].any() else None
+        center = np.array((solid.position if to_local is None else to_local @ solid.position)[:, None])
+        center[2] -= obstacle.depth
+        if family is None:
+            assert solid.polytope is not None
+            return cls(solid.polytope.formula, to_local, center, [])
         parameters = family.prepare([solid.kind], np.array([solid.size], dtype=float))
-        return cls(family.formula, to_own, center, [None if p is None else p[..., 0, None] for p in parameters])
+        return cls(family.formula, to_local, center, [p if p is None or p.ndim > 1 else p.item() for p in parameters])
 
 
-def _distance(single: _Single, points: ArrayLike, gradient: bool) -> tuple[Array, Array | None]:
+def _distance(single: _Single, points: ArrayLike, gradient: bool) -> tuple[Array, Any]:
     """Return the distances (...) [m] of one obstacle and, if ``gradient``, their gradients (..., 3)."""
     p = finite_points(points)
-    formula, to_own, center, parameters = single
-    columns = (p if p.ndim == 2 else p.reshape(-1, 3)).T
-    if to_own is None:
+    formula, to_local, center, parameters = single
+    flat = p.ndim == 2
+    columns = p.T if flat else p.reshape(-1, 3).T
+    if to_local is None:
         q = np.subtract(columns, center, order="C")
     else:
-        q = np.dot(to_own, columns)
+        q = np.dot(to_local, columns)
         q -= center
     distance, normal = formula(q, gradient, *parameters)
     if normal is not None:
-        normal = normal.T if to_own is None else np.dot(normal.T, to_own)
-        normal = normal if p.ndim == 2 else normal.reshape(p.shape)
-    return (distance if p.ndim == 2 else distance.reshape(p.shape[:-1])), normal
+        normal = normal.T if to_local is None else np.dot(normal.T, to_local)
+        normal = normal if flat else normal.reshape(p.shape)
+    return (distance if flat else distance.reshape(p.shape[:-1])), normal
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -130,6 +199,8 @@ class Obstacle(ABC):
     """
 
     kind: ClassVar[str]  # the shape's name in scene files and messages
+    family: ClassVar[Family | None] = None  # None: the polytope of its solid has the formula
+    depth: ClassVar[float] = 0.0  # [m] of the point to which the formula refers, below the frame's origin along its z
 
     velocity: Array = field(default_factory=lambda: np.zeros(3))
     name: str = ""
@@ -164,7 +235,7 @@ class Obstacle(ABC):
 
     def _forget(self) -> None:
         """Drop, in a new copy, the values that were computed for the old pose."""
-        for key in ("packed", "_single", "vertices"):
+        for key in ("_single", "vertices"):
             self.__dict__.pop(key, None)
 
     def _set(self, **values: object) -> None:
@@ -174,13 +245,8 @@ class Obstacle(ABC):
             object.__setattr__(self, key, value)
 
     @cached_property
-    def packed(self) -> PackedObstacles:
-        """The obstacle alone as :class:`~imitarm.scene.distances.PackedObstacles`, at time 0."""
-        return pack((self,), 0.0)
-
-    @cached_property
     def _single(self) -> _Single:
-        return _Single.of(self.solid())
+        return _Single.of(self)
 
     def signed_distance(self, points: ArrayLike) -> Array:
         """Return the distance to the surface, negative inside.
@@ -219,9 +285,7 @@ class Obstacle(ABC):
         Raises:
             InputError: when the last axis has not length 3 or a number is not finite.
         """
-        distance, gradient = _distance(self._single, points, True)
-        assert gradient is not None
-        return distance, gradient
+        return _distance(self._single, points, True)
 
     def support(self, directions: ArrayLike) -> Array:
         """Return the farthest point of the solid in each direction (its support mapping, as used by GJK).
@@ -276,7 +340,7 @@ class Obstacle(ABC):
         Args:
             position: position of the local frame's origin, see :class:`~imitarm.scene.distances.PackedObstacles`, shape
                 (3,) [m].
-            quaternion: own_to_base rotation wxyz, shape (4,).
+            quaternion: local_to_base rotation wxyz, shape (4,).
             velocity: velocity of the obstacle, shape (3,) [m/s].
             angular_velocity: angular velocity of the copy, shape (3,) [rad/s].
         """
@@ -303,19 +367,6 @@ class Obstacle(ABC):
     @abstractmethod
     def _move(self, offset: Array, turn: Array | None) -> None:
         """Move this fresh copy by ``offset`` (3,) [m] and rotate it about its centre by ``turn`` (4,)."""
-
-
-def pack(obstacles: tuple[Obstacle, ...], stamp: float) -> PackedObstacles:
-    """Return obstacles as arrays; ``stamp`` [s] is the time at which they have these poses."""
-    zero = np.zeros((3, 3))
-    return PackedObstacles.of(
-        [obstacle.solid() for obstacle in obstacles],
-        [obstacle.velocity for obstacle in obstacles],
-        [obstacle.angular_velocity for obstacle in obstacles],
-        [zero if obstacle.covariance is None else obstacle.covariance for obstacle in obstacles],
-        [stamp] * len(obstacles),
-        [-1 if obstacle.track_id is None else obstacle.track_id for obstacle in obstacles],
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from imitarm.errors import InputError
 from imitarm.html_table import html_table
 from imitarm.kinematics.pose import Pose
 from imitarm.scene.distances import PackedObstacles, distances, distances_and_gradients
-from imitarm.scene.obstacle import Array, Obstacle, pack
+from imitarm.scene.obstacle import Array, Obstacle
 from imitarm.validation import finite_number, finite_points, whole_number
 
 _LISTED = 4  # obstacles that a short repr names
@@ -66,7 +66,7 @@ class Scene:
     @cached_property
     def packed(self) -> PackedObstacles:
         """The obstacles as arrays, from which distances are computed."""
-        return pack(self.obstacles, self.stamp)
+        return PackedObstacles.of(self.obstacles, self.stamp)
 
     def at(self, time: float) -> Scene:
         """Return the scene as predicted for another time; only this method predicts the motion of obstacles.
