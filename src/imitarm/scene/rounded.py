@@ -102,7 +102,7 @@ class Sphere(Obstacle):
         Raises:
             InputError: when the last axis has not length 3 or a number is not finite.
         """
-        if type(points) is np.ndarray and points.dtype is _FLOAT64 and points.ndim == 2 and points.shape[1] == 3:
+        if type(points) is np.ndarray and points.dtype is _FLOAT64 and points.shape[1:] == (3,) and len(points) > 1:
             offsets: Array = np.subtract(points.T, self._single.center, order="C")
             offsets *= offsets
             squares: Array = ONES.dot(offsets)
