@@ -29,10 +29,10 @@ class Row:
     """A comparison of our time with the time of a reference.
 
     Attributes:
-        name: what is done.
-        ours: does it once.
-        reference: what it is compared with: the same job in another library, or a yardstick.
-        reference_name: its name, with the version.
+        name: description of the job.
+        ours: function that does the job once with our code.
+        reference: function for comparison: the same job in another library, or a standard computation.
+        reference_name: name of the reference, with its version.
         faster: target: the reference takes at least this many times as long as ours; 0 when ``cost`` is the target.
         cost: target: ours takes at most this many times as long as the reference; 0 when ``faster`` is the target.
         check: evaluates the results: whether they are good enough, and a remark. Speed at the expense of accuracy
@@ -96,7 +96,7 @@ class Measurement:
         name: name of the row.
         ours: median time of our code [s]; nan when it could not be measured.
         reference: median time of the reference [s]; nan when it could not be measured.
-        reference_name: name of the reference row.
+        reference_name: name of the reference.
         ratio: ratio in the direction of the target; None when it could not be measured.
         target: in words.
         passed: whether the whole interval of the ratio meets the target, and the results are good; None when it could

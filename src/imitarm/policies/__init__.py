@@ -1,6 +1,6 @@
 """Policies: methods of reproducing a skill around obstacles, one file for each.
 
-``POLICIES`` is the registry: a new method is one file and one line here.
+``POLICIES`` is the registry: to add a policy, write one file and add one line here.
 """
 
 from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, Adaptation, adapt

@@ -390,7 +390,7 @@ class PosedObstacle(Obstacle):
         self._set(**{key: check(getattr(self, key), f"{self._label}: {key}") for key in self.lengths})
 
     def solid(self) -> Solid:
-        """Return the geometry: at ``pose``."""
+        """Return the geometry; its frame is ``pose``."""
         values = [getattr(self, key) for key in self.lengths]
         size = values[0] if len(values) == 1 else (*values, 0.0)
         return Solid(self.kind, self.pose.position, self.pose.quaternion, size)

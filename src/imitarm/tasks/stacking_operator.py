@@ -70,8 +70,8 @@ class Habits:
             correction.
         look_every: time between two looks that may lead to a correction [s].
         gain: fraction of a small error that one correction covers, below 1.
-        noise: standard deviation of the seen positions on each axis, drawn at each look [m].
-        bias: constant error of the seen position of the gripper, 3 values [m].
+        noise: standard deviation of the observed positions on each axis, drawn at each look [m].
+        bias: constant error of the observed position of the gripper, 3 values [m].
         speed: mean speed of the hand over long distances [m/s].
         fine_speed: mean speed of the hand near a contact [m/s].
         tolerance: largest error at which the gripper looks aligned, so that the hand closes or opens [m].
