@@ -75,7 +75,7 @@ KINDS = (*SIMPLE, "capsule", "cylinder", "ellipsoid", "convex hull")
 
 
 class _Draft(NamedTuple):
-    """A random obstacle before it is built, which takes much longer than to draw its numbers.
+    """The parameters of a random obstacle; drawing them is much faster than building the obstacle.
 
     ``outer`` is the radius of a sphere about ``centre`` that holds it, ``inner`` the distance from ``centre`` to a
     point of it [m].
