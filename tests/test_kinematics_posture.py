@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from imitarm.errors import InputError, UnknownNameError, UnreachableError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
-from imitarm.kinematics.posture import find_posture
 
 ARMS = {name: ArmModel.load(name, tool="brush") for name in ("sawyer", "panda")}
 

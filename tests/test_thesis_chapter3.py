@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import spearmanr, t
 
 from imitarm import ArmModel
-from imitarm.kinematics.ik_problem import ROTATION_LENGTH
+from imitarm.kinematics.arm_kinematics import ROTATION_LENGTH
 from imitarm.retarget.human_arm import human_arm_pose
 from imitarm.retarget.limbs import LimbLengths, correct_limbs
 

@@ -4,10 +4,10 @@ from .control_loop import reproduce
 from .demonstrations import Finding, align, lint, read
 from .errors import ImitarmError, InfeasibleError, InputError, TaskFailedError, UnreachableError
 from .kinematics.arm import ArmModel, ArmState
+from .kinematics.arm_kinematics import find_posture
 from .kinematics.ik import IKSolver, solve_ik
 from .kinematics.limits import JointLimits, singularity_limits
 from .kinematics.pose import Pose
-from .kinematics.posture import find_posture
 from .kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, TwistTask
 from .policies import ACFRA, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Adaptation, Observation, Policy, adapt
 from .retarget import RETARGETERS, Correspondence, Retargeter

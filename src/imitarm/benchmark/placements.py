@@ -23,8 +23,8 @@ from imitarm.control_loop import reproduce
 from imitarm.errors import InfeasibleError, InputError, UnreachableError
 from imitarm.evaluation.intervals import wilson_interval
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
-from imitarm.kinematics.posture import find_posture
 from imitarm.policies import POLICIES
 from imitarm.robots import SimulatedRobot
 from imitarm.safety import SafetyFilter

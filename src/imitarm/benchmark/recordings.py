@@ -18,8 +18,8 @@ from imitarm.capture.skeleton import HandState, Skeleton
 from imitarm.errors import InputError, TaskFailedError, UnknownNameError, UnreachableError
 from imitarm.evaluation.tracking import TrueArm, motion_end
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
-from imitarm.kinematics.posture import find_posture
 from imitarm.retarget.correspondence import FACING, Correspondence, Orientation
 from imitarm.retarget.fitting import fit_motion
 from imitarm.retarget.limbs import LimbLengths

@@ -16,8 +16,8 @@ from imitarm.cli.run_scene import provenance, run_scene, show_results
 from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
-from imitarm.kinematics.posture import find_posture
 from imitarm.policies import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Policy
 from imitarm.robots import SimulatedRobot
 from imitarm.scene import Scene, load_scene

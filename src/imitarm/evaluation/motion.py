@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik_problem import ROTATION_LENGTH
+from imitarm.kinematics.arm_kinematics import ROTATION_LENGTH
 
 Array = NDArray[np.float64]
 

@@ -34,7 +34,7 @@ _SIDE_BRANCH = 2  # joints: a branch of at most so many beside one more than twi
 
 
 @dataclass(frozen=True, eq=False)
-class JointLimits:
+class FileLimits:
     """Limits of an arm's joints, each of shape (n_joints,).
 
     Attributes:
@@ -249,7 +249,7 @@ def place(path: Path, root: XmlElement, joint: str) -> str:
 
 def read_limits(
     spec: mujoco.MjSpec, model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root: XmlElement
-) -> JointLimits:
+) -> FileLimits:
     """Return the velocity, acceleration and torque limits, and check the position limits.
 
     Args:
@@ -290,7 +290,7 @@ def read_limits(
     if np.isinf(torque).any():
         free = [name for name, value in zip(joints, torque, strict=True) if np.isinf(value)]
         notes.append(f"no torque limit in the file for {_located(free, joints, root)}: taken as unlimited")
-    return JointLimits(velocity, acceleration, torque, tuple(notes))
+    return FileLimits(velocity, acceleration, torque, tuple(notes))
 
 
 def _urdf_limits(joint: XmlElement, where: str) -> tuple[float, float]:

@@ -14,9 +14,6 @@ from imitarm.kinematics.arm_kinematics import ArmMemory
 
 Array = NDArray[np.float64]
 
-ROTATION_LENGTH = 0.3
-"""[m/rad] A rotation of 1 rad is weighted like a displacement of 0.3 m."""
-
 
 class Box(NamedTuple):
     """Bounds of each joint velocity, ``lower <= v <= upper``; always kept.

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik_problem import ROTATION_LENGTH, IKProblem, TaskRows
+from imitarm.kinematics.arm_kinematics import ROTATION_LENGTH
+from imitarm.kinematics.ik_problem import IKProblem, TaskRows
 from imitarm.kinematics.sew import one_angle
 from imitarm.validation import finite_number, finite_vector, text
 

@@ -21,11 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError, UnreachableError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import ROTATION_LENGTH, find_posture
 from imitarm.kinematics.ik import IKSolver
-from imitarm.kinematics.ik_problem import ROTATION_LENGTH
 from imitarm.kinematics.limits import JointLimits, singularity_limits
 from imitarm.kinematics.pose import Pose
-from imitarm.kinematics.posture import find_posture
 from imitarm.kinematics.tasks import TwistTask
 from imitarm.scene.clearance import SelfClearance
 from imitarm.validation import finite_number, instance, real_array

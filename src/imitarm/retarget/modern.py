@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.capture.skeleton import Skeleton
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import ROTATION_LENGTH
 from imitarm.kinematics.ik import IKSolver
-from imitarm.kinematics.ik_problem import ROTATION_LENGTH, Rows
+from imitarm.kinematics.ik_problem import Rows
 from imitarm.kinematics.limits import JointLimits, singularity_limits
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
 from imitarm.kinematics.sew import one_angle

@@ -385,10 +385,10 @@ def _touch(
     )  # continuous joints have no limits
     from scipy.stats import qmc  # noqa: PLC0415  takes half a second to import
 
-    q = arm.home.copy()
+    addresses = [int(model.jnt_qposadr[model.joint(name).id]) for name in arm.joint_names[between]]
+    data.qpos[:] = arm.posture(model)
     for fraction in qmc.Sobol(len(low), scramble=False).random(_POSTURES):
-        q[between] = low + fraction * (high - low)
-        data.qpos[:] = arm.posture(model, q)
+        data.qpos[addresses] = low + fraction * (high - low)
         mujoco.mj_kinematics(model, data)
         for one in links[0]:
             for other in links[1]:

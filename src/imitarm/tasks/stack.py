@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
-from imitarm.kinematics.posture import find_posture
 from imitarm.robots.simulated import Control, SimulatedRobot
 from imitarm.robots.world import arm_world
 

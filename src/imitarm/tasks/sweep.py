@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
-from imitarm.kinematics.posture import find_posture
 from imitarm.robots.simulated import Control, SimulatedRobot
 from imitarm.robots.world import arm_world
 from imitarm.scene import Scene, load_scene
