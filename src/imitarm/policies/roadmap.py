@@ -143,14 +143,15 @@ class Roadmap:
         nodes in a layer; the keys are sorted.
         """
         start, end = self.pairs_of_nodes
-        n = self.exists.shape[1]
-        layer, edge = np.nonzero(self.exists[:-1].take(start, axis=1) & self.exists[1:].take(end, axis=1))
-        first, last = layer * n + start.take(edge), (layer + 1) * n + end.take(edge)  # as columns of all nodes
+        n_layers, n = self.exists.shape
+        both = np.flatnonzero(self.exists[:-1].take(start, axis=1) & self.exists[1:].take(end, axis=1))
+        layer = n * np.arange(n_layers - 1)[:, None]
+        first, last = (layer + start).take(both), (layer + n + end).take(both)  # as columns of all nodes
         positions = self.path.nominal.positions[self.layers][:, None, :] + self.nodes
         length = _changes(_columns(positions), first, last)
         length = np.sqrt(np.einsum("ke,ke->e", length, length))
-        longest = MAX_STEP_RATIO * largest_step(self.path.nominal.positions)
-        slow = np.flatnonzero(length <= (longest * np.diff(self.layers)).take(layer))
+        longest = MAX_STEP_RATIO * largest_step(self.path.nominal.positions) * np.diff(self.layers)
+        slow = np.flatnonzero(length <= np.repeat(longest, len(start)).take(both))
         first, last, length = first.take(slow), last.take(slow), length.take(slow)
         violation = np.zeros(len(first))
         spread = np.swapaxes(positions, 0, 1)  # (n_nodes, n_layers, 3)
@@ -174,7 +175,8 @@ class Roadmap:
                 violation[near] = np.maximum(violation.take(near), self.clearance - _JUST_OUTSIDE - low)
         change = _changes(_columns(self.nodes), first, last)
         cost = np.einsum("ke,ke->e", change, change) / _CHANGE_SCALE**2 + _VIOLATION_COST * violation
-        return first * n + last % n, cost, violation
+        edges = (n * layer + n * start + end).take(both)
+        return edges.take(slow), cost, violation
 
     def _sweep(self, *, forward: bool) -> tuple[Array, Index]:
         """Return the lowest cost from the start to each node (or from it to the goal), and the adjacent node."""
