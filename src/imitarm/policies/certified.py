@@ -132,10 +132,12 @@ class _SideSearch:
         self.clearance, self.allowed = clearance, allowed
         self.least = LeastDetour(path, self.tool, clearance, allowed)
         self.target = self.least.target
-        self._heap = [_Node(np.inf, 0, np.zeros((path.n_components, 3)))]
+        missing = np.maximum(0.0, self.target - nominal.distance[:, ::_THINNED])
+        cost = _THINNED * _VIOLATION_COST * float(missing.sum())
+        self._heap = [_Node(cost, 0, np.zeros((path.n_components, 3)))]
         self._tried: list[Array] = []
         self._best: Detour | None = None
-        self._order, self._choices, self._cost = 0, 0, np.inf
+        self._order, self._choices, self._cost = 0, 0, cost
 
     def run(self, *, while_cheaper: bool = False) -> Detour | None:
         """Follow the cheapest choice of sides until a path is feasible, starting at the nominal path.
@@ -146,7 +148,7 @@ class _SideSearch:
             while_cheaper: stop as soon as another choice is hardly cheaper than the one before; the answer is None.
         """
         while self._heap:
-            if while_cheaper and 1 < self._choices < _MAX_CHOICES and self._heap[0].cost > _HARDLY_CHEAPER * self._cost:
+            if while_cheaper and 0 < self._choices < _MAX_CHOICES and self._heap[0].cost > _HARDLY_CHEAPER * self._cost:
                 return None
             node = heapq.heappop(self._heap)
             if any(np.abs(node.displacement - other).max() < _SAME for other in self._tried):
