@@ -13,7 +13,9 @@ The algorithm of :func:`find_detour`:
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
    samples.
 4. If the search over sides finds no path, a second search treats all samples together
-   (:mod:`~imitarm.policies.roadmap`), first with the learned components, then with more and narrower ones.
+   (:mod:`~imitarm.policies.roadmap`), first with the learned components, then with more and narrower ones. Where
+   components move only in a plane, the roadmap is built as soon as the next side costs hardly less than the one before;
+   if it shows no route, no further side is tried.
 """
 
 from __future__ import annotations
