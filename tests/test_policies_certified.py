@@ -79,10 +79,28 @@ def test_no_place_is_tried_twice(monkeypatch):
         return children(self, displacement, *rest)
 
     monkeypatch.setattr(_SideSearch, "_children", recorded)
+    monkeypatch.setattr("imitarm.policies.certified._HARDLY_CHEAPER", np.inf)  # try further sides before the roadmap
     assert not adapt(skill, case.scene, forbidden=case.forbidden, **OPTIONS).feasible
     assert len(places) > 1
     for i, place in enumerate(places):
         assert all(np.abs(place - other).max() >= 1e-5 for other in places[:i])
+
+
+def test_in_a_plane_a_hopeless_roadmap_ends_the_search_over_sides(monkeypatch):
+    """The roadmap refuses a gap that is too narrow before the other sides are tried, and the answer stays the same."""
+    skill, path = learn(planar=True)
+    cases = [families.narrow_gap(seed, path, solvable=seed % 2 == 0) for seed in range(20)]
+    expanded, children = [], _SideSearch._children
+    monkeypatch.setattr(_SideSearch, "_children", lambda *given: expanded.append(0) or children(*given))
+
+    def answers():
+        expanded.clear()
+        return [adapt(skill, case.scene, forbidden=case.forbidden, **OPTIONS).feasible for case in cases]
+
+    early, n_early = answers(), len(expanded)
+    monkeypatch.setattr("imitarm.policies.certified._HARDLY_CHEAPER", np.inf)
+    assert early == answers() == [case.solvable for case in cases]
+    assert n_early < len(expanded)
 
 
 def test_the_scenes_are_not_void(learnt):
