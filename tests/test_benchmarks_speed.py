@@ -179,7 +179,7 @@ def test_two_checkouts_are_compared_each_with_its_own_rows(tmp_path: Path) -> No
     console = Console(width=200, record=True)
     show_changes([slower, broken], console)
     text = console.export_text()
-    assert "1.5 (1.5 to 1.5)" in text and "SLOWER" in text and "not measured" in text
+    assert "1.500 (1.500 to 1.500)" in text and "SLOWER" in text and "not measured" in text
 
 
 def test_a_checkout_that_can_not_be_loaded_is_reported(tmp_path: Path) -> None:

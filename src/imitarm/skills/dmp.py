@@ -42,6 +42,7 @@ Coupling = Callable[[Array, Array], ArrayLike]
 
 MOST_STEPS = 10_000_000  # of a generated motion
 _SHORTEST_STEP, _LONGEST_STEP = 1e-100, 100.0  # in durations: the spring's numbers stay finite, and the time to compute
+_state = tuple.__new__  # makes a named tuple without its slower constructor
 
 
 class DMPState(NamedTuple):
@@ -352,8 +353,8 @@ class DMP:
         if rotation is not None and self.orientation_ is not None:
             rotation = self.orientation_.step(rotation, h, angular)
         if done < 0:
-            return DMPState(motion, fraction + h, target, rotation, None, motion)
-        return DMPState(motion, (done + 1) * h, target, rotation, (h, done + 1), motion)
+            return _state(DMPState, (motion, fraction + h, target, rotation, None, motion))
+        return _state(DMPState, (motion, (done + 1) * h, target, rotation, (h, done + 1), motion))
 
     def generate(
         self,
