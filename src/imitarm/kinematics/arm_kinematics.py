@@ -107,7 +107,7 @@ class ArmMemory:
             self._views = self.jacobian[:, joints], self._stacked[:, joints]
         self._landmarks = list(zip(landmarks, stacked, strict=True))
         self._landmark_sites = np.array(landmarks, dtype=np.intp)
-        self.sites = self.data.site_xpos
+        self.sites, self._rotations = self.data.site_xpos, self.data.site_xmat
         self._qpos = self.data.qpos  # asking MuJoCo for it takes as long as the kinematics of one link
 
     def move_to(self, q: Array) -> None:
@@ -122,8 +122,8 @@ class ArmMemory:
     def site_pose(self, site: int) -> Pose:
         """Return the pose of a site in the base frame."""
         quaternion = np.empty(4)
-        mujoco.mju_mat2Quat(quaternion, self.data.site_xmat[site])
-        return Pose.trusted(self.data.site_xpos[site].copy(), quaternion)
+        mujoco.mju_mat2Quat(quaternion, self._rotations[site])
+        return Pose.trusted(self.sites[site].copy(), quaternion)
 
     def site_jacobian(self, site: int) -> Array:
         """Return the Jacobian of a site, shape (6, n), as a view that the next call overwrites."""

@@ -100,12 +100,13 @@ class _VelocityBox:
         room = self._most * self._most / self._double + self._most * dt  # farther from a limit, v_b exceeds v_max
         # both directions at once: row 0 upwards, row 1 downwards with signs changed
         self._ends = np.stack((arm.upper, -arm.lower))
+        self._range = list(zip((arm.lower + room).tolist(), (arm.upper - room).tolist(), strict=True))
         slower = self._most - self._step  # a joint that is no faster can't reach v_max in one step
         self._inner = list(zip((arm.lower + room).tolist(), (arm.upper - room).tolist(), slower.tolist(), strict=True))
 
     def at(self, q: Array, velocity: Array | None) -> Box:
         if velocity is None:
-            for value, (low, high, _) in zip(q.tolist(), self._inner, strict=True):
+            for value, (low, high) in zip(q.tolist(), self._range, strict=True):
                 if not low <= value <= high:
                     return self._near_a_limit(q, None)
             return self._free

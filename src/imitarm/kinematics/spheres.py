@@ -63,6 +63,7 @@ class SphereCover:
         self._joints, self._owners = np.array([working.joint(name).id for name in names]), np.array(owners, dtype=int)
         self._centers = np.concatenate(centers)[:, :, None]
         self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
+        self._any_slides = bool(self._slides.any())
         moves = [[_carries(model, int(model.jnt_bodyid[joint]), body) for joint in joints] for body in owners]
         self._moves = np.array(moves, dtype=float).reshape(len(owners), 1, len(joints))
         self._moves_of_all = np.concatenate([self._moves[:, 0], np.zeros((len(self.base_radii), len(joints)))])
@@ -130,7 +131,7 @@ class SphereCover:
         axes, anchors = data.xaxis[self._joints], data.xanchor[self._joints]
         rates = _cross(centers, normals) @ axes.T
         rates -= normals @ _cross(axes, anchors).T
-        if self._slides.any():
+        if self._any_slides:
             rates[:, self._slides] = normals @ axes[self._slides].T
         rates *= self._moves_of_all[outer] - self._moves_of_all[inner]
         return np.asarray(rates)
@@ -145,7 +146,7 @@ class SphereCover:
         u, v, w = anchors
         offsets = np.stack((y * w - z * v, z * u - x * w, x * v - y * u))
         columns = (self.centers(data) @ crosses).reshape(-1, *axes.shape) - offsets
-        if self._slides.any():
+        if self._any_slides:
             columns[:, :, self._slides] = axes[:, self._slides]
         return np.asarray(columns * self._moves)
 

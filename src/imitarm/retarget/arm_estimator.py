@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +26,7 @@ _DOUBTFUL = 0.02  # [m] offset of the elbow from its measured position at which 
 _JUMP = 0.12  # [m] that a hand may move within half the outlier filter's window without being an outlier
 
 
-@dataclass(frozen=True, eq=False)
-class ArmEstimate:
+class ArmEstimate(NamedTuple):
     """A person's arm, smoothed, with the true lengths of its bones, in the robot's base frame.
 
     Attributes:
@@ -129,11 +127,12 @@ class ArmEstimator:
         bones = self._bones(points[:3], arm.confidence[:3], period, self.lengths)
         rotation, hand_known = self._hand_rotation(points, confidence, bones[2] - bones[1])
         hand = matrix_to_quaternion(rotation)
-        velocities, angular_velocity = np.zeros((3, 3)), np.zeros(3)
         if self._smoothing:
             bones = self._filter.filter(arm.time, bones, arm.confidence[:3, None])
             hand = self._rotation_filter.filter(arm.time, hand, 1.0 if hand_known else 0.5)
             velocities, angular_velocity = self._filter.velocity, self._rotation_filter.velocity
+        else:
+            velocities, angular_velocity = np.zeros((3, 3)), np.zeros(3)
         known = (confidence[1], min(confidence[2], confidence[0]), hand_known)
         closed = self._grip(arm.hand_state)
         return ArmEstimate(arm.time, bones[0], bones[1], bones[2], velocities, hand, angular_velocity, known, closed)

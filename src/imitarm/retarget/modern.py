@@ -210,7 +210,8 @@ class ModernRetargeter(Retargeter):
         # far from the target it moves no faster than it can brake, or it would overshoot
         gain = min(self._gain, math.sqrt(2.0 * _BRAKING / max(weighted, 1e-9)))
         if elbow is not None:  # a tool that lags needs all the joints
-            elbow = elbow._replace(confidence=elbow.confidence / (1.0 + (weighted / _BEHIND) ** 2))
+            confidence = elbow.confidence / (1.0 + (weighted / _BEHIND) ** 2)
+            elbow = ElbowTask(elbow.angle, elbow.weight, confidence, elbow.gain, elbow.max_rate)
         twist = gain * error + ahead
         held = max(map(abs, (self._limiter.q - measured).tolist()))
         if held > _HELD:
