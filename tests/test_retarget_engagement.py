@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -34,7 +32,7 @@ STILL = ArmEstimate(
 
 def update(engagement: Engagement, time: float | None, period: float = DT, *, at_rest: bool = True) -> EngagementState:
     """One control period, with a frame of that time or without one; engages as soon as that is possible."""
-    engagement.update(None if time is None else replace(STILL, time=float(time)), period, at_rest=at_rest)
+    engagement.update(None if time is None else STILL._replace(time=float(time)), period, at_rest=at_rest)
     if engagement.ready:
         engagement.engage(STILL.wrist, STILL.hand, TOOL)
     return engagement.state
