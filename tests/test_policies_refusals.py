@@ -22,6 +22,17 @@ def skills():
 
 
 @pytest.fixture(scope="module")
+def cases(skills):
+    """120 random scenes: skill, scene, and the skill adapted to it."""
+    made = []
+    for seed in range(120):
+        skill = skills[seed % len(skills)]
+        case = scene_for(skill, seed)
+        made.append((skill, case, adapted(skill, case)))
+    return made
+
+
+@pytest.fixture(scope="module")
 def planar():
     return learn(planar=True)
 
@@ -46,13 +57,10 @@ def planar_question(skill, obstacles, *, clearance, radius=0.0):
     return Question(parts.nominal, parts.basis, tuple(obstacles), spheres, clearance, forbidden, parts.fixed_times)
 
 
-def test_no_accepted_path_is_closer_than_required(skills):
+def test_no_accepted_path_is_closer_than_required(cases):
     """Each of 4000 points is separated from each obstacle by a plane at the required distance."""
     accepted = 0
-    for seed in range(120):
-        skill = skills[seed % len(skills)]
-        case = scene_for(skill, seed)
-        adaptation = adapted(skill, case)
+    for seed, (skill, case, adaptation) in enumerate(cases):
         if adaptation.feasible:
             accepted += 1
             path = adaptation.trajectory
@@ -60,14 +68,11 @@ def test_no_accepted_path_is_closer_than_required(skills):
     assert accepted > 60
 
 
-def test_forbidden_directions_hold_to_rounding_on_the_whole_path(skills):
+def test_forbidden_directions_hold_to_rounding_on_the_whole_path(cases):
     moved = 0
-    for seed in range(120):
-        skill = skills[seed % len(skills)]
-        case = scene_for(skill, seed)
+    for _, case, adaptation in cases:
         if not case.forbidden:
             continue
-        adaptation = adapted(skill, case)
         away = adaptation.trajectory.positions - adaptation.nominal.positions
         moved += np.abs(away).max() > 0.01
         assert (away @ np.array(case.forbidden).T).max() <= 1e-15
@@ -84,10 +89,8 @@ def test_oblique_forbidden_directions_hold_as_well(planar):
         assert (away @ forbidden.T).max() <= 1e-15
 
 
-def test_the_jerk_is_limited_or_the_answer_says_why_not(skills):
-    for seed in range(120):
-        skill = skills[seed % len(skills)]
-        adaptation = adapted(skill, scene_for(skill, seed))
+def test_the_jerk_is_limited_or_the_answer_says_why_not(cases):
+    for _, _, adaptation in cases:
         path = adaptation.trajectory
         t = path.times
         if np.ptp(np.diff(t)) < 1e-9:

@@ -6,6 +6,7 @@ Limits are measured here, from the joint positions alone, in every control perio
 from __future__ import annotations
 
 import os
+from functools import cache
 
 import numpy as np
 import pytest
@@ -37,10 +38,11 @@ RECORDINGS = {
 each_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
 
 
+@cache
 def person(real_data, name):
     path, side = RECORDINGS[name]
     recording, _ = repaired(read_recording(real_data / path))
-    return list(recording.skeletons), side
+    return tuple(recording.skeletons), side
 
 
 def fitted(arm, skeletons, correspondence):

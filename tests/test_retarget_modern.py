@@ -1,3 +1,5 @@
+from functools import cache
+
 import mujoco
 import numpy as np
 import pytest
@@ -23,10 +25,11 @@ def lengths(person):
     return LimbLengths(person.upper_arm, person.forearm)
 
 
+@cache
 def recording(seed, kind="inside", duration=8.0, **camera):
     person = Person.from_seed(seed)
     truth = reaching(person, seed, duration=duration, kind=kind)
-    return person, truth, list(SyntheticSource(truth, SkeletonCamera(seed, **camera), duration))
+    return person, truth, tuple(SyntheticSource(truth, SkeletonCamera(seed, **camera), duration))
 
 
 def assert_within_limits(arm, joints):
@@ -53,6 +56,7 @@ def test_no_limit_is_broken_in_any_frame(arm, kind):
             assert (run.states == "following").mean() > 0.2
 
 
+@cache
 def tool_and_hand(arm, seed):
     """The tool of a robot that follows a faultlessly seen hand, and where it should be, from half a second on."""
     person, truth, frames = recording(seed, sigma=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
