@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -41,10 +40,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 class CpuTimes:
-    """A pytest plugin: the CPU time (s) of each test with its fixtures and the processes that it waits for.
+    """A pytest plugin that measures the CPU time (s) of each test, including its fixtures and its child processes.
 
-    Unlike the time on the clock, it hardly depends on what else the machine does. What several tests share, like a
-    fixture of the session or the first import of a library, counts for the first test that needs it.
+    CPU time hardly depends on what else the machine does. What several tests share, such as a session fixture or the
+    first import of a library, counts for the first test that needs it.
     """
 
     PROPERTY = "CPU time"
@@ -55,24 +54,24 @@ class CpuTimes:
 
     def spent(self) -> float:
         """Return the CPU time (s) since it was last asked for: of this process and of its children that ended."""
-        children = resource.getrusage(resource.RUSAGE_CHILDREN)
-        now = time.process_time() + children.ru_utime + children.ru_stime
+        times = os.times()
+        now = time.process_time() + times.children_user + times.children_system
         self.mark, before = now, self.mark
         return now - before
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self, item: pytest.Item) -> Iterator[None]:
-        """Write into the report of set-up, call and tear-down what it has taken: reports also come from workers."""
+        """Add the CPU time of set-up, call and tear-down to their reports; workers of pytest-xdist send them."""
         report = yield
         report.user_properties.append((self.PROPERTY, self.spent()))
         return report
 
     def pytest_collection_finish(self) -> None:
-        """Do not count starting and collecting for the first test."""
+        """Leave out the time before the first test."""
         self.spent()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Add up."""
+        """Add up the reports of each test."""
         self.seconds[report.nodeid] += dict(report.user_properties)[self.PROPERTY]
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:

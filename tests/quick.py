@@ -137,7 +137,10 @@ class Nearest:
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         """Run the nearest tests first, in the order of their files."""
         items.sort(key=lambda item: self.near[item.path])
-        self.left = len(items)
+
+    def pytest_collection_finish(self, session: pytest.Session) -> None:
+        """Count what is left after others, such as the option ``-m``, have taken tests out."""
+        self.left = len(session.items)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Remember failures: a run that is stopped has a status of its own."""

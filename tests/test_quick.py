@@ -61,11 +61,13 @@ def test_every_module_of_the_package_is_reached_by_a_test() -> None:
 
 
 def test_a_failure_counts_and_time_ends_the_run(tmp_path: Path) -> None:
-    (tmp_path / "test_a.py").write_text("import time\n\ndef test_a():\n    assert 0\n\ndef test_b():\n    pass\n")
+    (tmp_path / "test_a.py").write_text(
+        "def test_a():\n    assert 0\n\ndef test_b():\n    pass\n\ndef test_c():\n    pass\n"
+    )
     script = (
         "import sys, pytest; sys.path.insert(0, sys.argv[1]); import quick; from pathlib import Path\n"
         "path = Path(sys.argv[2]); nearest = quick.Nearest({path: 0}, 0.0)\n"
-        "pytest.main(['-q', '-p', 'no:cacheprovider', str(path)], plugins=[nearest])\n"
+        "pytest.main(['-q', '-p', 'no:cacheprovider', '-k', 'not test_c', str(path)], plugins=[nearest])\n"
         "assert nearest.failed and nearest.stopped and nearest.left == 1\n"
     )
     words = [sys.executable, "-c", script, str(quick.ROOT / "tests"), str(tmp_path / "test_a.py")]
