@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -241,7 +242,10 @@ def test_valid_arguments_are_accepted(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_invalid_arguments_are_refused_with_input_error(name: str) -> None:
+def test_invalid_arguments_are_refused_with_input_error(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # the text "abc" is a good path to save to
     function, arguments = CALLS[name]
     for changed in arguments:
         for bad in BAD:
