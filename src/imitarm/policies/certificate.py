@@ -145,15 +145,16 @@ class ToolAmongObstacles:
         offset = self.offsets[obstacle]
         return positions if offset is None else positions + offset[sphere, samples]
 
-    def distance(self, pair: int, positions: Array, samples: Index) -> Array:
+    def distance(self, pair: int, positions: Array, samples: Index | slice) -> Array:
         """Return the distance (..., m) [m] of a pair; the arguments are those of :meth:`centres`."""
         obstacle, sphere = divmod(pair, self.n_spheres)
-        return self.obstacles[obstacle].signed_distance(self.centres(pair, positions, samples)) - self.radii[sphere]
+        centres = self.centres(pair, positions, samples)
+        return self.obstacles[obstacle].distances_at(centres, gradient=False)[0] - self.radii[sphere]
 
     def distance_and_normal(self, pair: int, centres: Array) -> tuple[Array, Array]:
         """Return the distance (...) [m] from a sphere's surface to the obstacle, and its gradient (..., 3)."""
         obstacle, sphere = divmod(pair, self.n_spheres)
-        distance, normal = self.obstacles[obstacle].distance_and_gradient(centres)
+        distance, normal = self.obstacles[obstacle].distances_at(centres, gradient=True)
         return distance - self.radii[sphere], normal
 
     def exits(self, pair: int, points: Array, directions: Array, target: float, tolerance: float) -> Array:
@@ -196,12 +197,13 @@ class ToolAmongObstacles:
         """Return the distances and normals of every pair along a path of the tip (n, 3)."""
         n, k = len(positions), self.n_spheres
         if k == 1 and len(self.obstacles) == 1 and self.offsets[0] is None:
-            d, normals = self.obstacles[0].distance_and_gradient(positions)
+            d, normals = self.obstacles[0].distances_at(positions, gradient=True)
             return PathClearance(self, positions, (d - self.radii[0])[None], normals[None])
         distance, normal = np.empty((self.n_pairs, n)), np.empty((self.n_pairs, n, 3))
         for o, obstacle in enumerate(self.obstacles):
             rows, offset = slice(o * k, (o + 1) * k), self.offsets[o]
-            d, normal[rows] = obstacle.distance_and_gradient(positions if offset is None else positions + offset)
+            centres = positions if offset is None else positions + offset
+            d, normal[rows] = obstacle.distances_at(centres, gradient=True)
             distance[rows] = d - self.radii[:, None]
         return PathClearance(self, positions, distance, normal)
 

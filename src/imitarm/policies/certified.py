@@ -63,6 +63,7 @@ _SAME = 1e-5  # [m] choices that differ by less are one and the same up to round
 _ROUNDING = 1e-6  # [m] a sample that lacks less is not too near: quadratic programs keep their rows no better
 _LIFT_TOLERANCE = 1e-3  # [m] lifts are this much too long at most
 _THINNED = 3  # sides are rated on every third sample
+_FEW_PAIRS = 4  # of spheres and obstacles: measuring all samples then takes less time than choosing those nearby
 
 
 class CertifiedAdapter(PathAdapter):
@@ -246,22 +247,33 @@ class _SideSearch:
     def _costs(self, displacements: Array, here: PathClearance) -> tuple[Array, Array]:
         """Rate displacements (c, n_components, 3) by their size and the remaining violation.
 
-        A distance changes by at most one metre per metre, so only samples near an obstacle can violate its clearance.
-
         Returns:
             Costs (c,), and for each pair the violation summed over every third sample (n_pairs, c) [m].
         """
         style = np.einsum("ckd,kde,cke->c", displacements, self.path.precisions, displacements)
         sampled = self.path.nominal.positions[::_THINNED] + self.path.basis[::_THINNED] @ displacements
+        if self.tool.n_pairs <= _FEW_PAIRS:
+            every = slice(None, None, _THINNED)
+            distances = (self.tool.distance(pair, sampled, every) for pair in range(self.tool.n_pairs))
+            violation = np.stack([np.maximum(0.0, self.target - d).sum(axis=1) for d in distances])
+        else:
+            violation = self._violations_near(sampled, here)
+        return _STYLE_COST * style + _THINNED * _VIOLATION_COST * violation.sum(axis=0), violation
+
+    def _violations_near(self, sampled: Array, here: PathClearance) -> Array:
+        """Return the violation of each pair, summed over the samples (c, m, 3) of displaced paths, (n_pairs, c) [m].
+
+        A distance changes by at most one metre per metre, so only samples near an obstacle can violate its clearance.
+        """
         moved = sampled - here.positions[::_THINNED]
         farthest = np.sqrt(np.einsum("csd,csd->cs", moved, moved).max(axis=0))
         near = here.distance[:, ::_THINNED] < self.target + farthest
-        violation = np.zeros((self.tool.n_pairs, len(displacements)))
+        violation = np.zeros((self.tool.n_pairs, len(sampled)))
         for pair in np.flatnonzero(near.any(axis=1)).tolist():
             samples = np.flatnonzero(near[pair])
             distance = self.tool.distance(pair, sampled.take(samples, axis=1), _THINNED * samples)
             violation[pair] = np.maximum(0.0, self.target - distance).sum(axis=1)
-        return _STYLE_COST * style + _THINNED * _VIOLATION_COST * violation.sum(axis=0), violation
+        return violation
 
     def _directions(self, positions: Array, normal: Array, at: int) -> Array:
         """Return unit directions (m, 3) across the path at sample ``at``, none of them forbidden."""
