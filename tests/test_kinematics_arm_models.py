@@ -291,7 +291,7 @@ def test_nan_in_an_included_file_is_refused(load, tmp_path):
 MASSES = {
     "no inertial": ("", "no mass"),
     "no mass": (INERTIAL.replace("value='2'", "value='0'"), "no mass"),
-    "a negative mass": (INERTIAL.replace("value='2'", "value='-2'"), "no mass"),
+    "a negative mass": (INERTIAL.replace("value='2'", "value='-2'"), "a negative mass"),
     "no inertia": (INERTIAL.replace(".02", "0").replace(".01", "0"), "no inertia"),
     "a negative inertia": (INERTIAL.replace("ixx='.02'", "ixx='-.02'"), "no rigid body"),
     "an impossible inertia": (INERTIAL.replace("ixx='.02'", "ixx='.9'"), "no rigid body"),
@@ -609,3 +609,67 @@ def test_a_motion_without_masses_is_measured_without_torques(load):
 def test_home_is_bent_even_if_the_last_joint_does_not_move_the_flange(load):
     arm = load(robot(limb("a_", 3)))
     assert np.linalg.svd(arm.jacobian(arm.home)[:3], compute_uv=False)[1] > 0.03
+
+
+def six_hinges(limit=LIMIT, xyz="0 0 .22"):
+    return robot(limb("", 6)).replace(LIMIT, limit).replace("xyz='0 0 .22'", f"xyz='{xyz}'")
+
+
+def mjcf_chain(attributes="", compiler="<compiler angle='radian'/>", after=""):
+    bodies = "".join(
+        f"<body name='b{i}' pos='0 0 .2'>\n<joint name='j{i}' axis='{axis}' {attributes}/><geom size='.03' mass='1'/>\n"
+        for i, axis in enumerate(AXES[:4])
+    )
+    return f"<mujoco>{compiler}<worldbody>{bodies}{'</body>' * 4}</worldbody>{after}</mujoco>"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (six_hinges(LIMIT.replace("2.5", "165")), ("axis1", "line", "degrees", "radians", "continuous")),
+        (six_hinges(xyz="0 0 220"), ("metres", "millimetres")),
+        (robot(limb("", 3)).replace("name='axis3'", "name='axis2'"), ("both define joint 'axis2'", "lines")),
+        (robot(limb("", 3)).replace("name='link3'", "name='link2'", 1), ("both define link 'link2'", "lines")),
+        (
+            robot(limb("", 3), link("e"), joint("g", "link3", "e", extra="<mimic joint='axes1'/>")),
+            ("'g'", "'axes1'", "not in the file"),
+        ),
+    ],
+)
+def test_a_urdf_whose_entries_can_not_be_meant_is_refused(tmp_path, text, words):
+    path = tmp_path / "r.urdf"
+    path.write_text(text)
+    with pytest.raises(FileFormatError) as caught:
+        ArmModel.load(path)
+    assert all(word in str(caught.value) for word in (str(path), *words)), caught.value
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (mjcf_chain("range='2 -2'"), ("line 2", "'2 -2'", "exchange")),
+        (mjcf_chain("range='-2 2' actuatorfrcrange='9 -9'"), ("actuatorfrcrange", "exchange")),
+        (mjcf_chain("range='-150 150'"), ("j0", "rotations", "degree")),
+        (mjcf_chain("range='-2.6 2.6'", compiler=""), ("j0", "5.2 degrees", "radian")),
+        (mjcf_chain(after="<keyframe><key name='home' qpos='0 .4'/></keyframe>"), ("home", "2 positions", "has 4")),
+    ],
+)
+def test_an_mjcf_whose_entries_can_not_be_meant_is_refused(tmp_path, text, words):
+    path = tmp_path / "r.xml"
+    path.write_text(text)
+    with pytest.raises(FileFormatError) as caught:
+        ArmModel.load(path)
+    assert all(word in str(caught.value) for word in (str(path), *words)), caught.value
+
+
+def test_limits_of_several_rotations_and_placeholders_for_none_are_accepted(tmp_path):
+    for name, limit in (("cable", "6.5"), ("many", "12.6"), ("placeholder", "1e16")):
+        path = tmp_path / f"{name}.urdf"
+        path.write_text(six_hinges(LIMIT.replace("2.5", limit)))
+        assert ArmModel.load(path).n_joints == 6
+
+
+def test_a_velocity_limit_in_degrees_is_noted(tmp_path):
+    path = tmp_path / "r.urdf"
+    path.write_text(six_hinges(LIMIT.replace("1.8", "180")))
+    assert any("degrees" in note for note in ArmModel.load(path).notes)

@@ -98,11 +98,11 @@ def test_units(tmp_path, units, metres):
         tmp_path,
         HEAD + f"units: {units}\n"
         "goal: {position: [100, 20, 30], quaternion: [1, 0, 0, 0]}\n"
-        "obstacles:\n- {type: sphere, center: [40, 50, 60], radius: 7e-1, velocity: [1, 0, 0]}\n"
+        "obstacles:\n- {type: sphere, center: [4, 5, 6], radius: 7e-1, velocity: [1, 0, 0]}\n"
         "- {type: convex_hull, points: [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]}\n",
     )
     np.testing.assert_allclose(scene.goal.position, np.array([100, 20, 30]) * metres)
-    np.testing.assert_allclose(scene.obstacles[0].center, np.array([40, 50, 60]) * metres)
+    np.testing.assert_allclose(scene.obstacles[0].center, np.array([4, 5, 6]) * metres)
     assert scene.obstacles[0].radius == pytest.approx(0.7 * metres)
     np.testing.assert_allclose(scene.obstacles[0].velocity, [metres, 0, 0])
     np.testing.assert_allclose(scene.obstacles[1].bounds()[1], np.full(3, metres))
@@ -494,3 +494,21 @@ def test_wrong_stamps_and_fixtures_are_refused(tmp_path):
         ("fixtures:\n- {type: sphere, radius: 1}", 'fixtures[0] (sphere): key "center" is missing'),
     ):
         assert expected in message_of(tmp_path, HEAD + line + "\n")
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ("{type: sphere, center: [40, -30, 25], radius: 5}", ("from the robot's base", "units")),
+        ("{type: box, position: [0, 60, 10], yaw_degrees: 0, size: [8, 8, 8]}", ("from the robot's base", "units")),
+        ("{type: sphere, center: [.4, 0, .3], radius: .05, velocity: [0, -50, 0]}", ("velocity of 50 m/s", "unit")),
+        (
+            "{type: box, position: [.5, 0, 0], size: [.1, .1, .1], angular_velocity: [0, 0, 45]}",
+            ("angular_velocity of 45 rad/s", "unit"),
+        ),
+    ],
+)
+def test_numbers_in_another_unit_are_refused(tmp_path, entry, words):
+    message = message_of(tmp_path, f"{HEAD}obstacles:\n  - {entry}\n")
+    assert "obstacles[0]" in message
+    assert all(word in message for word in words)

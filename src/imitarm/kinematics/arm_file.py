@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from imitarm.errors import FileFormatError, InputError, UnknownNameError
 from imitarm.files.xml_tree import XmlElement, read_xml
+from imitarm.kinematics.arm_file_checks import check_file, check_key_lengths, check_units
 from imitarm.kinematics.arm_joints import (
     arm_end,
     chain_to,
@@ -39,20 +40,7 @@ TOOL_PREFIX = "tool/"
 """Prefix of every name from a tool's file, except its site ``tool``."""
 
 _MESHES = {mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF, mujoco.mjtGeom.mjGEOM_HFIELD}
-_NAMES = {
-    "name",
-    "link",
-    "joint",
-    "body",
-    "site",
-    "class",
-    "childclass",
-    "file",
-    "filename",
-    "mesh",
-    "material",
-    "model",
-}
+_LONGEST_ARM = 15.0  # [m] from the first joint to the last; longer arms are in another unit
 _LARGEST = 1e6  # [m], [kg], [kg m^2]
 _PLACEHOLDER_MASS, _PLACEHOLDER_INERTIA = 1e-3, 1e-6  # [kg], [kg m^2] of a link whose own can't be used
 
@@ -131,6 +119,7 @@ def read_arm(
     keyframe, key_name = take_keyframe(spec, compiled(spec, path))
     joints, notes = _set_flange(spec, flange, path, root)
     model = compiled(spec, path)
+    check_units(model, joints, path, root)
     limits = read_limits(spec, model, joints, path, root)
     check_keyframe(keyframe, key_name, model, joints, path, root)
     tool_radius = 0.0
@@ -176,8 +165,7 @@ def _located(source: str | Path, packaged: Mapping[str, str], kind: str) -> Path
 def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _Part:
     """Read ``path``; fixed links of a URDF remain separate bodies, so that a flange can be found among them."""
     root = read_xml(path, "an MJCF or URDF file")
-    _check_kind(path, root)
-    _check_numbers(path, root)
+    check_file(path, root)
     try:
         known = path.suffix.lower() in {".xml", ".urdf"}
         with _no_engine_log():
@@ -204,7 +192,9 @@ def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _P
     _name_all(spec)
     _separate_contact_shapes(spec)
     faults = _replace_unusable_masses(spec, path, root)
-    _check_sizes(compiled(spec, path), path, root)
+    model = compiled(spec, path)
+    check_key_lengths(model.nq, path, root)
+    _check_sizes(model, path, root)
     return _Part(spec, root, faults)
 
 
@@ -217,73 +207,6 @@ def _no_engine_log() -> Iterator[None]:
         yield
     finally:
         mujoco.set_mju_user_warning(former)
-
-
-def _check_kind(path: Path, root: XmlElement) -> None:
-    """Reject files that are not MJCF or URDF; the message names their type.
-
-    Raises:
-        FileFormatError: when the file is a xacro file, a part of an MJCF file or something else.
-        InputError: when the base of the arm is not fixed.
-    """
-    for element in root.walk():
-        xacro = element.tag.startswith("xacro:")
-        unexpanded = [f"{key}={value!r}" for key, value in element.attributes.items() if re.search(r"\$[{(]", value)]
-        if xacro or unexpanded:
-            found = f"<{element.tag}>" if xacro else unexpanded[0]
-            target = path.name.removesuffix(".xacro").removesuffix(".urdf") + "_expanded.urdf"
-            raise FileFormatError(
-                f"{path}: is a xacro file, from which a URDF is made ({found} in line {element.line}). Expand it "
-                f"first, 'xacro {path.name} > {target}' (xacro comes with ROS, or with 'pip install xacro'), and load "
-                f"{target}"
-            )
-    if root.tag == "mujocoinclude":
-        raise FileFormatError(f"{path}: is a part that other MJCF files include; load the file that includes it")
-    if root.tag == "sdf":
-        raise FileFormatError(f"{path}: is an SDF file (Gazebo); load the robot's URDF or MJCF file instead")
-    if root.tag not in {"mujoco", "robot"}:
-        raise FileFormatError(f"{path}: root element is <{root.tag}>; MJCF has <mujoco>, URDF has <robot>")
-    for joint in root.all("joint"):
-        if joint.get("type") in {"floating", "planar"}:
-            raise InputError(
-                f"{path}: joint {joint.get('name')!r} (line {joint.line}) is {joint.get('type')}: the base moves. "
-                "imitarm needs an arm on a fixed base: make this joint fixed (type='fixed')"
-            )
-
-
-def _check_numbers(path: Path, root: XmlElement) -> None:
-    """Reject attributes that are NaN or infinite, and limits that are not numbers.
-
-    Raises:
-        FileFormatError: naming the joint, link or body around the attribute, and the line.
-    """
-    pending = [(root, "")]
-    while pending:
-        element, owner = pending.pop()
-        if element.tag in {"joint", "link", "body", "geom", "site"} and element.get("name"):
-            owner = f"{element.tag} {element.get('name')!r}, "
-        for key, value in element.attributes.items():
-            if key in _NAMES:
-                continue
-            numbers, fault = _numbers(value), ""
-            if not all(math.isfinite(number) for number in numbers):
-                fault = "not finite"
-            elif element.tag == "limit" and value.strip() and not numbers:
-                fault = "not a number"
-            if fault:
-                raise FileFormatError(
-                    f"{path}: {owner}line {element.line}: {key}={value!r} of <{element.tag}> is {fault}; write a "
-                    "finite number, or leave the attribute out if there is no such limit"
-                )
-        pending += [(child, owner) for child in reversed(element.children)]
-
-
-def _numbers(value: str) -> list[float]:
-    """Return the numbers of an attribute; an empty list when it holds anything else."""
-    try:
-        return [float(word) for word in value.split()]
-    except ValueError:
-        return []
 
 
 def _check_sizes(model: mujoco.MjModel, path: Path, root: XmlElement) -> None:
@@ -345,6 +268,8 @@ def _mass_fault(body: mujoco.MjsBody, message: str, root: XmlElement) -> str:
     where = f"link {body.name!r}" + (f" (line {lines[0]})" if lines else "")
     if "A + B" in message or "eigenvalues" in message:
         return f"{where} has an inertia that no rigid body can have"
+    if body.mass < 0.0:
+        return f"{where} has a negative mass"
     return f"{where} has no inertia" if body.mass > 0.0 else f"{where} has no mass"
 
 
@@ -414,6 +339,12 @@ def _set_flange(
             "flange=... (--flange on the command line)"
         )
     check_joints(spec, joints, path, root)
+    offsets = [float(np.linalg.norm(joint.parent.pos)) for joint in joints[1:]]
+    if sum(offsets) > _LONGEST_ARM:
+        raise FileFormatError(
+            f"{path}: the joints are {sum(offsets):.3g} m apart from first to last; lengths must be in "
+            "metres: are these millimetres?"
+        )
     return tuple(joint.name for joint in joints), notes
 
 

@@ -30,6 +30,7 @@ _HAND_LINK = re.compile(r"finger|jaw|knuckle|thumb|claw|pincer|pinch", re.IGNORE
 _PALM_LINK = re.compile(r"base|mount|palm|body|hand", re.IGNORECASE)
 _END_LINK = re.compile(r"(^|[_/-])(tool0|flange)$", re.IGNORECASE)
 _JAW_STROKE = 0.1  # [m] a slide at the end of an arm that moves no further is taken for a jaw
+_FASTEST = 25.0  # [rad/s] no joint of an arm is faster
 _SIDE_BRANCH = 2  # joints: a branch of at most so many beside one more than twice as long is no arm (a head, a wheel)
 
 
@@ -278,6 +279,12 @@ def read_limits(
                 index = joints.index(element.get("name"))
                 velocity[index], torque[index] = _urdf_limits(element, place(path, root, joints[index]))
     notes = []
+    fast = [name for name, v, one in zip(joints, velocity, scale, strict=True) if one == 1.0 and v > _FASTEST]
+    if fast:
+        notes.append(
+            f"velocity limit above {_FASTEST:g} rad/s for {_located(fast, joints, root)}: no arm is so fast; if the "
+            "file's limits are in degrees, convert them to radians"
+        )
     if np.isnan(velocity).any():
         assumed = [name for name, value in zip(joints, velocity, strict=True) if np.isnan(value)]
         speeds = " and ".join(

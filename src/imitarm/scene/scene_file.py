@@ -32,6 +32,8 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 _SMALLEST = 1e-3  # [m] of an obstacle; smaller sizes are in another unit
 _NEAREST = 0.02  # [m] in a scene in cm or mm, something is farther from the base than this, which stands there
+_FARTHEST = 15.0  # [m] from the robot's base; obstacles beyond it are in another unit
+_FASTEST, _FASTEST_ROTATION = 20.0, 30.0  # [m/s], [rad/s] of an obstacle, likewise
 _POINTS = ("center", "start", "end", "point", "normal", "points")  # keys that are no sizes
 
 _TOP = ("format", "version", "units", "stamp", "goal", "obstacles", "fixtures")
@@ -228,10 +230,27 @@ def _obstacle(entry: object, where: str, metres: float) -> Obstacle:
     except InputError as error:
         label = f'{shape.__name__} "{name}": ' if name else f"{shape.__name__}: "
         raise InputError(f"{where}: {str(error).replace(label, '')}") from error
+    _check_speed("velocity", obstacle.velocity, _FASTEST, "m/s", where)
+    _check_speed("angular_velocity", obstacle.angular_velocity, _FASTEST_ROTATION, "rad/s", where)
+    _check_distance(obstacle, where)
     for key in lengths:
         if key not in _POINTS or key == "points":
             _check_size(key, values[key], where)
     return obstacle
+
+
+def _check_speed(key: str, value: Any, fastest: float, unit: str, where: str) -> None:
+    """Reject a velocity that is probably in another unit."""
+    speed = float(np.linalg.norm(value))
+    if speed > fastest:
+        raise InputError(f"{where}: {key} of {speed:.3g} {unit} is beyond {fastest:g} {unit}; check its unit")
+
+
+def _check_distance(obstacle: Obstacle, where: str) -> None:
+    """Reject an obstacle far from the robot, because its numbers are probably centimetres, not metres."""
+    nearest = float(np.linalg.norm(np.clip(0.0, *obstacle.bounds())))
+    if nearest > _FARTHEST:
+        raise InputError(f"{where}: is {nearest:.3g} m from the robot's base, where no arm reaches; check units")
 
 
 def _check_size(key: str, value: Any, where: str) -> None:

@@ -1,0 +1,186 @@
+"""Checks of a robot file's own text, for what the engine would drop or read in another way without a message."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from imitarm.errors import FileFormatError, InputError
+from imitarm.files.xml_tree import XmlElement
+from imitarm.kinematics.arm_joints import HINGE, place
+
+_NAMES = {
+    "name",
+    "link",
+    "joint",
+    "body",
+    "site",
+    "class",
+    "childclass",
+    "file",
+    "filename",
+    "mesh",
+    "material",
+    "model",
+}
+_MOST_ROTATION = 25.0  # [rad] limits of a hinge beyond this are degrees
+_LEAST_ROTATION = 0.2  # [rad] an arm none of whose hinges moves so far has limits in another unit
+_RANGES = ("range", "actuatorfrcrange", "ctrlrange", "forcerange")
+
+
+def check_file(path: Path, root: XmlElement) -> None:
+    """Reject a file that is no MJCF or URDF of an arm, and entries that the engine would not report.
+
+    Raises:
+        FileFormatError: naming the element, its line and the remedy.
+        InputError: when the base of the arm is not fixed.
+    """
+    _check_kind(path, root)
+    _check_numbers(path, root)
+    _check_names(path, root)
+    _check_ranges(path, root)
+
+
+def _check_kind(path: Path, root: XmlElement) -> None:
+    """Reject files that are not MJCF or URDF; the message names their type.
+
+    Raises:
+        FileFormatError: when the file is a xacro file, a part of an MJCF file or something else.
+        InputError: when the base of the arm is not fixed.
+    """
+    for element in root.walk():
+        xacro = element.tag.startswith("xacro:")
+        unexpanded = [f"{key}={value!r}" for key, value in element.attributes.items() if re.search(r"\$[{(]", value)]
+        if xacro or unexpanded:
+            found = f"<{element.tag}>" if xacro else unexpanded[0]
+            target = path.name.removesuffix(".xacro").removesuffix(".urdf") + "_expanded.urdf"
+            raise FileFormatError(
+                f"{path}: is a xacro file, from which a URDF is made ({found} in line {element.line}). Expand it "
+                f"first, 'xacro {path.name} > {target}' (xacro comes with ROS, or with 'pip install xacro'), and load "
+                f"{target}"
+            )
+    if root.tag == "mujocoinclude":
+        raise FileFormatError(f"{path}: is a part that other MJCF files include; load the file that includes it")
+    if root.tag == "sdf":
+        raise FileFormatError(f"{path}: is an SDF file (Gazebo); load the robot's URDF or MJCF file instead")
+    if root.tag not in {"mujoco", "robot"}:
+        raise FileFormatError(f"{path}: root element is <{root.tag}>; MJCF has <mujoco>, URDF has <robot>")
+    for joint in root.all("joint"):
+        if joint.get("type") in {"floating", "planar"}:
+            raise InputError(
+                f"{path}: joint {joint.get('name')!r} (line {joint.line}) is {joint.get('type')}: the base moves. "
+                "imitarm needs an arm on a fixed base: make this joint fixed (type='fixed')"
+            )
+
+
+def _check_numbers(path: Path, root: XmlElement) -> None:
+    """Reject attributes that are NaN or infinite, and limits that are not numbers.
+
+    Raises:
+        FileFormatError: naming the joint, link or body around the attribute, and the line.
+    """
+    pending = [(root, "")]
+    while pending:
+        element, owner = pending.pop()
+        if element.tag in {"joint", "link", "body", "geom", "site"} and element.get("name"):
+            owner = f"{element.tag} {element.get('name')!r}, "
+        for key, value in element.attributes.items():
+            if key in _NAMES:
+                continue
+            numbers, fault = _numbers(value), ""
+            if not all(math.isfinite(number) for number in numbers):
+                fault = "not finite"
+            elif element.tag == "limit" and value.strip() and not numbers:
+                fault = "not a number"
+            if fault:
+                raise FileFormatError(
+                    f"{path}: {owner}line {element.line}: {key}={value!r} of <{element.tag}> is {fault}; write a "
+                    "finite number, or leave the attribute out if there is no such limit"
+                )
+        pending += [(child, owner) for child in reversed(element.children)]
+
+
+def _numbers(value: str) -> list[float]:
+    """Return the numbers of an attribute; an empty list when it holds anything else."""
+    try:
+        return [float(word) for word in value.split()]
+    except ValueError:
+        return []
+
+
+def _check_names(path: Path, root: XmlElement) -> None:
+    """Reject joints and links of the same name, and a mimic joint whose leader does not exist."""
+    if root.tag == "robot":
+        elements = [*root.all("link"), *root.all("joint")]
+    else:
+        elements = [e for world in root.all("worldbody") for e in world.walk() if e.tag in {"body", "joint"}]
+    first: dict[tuple[str, str], int] = {}
+    for element in elements:
+        key = (element.tag, element.get("name"))
+        if key[1] and first.setdefault(key, element.line) != element.line:
+            raise FileFormatError(
+                f"{path}: lines {first[key]} and {element.line} both define {key[0]} {key[1]!r}; give each its own name"
+            )
+    for element in elements if root.tag == "robot" else []:
+        mimic = element.find("mimic")
+        if mimic is not None and ("joint", mimic.get("joint")) not in first:
+            raise FileFormatError(
+                f"{path}: joint {element.get('name')!r} (line {element.line}) mimics joint "
+                f"{mimic.get('joint')!r}, which is not in the file; correct the name, or remove the <mimic>"
+            )
+
+
+def _check_ranges(path: Path, root: XmlElement) -> None:
+    """Reject ranges of an MJCF file whose first number is above the second; the engine ignores such a range."""
+    for element in root.walk() if root.tag == "mujoco" else ():
+        for key in _RANGES:
+            numbers = _numbers(element.get(key))
+            if len(numbers) == 2 and numbers[0] > numbers[1]:
+                name = f" {element.get('name')!r}" if element.get("name") else ""
+                raise FileFormatError(
+                    f"{path}: line {element.line}: {key}={element.get(key)!r} of {element.tag}{name} has its "
+                    "lower limit above its upper limit; exchange them"
+                )
+
+
+def check_key_lengths(n_positions: int, path: Path, root: XmlElement) -> None:
+    """Reject a keyframe with another number of positions than the model, which the engine would fill up."""
+    for key in (e for e in root.walk() if e.tag == "key"):
+        n = len(_numbers(key.get("qpos")))
+        if n not in (0, n_positions):
+            raise FileFormatError(
+                f"{path}: keyframe {key.get('name')!r} (line {key.line}) has {n} positions, the model has "
+                f"{n_positions}; give one for each joint, or remove the keyframe"
+            )
+
+
+def check_units(model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root: XmlElement) -> None:
+    """Reject limits of hinges that are degrees read as radians, or radians read as degrees.
+
+    Raises:
+        FileFormatError: naming a joint and its line.
+    """
+    limited = [
+        name for name in joints if model.joint(name).type[0] == HINGE and model.jnt_limited[model.joint(name).id]
+    ]
+    widest = 0.0
+    for name in limited:
+        low, high = model.joint(name).range
+        if _MOST_ROTATION < max(abs(low), abs(high)) <= 720.0:
+            remedy = "convert them to radians" if root.tag == "robot" else 'write <compiler angle="degree"/>'
+            free = "make it continuous" if root.tag == "robot" else "leave out its range"
+            raise FileFormatError(
+                f"{place(path, root, name)}: limits {low:g} to {high:g} rad are {(high - low) / math.tau:.0f} "
+                f"rotations; if they are degrees, {remedy}; if the joint has no limits, {free}"
+            )
+        widest = max(widest, float(high - low))
+    if len(limited) > 1 and widest < _LEAST_ROTATION:
+        hint = "" if root.tag == "robot" else ': MJCF is in degrees unless it says <compiler angle="radian"/>'
+        raise FileFormatError(
+            f"{place(path, root, limited[0])}: no hinge of the arm can rotate by more than {np.degrees(widest):.2g} "
+            f"degrees; check the unit of the limits{hint}"
+        )
