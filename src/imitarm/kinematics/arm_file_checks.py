@@ -121,10 +121,11 @@ def _check_names(path: Path, root: XmlElement) -> None:
     first: dict[tuple[str, str], int] = {}
     for element in elements:
         key = (element.tag, element.get("name"))
-        if key[1] and first.setdefault(key, element.line) != element.line:
+        if key[1] and key in first:
             raise FileFormatError(
                 f"{path}: lines {first[key]} and {element.line} both define {key[0]} {key[1]!r}; give each its own name"
             )
+        first[key] = element.line
     for element in elements if root.tag == "robot" else []:
         mimic = element.find("mimic")
         if mimic is not None and ("joint", mimic.get("joint")) not in first:
