@@ -137,3 +137,17 @@ def test_a_damaged_skill_is_refused(sweep, tmp_path, capsys):
     damaged.write_text(sweep.read_text().replace("0.5", "0.6", 1))
     assert main(["reproduce", str(damaged), "--robot", "sawyer"]) == 2
     assert "skill.json" in capsys.readouterr().err
+
+
+def test_a_certificate_that_needs_a_schedule_is_void_when_the_motion_stops(sweep, tmp_path, capsys):
+    """A ball drives into the shoulder: after the stop, nothing holds that was certified for the plan."""
+    scene, report = tmp_path / "scene.yaml", tmp_path / "report.html"
+    scene.write_text(
+        "format: imitarm-scene\nversion: 1\nobstacles:\n"
+        "- {type: sphere, name: ball, center: [0.9, 0, 0.35], radius: 0.1, velocity: [-0.15, 0, 0]}\n"
+    )
+    arguments = ["--tool", "brush", "--scene", str(scene), "--report", str(report)]
+    assert main(["reproduce", str(sweep), *arguments]) == 1
+    text = " ".join(capsys.readouterr().out.split())
+    assert "void" in text and "on schedule, which was not completed" in text, text
+    assert "on schedule, which was not completed" in report.read_text()

@@ -81,6 +81,7 @@ class SampleAdaptation:
     moved: np.ndarray
     tolerance: np.ndarray
     certified_clearance: float = 0.0201
+    only_on_schedule: bool = False
     feasible: bool = True
     method: str = "certified"
     compute_time: float = 0.00134

@@ -22,6 +22,7 @@ from imitarm.safety import SafetyFilter
 from imitarm.skills import Skill
 from imitarm.trajectory import Demonstration, Rollout, Trajectory
 from imitarm.viewer import FrameRecorder, LearningSummary, Report, SceneResult
+from imitarm.viewer.content import CERTIFICATE_VOID
 
 Array = NDArray[np.float64]
 
@@ -176,6 +177,12 @@ def _version(package: str) -> str:
         return "not installed"
 
 
+def _certified(scene: SceneResult) -> str:
+    """Return the certified clearance in mm, for the table."""
+    assert scene.adaptation is not None
+    return "void" if scene.certificate_void else f"{1e3 * scene.adaptation.certified_clearance:.1f}"
+
+
 def show_results(report: Report) -> None:
     """Print a row for each scene, and below the table why a scene failed."""
     rows, styles = [], []
@@ -188,7 +195,7 @@ def show_results(report: Report) -> None:
                 "done" if scene.success else "FAILED",
                 str(len(scene.scene.obstacles)),
                 f"{1e3 * scene.min_clearance:.1f}" if np.isfinite(scene.min_clearance) else "-",
-                f"{1e3 * adaptation.certified_clearance:.1f}" if adaptation and around else "-",
+                _certified(scene) if around else "-",
                 f"{1e3 * scene.rmse:.1f}" if np.isfinite(scene.rmse) else "-",
                 f"{100 * scene.unmoved_fraction:.0f} %",
                 f"{1e3 * adaptation.compute_time:.1f}" if adaptation else "-",
@@ -202,6 +209,8 @@ def show_results(report: Report) -> None:
         "guaranteed lower bound for the tool on the planned path [mm]; RMSE to the demonstrations [mm]; unmoved: "
         "fraction of the components; adaptation: computing time [ms]"
     )
+    if any(scene.certificate_void for scene in report.scenes):
+        say(f"void: {CERTIFICATE_VOID}")
     for scene in report.scenes:
         if not scene.success:
             say(f"{scene.title}: {scene.reason}")

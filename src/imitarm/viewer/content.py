@@ -19,6 +19,8 @@ from imitarm.scene import Scene
 from imitarm.trajectory import Demonstration, Rollout, Trajectory
 from imitarm.viewer.recording import Recording
 
+CERTIFICATE_VOID = "an obstacle moves, so the certificate requires a motion on schedule, which was not completed"
+
 Array = NDArray[np.float64]
 
 
@@ -57,6 +59,10 @@ class AdaptedPath(Protocol):
     @property
     def certified_clearance(self) -> float:
         """Guaranteed lower bound of the tool's clearance on the whole planned path [m]."""
+
+    @property
+    def only_on_schedule(self) -> bool:
+        """Whether the bound holds only while the motion is on schedule, because an obstacle moves."""
 
     @property
     def feasible(self) -> bool:
@@ -130,6 +136,11 @@ class SceneResult:
     def min_clearance(self) -> float:
         """Smallest measured clearance [m]: inf without obstacles, NaN when the robot did not start."""
         return math.nan if self.rollout is None else self.rollout.min_clearance
+
+    @property
+    def certificate_void(self) -> bool:
+        """Whether the certificate required a motion on schedule, among moving obstacles, and there was none."""
+        return self.adaptation is not None and self.adaptation.only_on_schedule and not self.success
 
     @property
     def contact(self) -> bool:
@@ -269,7 +280,9 @@ def as_data(report: Report) -> dict[str, Any]:
                 "n_obstacles": len(scene.scene.obstacles),
                 "required_clearance_m": scene.required_clearance,
                 "min_clearance_m": scene.min_clearance,
-                "certified_clearance_m": adaptation.certified_clearance if adaptation else None,
+                "certified_clearance_m": adaptation.certified_clearance
+                if adaptation and not scene.certificate_void
+                else None,
                 "rmse_to_demonstrations_m": scene.rmse,
                 "n_components": len(adaptation.moved) if adaptation else None,
                 "n_moved_components": int(np.sum(adaptation.moved)) if adaptation else None,

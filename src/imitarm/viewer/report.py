@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from imitarm.viewer import charts, maps, palette
-from imitarm.viewer.content import LearningSummary, Report, SceneResult, as_data
+from imitarm.viewer.content import CERTIFICATE_VOID, LearningSummary, Report, SceneResult, as_data
 from imitarm.viewer.page import (
     MM,
     Figure,
@@ -246,7 +246,9 @@ def _scene_facts(scene: SceneResult) -> dict[str, Any]:
         largest = float(np.linalg.norm(a.displacement, axis=1).max(initial=0.0))
         values |= {
             "Method": a.method,
-            "Certified clearance": number(MM * a.certified_clearance, 2, "mm"),
+            "Certified clearance": f"void: {CERTIFICATE_VOID}"
+            if scene.certificate_void
+            else number(MM * a.certified_clearance, 2, "mm"),
             "Tool model in the plan": _tool(scene),
             "Components moved": f"{int(np.sum(a.moved))} of {len(a.moved)}",
             "Largest displacement": number(MM * largest, 1, "mm"),
