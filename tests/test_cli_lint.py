@@ -119,3 +119,14 @@ def test_motions_that_only_rotate_are_learned(tmp_path):
     half = np.arccos(abs(trajectory.quaternions[0] @ trajectory.quaternions[-1]))
     assert np.degrees(2.0 * half) == pytest.approx(75.0, abs=1.0)
     assert np.ptp(trajectory.positions, axis=0).max() < 1e-6
+
+
+@pytest.mark.parametrize("options", [[], ["--repair"]])
+def test_learning_warns_of_a_rotation_that_is_not_read(tmp_path, capsys, options):
+    files = [
+        table(tmp_path / f"{i}.csv", np.column_stack([plain(one), np.zeros((len(plain(one)), 3))]), "t,x,y,z,rx,ry,rz")
+        for i, one in enumerate(motions(3))
+    ]
+    assert main(["learn", *files, "--out", str(tmp_path / "skill.json"), *options]) == 0
+    text = capsys.readouterr().out
+    assert "rotation-not-read" in text and "rx, ry, rz" in text and "qw qx qy qz" in text

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from demonstration_samples import path, turn
-from imitarm.demonstrations import ReadOptions, read, read_raw
-from imitarm.demonstrations.arrays import unnamed_columns
+from imitarm.demonstrations import ReadOptions, lint, read, read_raw
+from imitarm.demonstrations.columns import Column, column_of, named_columns, unnamed_columns
 from imitarm.demonstrations.reading import SaidUnits
-from imitarm.demonstrations.text_tables import Column, column_of, named_columns
 from imitarm.errors import FileFormatError, InputError
-from imitarm.kinematics.pose import quaternion_exp
+from imitarm.kinematics.pose import quaternion_exp, quaternion_to_matrix
 
 TABLE = np.arange(1.0, 25.0).reshape(3, 8)
 PHASE = np.linspace(0.0, 1.0, 30)
@@ -405,3 +404,108 @@ def test_quaternions_of_few_digits_are_scaled_and_others_refused(tmp_path):
     invalid[12, 3:] = 0.0
     with pytest.raises(FileFormatError, match=r"a\.csv, line 13: quaternion of length 0, must be 1"):
         read(write(tmp_path / "a.csv", invalid), rate=10.0)
+
+
+# --- rotations in other forms
+
+ROTATIONS_NOT_READ = [
+    "roll pitch yaw",
+    "tcp_roll tcp_pitch tcp_yaw",
+    "rx ry rz",
+    "RX [rad],RY [rad],RZ [rad]",
+    "rotvec_x rotvec_y rotvec_z",
+    "q1 q2 q3 q4",
+    "q0 q1 q2 q3",
+    "A B C",
+    "W P R",
+    "euler_x euler_y euler_z",
+    "rx_deg ry_deg rz_deg",
+    "r11 r12 r13 r21 r22 r23",
+    "theta",
+]
+
+
+def names_in(text):
+    return text.split("," if "," in text else None)
+
+
+@pytest.mark.parametrize("text", ROTATIONS_NOT_READ)
+def test_a_rotation_that_is_not_read_is_a_warning_that_names_its_columns(text):
+    extra = names_in(text)
+    table = np.column_stack([PHASE, path(PHASE), np.zeros((30, len(extra)))])
+    raw = named_columns("a.csv", ["t", "x", "y", "z", *extra], table, ReadOptions())
+    assert raw.quaternions is None and raw.unread_rotation == tuple(extra)
+    (found,) = [f for f in lint([raw]) if f.code == "rotation-not-read"]
+    assert found.severity == "warning" and ", ".join(extra) in found.message
+    assert "qw qx qy qz" in found.remedy and "r11" in found.remedy
+
+
+@pytest.mark.parametrize(
+    "text", ["force_x force_y", "a b", "q1 q2 q3 q4 q5 q6", "roll_rate", "vel_rx vel_ry", "wx wy wz", "gripper"]
+)
+def test_other_columns_are_no_rotation(text):
+    extra = text.split()
+    table = np.column_stack([PHASE, path(PHASE), np.zeros((30, len(extra)))])
+    assert named_columns("a.csv", ["t", "x", "y", "z", *extra], table, ReadOptions()).unread_rotation == ()
+
+
+def test_reading_warns_of_a_rotation_that_is_not_read(tmp_path):
+    table = np.column_stack([PHASE, path(PHASE), np.zeros((30, 3))])
+    file = write(tmp_path / "a.csv", table, first="t,x,y,z,roll,pitch,yaw", separator=",")
+    with pytest.warns(UserWarning, match="roll, pitch, yaw is not read"):
+        read(file)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("pattern", ["r{}{}", "R_{}_{}", "rot{}{}"])
+def test_rotation_matrices_are_read(first, pattern):
+    names = [pattern.format(i + first, j + first) for i in range(3) for j in range(3)]
+    order = np.random.default_rng(1).permutation(9)
+    table = np.column_stack([PHASE, path(PHASE), quaternion_to_matrix(TILTED).reshape(30, 9)[:, order]])
+    raw = named_columns("a.csv", ["t", "x", "y", "z", *(names[i] for i in order)], table, ReadOptions())
+    assert raw.quaternions is not None and raw.notes == () and raw.unread_rotation == ()
+    np.testing.assert_allclose(np.abs(np.sum(raw.quaternions * TILTED, axis=1)), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("spoil", [lambda m: 2.0 * m, lambda m: -m])
+def test_matrices_that_are_no_rotations_are_refused(spoil):
+    names = [f"r{i}{j}" for i in "123" for j in "123"]
+    table = np.column_stack([PHASE, path(PHASE), spoil(quaternion_to_matrix(TILTED).reshape(30, 9))])
+    with pytest.raises(FileFormatError, match="do not hold a rotation matrix; check"):
+        named_columns("a.csv", ["t", "x", "y", "z", *names], table, ReadOptions())
+
+
+# --- usual names of other recorders
+
+
+@pytest.mark.parametrize("first", ["# timestamp tx ty tz qx qy qz qw", "timestamp tx ty tz qx qy qz qw"])
+def test_tum_names(tmp_path, first):
+    table = np.column_stack([PHASE, path(PHASE), np.roll(TILTED, -1, axis=1)])
+    (raw,) = read_raw(write(tmp_path / "tum.txt", table, first=first))
+    np.testing.assert_array_equal(raw.positions, path(PHASE))
+    np.testing.assert_array_equal(raw.quaternions, TILTED)
+
+
+@pytest.mark.parametrize("names", ["t fx fy fz tx ty tz", "t tx ty tz", "t fx fy fz tx ty tz qw qx qy qz"])
+def test_torques_are_no_positions(names):
+    columns = names.split()
+    with pytest.raises(FileFormatError, match="no column is named x y z"):
+        named_columns("a.csv", columns, np.ones((30, len(columns))), ReadOptions())
+
+
+def test_euroc_names(tmp_path):
+    units = ["[m]"] * 3 + ["[]"] * 4 + ["[m s^-1]"]
+    names = [f"p_RS_R_{a}" for a in "xyz"] + [f"q_RS_{a}" for a in "wxyz"] + ["v_RS_R_x"]
+    first = "#timestamp [ns], " + ", ".join(f"{name} {unit}" for name, unit in zip(names, units, strict=True))
+    table = np.column_stack([1e9 * PHASE, path(PHASE), TILTED, PHASE])
+    (raw,) = read_raw(write(tmp_path / "data.csv", table, first=first, separator=","))
+    np.testing.assert_array_equal(raw.positions, path(PHASE))
+    np.testing.assert_array_equal(raw.quaternions, TILTED)
+    np.testing.assert_allclose(raw.times, PHASE)
+
+
+@pytest.mark.parametrize("names", ["t x_dm y_dm z_dm", "t x y z_dm", "t x_km y_km z_km", "time_ds x y z"])
+def test_a_suffix_that_is_an_unknown_unit_is_named(names):
+    unit = names.rpartition("_")[2][:2]
+    with pytest.raises(FileFormatError, match=f"'{unit}' is not a known unit of .*; convert the column"):
+        named_columns("a.csv", names.split(), np.ones((30, 4)), ReadOptions())

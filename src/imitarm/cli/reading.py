@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 from imitarm.cli.robot_options import add_robot_options
 from imitarm.cli.screen import say, show_table
@@ -85,11 +86,17 @@ def read_and_lint(
                 task=task,
                 thin=arguments.thin,
             )
-            raw += [RawDemonstration.of(one.demonstration(arm, repair=True)) for one in read] if repair else read
+            raw += [_repaired(one, arm) for one in read] if repair else read
         except InputError as error:
             message, _, remedy = str(error).removeprefix(path).lstrip(":, ").rpartition("; ")
             unreadable.append(Finding("error", "unreadable", message or remedy, path, remedy=remedy if message else ""))
     return raw, unreadable + (lint(raw, arm=arm) if raw else [])
+
+
+def _repaired(raw: RawDemonstration, arm: ArmModel | None) -> RawDemonstration:
+    """Return a copy without invalid rows that still carries the reader's notes."""
+    repaired = RawDemonstration.of(raw.demonstration(arm, repair=True))
+    return replace(repaired, notes=raw.notes, unread_rotation=raw.unread_rotation)
 
 
 def show_findings(raw: Sequence[RawDemonstration], findings: Sequence[Finding], *, every: bool = False) -> None:

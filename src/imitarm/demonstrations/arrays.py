@@ -12,16 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.demonstrations.columns import COUNTS, UNNAMED, in_space, unnamed_columns
 from imitarm.demonstrations.raw import RawDemonstration
-from imitarm.demonstrations.reading import Reader, ReadOptions, SaidUnits
+from imitarm.demonstrations.reading import Reader, ReadOptions
 from imitarm.errors import FileFormatError
 from imitarm.files.table import read_bytes
 
 Array = NDArray[np.float64]
-
-# columns without names, by their number ("q": the four numbers of a quaternion)
-UNNAMED = {2: "xy", 3: "xyz", 4: "txyz", 7: "xyzq", 8: "txyzq"}
-COUNTS = "2 (x y), 3 (x y z), 7 (x y z and quaternion), or 4 or 8 with the time as first column"
 
 _NPY, _NPZ = b"\x93NUMPY", b"PK\x03\x04"
 _FEWEST_ROWS = 20  # of a demonstration; a stack with fewer rows than this and than demonstrations is transposed
@@ -54,35 +51,6 @@ class NumpyReader(Reader):
         if "positions" in arrays:
             return _by_field(path, arrays, options)
         return [raw for name, array in arrays.items() for raw in _stack(f"{path}:{name}", array, options)]
-
-
-def unnamed_columns(
-    source: str, values: Array, options: ReadOptions, said: SaidUnits | None = None
-) -> RawDemonstration:
-    """Assign the columns of a table without names by their number (see ``UNNAMED``).
-
-    Raises:
-        InputError: when the number of columns is unknown, or the options do not fit.
-    """
-    said = said or SaidUnits()
-    layout = UNNAMED.get(values.shape[1])
-    if layout is None:
-        raise FileFormatError(
-            f"{source}: {values.shape[1]} columns without names; known are {COUNTS}. Name them in a first line"
-        )
-    start, n = int(layout[0] == "t"), len(values)
-    times = options.seconds(source, values[:, 0], said.time) if start else options.even_times(source, n)
-    axes = slice(start, start + (2 if layout == "xy" else 3))
-    positions = in_space(options.metres(source, values[:, axes], said.length))
-    quaternions = None
-    if layout.endswith("q"):
-        quaternions = options.wxyz(source, values[:, start + 3 : start + 7], said.quaternion_order)
-    return RawDemonstration(source, times, positions, quaternions, task=options.task)
-
-
-def in_space(positions: Array) -> Array:
-    """Return positions (n, 3); planar positions (n, 2) get z = 0."""
-    return np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
 
 
 def _damaged(path: str, error: BaseException) -> FileFormatError:

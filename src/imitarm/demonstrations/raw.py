@@ -90,6 +90,7 @@ class RawDemonstration:
         task: name of the task.
         lines: line of the text file of each row, from 1, shape (n,); None when the file is not text.
         notes: data that the reader left out, and its assumptions.
+        unread_rotation: names of columns that seem to hold a rotation in a form that is not read.
 
     Raises:
         InputError: when an array has the wrong shape or does not contain numbers, or joints and names do not agree.
@@ -104,6 +105,7 @@ class RawDemonstration:
     task: str = ""
     lines: NDArray[np.int64] | None = None
     notes: tuple[str, ...] = ()
+    unread_rotation: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         what = f"RawDemonstration {text(self.source, 'RawDemonstration: source')}"
@@ -436,7 +438,11 @@ def check_held(raw: RawDemonstration) -> Iterator[Finding]:
 
 
 def check_notes(raw: RawDemonstration) -> Iterator[Finding]:
-    """Convert the reader's notes about omissions and assumptions to findings."""
+    """Convert what the reader left out or assumed to findings."""
+    if raw.unread_rotation:
+        message = f"the rotation in columns {', '.join(raw.unread_rotation)} is not read: there is no orientation"
+        remedy = "write it as a quaternion in columns qw qx qy qz, or as a rotation matrix in columns r11 r12 ... r33"
+        yield raw.finding("warning", "rotation-not-read", message, remedy)
     for note in raw.notes:
         yield raw.finding("note", "reader", note, "none, unless you need these data")
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.demonstrations.raw import RawDemonstration
+from imitarm.demonstrations.raw import RawDemonstration, check_notes
 from imitarm.errors import FileFormatError, InputError
 from imitarm.files.table import kind_of, read_bytes
 from imitarm.registry import Registry
@@ -281,6 +282,9 @@ def read(
         task=task,
         thin=thin,
     )
+    for one in raw:
+        if one.unread_rotation:
+            warnings.warn(str(next(check_notes(one))), UserWarning, stacklevel=2)
     return [one.demonstration(arm, repair=repair) for one in raw]
 
 
