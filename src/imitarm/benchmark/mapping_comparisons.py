@@ -42,9 +42,10 @@ succeeded."""
 
 
 def _compared(results: Results, tasks: Sequence[str]) -> Iterator[tuple[Figure, str, Comparison, float]]:
-    """One comparison.
+    """Yield one comparison of ``modern`` for each measure and each other method.
 
-    Measure, other method, ``modern`` minus that method, and p after Holm's correction within the measure.
+    Each is a measure, the name of the other method, the difference ``modern`` minus that method, and p after Holm's
+    correction over the methods within this measure.
     """
     baselines = [name for name in results.methods if name != OURS and results.of(name, tasks)]
     if not results.of(OURS, tasks):
@@ -183,9 +184,9 @@ def claims_table(results: Results, tasks: Sequence[str]) -> Table:
         rows.append((claim, *cells))
     columns = ("the thesis claims", "thesis, corrected", "held?", "modern", "held?")
     note = (
-        "Me minus the baseline, paired. yes: for every baseline the 95 % interval is on the claimed side and the "
-        "corrected p is below 0.05; no: for one of them it is on the other side; not shown: neither. Times are "
-        "compared where both succeeded."
+        "Each difference is the method of the column minus the baseline, in paired trials. yes: for every baseline the "
+        "95 % interval of the difference is on the claimed side and the corrected p is below 0.05; no: for at least "
+        "one baseline the interval is on the other side; not shown: neither. Times are compared where both succeeded."
     )
     return Table("Claims of the thesis, and results", columns, tuple(rows), note)
 
@@ -201,7 +202,7 @@ def verdict(comparisons: Sequence[Comparison], sign: float) -> str:
     with only two persons no claim can be confirmed.
 
     Args:
-        comparisons: Me minus each baseline.
+        comparisons: the evaluated method minus each baseline.
         sign: claimed sign of the differences, -1 or 1.
     """
     corrected = holm([c.p for c in comparisons])

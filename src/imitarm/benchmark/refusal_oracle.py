@@ -262,7 +262,7 @@ def _tangent_bound(f0: Array, a: Array, f1: Array, b: Array) -> Array:
 
 
 def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
-    """Return the costs when one further move is allowed: a free move to a neighbouring cell along any axis."""
+    """Return the costs when one more move is allowed: to a cell beside it with no obstacle between the two."""
     d = cost.ndim
     result = cost.copy()
     for axis in range(d):
@@ -397,7 +397,11 @@ def _tangent_rows(
 
 
 def _close_points(question: Question, times: Array, tip: Array, relative: Array, here: Array) -> Array:
-    """Return sample and fraction of the closest of 49 points on each segment that is too close, shape (r, 2)."""
+    """Return where the path comes too close to an obstacle, shape (r, 2).
+
+    On each segment 49 points are examined. If one is too close, the closest is returned as the index of the segment's
+    first sample and the fraction of the segment before the point.
+    """
     found = []
     fractions = np.linspace(0.02, 0.98, 49)[:, None, None]
     path = tip + here

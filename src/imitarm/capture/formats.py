@@ -340,7 +340,8 @@ class MotionCapture:
         upper = float(np.median(np.linalg.norm(e - s, axis=1)))
         if not _UPPER_ARM[0] < upper < _UPPER_ARM[1]:
             raise FileFormatError(
-                f"{path}: an upper arm of {upper:.3g} m, if its numbers are millimetres; export positions in mm"
+                f"{path}: if the positions are in millimetres, the upper arm would be {upper:.3g} m long; export "
+                "positions in mm"
             )
         return cls(table[:, 0], np.stack([s, e, 0.5 * (left + right), tip, thumb], axis=1), path.name)
 

@@ -63,7 +63,7 @@ class BodyCamera(SkeletonSource):
             self._release()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton, or None when none came within ``timeout`` seconds or the source is over.
+        """Return the next skeleton, or None when none came within ``timeout`` seconds or the source has ended.
 
         Raises:
             TaskFailedError: when the driver fails, or no frame arrived for 3 s because the camera was unplugged.

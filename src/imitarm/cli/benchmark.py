@@ -175,7 +175,9 @@ def _mapping(arguments: argparse.Namespace) -> int:
 def _avoidance(arguments: argparse.Namespace) -> int:
     """Run the avoidance benchmark and print its table."""
     if arguments.seeds < 1 or arguments.first < 0:
-        raise InputError(f"--seeds must be at least 1 and --first 0, got {arguments.seeds} and {arguments.first}")
+        raise InputError(
+            f"--seeds must be at least 1 and --first at least 0, got {arguments.seeds} and {arguments.first}"
+        )
     place = _place(arguments, "avoidance")
     with progress_bar() as bar:
         task = bar.add_task("avoiding", total=None)
@@ -192,7 +194,9 @@ def _avoidance(arguments: argparse.Namespace) -> int:
 def _refusals(arguments: argparse.Namespace) -> int:
     """Run the random scenes and print their table; return 1 when an accepted path violates its clearance."""
     if arguments.scenes < 1 or arguments.first < 0:
-        raise InputError(f"--scenes must be at least 1 and --first 0, got {arguments.scenes} and {arguments.first}")
+        raise InputError(
+            f"--scenes must be at least 1 and --first at least 0, got {arguments.scenes} and {arguments.first}"
+        )
     place = _place(arguments, "refusals")
     with progress_bar() as bar:
         task = bar.add_task("adapting", total=arguments.scenes)

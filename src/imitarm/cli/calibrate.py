@@ -285,7 +285,7 @@ def choose(question: str, choices: Mapping[Word, str]) -> Word:
     """Ask until the answer is one of the choices: its number, or the beginning of its name.
 
     Raises:
-        InputError: when nobody can answer.
+        InputError: when nobody can answer because the input has ended.
     """
     names = list(choices)
     for i, name in enumerate(names, start=1):
@@ -321,7 +321,7 @@ def touched_points(
         Position of the hand in the sensor's frame, shape (3,) [m], by the index of each point that was not skipped.
 
     Raises:
-        InputError: when the user gives up, the source is over, or fewer than four points are left.
+        InputError: when the user gives up, the source has ended, or fewer than four points were measured.
     """
     wanted = range(len(points)) if only is None else [only]
     if only is None:
@@ -346,7 +346,7 @@ def touched_points(
                 seen[i] = hand
                 break
             if source.over:
-                raise InputError(f"sensor calibration: {source.name} is over at point {i + 1}; use a live source")
+                raise InputError(f"sensor calibration: {source.name} ended at point {i + 1}; use a live source")
             remark(f"{fault}. Try again:")
     if only is None and len(seen) < LEAST_PAIRS:
         raise InputError(f"sensor calibration: {len(seen)} points were measured, at least {LEAST_PAIRS} are needed")

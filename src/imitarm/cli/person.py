@@ -79,7 +79,7 @@ def gather(
     """Read skeletons until the source ends, the time is up, or the user stops; show the progress.
 
     Args:
-        source: to read from.
+        source: source of the skeletons.
         seconds: duration, by the clock for a live source, otherwise by the skeletons' times; None: to the end.
         what: text of the progress bar, for example ``"capturing"``.
         live: whether the source runs until it is stopped.

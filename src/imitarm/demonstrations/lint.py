@@ -191,7 +191,9 @@ def check_units(motion: ValidRows) -> Iterator[Finding]:
             if distance[row] * metres <= _FAR and (extent * metres >= _TINY or extent < _NO_MOTION)
         ]
         remedy = f"read it with {' or '.join(fits)}" if fits else "check which columns hold the position"
-        yield motion.finding("error", "units", f"{distance[row]:.4g} m from the base: hardly metres", remedy, row)
+        yield motion.finding(
+            "error", "units", f"{distance[row]:.4g} m from the base: the unit is probably not metres", remedy, row
+        )
     elif _NO_MOTION < extent < _TINY and motion.quaternions is None:
         message = f"the whole motion is {1e3 * extent:.2g} mm large"
         yield motion.finding("warning", "units", message, "check units: are the numbers metres?")

@@ -200,7 +200,7 @@ def _tracking(
     correspondence: Correspondence,
     true: TrueArm | None,
 ) -> tuple[float, ...]:
-    """Return the measures that compare with the true arm, in the order of the fields."""
+    """Return the seven measures that need the true arm, in the order of :class:`MappingMetrics`."""
     if true is None or not periods.engaged.any():
         return (math.nan,) * 7
     scale, engaged = correspondence.scale, periods.engaged

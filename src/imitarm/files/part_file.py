@@ -75,7 +75,7 @@ class PartFile:
             take: function called with ``part``, which may create ``path`` from it, and returns whether it renamed
                 ``part``. If it did not rename the file, ``part`` is removed. If it did, a file of that name now belongs
                 to another recorder and is not touched.
-            begin: text of the same length that replaces the text that was written first.
+            begin: text that replaces the ``begin`` given to the constructor; both must have the same length.
 
         Raises:
             InputError: when this fails; the written text stays in ``part``.

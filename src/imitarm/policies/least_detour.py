@@ -77,7 +77,10 @@ class AllowedDirections:
 
     @classmethod
     def without(cls, forbidden: Array) -> AllowedDirections:
-        """Build from forbidden directions, unit rows (m, 3); the last ones are kept, because scenes share them."""
+        """Build from forbidden directions, unit rows (m, 3).
+
+        The latest results are cached, because many scenes forbid the same directions.
+        """
         return _allowed(forbidden.tobytes())
 
     @classmethod

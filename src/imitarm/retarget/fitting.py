@@ -120,7 +120,7 @@ class _Search:
 
         Args:
             centre: centre of the motion, shape (3,) [m].
-            near: posture near the centre, shape (n_joints,) [rad].
+            near: posture in which the tool is near the centre of the motion, shape (n_joints,) [rad].
             begin: start of the motion relative to its centre, shape (3,) [m].
             outermost: the outermost points relative to the centre, shape (k, 3) [m].
         """

@@ -32,10 +32,10 @@ class DemonstrationDistance:
 
     Attributes:
         source: the source of the demonstration.
-        rms: root mean square over its samples [m].
-        largest: [m].
-        start: distance at its first sample [m].
-        goal: distance at its last sample [m].
+        rms: root mean square of the distance over the samples of the demonstration [m].
+        largest: largest distance [m].
+        start: distance at the first sample of the demonstration [m].
+        goal: distance at the last sample of the demonstration [m].
     """
 
     source: str

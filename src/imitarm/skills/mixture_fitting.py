@@ -255,7 +255,7 @@ def _segment_costs(statistics: Array, n_samples: int) -> Array:
 
 
 def _cut(slot: NDArray[np.intp], came_from: list[NDArray[np.intp]], n_slots: int) -> Array:
-    """Follow the cheapest division back from the last slot and return its responsibilities (K, n)."""
+    """Return the responsibilities (K, n) of the cheapest division into K segments, traced back from the last slot."""
     borders = [n_slots]
     for back in reversed(came_from):
         borders.append(int(back[borders[-1]]))

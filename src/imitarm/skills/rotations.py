@@ -183,8 +183,8 @@ class QuaternionDMP:
     never of the rotation to the goal. Therefore a rotation by 270 degrees, or by three full revolutions, is reproduced
     as demonstrated. (Forms that use log(q_goal conj(q)) rotate in the opposite direction beyond 180 degrees.) The
     target is a cubic spline through quaternions with continuous signs, normalised. Another start or goal rotates the
-    target in the base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both
-    changes rotate by at most 180 degrees.
+    target in the base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. The
+    rotations ``d_start`` and ``d_goal`` are each at most 180 degrees.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.

@@ -226,7 +226,7 @@ class Skill:
         *,
         adjustment: Adjustment = "progress",
     ) -> Trajectory:
-        """Return the primitive's motion, ``round(duration / dt) + 1`` samples, with the rotation when it was learned.
+        """Return the primitive's motion, ``round(duration / dt) + 1`` samples, with the rotation if one was learned.
 
         Args:
             start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.

@@ -64,7 +64,7 @@ class Summary:
         skeletons: number of skeletons used.
         engagement: number of steps in each state of the retargeter.
         interrupted: number of steps in which the robot could not be controlled.
-        clamped: number of steps in which the robot changed the command, by limit.
+        clamped: number of steps in which a limit of the robot changed the command, for each limit.
         filtered: number of steps in which the safety filter changed the command to keep a clearance.
         unsafe: number of steps in which no joint velocity kept every limit and clearance.
         speed: largest velocity of the set-point, as a fraction of its limit.

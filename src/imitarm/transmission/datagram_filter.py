@@ -188,7 +188,7 @@ class DatagramFilter:
         n_sessions: number of sessions so far.
         age: delay of the last accepted datagram [s].
         accepted: number of accepted datagrams.
-        dropped: number of dropped datagrams by reason, a key of :data:`DROP_REASONS`.
+        dropped: number of dropped datagrams for each reason, a key of :data:`DROP_REASONS`.
 
     Raises:
         InputError: when a time is not positive.

@@ -229,7 +229,9 @@ def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:
             names, limits = scene.joint_names, scene.torque_limits
             svg = charts.torques(times, rollout.torques, limits, joint_names=names, name=f"{key}-torques")
             yield Figure(
-                svg, "Joint torques", "Dashed: the rated torque. Above each chart: the highest torque, relative to it."
+                svg,
+                "Joint torques",
+                "Dashed: the rated torque. Above each chart: the highest torque, as a percentage of the rated torque.",
             )
 
 

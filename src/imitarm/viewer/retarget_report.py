@@ -299,7 +299,8 @@ def _figures(run: Retargeting, key: str) -> Iterator[Figure]:
     yield Figure(
         retarget_charts.velocities(run, name=f"{key}-velocities"),
         "Joint velocities",
-        "Computed from the joint positions. Dashed: the limit. Above each chart: the highest velocity, relative to it.",
+        "Computed from the joint positions. Dashed: the limit. Above each chart: the highest velocity, as a percentage "
+        "of the limit.",
     )
     yield Figure(
         retarget_charts.joints(run, name=f"{key}-joints"), "Joint positions", "Dashed: the limits of each joint."
@@ -307,8 +308,8 @@ def _figures(run: Retargeting, key: str) -> Iterator[Figure]:
     yield Figure(
         retarget_charts.accelerations(run, name=f"{key}-accelerations"),
         "Joint accelerations",
-        "Computed from the joint positions. Dashed: the limit. Above each chart: the highest acceleration, relative "
-        "to it.",
+        "Computed from the joint positions. Dashed: the limit. Above each chart: the highest acceleration, as a "
+        "percentage of the limit.",
     )
     if run.arm.landmarks is not None:
         points = np.array([run.arm.sew_points(q) for q in run.joints])
