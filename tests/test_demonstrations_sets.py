@@ -155,3 +155,36 @@ def test_pairs_of_real_recordings_belong_together(real_data):
         family = read_raw(real_data / "panda_kinesthetic" / f"{name}.npy", units="cm", duration=10.0)[::2]
         for few in itertools.combinations(family, 2):
             assert worrying(list(few)) == []
+
+
+def turned(degrees, source, seed=0):
+    """A reach with a tool rotated by ``degrees`` about the vertical."""
+    half = 0.5 * np.radians(degrees) + 0.1 * SMOOTH
+    quaternions = np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=1)
+    return shown(reach(0.04, seed=seed).trajectory.positions, source, quaternions)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "odd"),
+    [
+        ([0, 170], None),
+        ([0, 3, 170], "c"),
+        ([0, 172, 4, 170], None),
+        ([0, 2, 4, -3, 170], "e"),
+        ([0, 30, 60, 90, 120], None),
+    ],
+)
+def test_opposed_rotations_are_an_error(degrees, odd):
+    demonstrations = [
+        turned(angle, name, seed) for seed, (angle, name) in enumerate(zip(degrees, "abcde", strict=False))
+    ]
+    errors = [f for f in lint(demonstrations) if f.severity == "error"]
+    assert [f.code for f in errors] == ["two-rotations"]
+    assert "at the same phase" in errors[0].message
+    assert odd is None or errors[0].source.endswith(odd)
+
+
+@pytest.mark.parametrize("degrees", [[0, 80], [0, 50, 3], [0, 40, 80]])
+def test_rotations_less_than_90_degrees_apart_are_a_warning_at_most(degrees):
+    demonstrations = [turned(angle, name) for angle, name in zip(degrees, "abc", strict=False)]
+    assert {f.severity for f in lint(demonstrations) if "rotation" in f.code} <= {"warning"}

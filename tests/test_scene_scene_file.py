@@ -512,3 +512,22 @@ def test_numbers_in_another_unit_are_refused(tmp_path, entry, words):
     message = message_of(tmp_path, f"{HEAD}obstacles:\n  - {entry}\n")
     assert "obstacles[0]" in message
     assert all(word in message for word in words)
+
+
+@pytest.mark.parametrize("key", ["obstacles", "fixtures"])
+def test_two_entries_with_one_name_are_refused(tmp_path, key):
+    entry = "  - {type: sphere, name: %s, center: [0.5, 0, %g], radius: 0.1}\n"
+    head = f"format: imitarm-scene\nversion: 1\n{key}:\n"
+    file = tmp_path / "scene.yaml"
+    file.write_text(head + entry % ("ball", 0.1) + entry % ("crate", 0.2) + entry % ("ball", 0.3), encoding="utf-8")
+    with pytest.raises(FileFormatError, match=rf'{key}\[0\] and {key}\[2\] are both named "ball"; give each'):
+        load_scene(file)
+    file.write_text(head + (entry % ('""', 0.1)) * 2, encoding="utf-8")
+    assert len(getattr(load_scene(file), key)) == 2
+
+
+def test_a_scene_that_could_not_be_read_back_is_not_written(tmp_path):
+    scene = Scene(None, [Sphere([0.5, 0, z], 0.1, name="ball") for z in (0.1, 0.3)])
+    with pytest.raises(InputError, match="are both named"):
+        save_scene(scene, tmp_path / "scene.yaml")
+    assert not list(tmp_path.iterdir())

@@ -67,6 +67,7 @@ _APART = 0.02  # [m] smallest difference between demonstrations that is reported
 _ENDS_APART = 0.25  # of the size of the motion, likewise of starts and goals
 _PATHS_APART = 0.2  # of the size of the motion, likewise of paths between the same ends
 _ROTATIONS_APART = 0.6  # [rad] likewise of rotations
+_OPPOSED = np.pi / 2.0  # [rad] rotations farther apart have no useful mean
 _GROUP_RATIO = 2.5  # two groups are so many times farther apart than neighbours within a group
 _SHORT = {"goal": 0.12, "start": 0.2}  # fraction of the motion that an incomplete demonstration lacks, at least
 _DIFFERENT = 0.1  # of the size of the motion: smallest mean distance between a motion and a reversed one
@@ -362,7 +363,16 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
     ]
     if rotations is not None:
         apart = np.stack([_angles(rotations, q).max(axis=1) for q in rotations])
-        kinds.append(("two-rotations", "warning", "rotations", apart, _ROTATIONS_APART, np.degrees(1.0), "degrees"))
+        if apart.max() > _OPPOSED:
+            odd = int(np.argmax(apart.sum(axis=1)))
+            name, degrees = motions[int(np.argmax(apart[odd]))].name, np.degrees(apart[odd].max())
+            message = (
+                f"its rotation is up to {degrees:.0f} degrees from that of {name} at the same phase: no mean of them"
+            )
+            remedy = "check how the tool was held and the order of the quaternions (wxyz or xyzw), or leave it out"
+            yield motions[odd].finding("error", "two-rotations", f"{message} is useful", remedy)
+        else:
+            kinds.append(("two-rotations", "warning", "rotations", apart, _ROTATIONS_APART, np.degrees(1.0), "degrees"))
     for code, severity, what, distance, floor, factor, unit in kinds:
         split = _split(distance, floor if unit == "degrees" else max(_APART, floor))
         if split is None:

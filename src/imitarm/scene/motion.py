@@ -86,6 +86,8 @@ class MovingScene:
         names = [obstacle.name for obstacle in self.scene.obstacles]
         moved = []
         for key, motion in self.motions.items():
+            if isinstance(key, str) and names.count(key) > 1:
+                raise InputError(f"MovingScene: {names.count(key)} obstacles are named {key!r}; give the index instead")
             index = names.index(key) if key in names else key
             if not isinstance(index, int) or not 0 <= index < len(names):
                 known = ", ".join(repr(name) for name in names if name) or "none has a name"

@@ -10,7 +10,7 @@ import difflib
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from reprlib import repr as _shown  # a few items only, however much a file holds
 from typing import Any
@@ -79,10 +79,12 @@ def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
         path: the file; its folder must exist.
 
     Raises:
-        InputError: when an obstacle's shape is in no registry, or the file can't be written.
+        InputError: when an obstacle's shape is in no registry, two have one name, or the file can't be written.
     """
     instance(scene, Scene, "scene")
     path = file_path(path, "path")
+    _check_names("obstacles", scene.obstacles)
+    _check_names("fixtures", scene.fixtures)
     content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "units": "m"}
     if scene.goal is not None:
         content["goal"] = _pose_entry(scene.goal)
@@ -182,7 +184,17 @@ def _obstacles(content: Mapping[Any, Any], key: str, metres: float) -> tuple[Obs
     entries = content.get(key)
     if entries is not None and not isinstance(entries, list):
         raise InputError(f"{key}: must be a list; begin each entry with a dash")
-    return tuple(_obstacle(entry, f"{key}[{i}]", metres) for i, entry in enumerate(entries or []))
+    obstacles = tuple(_obstacle(entry, f"{key}[{i}]", metres) for i, entry in enumerate(entries or []))
+    _check_names(key, obstacles)
+    return obstacles
+
+
+def _check_names(key: str, obstacles: Sequence[Obstacle]) -> None:
+    """Reject two obstacles with one name: motions of obstacles and bodies of fixtures are found by name."""
+    names = [obstacle.name for obstacle in obstacles]
+    for i, name in enumerate(names):
+        if name and (first := names.index(name)) < i:
+            raise InputError(f'{key}[{first}] and {key}[{i}] are both named "{name}"; give each a name of its own')
 
 
 def _check_distances(goal: Pose | None, obstacles: Iterable[Obstacle], units: str) -> None:
