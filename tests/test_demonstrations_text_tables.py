@@ -509,3 +509,63 @@ def test_a_suffix_that_is_an_unknown_unit_is_named(names):
     unit = names.rpartition("_")[2][:2]
     with pytest.raises(FileFormatError, match=f"'{unit}' is not a known unit of .*; convert the column"):
         named_columns("a.csv", names.split(), np.ones((30, 4)), ReadOptions())
+
+
+# --- decimal commas, and a row of units
+
+
+def comma_file(file, separator=";", places=6, heading="t;x;y;z"):
+    table = np.column_stack([PHASE, path(PHASE)])
+    rows = [separator.join(f"{value:.{places}f}".replace(".", ",") for value in row) for row in table]
+    file.write_text("\n".join([heading.replace(";", separator), *rows]) + "\n", encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "; "])
+def test_decimal_commas_between_semicolons_or_tabs_are_read(tmp_path, separator):
+    (raw,) = read_raw(comma_file(tmp_path / "a.csv", separator))
+    np.testing.assert_allclose(raw.positions, path(PHASE), atol=1e-6)
+    np.testing.assert_allclose(raw.times, PHASE, atol=1e-6)
+
+
+def test_decimal_commas_without_names_are_numbers_and_not_names(tmp_path):
+    (raw,) = read_raw(comma_file(tmp_path / "a.csv", heading="# recorded"))
+    np.testing.assert_allclose(raw.positions, path(PHASE), atol=1e-6)
+
+
+@pytest.mark.parametrize("separator", [" ", ","])
+def test_other_decimal_commas_are_refused_with_the_remedy(tmp_path, separator):
+    with pytest.raises(FileFormatError, match=r"line 2.*(decimal point|values where 4)"):
+        read_raw(comma_file(tmp_path / "a.csv", separator))
+
+
+@pytest.mark.parametrize("row", ["1,234;2,500;3,125;4,000", "0,1;2.5;3,1;4", "1.234,5;1;2;3"])
+def test_commas_that_may_separate_thousands_are_refused(tmp_path, row):
+    file = tmp_path / "a.csv"
+    file.write_text(f"t;x;y;z\n{row}\n{row}\n", encoding="utf-8")
+    with pytest.raises(FileFormatError, match=r"line [23].*decimal point"):
+        read_raw(file)
+
+
+@pytest.mark.parametrize("units", ["ms,mm,mm,mm", "[ms],[mm],[mm],[mm]", "(ms),(mm),(mm),(mm)"])
+def test_a_row_of_units_below_the_names_is_used(tmp_path, units):
+    table = np.column_stack([PHASE, path(PHASE)]) * 1e3
+    (raw,) = read_raw(write(tmp_path / "a.csv", table, first=f"t,x,y,z\n{units}", separator=","))
+    np.testing.assert_allclose(raw.positions, path(PHASE))
+    np.testing.assert_allclose(raw.times, PHASE)
+    assert raw.lines is not None and raw.lines[0] == 3
+
+
+@pytest.mark.parametrize(
+    ("units", "message"),
+    [
+        ("s,dm,dm,dm", "'dm' is not a known unit of length"),
+        ("float,float,float,float", "'float' is not a known unit of time"),
+        ("s,m,m,-", "column 'x .m.' has a unit, but column 'z' has none"),
+        ("s,m,m", "line 2: 3 values where 4"),
+    ],
+)
+def test_a_row_of_units_that_is_not_understood_is_refused(tmp_path, units, message):
+    table = np.column_stack([PHASE, path(PHASE)])
+    with pytest.raises(FileFormatError, match=message):
+        read_raw(write(tmp_path / "a.csv", table, first=f"t,x,y,z\n{units}", separator=","))

@@ -73,7 +73,7 @@ def test_lines_are_those_of_an_editor(tmp_path):
         (b"x,y,z\n1,2,3\n4,5", r"line 3: 2 values .* cut off"),
         (b"1,2,3\n4,5,six\n", r"line 2, column 3: 'six' is not a number"),
         (b"1,2,3\n4,,6\n", r"line 2, column 2: a value is missing"),
-        (b"1;2;3\n4;5,5;6\n", r"line 2, column 2: '5,5' .* decimal point"),
+        (b"1.5;2;3\n4;5,5;6\n", r"line 2: '5,5' .* decimal point"),
         (b"1,2,3\n4,1_000,6\n", r"line 2, column 2"),
         (b"x,2,z\n1,2,3\n", r"line 1, column 1: 'x' is not a number"),
         (b"1,2\n3,4 \xe9\n", r"line 2: byte 0xe9 is not UTF-8"),

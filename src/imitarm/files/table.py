@@ -1,6 +1,7 @@
 """Tables of numbers in text files. Errors name the line, and writing never leaves an incomplete file.
 
-A table is lines of numbers, separated by comma, semicolon, tab or spaces. A row of column names may come first.
+A table is lines of numbers, separated by comma, semicolon, tab or spaces. A row of column names may come first, and a
+row of their units below it. Between semicolons or tabs, numbers may have decimal commas.
 Lines that start with ``#`` or ``%`` are remarks. Remarks before the numbers are kept: they may hold ``key: value``
 pairs or the column names.
 """
@@ -36,6 +37,8 @@ SIGNATURES = {
 }
 
 
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 _NAME = re.compile(r"\"[^\"]*\"|[^\s\[(]*(?:\s*[\[(][^\])]*[\])])|[^\s\[(]+")
 
 
@@ -46,8 +49,9 @@ class Table:
     Attributes:
         path: path of the file as given by the caller.
         remarks: the ``key: value`` remarks before the numbers, keys in lower case.
-        names: column names; None when the file has no names. They are in a separate row, or else in the last remark
-            before the numbers that has one word for each column.
+        names: column names, with the units of a row of units in brackets (``x [mm]``); None when the file has no
+            names. They are in a separate row, or else in the last remark before the numbers that has one word for
+            each column.
         values: the numbers, shape (n, columns). The numbers may include nan and inf, for which the caller must check.
         lines: line number of each row in the file, from 1, shape (n,).
         ends_in_newline: False when the last line may have been cut off.
@@ -141,6 +145,8 @@ def _number(field: str) -> float | None:
 def _row(path: str | Path, number: int, fields: Sequence[str], width: int, last: bool) -> list[float]:
     if len(fields) != width:
         remedy = "the file was cut off: record it again or remove its last line" if last else "fix that line"
+        if len(fields) == 2 * width:
+            remedy = "if these are decimal commas, write decimal points"
         raise FileFormatError(f"{path}, line {number}: {len(fields)} values where {width} are expected; {remedy}")
     numbers = [_number(field) for field in fields]
     values = [value for value in numbers if value is not None]
@@ -148,9 +154,43 @@ def _row(path: str | Path, number: int, fields: Sequence[str], width: int, last:
         column = numbers.index(None)
         field = fields[column]
         what = f"{field[:40]!r} is not a number" if field else "a value is missing"
-        hint = "use a decimal point" if field.replace(",", "", 1).lstrip("+-").isdigit() else "fix or remove that line"
+        hint = "use a decimal point" if re.fullmatch(r"[-+]?[\d.]*,[\d.,]*", field) else "fix or remove that line"
         raise FileFormatError(f"{path}, line {number}, column {column + 1}: {what}; {hint}")
     return values
+
+
+def _units_row(names: Sequence[str], line: str) -> list[str] | None:
+    """Return the units in the line below the column names; None when that line is no row of units."""
+    units = [unit.strip("[]()") for unit in _fields(line, _separator(line))]
+    if len(units) != len(names) or any(_number(unit) is not None or "," in unit for unit in units) or not any(units):
+        return None
+    return None if any("[" in name or "(" in name for name in names) else units
+
+
+def _with_units(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
+    """Return the column names with their units in brackets; ``-`` and an empty unit mean that there is none."""
+    return tuple(f"{name} [{unit}]" if unit not in ("", "-") else name for name, unit in zip(names, units, strict=True))
+
+
+def _with_decimal_points(path: str | Path, body: Sequence[tuple[int, str]], separator: str) -> list[tuple[int, str]]:
+    """Return rows with decimal points instead of decimal commas; rows without decimal commas are returned as they are.
+
+    Raises:
+        FileFormatError: when the commas may separate thousands instead.
+    """
+    fields = {field: number for number, line in body for field in _fields(line, separator)}
+    commas = [field for field in fields if _DECIMAL_COMMA.fullmatch(field)]
+    if not commas:
+        return list(body)
+    first = commas[0]
+    points = next((field for field in fields if "." in field and _number(field.replace(",", "")) is not None), None)
+    if points is not None or all(_THOUSANDS.fullmatch(field) for field in commas):
+        why = f", and {points!r} has a decimal point" if points else ""
+        raise FileFormatError(
+            f"{path}, line {fields[first]}: {first!r} has a decimal comma or a comma between thousands{why}; write all "
+            "numbers with decimal points and without other commas"
+        )
+    return [(number, line.replace(",", ".")) for number, line in body]
 
 
 def _names_in_remarks(remarks: Sequence[tuple[int, str]], width: int) -> tuple[int | None, tuple[str, ...] | None]:
@@ -196,14 +236,21 @@ def parse_table(path: str | Path, content: bytes) -> Table:
     names_line: int | None
     names: tuple[str, ...] | None
     names_line, names = body[0][0], split_names(body[0][1])
-    if all(_number(name) is None for name in names):
+    if all(_number(name) is None and _DECIMAL_COMMA.fullmatch(name) is None for name in names):
         width, body = len(names), body[1:]
         if not body:
             raise FileFormatError(f"{path}: has column names but no rows; record or export it again")
     else:
         width = len(_fields(body[0][1], _separator(body[0][1])))
         names_line, names = _names_in_remarks(remark_lines, width)
+    units = _units_row(names, body[0][1]) if names is not None and names_line not in dict(remark_lines) else None
+    if names is not None and units is not None:
+        names, body = _with_units(names, units), body[1:]
+        if not body:
+            raise FileFormatError(f"{path}: has column names and units but no rows; record or export it again")
     separator = _separator(body[0][1])
+    if separator in (";", "\t"):
+        body = _with_decimal_points(path, body, separator)
     rows = [_row(path, number, _fields(line, separator), width, number == len(stripped)) for number, line in body]
     lines = np.array([number for number, _ in body], dtype=np.int64)
     return Table(str(path), remarks, names, np.array(rows), lines, text.endswith("\n"), names_line, remark_lines)
