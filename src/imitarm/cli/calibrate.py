@@ -34,7 +34,7 @@ Word = TypeVar("Word", bound=str)
 
 EPILOG = """\
 examples:
-  imitarm calibrate limbs wave.csv --side left --out left.json
+  imitarm calibrate limbs wave.csv --side left
   imitarm calibrate sensor pairs.csv
   imitarm calibrate clutch --robot sawyer --anchor shoulder --orientation upright
 

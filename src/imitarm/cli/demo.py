@@ -25,7 +25,7 @@ EPILOG = """\
 examples:
   imitarm demo
   imitarm demo --out results --method mapf
-  imitarm demo --seed 7
+  imitarm demo --out demo_7 --seed 7
 
 The package contains eight demonstrations of a sweep, in which a synthetic teacher guides the simulated Sawyer by hand.
 The command checks and aligns them, learns a skill, and reproduces the skill without obstacles and in four scenes with

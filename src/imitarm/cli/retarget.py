@@ -46,7 +46,7 @@ examples:
   imitarm retarget dance.csv --side left --trim 2 8 --pace 0.5 --orientation fixed
   imitarm retarget wave.csv --fit --pace 0.5 --drive
   imitarm retarget synthetic:7 --method all --report compare.html
-  imitarm learn wave_*.csv --task wave --out wave.json
+  imitarm learn wave_1.csv wave_2.csv wave_3.csv --task wave --out wave.json
 
 The robot starts at its home posture, or with --fit at a posture from which the whole recorded motion is within reach.
 It waits until the person has been seen for half a second; then its tool follows the hand. The demonstration contains
