@@ -242,9 +242,9 @@ def test_left_alone_a_guided_arm_stays_and_a_pull_leads_it(arm):
 def test_an_arm_from_elsewhere_without_the_collision_group_has_clearance(tmp_path):
     path = tmp_path / "two.xml"
     path.write_text("""<mujoco model="two"><worldbody><body name="base"><geom size="0.05"/>
-      <body name="upper" pos="0 0 0.1"><joint name="a" axis="0 1 0" range="-2 2" limited="true"/>
+      <body name="upper" pos="0 0 0.1"><joint name="a" axis="0 1 0" range="-120 120" limited="true"/>
         <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.03"/>
-      <body name="fore" pos="0 0 0.3"><joint name="b" axis="0 1 0" range="-2 2" limited="true"/>
+      <body name="fore" pos="0 0 0.3"><joint name="b" axis="0 1 0" range="-120 120" limited="true"/>
         <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.03"/></body></body></body></worldbody></mujoco>""")
     arm = ArmModel.load(path)
     robot = SimulatedRobot(arm, scene=Scene(None, (Sphere([0.0, 0.0, 1.0], 0.1),)), q=[0.0, 0.0])
