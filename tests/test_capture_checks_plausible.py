@@ -277,3 +277,20 @@ def test_real_recordings_have_no_issue_of_plausibility(real_data, folder):
         assert not IMPLAUSIBLE & {issue.code for side in ("left", "right") for issue in check(recording, side)}
         mended, notes = repaired(recording)
         assert len(mended) == len(recording) and not notes
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1e3, "mm"), (1e2, "cm")])
+def test_nobody_is_told_to_record_again_when_only_the_unit_is_wrong(tmp_path, scale, unit):
+    frames = [
+        ",".join([str(round(s.time / TICK)), *(f"{scale * x:.4f},{y:.4f},{z:.4f},2" for x, y, z in positions)])
+        for s, positions in ((s, s.positions * [1, scale, scale]) for s in skeletons(40))
+    ]
+    (tmp_path / "a.csv").write_text("\n".join(frames))
+    found = {issue.code: issue for issue in check(read_recording(tmp_path / "a.csv"))}
+    assert "metres" in found["nobody"].remedy and f"plausible in {unit}" in found["far-joint"].remedy
+
+
+def test_a_repeated_time_stamp_is_not_said_to_go_back():
+    frames = skeletons(60)
+    frames[30] = changed(frames[30], time=frames[29].time)
+    assert "but repeats it" in issues(frames)["time-backwards"].message

@@ -10,7 +10,7 @@ import pytest
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
-from imitarm.scene import Box, Scene, Sphere
+from imitarm.scene import Box, MovingScene, Scene, Sphere
 from scene_shapes import KINDS, random_obstacle
 
 GOAL = Pose([0.5, 0.0, 0.3], [0, 1, 0, 0])
@@ -179,3 +179,10 @@ def test_a_time_that_is_none_is_refused(bad):
         Scene().name_of(bad)
     with pytest.raises(InputError, match=r"fixtures"):
         Scene(fixtures=[bad])
+
+
+def test_a_motion_of_a_name_that_two_obstacles_have_is_refused():
+    scene = Scene(None, [Sphere([0.5, 0.0, z], 0.1, name="ball") for z in (0.1, 0.4)])
+    with pytest.raises(InputError, match="2 obstacles are named 'ball'; give the index"):
+        MovingScene(scene, {"ball": lambda t: [0.5, 0.0, t]})
+    assert MovingScene(scene, {1: lambda t: [0.5, 0.0, t]}).poses(2.0)[0][1, 2] == 2.0

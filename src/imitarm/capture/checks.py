@@ -184,7 +184,9 @@ class _View:
         """Return a remedy: the unit of time that fits or, if no unit fits, what to check instead."""
         fit = time_unit_that_fits(1.0 / self.period, self.time_unit)
         if fit is None:
-            return "look at the spikes and jumps; if there are none, check the units of time and length"
+            return (
+                "check the spikes and jumps, the frame rate from which the times were computed, and the unit of length"
+            )
         name, factor = fit
         return (
             f"the times were read in units of {time_unit_name(self.time_unit)}, but are plausible in {name} "
@@ -197,6 +199,8 @@ def _people(recording: SkeletonRecording) -> Iterator[RecordingIssue]:
     if not any((skeleton.tracking > Tracking.LOST).any() for skeleton in recording.skeletons):
         message = f"nobody is visible in any of {n} frames" if n else "holds no frames"
         remedy = "stand 1.5 to 3 m in front of the sensor and record again"
+        if any(issue.code == "far-joint" for issue in recording.issues):
+            remedy = "convert the positions to metres (see far-joint)"
         yield RecordingIssue("error", "nobody", message, remedy=remedy)
         return
     if len(recording.persons) > 1:
@@ -217,8 +221,9 @@ def _times(view: _View) -> Iterator[RecordingIssue]:
     steps = np.diff(view.times)
     if (steps <= 0.0).any():
         i = int(np.argmax(steps <= 0.0)) + 1
-        message = f"time decreases or does not increase in {int((steps <= 0.0).sum())} frames, by up to "
-        message += f"{1e3 * max(-float(steps.min()), 0.0):.0f} ms"
+        message = f"the time stamp is not later than the previous one {int((steps <= 0.0).sum())} times, "
+        back = 1e3 * float(-steps.min())
+        message += f"and goes back by up to {back:.0f} ms" if back > 0.0 else "but repeats it"
         yield view.issue("error", "time-backwards", message, "repair drops these frames", i)
     if len(view.times) < _FEW:
         yield view.issue("error", "few-frames", f"{len(view.times)} frames only", "record for longer")
