@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imitarm import ArmModel, InputError, Pose, UnreachableError, find_posture
+from imitarm import ArmModel, HalfSpace, InputError, Pose, SimulatedRobot, UnreachableError, find_posture
 from imitarm.retarget.fitting import fit_motion
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
@@ -92,3 +92,35 @@ def test_the_whole_workspace_is_searched_if_home_is_a_poor_place(tmp_path, home)
 def test_what_is_no_motion_is_refused(wrist, start, scale):
     with pytest.raises(InputError):
         fit_motion(ARMS["panda"], wrist, start, scale=scale)
+
+
+# the outermost points and the start of a real swing of an arm, seen by a camera (second view of the video)
+SWING = np.array(
+    [
+        [-0.24, 0.09, -0.3],
+        [-0.04, 0.09, -0.38],
+        [-0.3, 0.1, -0.33],
+        [0.3, 0.03, -0.23],
+        [0.26, -0.3, 0.01],
+        [0.22, 0.3, 0.11],
+        [0.26, 0.17, 0.38],
+    ]
+)
+
+
+@each_arm
+@pytest.mark.parametrize("path", [circle(0.6), SWING], ids=["circle", "swing"])
+def test_an_arm_that_starts_in_the_fitted_posture_touches_neither_itself_nor_its_pedestal(arm, path):
+    robot = SimulatedRobot(arm, q=fit_motion(arm, path, path[0]).q)
+    for _ in range(30):
+        robot.move(np.zeros(7), 0.01)
+    assert (robot.fault, robot.contacts) == ("", set())
+
+
+def test_a_table_in_the_way_moves_the_start_or_shrinks_the_motion():
+    arm, path = ARMS["panda"], circle(0.3)
+    free, table = fit_motion(arm, path, path[0]), HalfSpace([0.0, 0.0, 0.25])
+    above = fit_motion(arm, path, path[0], fixtures=[table])
+    tool = arm.tool_pose(above.q).position + above.scale * (path - path[0])
+    assert tool[:, 2].min() > 0.25
+    assert not np.array_equal(free.q, above.q)

@@ -7,12 +7,13 @@ Only a recording can be fitted; a live motion is not known in advance. The tool 
 where :math:`W` is the person's wrist along the axes of the base, :math:`W_0` the wrist when the clutch engages,
 :math:`p_0` the tool's start and :math:`\rho` the scale. The middle of the motion is placed near the tool's home
 position, then throughout the workspace. The scale is reduced until the arm reaches the start and the six outermost
-points of the motion, with the tool's orientation at home, away from singularities and with its links apart.
+points of the motion, with the tool's orientation at home, away from singularities, with its links apart, and clear of
+the fixtures on which the arm stands.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -26,7 +27,9 @@ from imitarm.kinematics.ik import IKSolver
 from imitarm.kinematics.limits import JointLimits, singularity_limits
 from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.tasks import TwistTask
+from imitarm.scene import Obstacle, Scene, standard_fixtures
 from imitarm.scene.clearance import SelfClearance
+from imitarm.scene.distances import distances
 from imitarm.validation import finite_number, instance, real_array
 
 Array = NDArray[np.float64]
@@ -34,7 +37,7 @@ Array = NDArray[np.float64]
 _SHRINK: Final = 0.85  # factor from one scale that is tried to the next
 _SMALLEST: Final = 0.15
 _EASY, _POSSIBLE = 0.1, 0.05  # [m/rad] smallest singular value: where an arm begins; where it passes
-_APART: Final = 0.02  # [m] between links
+_APART: Final = 0.02  # [m] between two links, and between a link and a fixture
 _STILL: Final = 1e-3  # [rad/s] slower is standing still
 _GRID: Final = np.stack(
     np.meshgrid([0.0, 0.1, -0.1], [0.0, 0.15, -0.15], [0.0, 0.1, -0.1, 0.2], indexing="ij"), axis=-1
@@ -53,7 +56,14 @@ class Fit:
     scale: float
 
 
-def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: float = 1.0) -> Fit:
+def fit_motion(
+    arm: ArmModel,
+    wrist: ArrayLike,
+    start: ArrayLike,
+    *,
+    scale: float = 1.0,
+    fixtures: Sequence[Obstacle] | None = None,
+) -> Fit:
     """Find a start and a scale that bring a recorded motion within the arm's reach.
 
     Args:
@@ -61,6 +71,8 @@ def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: floa
         wrist: positions of the person's wrist along the axes of the base, shape (n, 3) [m]; rows with NaN are skipped.
         start: position of the wrist when the clutch engages, shape (3,) [m].
         scale: the largest scale to try.
+        fixtures: objects on which the arm stands or works, which it must not touch; None: a floor and a pedestal
+            (:func:`~imitarm.scene.standard_fixtures`).
 
     Returns:
         The largest scale that was found, and the start posture for it.
@@ -77,7 +89,7 @@ def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: floa
         raise InputError("fit: the wrist was never seen, so nothing can be fitted")
     middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
     outermost = path[np.unique(np.concatenate([path.argmin(axis=0), path.argmax(axis=0)]))] - middle
-    search = _Search(arm, SelfClearance(arm, _APART))
+    search = _Search(arm, standard_fixtures() if fixtures is None else fixtures)
     reach, span = search.reach(), np.ptp(path, axis=0)
     tried = scale
     while tried >= _SMALLEST:
@@ -94,10 +106,12 @@ def fit_motion(arm: ArmModel, wrist: ArrayLike, start: ArrayLike, *, scale: floa
 
 
 class _Search:
-    """Finds postures with the tool oriented as at home, away from singularities and without contact between links."""
+    """Finds postures with the tool oriented as at home, away from singularities and without contact."""
 
-    def __init__(self, arm: ArmModel, links: SelfClearance) -> None:
-        self.arm, self.links, self.home = arm, links, arm.tool_pose(arm.home)
+    def __init__(self, arm: ArmModel, fixtures: Sequence[Obstacle]) -> None:
+        self.arm, self.links, self.home = arm, SelfClearance(arm, _APART), arm.tool_pose(arm.home)
+        self._fixtures = Scene(None, fixtures).packed
+        self._kept_off = self._room(arm.home) >= 0.0  # links beside the pedestal at home cannot leave it
         self._far: list[tuple[Array, Array]] | None = None
 
     def reach(self) -> float:
@@ -157,7 +171,13 @@ class _Search:
         jacobian = self.arm.tool_jacobian(q)
         jacobian[3:] *= ROTATION_LENGTH
         regular = float(np.linalg.svd(jacobian, compute_uv=False)[-1]) >= smallest
-        return q if regular and self.links.distance(q) >= self.links.clearance else None
+        apart = regular and self.links.distance(q) >= self.links.clearance
+        return q if apart and (self._room(q)[self._kept_off] >= 0.0).all() else None
+
+    def _room(self, q: Array) -> Array:
+        """Return how much farther each sphere of the arm is from each fixture than it must be (n_fixtures, m) [m]."""
+        centers, radii = self.arm.collision_spheres(q)
+        return distances(self._fixtures, centers) - radii - _APART
 
     def _stands(self, q: Array) -> bool:
         """Return whether an arm that avoids its singularities stays at a posture and does not drift away."""

@@ -22,9 +22,8 @@ from imitarm.robots.world import (
     add_obstacles,
     arm_world,
     fixture_names,
-    standard_fixtures,
 )
-from imitarm.scene import MovingScene, Scene
+from imitarm.scene import MovingScene, Scene, standard_fixtures
 from imitarm.scene.motion import Motion
 from imitarm.validation import choice, finite_number, finite_vector, instance
 

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.kinematics.pose import Pose
-from imitarm.scene import ConvexHull, Cylinder, HalfSpace, Obstacle, Scene
-from imitarm.validation import finite_number
+from imitarm.scene import ConvexHull, Obstacle, Scene, standard_fixtures
 
 if TYPE_CHECKING:
     from imitarm.kinematics.arm import ArmModel
@@ -26,24 +25,6 @@ _FIXTURE_COLORS = {"floor": (0.55, 0.57, 0.60, 1.0), "pedestal": (0.28, 0.30, 0.
 _FAR = 100.0  # [m] farther pairs are not measured
 
 
-def standard_fixtures(*, floor: float = -0.75, pedestal_radius: float = 0.12) -> tuple[Obstacle, ...]:
-    """Return the standard fixtures under an arm: a floor, and a pedestal below the base.
-
-    Args:
-        floor: height of the floor in the base frame [m]; at 0 or above there is no pedestal.
-        pedestal_radius: [m].
-
-    Raises:
-        InputError: when a number is not finite, or the radius is not positive.
-    """
-    height = finite_number(floor, "floor", "m")
-    ground = HalfSpace(np.array([0.0, 0.0, height]), name="floor")
-    if height >= 0.0:
-        return (ground,)
-    pose = Pose(np.array([0.0, 0.0, 0.5 * height]), np.array([1.0, 0.0, 0.0, 0.0]))
-    return ground, Cylinder(pose, pedestal_radius, -height, name="pedestal")
-
-
 def arm_world(
     arm: ArmModel, *, floor: float = -0.75, pedestal_radius: float = 0.12, fixtures: Sequence[Obstacle] | None = None
 ) -> mujoco.MjSpec:
@@ -51,8 +32,8 @@ def arm_world(
 
     Args:
         arm: the arm with its tool.
-        floor: see :func:`standard_fixtures`.
-        pedestal_radius: see :func:`standard_fixtures`.
+        floor: see :func:`~imitarm.scene.standard_fixtures`.
+        pedestal_radius: see :func:`~imitarm.scene.standard_fixtures`.
         fixtures: fixtures that replace the standard ones.
 
     Returns:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from imitarm.scene.convex_hull import ConvexHull
-from imitarm.scene.edged import Box, Cone, Cylinder, HalfSpace
+from imitarm.scene.edged import Box, Cone, Cylinder, HalfSpace, standard_fixtures
 from imitarm.scene.motion import MovingScene, Track
 from imitarm.scene.obstacle import Obstacle
 from imitarm.scene.rounded import Capsule, Ellipsoid, Sphere
@@ -30,4 +30,5 @@ __all__ = [
     "Track",
     "load_scene",
     "save_scene",
+    "standard_fixtures",
 ]

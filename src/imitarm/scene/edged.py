@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from imitarm.errors import InputError
-from imitarm.kinematics.pose import rotate
+from imitarm.kinematics.pose import Pose, rotate
 from imitarm.scene.obstacle import (
     MAX_COORDINATE,
     TINY,
@@ -24,6 +24,7 @@ from imitarm.scene.obstacle import (
     lengths,
     rotation_from_z,
 )
+from imitarm.validation import finite_number
 
 DEPTH = 1e3  # [m] a half-space is a box of this half height without ends: same distance wherever an arm can be
 
@@ -265,3 +266,21 @@ class Cone(PosedObstacle):
         at_tip = self.height * v[2] >= self.radius * np.hypot(v[0], v[1])
         half = 0.5 * self.height
         return np.stack([*np.where(at_tip, 0.0, _rim(v, self.radius)), np.where(at_tip, half, -half)])
+
+
+def standard_fixtures(*, floor: float = -0.75, pedestal_radius: float = 0.12) -> tuple[Obstacle, ...]:
+    """Return the standard fixtures under an arm: a floor, and a pedestal below the base.
+
+    Args:
+        floor: height of the floor in the base frame [m]; at 0 or above there is no pedestal.
+        pedestal_radius: [m].
+
+    Raises:
+        InputError: when a number is not finite, or the radius is not positive.
+    """
+    height = finite_number(floor, "floor", "m")
+    ground = HalfSpace(np.array([0.0, 0.0, height]), name="floor")
+    if height >= 0.0:
+        return (ground,)
+    pose = Pose(np.array([0.0, 0.0, 0.5 * height]), np.array([1.0, 0.0, 0.0, 0.0]))
+    return ground, Cylinder(pose, pedestal_radius, -height, name="pedestal")
