@@ -110,7 +110,7 @@ class _Search:
 
     def __init__(self, arm: ArmModel, fixtures: Sequence[Obstacle]) -> None:
         self.arm, self.links, self.home = arm, SelfClearance(arm, _APART), arm.tool_pose(arm.home)
-        self._fixtures = Scene(None, fixtures).packed
+        self._fixtures = Scene(None, tuple(fixtures)).packed
         self._kept_off = self._room(arm.home) >= 0.0  # links beside the pedestal at home cannot leave it
         self._far: list[tuple[Array, Array]] | None = None
 
