@@ -67,10 +67,10 @@ def test_findings_of_one_kind_share_a_row(tmp_path, capsys, n):
     files = [table(tmp_path / f"demo_{i}.csv", rows + [0, i, 0, 0]) for i in range(n)]
     assert main(["lint", *files]) == 2
     text = capsys.readouterr().out
-    assert text.count("probably not metres") == 1 and f"{n} of this kind; the first: " in text
+    assert text.count("probably not the metre") == 1 and f"{n} of this kind; the first: " in text
     assert f"and {n - 1} other" in text and f"{n} errors" in text
     assert main(["lint", *files, "--all"]) == 2
-    assert capsys.readouterr().out.count("probably not metres") == n
+    assert capsys.readouterr().out.count("probably not the metre") == n
 
 
 def test_a_stack_of_matrices_is_one_finding(tmp_path, capsys):
@@ -91,7 +91,7 @@ def test_held_values_are_thinned_and_learned(tmp_path, capsys):
     out = tmp_path / "s.json"
     assert main(["learn", *files, "--thin", "--components", "6", "--out", str(out)]) == 0
     text = capsys.readouterr().out
-    assert "held-values" not in text and "rows repeated a held value and were dropped" in text
+    assert "held-values" not in text and "rows only repeated the previous row and were dropped" in text
     assert Skill.load(out).n_demonstrations_ == 3
 
 

@@ -44,9 +44,9 @@ def test_its_units_are_not_to_be_overruled(tmp_path):
     file = tmp_path / "a.csv"
     motion(n=20).save(file)
     assert len(read(file, units="m", time_units="s")) == 1
-    with pytest.raises(InputError, match="is in m and s, as its header says"):
+    with pytest.raises(InputError, match="its header states m and s"):
         read(file, units="cm")
-    with pytest.raises(InputError, match="time stamps of its own"):
+    with pytest.raises(InputError, match="its own time stamps"):
         read(file, duration=3.0)
 
 

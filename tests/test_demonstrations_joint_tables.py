@@ -77,10 +77,10 @@ def test_the_arm_must_be_named_and_the_right_one(tmp_path, sawyer):
     (tmp_path / "b.csv").write_text(text.replace("right_j6", "right_j7"))
     with pytest.raises(InputError, match="right_j7 are not those of sawyer"):
         read(tmp_path / "b.csv", arm=sawyer)
-    with pytest.raises(InputError, match="holds joint angles and no lengths"):
+    with pytest.raises(InputError, match="holds joint angles but no lengths"):
         read(tmp_path / "a.csv", units="cm", arm=sawyer)
     (tmp_path / "c.csv").write_text(text.replace("right_j6", "left_j0"))
-    with pytest.raises(FileFormatError, match="joints of two limbs"):
+    with pytest.raises(FileFormatError, match="joints of two arms"):
         read(tmp_path / "c.csv", arm=sawyer)
 
 

@@ -91,7 +91,7 @@ def test_real_recordings_with_a_stranger_among_them(real_data):
     stranger = read_raw(folder / "pouring.npy", units="cm", duration=10.0)[:1]
     outlier = find("outlier", lint(shown + stranger))
     assert outlier.source.endswith("pouring.npy[0]")
-    assert "mm from the most typical one" in outlier.message
+    assert "mm from the most typical demonstration" in outlier.message
 
 
 def test_findings_name_place_and_remedy_and_errors_come_first():

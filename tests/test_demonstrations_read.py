@@ -89,7 +89,7 @@ def test_the_content_decides_and_a_name_must_not_lie(tmp_path):
         ({"duration": 0.0}, InputError, "duration must be a finite number above 0"),
         ({"rate": float("nan")}, InputError, "rate must be a finite number above 0"),
         ({"duration": 1.0, "rate": 2.0}, InputError, "not both"),
-        ({"duration": 1.0}, InputError, "time stamps of its own"),
+        ({"duration": 1.0}, InputError, "its own time stamps"),
     ],
 )
 def test_options_that_can_not_be(tmp_path, options, error, message):
@@ -101,10 +101,10 @@ def test_options_that_can_not_be(tmp_path, options, error, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t[[0, 1, 3, 2, 4, 5]], r"line 5 is not later than the row before; fix .*repair=True"),
+        (lambda t: t[[0, 1, 3, 2, 4, 5]], r"line 5 is not later than the previous row; fix .*repair=True"),
         (lambda t: np.where(np.arange(6)[:, None] == 2, np.nan, t), "line 4 holds a number that is not finite"),
         (lambda t: t * [1, np.inf, 1, 1], "line 2 holds a number that is not finite"),
-        (lambda t: t * [1, 1e9, 1, 1], r"line 2: no robot reaches position"),
+        (lambda t: t * [1, 1e9, 1, 1], r"line 2: no robot reaches the position"),
         (lambda t: t[:1], "1 rows|of 1 rows"),
     ],
 )
@@ -164,14 +164,14 @@ def test_real_recordings_of_a_guided_panda(real_data, name, n, columns):
         else:
             same = np.abs(np.sum(one.trajectory.quaternions * table[:, 3:], axis=1))
             assert np.allclose(same, 1.0)
-    with pytest.raises(FileFormatError, match=r"no time stamps; give the length of the motion, duration=10\.0"):
+    with pytest.raises(FileFormatError, match=r"no time stamps; give the duration of the motion, duration=10\.0"):
         read(file, units="cm")
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("kinect_gestures/Ges01_wavehand.csv", "101 columns without names; known are 2"),
+        ("kinect_gestures/Ges01_wavehand.csv", "101 columns without names; a table without names must have 2"),
         ("mocap_arm/recording.tsv", "recording.tsv, line "),
         ("mocap_trolley/mid.csv", "mid.csv, line 2: 8 values where 7 are expected"),
     ],

@@ -67,7 +67,9 @@ def test_nothing_is_overwritten_unasked(tmp_path):
         DemonstrationRecorder(path, ARM)
     recorder = record(path, replace=True)
     assert path.read_text() == "precious"
-    with pytest.raises(InputError, match="was left by a recording that was not closed, or is being written"):
+    with pytest.raises(
+        InputError, match="an earlier recording left this file unfinished, or another program is writing it"
+    ):
         DemonstrationRecorder(path, ARM, replace=True)
     recorder.close()
     assert len(Demonstration.load(path)) == 40

@@ -1,17 +1,17 @@
-"""Align demonstrations: trim idle ends, and bring matching parts of all motions to the same time.
+"""Align demonstrations: cut off rest at both ends, and warp time so that all motions pass matching points together.
 
-People never repeat a motion at exactly the same speed. If demonstrations are averaged at equal times, a bend that
-occurs early in one demonstration and late in another is smeared: the mean cuts corners and flattens peaks. Alignment
-changes when a demonstration reaches each point, never the points.
+People never repeat a motion at exactly the same speed. A bend may therefore occur early in one demonstration and late
+in another. The mean at equal times would smear such a bend, because averaging cuts corners and flattens peaks.
+Alignment changes the time at which a demonstration reaches each point of its path, but never the path.
 
-Time is warped by dynamic time warping within a band. For two motions ``a``, ``b`` of n samples, the cheapest monotone
-path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` obeys
+Dynamic time warping within a band finds the matching points. For two motions ``a``, ``b`` of n samples, the cheapest
+monotone path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` obeys
 
     D(i, j) = c(i, j) + min(D(i-1, j-1) + c(i, j), D(i-1, j) + p, D(i, j-1) + p)
 
-(Sakoe and Chiba 1978, symmetric form, in which a diagonal step counts twice). The price ``p`` of a step that is not
-diagonal keeps noise from distorting time; |i - j| stays within the band. All cells of one anti-diagonal are computed
-together, for all pairs of motions.
+(Sakoe and Chiba 1978, symmetric form, in which a diagonal step counts twice). D(i, j) is the cost of the cheapest path
+from (0, 0) to (i, j). The price ``p`` of a step that is not diagonal keeps noise from distorting time, and the band
+limits |i - j|. The code computes all cells of one anti-diagonal together, for all pairs of motions.
 """
 
 from __future__ import annotations
@@ -60,15 +60,16 @@ _NOISE_FACTOR = 4.0  # standard deviations of noise that count as standing
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Aligned demonstrations, and the changes.
+    """Aligned demonstrations, and how alignment changed them.
 
     Attributes:
         demonstrations: demonstrations with common times from 0 to ``duration``.
-        duration: the median of the trimmed demonstrations' durations [s].
+        duration: common duration of the aligned demonstrations, the median of the trimmed demonstrations' durations
+            [s].
         kept_rows: first and last row of each demonstration that were kept, shape (n_demonstrations, 2).
         durations: duration of each trimmed demonstration before alignment [s], shape (n_demonstrations,).
-        warps: elapsed fraction of each demonstration's own trimmed duration at each sample of the common motion, 0
-            to 1, strictly increasing, shape (n_demonstrations, n).
+        warps: for each sample of the aligned motion, the fraction of the demonstration's own trimmed duration at which
+            the demonstration reached the same point; 0 to 1, strictly increasing, shape (n_demonstrations, n).
         method: ``"dtw"`` or ``"resample"``.
     """
 
@@ -81,12 +82,12 @@ class Alignment:
 
     @property
     def largest_shift(self) -> Array:
-        """Largest time shift within each demonstration [s], shape (n_demonstrations,)."""
+        """Largest time shift of any sample of each demonstration [s], shape (n_demonstrations,)."""
         even = np.linspace(0.0, 1.0, self.warps.shape[1])
         return np.asarray(np.abs(self.warps - even).max(axis=1) * self.duration)
 
     def notes(self) -> list[str]:
-        """Return the changes, one line for each demonstration."""
+        """Return a description of how alignment changed each demonstration, one line for each."""
         return [
             f"{one.source}: {duration:.2f} s to {self.duration:.2f} s, largest time shift {shift:.2f} s"
             for one, duration, shift in zip(self.demonstrations, self.durations, self.largest_shift, strict=True)
@@ -94,11 +95,12 @@ class Alignment:
 
 
 def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Method = "dtw") -> list[Demonstration]:
-    """Trim, re-time and resample demonstrations of one motion so that a skill can be learned from them.
+    """Trim, time-warp and resample demonstrations of one motion so that a skill can be learned from them.
 
-    Idle ends are cut off, time starts at 0, and the common duration is the median. ``"dtw"`` then warps the time of
-    each demonstration to a barycentre of them all (:func:`barycentre_warps`); ``"resample"`` only stretches it evenly.
-    Positions, rotations and joints all follow the same warp.
+    Rest at both ends is cut off, and time starts at 0. The common duration is the median duration. The method ``"dtw"``
+    then warps the time of each demonstration to match an average motion (:func:`barycentre_warps`). The method
+    ``"resample"`` only stretches time evenly. Positions, rotations and joint positions of one demonstration all follow
+    the same warp.
 
     Args:
         demonstrations: one or more demonstrations of one motion.
@@ -106,7 +108,8 @@ def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Meth
         method: ``"dtw"`` or ``"resample"``.
 
     Returns:
-        Demonstrations with the same ``n`` times; ``source`` names the rows that were kept.
+        Demonstrations with the same ``n`` times. The ``source`` of each one states which rows of the recording were
+        kept.
 
     Raises:
         InputError: when the list is empty, ``n`` is below 10, a demonstration does not move, or only some have
@@ -117,14 +120,16 @@ def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Meth
 
 
 def compute_alignment(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Method = "dtw") -> Alignment:
-    """Align like :func:`align`, and also return the changes; the arguments and errors are the same."""
+    """Align like :func:`align`, with the same arguments and errors, and also return how alignment changed them."""
     choice(method, METHODS, "method of alignment")
     n = whole_number(n, "align: n", at_least=10, at_most=_MOST_SAMPLES)
     if not sequence(demonstrations, Demonstration, "align: demonstrations"):
         raise InputError("align: no demonstrations; read some first")
     if len({one.trajectory.quaternions is None for one in demonstrations}) > 1:
         without = next(one for one in demonstrations if one.trajectory.quaternions is None)
-        raise InputError(f"align: some demonstrations have rotations, {without.source or 'one'} has none; leave it out")
+        raise InputError(
+            f"align: some demonstrations have rotations, but {without.source or 'one'} has none; leave it out"
+        )
     kept = [_kept_rows(one) for one in demonstrations]
     trimmed = [_trimmed(one, rows) for one, rows in zip(demonstrations, kept, strict=True)]
     durations = np.array([one.trajectory.duration for one in trimmed])
@@ -169,10 +174,11 @@ def _retimed(demonstration: Demonstration, warp: Array, times: Array) -> Demonst
 
 
 def noise_level(values: Array) -> float:
-    """Return the standard deviation of white noise on smooth samples (n, d), from their third differences.
+    """Estimate the standard deviation of white noise on samples (n, d), from their third differences.
 
-    For white noise of deviation s the variance of a third difference is 20 s^2; the median makes the result robust to
-    the remaining motion. With fewer than 20 samples, noise and motion can't be separated, and the result is 0.
+    For white noise of standard deviation s, the variance of a third difference is 20 s^2. The estimate uses the median,
+    so that motion that remains in the third differences has little influence. With fewer than 20 samples, noise and
+    motion can't be separated, and the result is 0.
     """
     if len(values) < 20:
         return 0.0
@@ -181,7 +187,7 @@ def noise_level(values: Array) -> float:
 
 
 def turns(quaternions: Array) -> Array:
-    """Return the accumulated rotation (n, 3) [rad]: the sum of the rotation vectors of all steps."""
+    """Return the accumulated rotation (n, 3) [rad]: the sum of the rotation vectors of all steps so far."""
     q = continuous_signs(quaternions)
     steps = quaternion_log(quaternion_multiply(q[1:], quaternion_conjugate(q[:-1])))
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
@@ -190,10 +196,11 @@ def turns(quaternions: Array) -> Array:
 def moving_rows(times: Array, positions: Array, quaternions: Array | None = None) -> tuple[int, int] | None:
     """Return the first and the last row between which the tool moves; None if it never moves.
 
-    The motion begins at the last row within 0.1 mm of the start before the tool is 0.5 mm away from it. The speed is
-    not used, so a slow motion is never mistaken for rest. The end is found in the same way, from the last row
-    backwards; 0.1 s more is kept on both sides. With noisy samples, both distances are at least 4 standard deviations
-    of the averaged noise. Rotation without displacement counts as motion.
+    The first row is found in two steps: find the row at which the tool is first more than 0.5 mm away from its start,
+        then go back to the last row that is within 0.1 mm of the start. The last row is found in the same way, from the
+        end backwards. A margin of 0.1 s is kept on both sides. Speed is not used, so a slow motion is never mistaken
+        for rest. With noisy samples, both distances are raised to at least 4 standard deviations of the averaged noise.
+        Rotation without displacement counts as motion.
 
     Args:
         times: strictly increasing, shape (n,) [s].
@@ -208,7 +215,7 @@ def moving_rows(times: Array, positions: Array, quaternions: Array | None = None
 
 
 def _moving(times: Array, values: Array, still: float) -> tuple[int, int] | None:
-    """Return the rows between which ``values`` (n, d) change by more than ``still`` and the noise."""
+    """Return the first and the last row of the part in which ``values`` (n, d) change by more than ``still``."""
     noise, step = noise_level(values), float(np.median(np.diff(times)))
     left = _LEFT * still
     quiet = (_NOISE_FACTOR * noise / left) ** 2 * step  # an average over so long has noise below the larger distance
@@ -233,7 +240,7 @@ def _moving(times: Array, values: Array, still: float) -> tuple[int, int] | None
 
 
 def held_rows(values: Array) -> NDArray[np.bool_]:
-    """Return whether each row of one recorded quantity (n, d) only repeats the previous value, shape (n,)."""
+    """Return for each row of one recorded quantity (n, d) whether it only repeats the previous row, shape (n,)."""
     none = np.zeros(len(values), dtype=bool)
     steps = np.abs(np.diff(values, axis=0))
     same = np.asarray(~(steps > 0.0).any(axis=1))
@@ -251,13 +258,13 @@ def held_rows(values: Array) -> NDArray[np.bool_]:
 
 
 def smooth_speed(times: Array, values: Array, window: float = _WINDOW) -> tuple[Array, Array]:
-    """Return speed (n,) [unit/s] and mean (n, d) of ``values`` (n, d) over a window [s] about each sample."""
+    """Return speed (n,) [unit/s] and mean (n, d) of ``values`` (n, d) in a time window [s] around each sample."""
     slope, mean, _ = smooth_slope(times, values, window)
     return np.linalg.norm(slope, axis=1), mean
 
 
 def smooth_slope(times: Array, values: Array, window: float = _WINDOW) -> tuple[Array, Array, Array]:
-    """Fit a straight line to the samples in a window about each sample.
+    """Fit a straight line over time to the samples in a window around each sample.
 
     Args:
         times: strictly increasing, shape (n,) [s].
@@ -292,11 +299,12 @@ def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, In
         a: first motions, shape (pairs, n, d).
         b: second motions, shape (pairs, n, d), same n.
         band: largest allowed |i - j|, in samples.
-        price: cost of a step that is not diagonal, in units of the cost.
+        price: cost of a step that is not diagonal, in the unit of squared distances between samples.
 
     Returns:
-        cost: D(n-1, n-1) of each pair, shape (pairs,).
-        path: index pairs (i, j) from the end to the start, padded with the start, shape (pairs, 2 n - 1, 2).
+        cost: cost D(n-1, n-1) of the cheapest path of each pair, shape (pairs,).
+        path: matched samples as index pairs (i, j), from the end to (0, 0) and padded with (0, 0), shape (pairs, 2 n -
+            1, 2).
     """
     n = a.shape[1]
     # one row for each anti-diagonal i + j, one column for each offset i - j; cells outside grid or band cost inf
@@ -317,7 +325,7 @@ def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, In
 
 
 def _trace(total: Array, cost: Array, price: float) -> Indices:
-    """Trace the path from the last pair of samples back to the first, for all pairs of motions together."""
+    """Trace the cheapest path from the last pair of samples back to the first, for all pairs of motions together."""
     length, pairs, width = total.shape
     every = np.arange(pairs)
     diagonal, column = np.full(pairs, length - 1), np.full(pairs, width // 2)
@@ -345,10 +353,11 @@ def identity_warps(n_demonstrations: int, n: int) -> Array:
 
 
 def features(trajectories: Sequence[Trajectory]) -> Array:
-    """Return the features by which motions are compared, shape (n_demonstrations, n, 3), or 6 with rotations [m].
+    """Return the features by which motions are compared [m]: shape (n_demonstrations, n, 3); with rotations (..., 6).
 
-    Each path is moved to the common start and goal, because a motion that began at another position did not begin
-    earlier. Rotations count as rotation vectors from their mean, times a lever of 0.1 m.
+    Each path is first moved to the common start and goal, because a different start position does not mean that the
+    motion started earlier or later. Rotations are expressed as rotation vectors relative to the mean rotation,
+    multiplied by a lever arm of 0.1 m.
     """
     parts = [to_common_ends(np.stack([trajectory.positions for trajectory in trajectories]))]
     if trajectories[0].quaternions is not None:
@@ -357,21 +366,21 @@ def features(trajectories: Sequence[Trajectory]) -> Array:
 
 
 def rotation_paths(trajectories: Sequence[Trajectory]) -> Array:
-    """Return the rotation vectors from the mean rotation, continuous beyond 180 degrees (m, n, 3) [rad]."""
+    """Return rotation vectors relative to the mean rotation, continuous beyond 180 degrees, shape (m, n, 3) [rad]."""
     q = np.stack([one.quaternions for one in trajectories if one.quaternions is not None])
     first = quaternion_log(quaternion_multiply(q[:, 0], quaternion_conjugate(mean_quaternion(q))))
     return np.stack([f + turns(one) for f, one in zip(first, q, strict=True)])
 
 
 def to_common_ends(values: Array) -> Array:
-    """Return motions (m, n, d) moved to the mean of their starts and the mean of their goals."""
+    """Return the motions (m, n, d), moved so that all begin at the mean start and end at the mean goal."""
     fraction = np.linspace(0.0, 1.0, values.shape[1])[:, None]
     start, goal = values[:, :1], values[:, -1:]
     return np.asarray(values - (1.0 - fraction) * (start - start.mean(axis=0)) - fraction * (goal - goal.mean(axis=0)))
 
 
 def medoid(values: Array) -> int:
-    """Return the index of the motion nearest to all others; ``values`` has shape (n_demonstrations, n, d)."""
+    """Return the index of the motion that is nearest to all others, among ``values`` (n_demonstrations, n, d)."""
     flat = values.reshape(len(values), -1)
     squares = np.sum(flat**2, axis=1)
     distance = np.sqrt(np.maximum(squares[:, None] + squares - 2.0 * flat @ flat.T, 0.0))
@@ -379,19 +388,19 @@ def medoid(values: Array) -> int:
 
 
 def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0, n_iterations: int = 8) -> Array:
-    """Return the warps that bring motions to their common barycentre.
+    """Return the time warps that align motions with their common average motion (barycentre).
 
-    The first barycentre is the medoid. Each motion is matched with the barycentre by :func:`dtw`, its matched times are
-    smoothed into a warp, and the mean of the warped motions is the next barycentre (averaging as in Petitjean et al.
-    2011, with one smooth warp for each motion in place of sets of matched samples). The warps are centred: their mean
-    at every time of the common motion is that time. Therefore the common speed profile is the mean profile, not that of
-    the medoid.
+    The first barycentre is the medoid: the motion nearest to all others. Each round matches every motion with the
+        barycentre by :func:`dtw` and smooths the matched times into a warp. The mean of the warped motions is the
+        barycentre of the next round. This is the averaging of Petitjean et al. 2011, except that each motion has one
+        smooth warp in place of sets of matched samples. The warps are centred, which means that their mean is the
+        identity. Therefore the common speed profile is the mean of all speed profiles, not the profile of the medoid.
 
     Args:
         values: features, shape (n_demonstrations, n, d), evenly spaced in time.
         band: largest time shift before centring, as a fraction of the duration.
-        stiffness: cost of warping time, in mean squared deviations from the barycentre.
-        n_iterations: largest number of rounds.
+        stiffness: price of a step that is not diagonal, as a multiple of the median squared distance to the barycentre.
+        n_iterations: largest number of rounds; the rounds end earlier when the warps no longer change.
 
     Returns:
         shape (n_demonstrations, n), from 0 to 1, strictly increasing.
@@ -413,7 +422,7 @@ def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0
 
 
 def _at(values: Array, warps: Array) -> Array:
-    """Return motions (m, n, d) at warped times (m, n)."""
+    """Return motions (m, n, d), interpolated at the warped times (m, n)."""
     even = np.linspace(0.0, 1.0, values.shape[1])
     return np.stack(
         [np.stack([np.interp(w, even, c) for c in v.T], axis=1) for v, w in zip(values, warps, strict=True)]
@@ -421,7 +430,7 @@ def _at(values: Array, warps: Array) -> Array:
 
 
 def _smooth_warp(path: Indices, n: int) -> Array:
-    """Return a strictly increasing warp over the n steps of the barycentre, from matched pairs (motion, barycentre)."""
+    """Return a smooth, strictly increasing warp (n,) from matched index pairs (motion, barycentre)."""
     length = int(np.argmax(path.sum(axis=1) == 0)) + 1
     own, common = path[:length, 0], path[:length, 1]
     mean = np.bincount(common, weights=own, minlength=n) / np.bincount(common, minlength=n)
@@ -436,6 +445,6 @@ def _smooth_warp(path: Indices, n: int) -> Array:
 
 
 def _centred(warps: Array, even: Array) -> Array:
-    """Change the common time so that the mean of all warps is the identity."""
+    """Return the warps over a changed common time, so that the mean of all warps is the identity."""
     back = np.interp(even, warps.mean(axis=0), even)
     return np.stack([np.interp(back, even, warp) for warp in warps])

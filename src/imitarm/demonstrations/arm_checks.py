@@ -24,7 +24,7 @@ _DEGREES = 2.5 * np.pi  # [rad] no joint rotates farther, so these are degrees
 
 
 def check_arm(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
-    """Find joints of another arm, in degrees, beyond their limits or too fast, and positions out of reach."""
+    """Check that joints belong to the arm, are in rad and within limits, and that positions are within reach."""
     if motion.joints is None:
         yield from _check_reach(motion, arm)
         return
@@ -63,7 +63,7 @@ def check_arm(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
             "joint-speed",
             f"{arm.joint_names[joint]} rotates at {speed[row, joint] * arm.max_velocity[joint]:.2f} rad/s, but "
             f"{arm.name} allows {arm.max_velocity[joint]:.2f}",
-            "reproduce it with a longer duration",
+            "reproduce the motion with a longer duration",
             int(row),
         )
 
@@ -84,15 +84,16 @@ def _check_reach(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
 
 
 def reach(arm: ArmModel, *, n_samples: int = 400, seed: int = 0) -> tuple[Array, float]:
-    """Return the shoulder of an arm, and the largest distance of the tool's tip from it.
+    """Return the shoulder of an arm, and the largest distance between the shoulder and the tool's tip.
 
-    The shoulder is the point of the first joint's axis that is nearest to the axis of the second joint. The distance is
-    the largest distance that gradient ascent within the joint limits finds from random postures, a tight lower bound.
+    The shoulder is the point on the first joint's axis that is nearest to the second joint's axis. The distance is
+    found by gradient ascent within the joint limits from random postures, so it is a close lower bound of the true
+    reach.
 
     Args:
         arm: arm with its tool.
-        n_samples: number of random postures; ascent starts from the best four.
-        seed: seed of these postures.
+        n_samples: number of random postures; gradient ascent starts from the four with the largest distance.
+        seed: seed of the random postures.
 
     Returns:
         Shoulder position in the base frame, shape (3,) [m], and largest distance [m].
@@ -116,7 +117,7 @@ def reach(arm: ArmModel, *, n_samples: int = 400, seed: int = 0) -> tuple[Array,
 
 
 def _shoulder(arm: ArmModel) -> Array:
-    """Return the point of the first joint's axis nearest to the second joint's, shape (3,) [m]."""
+    """Return the point on the first joint's axis that is nearest to the second joint's axis, shape (3,) [m]."""
     q = np.array(arm.home)
     columns = arm.tool_jacobian(q)
     position = arm.tool_pose(q).position

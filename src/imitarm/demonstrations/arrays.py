@@ -1,6 +1,6 @@
-"""Reader of NumPy files (.npy, .npz). The number of columns determines the meaning of columns without names.
+"""Reader of NumPy files (.npy, .npz). The columns have no names, so their number determines their meaning.
 
-Pickled objects are never loaded.
+Python objects stored in the files (pickles) are never loaded.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ _FIELDS = ("times", "positions", "quaternions", "joints")
 class NumpyReader(Reader):
     """Arrays of numbers.
 
-    An array (n, columns) is one motion, an array (n_demonstrations, n, columns) is several; the columns have the same
-    meaning as in a text table without names. An .npz with an array ``positions`` holds one set of motions, and may also
-    hold the arrays ``times``, ``quaternions`` and ``joints``; in any other .npz each array holds motions.
+    An array of shape (n, columns) is one motion of n samples. An array of shape (n_demonstrations, n, columns) is
+    several motions. The columns have the same meaning as in a text table without column names. An .npz file with an
+    array ``positions`` holds one set of motions, and may also hold the arrays ``times``, ``quaternions`` and
+    ``joints``. In any other .npz file, each array holds one or several motions.
     """
 
     suffixes = (".npy", ".npz")
 
     def recognises(self, head: bytes) -> bool:
-        """Return whether the file begins as .npy and .npz files do."""
+        """Return whether the first bytes of the file are those of an .npy or .npz file."""
         return head.startswith((_NPY, _NPZ))
 
     def read(self, path: str, options: ReadOptions) -> list[RawDemonstration]:
@@ -62,7 +63,7 @@ def _damaged(path: str, error: BaseException) -> FileFormatError:
 
 
 def _load(path: str, content: bytes) -> Any:
-    """Return the array of an .npy, or the arrays of an .npz by name, from the bytes of the file."""
+    """Return the array of an .npy file, or the arrays of an .npz file by name, from the bytes of the file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # NumPy warns about headers that old versions wrote
@@ -76,13 +77,13 @@ def _load(path: str, content: bytes) -> Any:
 
 
 def _check_size(content: bytes) -> None:
-    """Reject a header that states more data than the file contains, before memory is allocated."""
+    """Reject a file whose header states more data than the file contains, before memory is allocated for the data."""
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = header(stream)
     if not dtype.hasobject and np.prod(shape, dtype=float) * dtype.itemsize > len(content):
-        raise ValueError(f"its header says shape {shape}, the file is too short for it")
+        raise ValueError(f"its header states the shape {shape}, the file is too short for it")
 
 
 def _numbers(source: str, array: Any) -> Array:
@@ -112,7 +113,7 @@ def _stack(source: str, array: Array, options: ReadOptions) -> list[RawDemonstra
 
 
 def _check_matrices(source: str, array: Array) -> None:
-    """Reject stacks of rotation or transformation matrices, whose rows are not samples."""
+    """Reject stacks of rotation or transformation matrices, because their rows are not samples of a motion."""
     square = array.ndim >= 3 and array.shape[-2:] in ((4, 4), (3, 4), (3, 3))
     flat = array.ndim == 2 and array.shape[1] in (9, 12, 16) and len(array) > 1
     if not square and not flat:

@@ -1,6 +1,6 @@
-"""What the columns of a table hold: by their names, or by their number when they have no names.
+"""Find out what each column of a table holds, from the column names or, without names, from the number of columns.
 
-A name or a unit that is not understood is an error. A rotation in a form that is not read is reported.
+An unknown unit is an error. A rotation in a form that can't be read, such as Euler angles, is reported.
 """
 
 from __future__ import annotations
@@ -117,10 +117,11 @@ class Column:
     """The meaning of one column name.
 
     Attributes:
-        what: quantity: ``t``, ``x``, ``y``, ``z``, ``qw`` to ``qz`` or ``joint``; empty when the name is not known.
-        unit: unit in the name, in lower case; None if the name has no unit.
+        what: quantity in the column: ``t``, ``x``, ``y``, ``z``, ``qw`` to ``qz`` or ``joint``; empty if the name is
+            unknown.
+        unit: unit that the column name states, in lower case; None if the name states no unit.
         joint: name of the joint, without words such as ``position.``.
-        not_angle: the quantity in a joint's column if it is not its angle, for example ``"velocities"``.
+        not_angle: what the column of a joint holds if it does not hold joint angles, for example ``"velocities"``.
     """
 
     what: str
@@ -130,7 +131,7 @@ class Column:
 
 
 def column_of(name: str) -> Column:
-    """Return the meaning of a column name: ``x``, ``pose.position.x``, ``x [mm]``, ``time_ms`` or ``right_j0``."""
+    """Return the meaning of a name such as ``x``, ``pose.position.x``, ``x [mm]``, ``time_ms`` or ``right_j0``."""
     base, unit = name.strip(), None
     if (match := _BRACKETS.fullmatch(base)) is not None:
         base = match["name"]
@@ -176,13 +177,13 @@ def _meaning(base: str, words: Sequence[str]) -> tuple[str, None, str, str]:
 def named_columns(
     source: str, names: Sequence[str], values: Array, options: ReadOptions, said: SaidUnits | None = None
 ) -> RawDemonstration:
-    """Assign the columns of a table by their names.
+    """Convert a table with column names to a demonstration.
 
     Args:
         source: name of the file, for messages.
         names: name of each column; joints are recognised by names such as ``right_j0`` or ``panda_joint1``.
         values: numbers in the columns, shape (n, len(names)).
-        options: facts that the file may not state.
+        options: options for facts that the file does not state, such as units.
         said: units that the file states outside its column names.
 
     Raises:
@@ -197,7 +198,7 @@ def named_columns(
         key = f"joint {column.joint.lower()}" if column.joint else column.what
         if key not in ("", "t") and place.setdefault(key, i) != i:
             raise FileFormatError(
-                f"{source}: columns {names[place[key]]!r} and {names[i]!r} both hold {key}; remove one"
+                f"{source}: columns {names[place[key]]!r} and {names[i]!r} both hold {key}; remove one column"
             )
     units = {i: _unit_of(source, names[i], column) for i, column in enumerate(columns) if column.what}
     for group, needed in (("xyz", {"x", "y"}), ("quaternion", {"qw", "qx", "qy", "qz"})):
@@ -238,9 +239,9 @@ def named_columns(
 
 
 def _with_tum_positions(columns: list[Column], names: Sequence[str]) -> list[Column]:
-    """Return the columns with ``tx ty tz`` as positions, as in TUM files, where a quaternion follows them.
+    """Return the columns; ``tx ty tz`` become positions if there is also a quaternion, as in trajectory files of TUM.
 
-    Without a quaternion, or beside forces, ``tx ty tz`` may be torques and are left alone.
+    Without a quaternion, or together with forces, ``tx ty tz`` may be torques and do not become positions.
     """
     plain = [name.strip().lower() for name in names]
     known = {column.what for column in columns}
@@ -260,7 +261,7 @@ def _plain(name: str) -> str:
 
 
 def _matrix_elements(names: Sequence[str]) -> list[int]:
-    """Return the nine columns of a rotation matrix, row by row (``r11 r12 ... r33`` or ``r00 ... r22``), or none."""
+    """Return the indices of the columns of a rotation matrix (``r11 ... r33`` or ``r00 ... r22``), or none."""
     found: dict[tuple[int, int], int] = {}
     for i, name in enumerate(names):
         if (match := _ELEMENT.fullmatch(_plain(name))) is not None:
@@ -276,7 +277,7 @@ def _of_matrices(source: str, elements: Array) -> Array:
     """Return the quaternions wxyz (n, 4) of rotation matrices (n, 9); rows that are not finite become nan.
 
     Raises:
-        FileFormatError: when a matrix is not a rotation.
+        FileFormatError: when a matrix is not a rotation matrix.
     """
     matrices = elements.reshape(-1, 3, 3)
     finite = np.asarray(np.isfinite(elements).all(axis=1))
@@ -291,7 +292,7 @@ def _of_matrices(source: str, elements: Array) -> Array:
 
 
 def _unread_rotation(names: Sequence[str]) -> tuple[str, ...]:
-    """Return those of the unused columns that seem to hold a rotation in a form that is not read."""
+    """Return the names of columns that seem to hold a rotation in a form that can't be read, such as Euler angles."""
     plain = [_plain(name) for name in names]
     in_sets = {word for words in _ROTATION_SETS if set(words.split()) <= set(plain) for word in words.split()}
     if in_sets == {"q1", "q2", "q3", "q4"} and {"q5", "q6"} & set(plain):
@@ -307,12 +308,14 @@ def _what_is_there(names: Sequence[str], columns: Sequence[Column]) -> str:
     others = sorted({column.not_angle for column in columns if column.not_angle})
     if others:
         example = names[next(i for i, column in enumerate(columns) if column.not_angle)]
-        return f"holds joint {' and '.join(others)} ({example}), not joint angles; record the angles, or x y z"
-    return f"no column is named x y z or as a joint (right_j0, panda_joint1); found {', '.join(names)}"
+        return (
+            f"holds joint {' and '.join(others)} ({example}), not joint angles; record joint angles, or positions x y z"
+        )
+    return f"no columns are named x, y, z or like joints (right_j0, panda_joint1); found {', '.join(names)}"
 
 
 def _unit_of(source: str, name: str, column: Column) -> str | None:
-    """Return the unit in a column's name as one of the known symbols."""
+    """Return the symbol of the unit that a column's name states; None if it states no unit."""
     if column.unit is None:
         return None
     kind = _KINDS.get(column.what, "rotation")
@@ -332,9 +335,9 @@ def _one_unit(
     columns: Iterable[int],
     elsewhere: str | None,
 ) -> str | None:
-    """Return the common unit of ``columns``.
+    """Return the unit that all ``columns`` share.
 
-    Columns without a unit in their names have the unit stated ``elsewhere``.
+    The unit ``elsewhere``, from a remark in the file, applies to columns whose names state no unit.
     """
     found = {units[i] or elsewhere for i in columns}
     if None in found and len(found) > 1:
@@ -345,12 +348,13 @@ def _one_unit(
         )
     if len(found) > 1:
         raise FileFormatError(
-            f"{source}: has different units of {kind}, {' and '.join(sorted(map(str, found)))}; convert them to one"
+            f"{source}: has different units of {kind}: {' and '.join(sorted(map(str, found)))}; convert them to one"
         )
     stated_units = {units[i] for i in columns} - {None}
     if elsewhere is not None and stated_units - {elsewhere}:
         raise FileFormatError(
-            f"{source}: a remark says {elsewhere}, a column name {stated_units.pop()}; make them the same"
+            f"{source}: a remark states the unit {elsewhere}, but a column name {stated_units.pop()}; make them the "
+            f"same"
         )
     return found.pop() if found else None
 
@@ -363,7 +367,7 @@ def _times(
     options: ReadOptions,
     said: SaidUnits,
 ) -> Array:
-    """Return the time stamps (n,) [s]; a column of whole seconds and a column of fractions are added."""
+    """Return the time stamps (n,) [s]; if whole seconds and fractions are in two columns, add the columns."""
     if not units:
         return options.even_times(source, len(values))
     if len(units) == 1:
@@ -379,23 +383,24 @@ def _times(
             return options.seconds(source, seconds + rest, "s")
     both = " and ".join(repr(names[i]) for i in units)
     raise FileFormatError(
-        f"{source}: columns {both} both hold t, and are not whole seconds with fractions of a second; remove one"
+        f"{source}: columns {both} both hold times, but are not whole seconds and fractions of a second; remove one"
     )
 
 
 def unnamed_columns(
     source: str, values: Array, options: ReadOptions, said: SaidUnits | None = None
 ) -> RawDemonstration:
-    """Assign the columns of a table without names by their number (see ``UNNAMED``).
+    """Convert a table without column names to a demonstration; the number of columns gives their meaning (``UNNAMED``).
 
     Raises:
-        InputError: when the number of columns is unknown, or the options do not fit.
+        InputError: when the number of columns has no known meaning, or the options do not fit the file.
     """
     said = said or SaidUnits()
     layout = UNNAMED.get(values.shape[1])
     if layout is None:
         raise FileFormatError(
-            f"{source}: {values.shape[1]} columns without names; known are {COUNTS}. Name them in a first line"
+            f"{source}: {values.shape[1]} columns without names; a table without names must have {COUNTS}. Write "
+            "the column names in the first line"
         )
     start, n = int(layout[0] == "t"), len(values)
     times = options.seconds(source, values[:, 0], said.time) if start else options.even_times(source, n)

@@ -1,8 +1,9 @@
 """Lint: list the faults of demonstrations before a skill is learned from them.
 
-Each check yields findings. This module checks each motion, and compares the motions with each other. If some
-demonstrations run backwards, stop early, end elsewhere or take another path, the mean is a motion that nobody
-demonstrated. Checks of the numbers in a file are in ``raw.py``, checks against an arm in ``arm_checks.py``.
+Each check yields findings. The checks in this module examine each motion by itself, and compare the motions with each
+other. If some demonstrations run backwards, stop early, end elsewhere or take another path, the mean of all
+demonstrations is a motion that nobody demonstrated. Checks of the numbers in a file are in ``raw.py``. Checks of a
+motion against an arm are in ``arm_checks.py``.
 """
 
 from __future__ import annotations
@@ -79,9 +80,9 @@ def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: Arm
     """Check each demonstration by itself and against the arm, and compare all with each other.
 
     Args:
-        demonstrations: demonstrations of one motion. Raw demonstrations (``read_raw``) may contain invalid numbers,
-            which are reported; a Demonstration can't contain any.
-        arm: arm that was recorded, with its tool; None: joint limits and reach are not checked.
+        demonstrations: demonstrations of one motion. Raw demonstrations (from ``read_raw``) may contain invalid
+            numbers, which are reported.
+        arm: arm that was recorded, with its tool; without an arm, joint limits and reach are not checked.
 
     Returns:
         Findings, errors first, then warnings, then notes; empty when nothing was found.
@@ -119,7 +120,7 @@ def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: Arm
 
 
 def check_gaps(motion: ValidRows) -> Iterator[Finding]:
-    """Find gaps in time without samples."""
+    """Find gaps in the recording: periods without samples."""
     steps = np.diff(motion.times)
     gaps = np.flatnonzero(steps > max(_GAP, _GAP_STEPS * float(np.median(steps))))
     if len(gaps):
@@ -128,12 +129,12 @@ def check_gaps(motion: ValidRows) -> Iterator[Finding]:
         count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
         message = f"{count} of {steps[longest]:.3g} s (usual step {np.median(steps):.3g} s), "
         message += f"in which the tool moved {1e3 * moved:.0f} mm"
-        remedy = "record again, or accept a straight line across it"
+        remedy = "record again, or accept a straight line across the gap"
         yield motion.finding("warning", "gap", message, remedy, longest + 1)
 
 
 def check_idle(motion: ValidRows) -> Iterator[Finding]:
-    """Find rest before and after the motion, and recordings without motion."""
+    """Find rest before and after the motion, and recordings in which the tool never moves."""
     rows = moving_rows(motion.times, motion.positions, motion.quaternions)
     if rows is None:
         yield motion.finding("error", "still", "the tool does not move", "leave it out, or check units and columns")
@@ -141,16 +142,16 @@ def check_idle(motion: ValidRows) -> Iterator[Finding]:
     enough = max(_IDLE, _IDLE_FRACTION * motion.duration)
     head, tail = motion.times[rows[0]], motion.duration - motion.times[rows[1]]
     if head > enough:
-        message = f"rests for {head:.2f} s at the start, rows {motion.rows[0]} to {motion.rows[rows[0]]}"
+        message = f"the tool rests for {head:.2f} s at the start, rows {motion.rows[0]} to {motion.rows[rows[0]]}"
         yield motion.finding("note", "idle-head", message, "none needed: align trims it", 0)
     if tail > enough:
-        message = f"rests for {tail:.2f} s at the end, rows {motion.rows[rows[1]]} to {motion.rows[-1]}"
+        message = f"the tool rests for {tail:.2f} s at the end, rows {motion.rows[rows[1]]} to {motion.rows[-1]}"
         yield motion.finding("note", "idle-tail", message, "none needed: align trims it", rows[1])
 
 
 def check_jumps(motion: ValidRows) -> Iterator[Finding]:
     """Find steps that are much faster than the steps around them: lost samples, glitches, jumps of a tracker."""
-    remedy = "record again, or cut the file before or after it"
+    remedy = "record again, or cut the file before or after the jump"
     jumps, size = _jumps(motion.times, motion.positions, _JUMP_DISTANCE)
     if len(jumps):
         largest = f"{1e3 * size.max():.0f} mm"
@@ -164,10 +165,11 @@ def check_jumps(motion: ValidRows) -> Iterator[Finding]:
 
 
 def _jumps(times: Array, values: Array, floor: float) -> tuple[NDArray[np.int64], Array]:
-    """Return the samples (k,) before which ``values`` (n, d) jump, and the size of each jump (k,).
+    """Return the first sample after each jump of ``values`` (n, d), shape (k,), and the size of each jump, shape (k,).
 
-    A step is compared with the median of the steps two and three before and after it, so that neither a single bad
-    sample (two large steps) nor a fast start is hidden by its own neighbours.
+    A step is a jump if it is much larger than the median of four steps near it: the second and third step before it,
+        and the second and third step after it. The direct neighbours are left out, because a single bad sample causes
+        two large steps in a row.
     """
     if len(times) < 8:
         return np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -181,7 +183,7 @@ def _jumps(times: Array, values: Array, floor: float) -> tuple[NDArray[np.int64]
 
 
 def check_units(motion: ValidRows) -> Iterator[Finding]:
-    """Find lengths that can't be metres, and propose every unit that fits."""
+    """Find positions whose unit can't be the metre, and propose every unit that fits."""
     distance = np.abs(motion.positions).max(axis=1)
     extent = float(np.ptp(motion.positions, axis=0).max())
     if distance.max() > _FAR:
@@ -193,15 +195,15 @@ def check_units(motion: ValidRows) -> Iterator[Finding]:
         ]
         remedy = f"read it with {' or '.join(fits)}" if fits else "check which columns hold the position"
         yield motion.finding(
-            "error", "units", f"{distance[row]:.4g} m from the base: the unit is probably not metres", remedy, row
+            "error", "units", f"{distance[row]:.4g} m from the base: the unit is probably not the metre", remedy, row
         )
     elif _NO_MOTION < extent < _TINY and motion.quaternions is None:
         message = f"the whole motion is {1e3 * extent:.2g} mm large"
-        yield motion.finding("warning", "units", message, "check units: are the numbers metres?")
+        yield motion.finding("warning", "units", message, "check the unit: are the numbers in metres?")
 
 
 def check_speed(motion: ValidRows) -> Iterator[Finding]:
-    """Find motions that are too fast for a person who guides an arm."""
+    """Find motions that are faster than a person can guide an arm."""
     speed, _ = smooth_speed(motion.times, motion.positions)
     fast = float(np.percentile(speed, 95))
     if fast > _FAST and np.abs(motion.positions).max() <= _FAR:
@@ -216,11 +218,11 @@ def check_number(motions: Sequence[ValidRows]) -> Iterator[Finding]:
     """Report when there is only one demonstration."""
     if len(motions) == 1:
         message = "only one demonstration: it does not show how precise each part of the motion must be"
-        yield motions[0].finding("warning", "single", message, "show the motion three times or more")
+        yield motions[0].finding("warning", "single", message, "demonstrate the motion three times or more")
 
 
 def check_kinds(motions: Sequence[ValidRows]) -> Iterator[Finding]:
-    """Find rotations, joints or a third dimension in some demonstrations only."""
+    """Find rotations, joints or a third dimension that only some of the demonstrations have."""
     rotations, joints = ([getattr(m, what) is not None for m in motions] for what in ("quaternions", "joints"))
     count = f"of {len(motions)} demonstrations have"
     if any(rotations) and not all(rotations):
@@ -228,27 +230,29 @@ def check_kinds(motions: Sequence[ValidRows]) -> Iterator[Finding]:
         yield motions[rotations.index(False)].finding("error", "mixed-rotations", message, "leave it out")
     if any(joints) and not all(joints):
         message = f"{sum(joints)} {count} joints, but this one has no joints"
-        yield motions[joints.index(False)].finding("note", "mixed-joints", message, "none: skills ignore joints")
+        yield motions[joints.index(False)].finding(
+            "note", "mixed-joints", message, "none needed: skills are learned without joints"
+        )
     flat = [bool(np.ptp(m.positions[:, 2]) == 0.0) for m in motions]
     deep = [float(np.ptp(m.positions[:, 2])) > _FLAT for m in motions]
     if any(flat) and any(deep):
-        message = f"{sum(flat)} of {len(flat)} demonstrations are planar (z does not change), the others are not"
+        message = f"{sum(flat)} of {len(flat)} demonstrations are planar (z does not change), but the others are not"
         remedy = "do not mix recordings with and without z"
         yield motions[flat.index(True)].finding("warning", "mixed-dimensions", message, remedy)
 
 
 def check_durations(motions: Sequence[ValidRows]) -> Iterator[Finding]:
-    """Find demonstrations that take much longer than others."""
+    """Find demonstrations that take much longer than the shortest demonstration."""
     durations = np.array([motion.duration for motion in motions])
     if durations.max() > _DURATION_RATIO * durations.min():
         slow = int(np.argmax(durations))
-        message = f"takes {durations[slow]:.2f} s, another one {durations.min():.2f} s"
-        remedy = "align makes them equal; check that all show the whole motion"
+        message = f"takes {durations[slow]:.2f} s, but the shortest demonstration {durations.min():.2f} s"
+        remedy = "check that both show the whole motion; align makes the durations equal"
         yield motions[slow].finding("warning", "durations", message, remedy)
 
 
 def check_plane(motions: Sequence[ValidRows]) -> Iterator[Finding]:
-    """Find directions in which no demonstration moves."""
+    """Find a direction in which no demonstration moves: all motions lie in one plane or on one line."""
     positions = np.concatenate([motion.positions for motion in motions])
     deviations, directions = np.linalg.svd(positions - positions.mean(axis=0), full_matrices=False)[1:]
     deviations = deviations / np.sqrt(len(positions))
@@ -258,11 +262,13 @@ def check_plane(motions: Sequence[ValidRows]) -> Iterator[Finding]:
         shape = "in a plane, normal" if flat.sum() == 1 else "on a straight line, across"
         vector = " ".join(f"{x:.2f}" for x in normal + 0.0)
         message = f"all motions lie {shape} ({vector}), within {1e3 * deviations[flat].max():.2g} mm"
-        yield Finding("note", "planar", message, remedy="none needed: that direction is kept constant when learning")
+        yield Finding(
+            "note", "planar", message, remedy="none needed: the skill keeps the position in that direction constant"
+        )
 
 
 def check_agreement(motions: Sequence[ValidRows]) -> Iterator[Finding]:
-    """Find demonstrations that run backwards, are incomplete, end elsewhere, or take another path than the others."""
+    """Find demonstrations that run backwards, are incomplete, or differ in start, goal, path or rotation."""
     trajectories = [one for motion in motions if (one := motion.moving_part()) is not None]
     if len(trajectories) < len(motions) or len(motions) < 2:
         return
@@ -291,7 +297,7 @@ def check_agreement(motions: Sequence[ValidRows]) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class _Scale:
-    """How differences are reported: conversion factor, unit, and smallest relevant difference."""
+    """The unit in which differences are reported, its conversion factor, and the smallest relevant difference."""
 
     factor: float
     unit: str
@@ -302,29 +308,29 @@ _Odd = tuple[int, str, str, str]  # which demonstration, message, code, remedy
 
 
 def _by_length(positions: Array) -> Array:
-    """Return the path (n, 3) at equal distances along it, independent of its speed."""
+    """Return the path resampled at equal distances, shape (n, 3), so that it no longer depends on the speed."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     even = np.linspace(0.0, length[-1], len(positions))
     return np.stack([np.interp(even, length, column) for column in positions.T], axis=1)
 
 
 def _mean_distance(paths: Array, others: Array) -> Array:
-    """Return the mean distance between each of ``paths`` and each of ``others``, shape (m, m)."""
+    """Return the mean distance between each path in ``paths`` and each path in ``others``, shape (m, m)."""
     return np.stack([np.linalg.norm(others - path, axis=2).mean(axis=1) for path in paths])
 
 
 def _backwards(paths: Array, size: float, motions: Sequence[ValidRows], scale: _Scale) -> Iterator[_Odd]:
-    """Find motions that fit the most typical motion much better when they are reversed."""
+    """Find motions that are much nearer to the most typical motion when they are reversed."""
     forward, backward = _mean_distance(paths, paths), _mean_distance(paths[:, ::-1], paths)
     typical = int(np.argmin(forward.sum(axis=1)))
     differs = forward[:, typical] > max(scale.smallest, _DIFFERENT * size)
     for i in np.flatnonzero((backward < 0.5 * forward)[:, typical] & differs):
         message = f"runs in the opposite direction to {motions[typical].name}"
-        yield int(i), message, "direction", "leave it out, or learn each direction as a skill of its own"
+        yield int(i), message, "direction", "leave it out, or learn a separate skill for each direction"
 
 
 def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: _Scale) -> Iterator[_Odd]:
-    """Find motions that end or begin in the middle of the path of others."""
+    """Find motions that begin or end in the middle of the path of the other motions."""
     m, n, _ = paths.shape
     for end, verb in (("goal", "stops"), ("start", "begins")):
         along = paths if end == "goal" else paths[:, ::-1]  # towards the end in question
@@ -344,7 +350,7 @@ def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: 
 
 
 def _aligned(trajectories: Sequence[Trajectory]) -> tuple[Array, Array | None]:
-    """Return positions (m, n, 3) and rotations (m, n, 4), or None, at corresponding times."""
+    """Return aligned positions (m, n, 3) and quaternions (m, n, 4), or None if a motion has no quaternions."""
     if any(one.quaternions is None for one in trajectories):
         trajectories = [Trajectory(one.times, one.positions) for one in trajectories]
     warps = barycentre_warps(features(trajectories), n_iterations=4)
@@ -354,7 +360,7 @@ def _aligned(trajectories: Sequence[Trajectory]) -> tuple[Array, Array | None]:
 
 
 def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | None, size: float) -> Iterator[Finding]:
-    """Find demonstrations that form two groups: by starts, goals, paths between them, or rotations."""
+    """Find demonstrations that form two groups, which differ in start, goal, path from start to goal, or rotation."""
     between = to_common_ends(positions)
     kinds: list[tuple[str, Severity, str, Array, float, float, str]] = [
         ("ends", "warning", "starts", _largest(positions[:, :1]), _ENDS_APART * size, 1e3, "mm"),
@@ -366,11 +372,9 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
         if apart.max() > _OPPOSED:
             odd = int(np.argmax(apart.sum(axis=1)))
             name, degrees = motions[int(np.argmax(apart[odd]))].name, np.degrees(apart[odd].max())
-            message = (
-                f"its rotation is up to {degrees:.0f} degrees from that of {name} at the same phase: no mean of them"
-            )
+            message = f"its rotation is up to {degrees:.0f} degrees from that of {name} at the same phase: their mean"
             remedy = "check how the tool was held and the order of the quaternions (wxyz or xyzw), or leave it out"
-            yield motions[odd].finding("error", "two-rotations", f"{message} is useful", remedy)
+            yield motions[odd].finding("error", "two-rotations", f"{message} would be meaningless", remedy)
         else:
             kinds.append(("two-rotations", "warning", "rotations", apart, _ROTATIONS_APART, np.degrees(1.0), "degrees"))
     for code, severity, what, distance, floor, factor, unit in kinds:
@@ -383,26 +387,27 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
             continue  # one among many is an outlier
         groups = f"of {_names(motions, few)} and of {_names(motions, many)}"
         message = f"the {what} {groups} are {factor * gap:.0f} {unit} apart"
-        remedy = "learn each group as a skill of its own: the mean of both is a motion that nobody demonstrated"
+        remedy = "learn a separate skill from each group, because the mean of both is a motion that nobody demonstrated"
         yield motions[few[0]].finding(severity, code, message, remedy)
 
 
 def _largest(paths: Array) -> Array:
-    """Return the largest distance between paths (m, n, 3) at equal times, shape (m, m)."""
+    """Return the largest distance at equal times between each two of the paths (m, n, 3), shape (m, m)."""
     return np.stack([np.linalg.norm(paths - path, axis=2).max(axis=1) for path in paths])
 
 
 def _angles(rotations: Array, reference: Array) -> Array:
-    """Return the angles between rotations (m, n, 4) and reference rotations (n, 4), shape (m, n) [rad]."""
+    """Return the angles between quaternions (m, n, 4) and reference quaternions (n, 4), shape (m, n) [rad]."""
     back = quaternion_conjugate(reference)
     return np.stack([np.linalg.norm(quaternion_log(quaternion_multiply(q, back)), axis=1) for q in rotations])
 
 
 def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | None:
-    """Return one of two groups as a mask (m,), and the gap between the groups; None when there is only one group.
+    """Divide m demonstrations into two groups by their distances (m, m); return None when there is only one group.
 
-    The gap is the longest link of the minimum spanning tree. The gap must exceed ``floor``, and the next longest link
-    by a factor, so that neighbours within the groups are much closer.
+    The result is a mask (m,) that selects one group, and the gap between the two groups. The gap is the longest link of
+    the minimum spanning tree. There are two groups only if the gap exceeds ``floor`` and is several times as long as
+    the second longest link, which means that demonstrations within a group are much closer together.
     """
     m = len(distance)
     nearest, inside, links = distance[0].copy(), np.arange(m) == 0, []
@@ -421,7 +426,7 @@ def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | N
 
 
 def _names(motions: Sequence[ValidRows], which: NDArray[np.int64]) -> str:
-    """Return up to three names and the number of further names."""
+    """Return the names of demonstrations for a message: at most three, then the number of the others."""
     names = [motions[i].name for i in which]
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
@@ -432,15 +437,21 @@ def _outliers(motions: Sequence[ValidRows], positions: Array, rotations: Array |
     center = int(np.argmin(np.sum(distance, axis=1)))
     for i in _unlike(distance[center], center, _OUTLIER_DISTANCE):
         usual = float(np.median(np.delete(distance[center], center)))
-        message = f"is {1e3 * distance[center, i]:.0f} mm from the most typical one ({motions[center].raw.source}), "
-        message += f"usual are {1e3 * usual:.0f} mm"
-        yield motions[i].finding("warning", "outlier", message, "check it; leave it out if it shows something else")
+        message = (
+            f"is {1e3 * distance[center, i]:.0f} mm from the most typical demonstration "
+            f"({motions[center].raw.source}), "
+        )
+        message += f"the others typically {1e3 * usual:.0f} mm"
+        yield motions[i].finding("warning", "outlier", message, "check it; leave it out if it shows another motion")
     if rotations is None:
         return
     angle = _angles(rotations, rotations[center]).mean(axis=1)
     for i in _unlike(angle, center, _OUTLIER_ANGLE):
-        message = f"is rotated by {np.degrees(angle[i]):.0f} degrees from the most typical one "
-        message += f"({motions[center].raw.source}), usual are {np.degrees(np.median(np.delete(angle, center))):.0f}"
+        message = f"is rotated by {np.degrees(angle[i]):.0f} degrees from the most typical demonstration "
+        message += (
+            f"({motions[center].raw.source}), the others typically by "
+            f"{np.degrees(np.median(np.delete(angle, center))):.0f}"
+        )
         remedy = "check it, and the order of its quaternions (wxyz or xyzw)"
         yield motions[i].finding("warning", "rotation-outlier", message, remedy)
 

@@ -1,4 +1,4 @@
-"""A demonstration as recorded, and checks of the numbers in its file."""
+"""RawDemonstration: a demonstration as recorded; and checks of the numbers that its file contains."""
 
 from __future__ import annotations
 
@@ -41,15 +41,16 @@ _NUMBER_AT_END = re.compile(r"(\d+)$")
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault of demonstrations, or one useful fact about them.
+    """One fault that ``lint`` found in demonstrations, or one useful fact about them.
 
     Attributes:
-        severity: ``"error"``: no good skill can be learned; ``"warning"``: check it; ``"note"``: for information.
+        severity: ``"error"`` (no good skill can be learned), ``"warning"`` (should be checked) or ``"note"``
+            (information).
         code: short name that does not change between versions, such as ``"gap"``.
-        message: description of the fault, with figures.
-        source: the demonstration concerned; empty when it concerns all of them.
-        row: the first sample concerned, from 0; None when it concerns the whole motion.
-        line: the line of that sample in the text file, from 1; None when the file is not text.
+        message: description of the fault, with measured values.
+        source: name of the demonstration concerned; empty when the finding concerns all demonstrations.
+        row: index of the first sample concerned, from 0; None when the finding concerns the whole motion.
+        line: line number of the sample ``row`` in the text file, from 1; None when the file is not text.
         remedy: action that fixes the fault. Options are written as arguments of ``read``, for example ``units="mm"``.
     """
 
@@ -63,7 +64,7 @@ class Finding:
 
     @property
     def place(self) -> str:
-        """Place of the finding: ``line 12``, ``row 10`` or an empty text."""
+        """Place of the finding in the recording: ``line 12``, ``row 10`` or an empty text."""
         if self.line is not None:
             return f"line {self.line}"
         return "" if self.row is None else f"row {self.row}"
@@ -84,13 +85,14 @@ class RawDemonstration:
         source: name of the file and, if needed, of the part in it.
         times: time stamps in any order, shape (n,) [s].
         positions: positions of the tool in the base frame, shape (n, 3) [m]; None when only joints were recorded.
-        quaternions: quaternions wxyz of any length, shape (n, 4); None when not recorded.
+        quaternions: quaternions wxyz, not necessarily of length one, shape (n, 4); None when not recorded.
         joints: joint positions, shape (n, n_joints) [rad]; None when not recorded.
         joint_names: one name for each column of ``joints``.
         task: name of the task.
-        lines: line of the text file of each row, from 1, shape (n,); None when the file is not text.
-        notes: data that the reader left out, and its assumptions.
-        unread_rotation: names of columns that seem to hold a rotation in a form that is not read.
+        lines: line number of each sample in the text file, from 1, shape (n,); None when the file is not text.
+        notes: remarks of the reader about data that it left out, and about its assumptions.
+        unread_rotation: names of columns that seem to hold a rotation in a form that can't be read, such as Euler
+            angles.
 
     Raises:
         InputError: when an array has the wrong shape or does not contain numbers, or joints and names do not agree.
@@ -122,7 +124,7 @@ class RawDemonstration:
 
     @classmethod
     def of(cls, demonstration: Demonstration | RawDemonstration) -> RawDemonstration:
-        """Return a demonstration as a raw demonstration; a raw demonstration is returned unchanged."""
+        """Convert a demonstration to a raw demonstration; a raw demonstration is returned unchanged."""
         if isinstance(demonstration, RawDemonstration):
             return demonstration
         motion = instance(demonstration, Demonstration, "a demonstration").trajectory
@@ -140,7 +142,7 @@ class RawDemonstration:
         return len(self.times)
 
     def line(self, row: int) -> int | None:
-        """Return the line of ``row`` in the text file, None when the file is not text."""
+        """Return the line number of the sample ``row`` in the text file; None when the file is not text."""
         return None if self.lines is None else int(self.lines[row])
 
     def finding(self, severity: Severity, code: str, message: str, remedy: str, row: int | None = None) -> Finding:
@@ -148,18 +150,18 @@ class RawDemonstration:
         return Finding(severity, code, message, self.source, row, None if row is None else self.line(row), remedy)
 
     def where(self, row: int) -> str:
-        """Return source and place of ``row``, for a message."""
+        """Return the file and the place of the sample ``row``, for a message."""
         line = self.line(row)
         return f"{self.source}, row {row}" if line is None else f"{self.source}, line {line}"
 
     def joints_of(self, arm: ArmModel) -> Array:
         """Return the joint angles (n, arm.n_joints) [rad] in the order of the arm's joints.
 
-        Columns are selected by the arm's joint names. Generic names (``joint_1``, ``j1``, ``q1``) are sorted by their
-        numbers, which must follow one another.
+        Columns are selected by the arm's joint names. If the columns have generic names (``joint_1``, ``j1``, ``q1``),
+        they are sorted by the numbers in the names, which must be consecutive.
 
         Raises:
-            InputError: when there are no joints, they belong to another arm, or their order is unknown.
+            InputError: when the demonstration has no joints, has those of another arm, or their order is unknown.
         """
         if self.joints is None:
             raise InputError(f"{self.source}: holds no joint angles")
@@ -181,10 +183,10 @@ class RawDemonstration:
         return self.joints[:, np.argsort(numbers)]
 
     def with_poses(self, arm: ArmModel | None) -> RawDemonstration:
-        """Return a copy with the tool's poses, which are computed from the joints if they were not recorded.
+        """Return a copy that has tool poses; if none were recorded, they are computed from the joint positions.
 
         Raises:
-            InputError: when the arm is needed but not given, or the joints belong to another arm.
+            InputError: when the arm is needed but not given, or the recorded joints belong to another arm.
         """
         check_arm_model(arm, "arm")
         if self.positions is not None:
@@ -200,29 +202,30 @@ class RawDemonstration:
         return replace(self, positions=positions, quaternions=quaternions, joints=q, joint_names=arm.joint_names)
 
     def not_finite(self) -> NDArray[np.bool_]:
-        """Return whether each row holds nan, inf or a number above 1e30, shape (n,)."""
+        """Return for each row whether it holds nan, inf or a number above 1e30, shape (n,)."""
         columns = [self.times[:, None], self.positions, self.quaternions, self.joints]
         table = np.hstack([part for part in columns if part is not None])
         return np.asarray(~(np.abs(table) < _BOUND).all(axis=1))
 
     def late(self) -> NDArray[np.bool_]:
-        """Return whether each row is not later than all rows before it, shape (n,)."""
+        """Return for each row whether its time stamp is not later than all time stamps before it, shape (n,)."""
         times = np.where(np.isfinite(self.times), self.times, -np.inf)
         before = np.concatenate([[-np.inf], np.maximum.accumulate(times)[:-1]])
         return np.asarray(np.isfinite(self.times) & (self.times <= before))
 
     def held(self) -> NDArray[np.bool_]:
-        """Return whether each row only repeats the previous value, shape (n,); all False unless values are held.
+        """Return for each row whether it only repeats the previous row, because the recorder outran its sensor.
 
-        A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest and
-        rounding do not count as held values: values must be held many times during the motion and change by more
-            than their last digits in between.
+        A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest also repeats
+        values, and so does rounding. These repetitions do not count. Values count as held only if they are repeated
+        many times during the motion and change by more than their last digits in between. The result has the shape
+        (n,).
         """
         masks = [held_rows(part) for part in (self.positions, self.quaternions, self.joints) if part is not None]
         return max(masks, key=lambda mask: int(mask.sum()), default=np.zeros(len(self), dtype=bool))
 
     def thinned(self) -> RawDemonstration:
-        """Return a copy without the rows that only repeat the previous value; a note gives their number."""
+        """Return a copy without the rows that :meth:`held` finds; a note states how many rows were dropped."""
         held = self.held()
         if not held.any():
             return self
@@ -234,16 +237,16 @@ class RawDemonstration:
             quaternions=None if self.quaternions is None else self.quaternions[keep],
             joints=None if self.joints is None else self.joints[keep],
             lines=None if self.lines is None else self.lines[keep],
-            notes=(*self.notes, f"{held.sum()} of {len(self)} rows repeated a held value and were dropped"),
+            notes=(*self.notes, f"{held.sum()} of {len(self)} rows only repeated the previous row and were dropped"),
         )
 
     def demonstration(self, arm: ArmModel | None = None, *, repair: bool = False) -> Demonstration:
-        """Check all rows and return a valid demonstration.
+        """Check all rows, and convert the raw demonstration to a valid demonstration.
 
         Args:
             arm: arm that was recorded; needed when only joints were recorded.
-            repair: whether to drop rows that are not finite or not later than the previous row, with a remark in
-                ``source``.
+            repair: whether to drop rows that contain numbers that are not finite or whose time stamps do not increase;
+                ``source`` then states how many rows were dropped.
 
         Raises:
             FileFormatError: when a row is invalid; the message names file, line and remedy.
@@ -254,8 +257,10 @@ class RawDemonstration:
         bad = invalid | late
         if bad.any() and not repair:
             row = int(np.flatnonzero(bad)[0])
-            what = "holds a number that is not finite" if invalid[row] else "is not later than the row before"
-            raise FileFormatError(f"{raw.where(row)} {what}; fix the file or read it with repair=True")
+            what = "holds a number that is not finite" if invalid[row] else "is not later than the previous row"
+            raise FileFormatError(
+                f"{raw.where(row)} {what}; fix the file, or read it with repair=True to drop such rows"
+            )
         keep = np.flatnonzero(~bad)
         if len(keep) < max(2, (1.0 - _MAX_DROPPED) * len(raw)):
             raise FileFormatError(f"{raw.source}: {bad.sum()} of {len(raw)} rows are invalid; record it again")
@@ -264,7 +269,9 @@ class RawDemonstration:
         if far.any():
             row = int(keep[np.flatnonzero(far)[0]])
             position = f"position {raw.positions[row].tolist()} m"
-            raise FileFormatError(f"{raw.where(row)}: no robot reaches {position}; check which columns hold it")
+            raise FileFormatError(
+                f"{raw.where(row)}: no robot reaches the {position}; check which columns hold the position"
+            )
         quaternions = None if raw.quaternions is None else _unit(raw, keep)
         source = raw.source + (f" ({bad.sum()} of {len(raw)} rows dropped)" if bad.any() else "")
         return Demonstration(
@@ -277,19 +284,19 @@ class RawDemonstration:
 
 
 def check_arm_model(arm: object, what: str) -> None:
-    """Raise InputError if ``arm`` is neither an ArmModel nor None, without importing the module of ArmModel."""
+    """Raise InputError if ``arm`` is neither an ArmModel nor None; the slow module of ArmModel is not imported."""
     if arm is not None and not hasattr(arm, "tool_path"):
         raise InputError(f"{what} must be an ArmModel, got {arm!r:.60}; load it with ArmModel.load('sawyer')")
 
 
 def _unit(raw: RawDemonstration, keep: NDArray[np.int64]) -> Array:
-    """Return the quaternions of rows ``keep`` scaled to length one."""
+    """Return the quaternions of the rows ``keep``, scaled to length one."""
     assert raw.quaternions is not None
     quaternions = raw.quaternions[keep]
     length = np.linalg.norm(quaternions, axis=1)
     bad = np.flatnonzero(np.abs(length - 1.0) > _LENGTH_TOLERANCE)
     if len(bad):
-        what = f"quaternion of length {length[bad[0]]:.3g}, must be 1; check which columns hold it"
+        what = f"the quaternion has length {length[bad[0]]:.3g}, must be 1; check which columns hold it"
         raise FileFormatError(f"{raw.where(int(keep[bad[0]]))}: {what}")
     return np.asarray(quaternions / length[:, None])
 
@@ -298,11 +305,12 @@ def _unit(raw: RawDemonstration, keep: NDArray[np.int64]) -> Array:
 class ValidRows:
     """The valid rows of a raw demonstration.
 
-    Finite, each later than the previous one, and without repeated held values.
+    A row is valid if its numbers are finite, its time stamp is later than the previous one, and it does not only repeat
+    the previous sample.
 
     Attributes:
         raw: the demonstration.
-        rows: the rows of ``raw`` that are used, shape (n,).
+        rows: indices of the valid rows of ``raw``, shape (n,).
         times: times since the first valid row, shape (n,) [s].
         positions: shape (n, 3) [m].
         quaternions: unit quaternions, shape (n, 4), or None.
@@ -318,7 +326,7 @@ class ValidRows:
 
     @classmethod
     def of(cls, raw: RawDemonstration) -> ValidRows | None:
-        """Choose the valid rows; None when fewer than 5 are left or there are no positions."""
+        """Select the valid rows; return None when fewer than 5 rows are valid or there are no positions."""
         if raw.positions is None:
             return None
         bad = raw.not_finite() | raw.late() | raw.held()
@@ -347,11 +355,11 @@ class ValidRows:
 
     @property
     def name(self) -> str:
-        """The name of the source without its folder."""
+        """Name of the demonstration's file without its folder."""
         return PurePath(self.raw.source).name or "a demonstration"
 
     def moving_part(self) -> Trajectory | None:
-        """Return the motion without idle ends, resampled to 100 samples; None when the tool does not move."""
+        """Return the motion without rest at both ends, resampled to 100 samples; None when the tool does not move."""
         rows = moving_rows(self.times, self.positions, self.quaternions)
         if rows is None or rows[1] <= rows[0]:
             return None
@@ -360,12 +368,12 @@ class ValidRows:
         return Trajectory(self.times[keep], self.positions[keep], quaternions).from_zero().resample(_SAMPLES)
 
     def finding(self, severity: Severity, code: str, message: str, remedy: str, index: int | None = None) -> Finding:
-        """Return a finding about the valid sample ``index``."""
+        """Return a finding about the valid row number ``index``."""
         return self.raw.finding(severity, code, message, remedy, None if index is None else int(self.rows[index]))
 
 
 def check_rows(raw: RawDemonstration) -> Iterator[Finding]:
-    """Find numbers that are not finite, and recordings with few samples."""
+    """Find numbers that are not finite, and recordings with too few samples."""
     invalid = np.flatnonzero(raw.not_finite())
     if len(invalid):
         message = f"{len(invalid)} of {len(raw)} rows hold nan or inf"
@@ -381,7 +389,7 @@ def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
     late = np.flatnonzero(raw.late())
     if len(late):
         row = int(late[0])
-        message = f"{len(late)} time stamps are not later than those before; the first is {raw.times[row]:.6g} s "
+        message = f"{len(late)} time stamps are not later than the previous ones; the first is {raw.times[row]:.6g} s "
         message += f"after {np.nanmax(raw.times[:row]):.6g} s"
         remedy = "record again, or read it with repair=True to drop those rows"
         yield raw.finding("error", "non-monotonic-stamps", message, remedy, row)
@@ -390,7 +398,7 @@ def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
         return
     if np.abs(times).max() > _EPOCH:
         message = f"time stamps are dates ({times[0]:.0f} s), not seconds since the start"
-        yield raw.finding("note", "epoch-stamps", message, "none needed: align subtracts the first", 0)
+        yield raw.finding("note", "epoch-stamps", message, "none needed: align subtracts the first time stamp", 0)
     step = float(np.median(np.diff(np.sort(times))))
     if step > _LONGEST_STEP:
         fits = [
@@ -399,7 +407,7 @@ def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
             if _STEPS[0] <= step * factor <= _STEPS[1]
         ]
         minutes = (times[-1] - times[0]) / 60.0
-        message = f"samples are {step:.4g} s apart, {minutes:.4g} min in all; these are hardly seconds"
+        message = f"samples are {step:.4g} s apart, {minutes:.4g} min in all; the unit is probably not the second"
         remedy = f"read it with {' or '.join(fits)}" if fits else "check which column holds the time, and its unit"
         yield raw.finding("error", "time-units", message, remedy)
 
@@ -418,33 +426,42 @@ def check_quaternions(raw: RawDemonstration) -> Iterator[Finding]:
         message = f"{n} quaternions do not have length 1; the first has length {length[first]:.3g}"
         yield raw.finding("error", "no-rotation", message, "check which columns hold the quaternion", first)
     elif off[worst] > 0.1 * _LENGTH_TOLERANCE:
-        message = f"quaternions have length {length.min():.4f} to {length.max():.4f}; they are scaled to 1 when read"
+        message = (
+            f"quaternions have length {length.min():.4f} to {length.max():.4f}; they are scaled to length 1 when read"
+        )
         yield raw.finding("warning", "quaternion-length", message, "write them with more digits", worst)
     flips = np.flatnonzero(np.sum(q[1:] * q[:-1], axis=1) < 0.0) + 1
     if len(flips):
-        message = f"{len(flips)} times the quaternion's sign flips (q and -q are the same rotation)"
+        message = f"the quaternion's sign flips {len(flips)} times (q and -q are the same rotation)"
         remedy = "none needed: signs are made continuous when read"
         yield raw.finding("note", "quaternion-flips", message, remedy, int(flips[0]))
 
 
 def check_held(raw: RawDemonstration) -> Iterator[Finding]:
-    """Find values that are sampled and held: a recorder that runs faster than its sensor."""
+    """Find repeated values, which a recorder writes when it runs faster than its sensor."""
     held = raw.held()
     if held.any():
         rows = (len(raw) - 1) / max(1, int((~held).sum()) - 1)
-        message = f"{held.sum()} of {len(raw)} rows repeat the row before: each value is held for about {rows:.2g} rows"
+        message = (
+            f"{held.sum()} of {len(raw)} rows repeat the previous row: each value is held for about {rows:.2g} rows"
+        )
         remedy = "read it with thin=True to drop the repeated rows"
         yield raw.finding("warning", "held-values", message, remedy, int(np.flatnonzero(held)[0]))
 
 
 def check_notes(raw: RawDemonstration) -> Iterator[Finding]:
-    """Convert what the reader left out or assumed to findings."""
+    """Report what the reader left out or assumed."""
     if raw.unread_rotation:
-        message = f"the rotation in columns {', '.join(raw.unread_rotation)} is not read: there is no orientation"
-        remedy = "write it as a quaternion in columns qw qx qy qz, or as a rotation matrix in columns r11 r12 ... r33"
+        message = (
+            f"the rotation in columns {', '.join(raw.unread_rotation)} can't be read, so the motion has no orientation"
+        )
+        remedy = (
+            "write the rotation as a quaternion in columns qw qx qy qz, or as a rotation matrix in columns r11 r12 "
+            "... r33"
+        )
         yield raw.finding("warning", "rotation-not-read", message, remedy)
     for note in raw.notes:
-        yield raw.finding("note", "reader", note, "none, unless you need these data")
+        yield raw.finding("note", "reader", note, "none needed, unless you need these data")
 
 
 RAW_CHECKS = (check_rows, check_stamps, check_quaternions, check_held, check_notes)

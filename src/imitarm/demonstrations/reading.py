@@ -1,7 +1,7 @@
-"""Read demonstrations: options, registry of readers, and ``read``.
+"""Read demonstrations: the function ``read``, its options, and the registry of readers.
 
-A file becomes a :class:`~imitarm.demonstrations.raw.RawDemonstration` by the first reader in ``READERS`` that
-recognises its content. If all its numbers are valid, the raw demonstration becomes a
+The first reader in ``READERS`` that recognises the content of a file converts the file to a
+:class:`~imitarm.demonstrations.raw.RawDemonstration`. If all its numbers are valid, the raw demonstration becomes a
 :class:`~imitarm.trajectory.Demonstration`.
 """
 
@@ -41,7 +41,7 @@ _HEAD = 65536  # bytes of a file that a reader sees before it says whether it re
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Facts that a file may not state, such as units.
+    """Options for facts that a file may not state itself, such as units.
 
     Attributes:
         units: unit of lengths, a key of ``LENGTH_UNITS``; None: as the file says, else m.
@@ -96,11 +96,11 @@ class ReadOptions:
                 also given.
         """
         if self.duration is not None or self.rate is not None:
-            raise InputError(f"{source}: has time stamps of its own; leave out duration and rate")
+            raise InputError(f"{source}: has its own time stamps; leave out duration and rate")
         return times * _factor(source, "time_units", self.time_units, said, TIME_UNITS, "s")
 
     def even_times(self, source: str, n: int) -> Array:
-        """Return times (n,) [s] for a file without time stamps.
+        """Return evenly spaced times (n,) [s] for a file without time stamps.
 
         Raises:
             FileFormatError: when neither duration nor rate was given.
@@ -110,7 +110,8 @@ class ReadOptions:
         if self.rate is not None:
             return np.arange(n) / self.rate
         raise FileFormatError(
-            f"{source}: has no time stamps; give the length of the motion, duration=10.0 [s], or rate=100.0 [Hz]"
+            f"{source}: has no time stamps; give the duration of the motion, duration=10.0 [s], or the sample rate, "
+            f"rate=100.0 [Hz]"
         )
 
     def wxyz(self, source: str, quaternions: Array, said: str | None = None) -> Array:
@@ -122,7 +123,7 @@ class ReadOptions:
         if None not in (self.quaternion_order, said) and self.quaternion_order != said:
             raise InputError(
                 f"{source}: says its order is {said}, which contradicts quaternion_order={self.quaternion_order!r}; "
-                "leave that out"
+                f"leave out that option"
             )
         return quaternions[..., list(QUATERNION_ORDERS[self.quaternion_order or said or "wxyz"])]
 
@@ -133,13 +134,15 @@ def _factor(
     if said is not None and said not in known:
         raise FileFormatError(f"{source}: says its unit is {said!r}; known: {', '.join(known)}")
     if asked is not None and said is not None and asked != said:
-        raise InputError(f"{source}: says its unit is {said}, which contradicts {option}={asked!r}; leave that out")
+        raise InputError(
+            f"{source}: says its unit is {said}, which contradicts {option}={asked!r}; leave out that option"
+        )
     return known[asked or said or default]
 
 
 @dataclass(frozen=True)
 class SaidUnits:
-    """Units and quaternion order that a file states outside its column names; None: not stated."""
+    """Units and quaternion order that a file states outside its column names; None if not stated."""
 
     length: str | None = None
     time: str | None = None
@@ -150,8 +153,9 @@ class SaidUnits:
 class Reader(ABC):
     """Reads one file format.
 
-    To add a format, write one subclass and register it: in ``READERS`` in this package, or by an entry point of
-        another package (group ``imitarm.readers``). It then works in ``read``, ``imitarm lint`` and ``imitarm learn``.
+    To add a format, write one subclass and register it. Inside this package, add the subclass to ``READERS``. In
+    another package, declare an entry point in the group ``imitarm.readers``. The format then works in ``read``,
+    ``imitarm lint`` and ``imitarm learn``.
 
     Attributes:
         suffixes: suffixes of file names in lower case, with the dot, such as ``(".csv", ".txt")``.
@@ -165,7 +169,7 @@ class Reader(ABC):
 
     @abstractmethod
     def read(self, path: str, options: ReadOptions) -> list[RawDemonstration]:
-        """Return the motions in a file of this format.
+        """Read a file of this format and return the motions in it.
 
         Raises:
             FileFormatError: when the file is damaged; the message names file, place and remedy.
@@ -179,16 +183,16 @@ _BUILT_IN = {
     "text table": "imitarm.demonstrations.text_tables:TextTableReader",
 }
 READERS: Registry[type[Reader]] = Registry("reader", "imitarm.readers", _BUILT_IN)
-"""Readers by name: the built-in ones, and those that other packages add by entry points."""
+"""Readers by name: the built-in readers, and readers that other packages add by entry points."""
 
 
 def files_of(paths: Paths) -> list[str]:
     """Return the files to read; a folder is replaced by its files that have the suffix of a reader.
 
-    Files of a folder come in natural order, ``demo_2`` before ``demo_10``; its subfolders are not entered.
+    The files of a folder are sorted in natural order, ``demo_2`` before ``demo_10``. Subfolders are ignored.
 
     Raises:
-        InputError: when there are no files, or a folder holds no such file.
+        InputError: when there are no files, or a folder holds no file with the suffix of a reader.
     """
     if isinstance(paths, str | os.PathLike):
         paths = [paths]
@@ -225,7 +229,7 @@ def read_raw(
     """Read files without checking the numbers in them; for the options, see :func:`read`.
 
     Raises:
-        InputError: when a file can't be opened or an option does not fit it.
+        InputError: when a file can't be opened, or an option does not fit the file.
         FileFormatError: when a file can't be understood; the message names file, place and remedy.
     """
     flag(thin, "read: thin")
@@ -247,7 +251,9 @@ def read(
     repair: bool = False,
     thin: bool = False,
 ) -> list[Demonstration]:
-    """Read demonstrations from a file, several files or a folder. The content decides the format.
+    """Read demonstrations from a file, several files or a folder.
+
+    The content of a file, not its name, decides its format.
 
     Args:
         paths: a file, a folder, or several of them.
@@ -262,13 +268,13 @@ def read(
         task: name of the task; used if the file does not state a task.
         repair: whether to drop rows that are not finite or not later than the previous row, with a remark in
             ``source``.
-        thin: whether to drop rows that only repeat the previous value (:meth:`RawDemonstration.held`).
+        thin: whether to drop rows that only repeat the previous row (see :meth:`RawDemonstration.held`).
 
     Returns:
         One demonstration for each motion, in the order of the files. Planar motions (x y) get z = 0.
 
     Raises:
-        InputError: when a file can't be opened or an option does not fit it.
+        InputError: when a file can't be opened, or an option does not fit the file.
         FileFormatError: when a file is damaged or can't be understood; the message names file, line and remedy.
     """
     flag(repair, "read: repair")
@@ -289,15 +295,15 @@ def read(
 
 
 def known_formats() -> str:
-    """Return the names of all readers with their suffixes, for messages."""
+    """Return the names of all formats with their suffixes, for messages."""
     return ", ".join(f"{name} ({' '.join(reader.suffixes)})" for name, reader in READERS.items())
 
 
 def _reader_of(path: str) -> Reader:
-    """Return the reader that recognises the content of a file; the suffix must not contradict it.
+    """Return the reader that recognises the content of a file; the suffix of the file's name must not contradict it.
 
-    Readers of other packages are tried first, because the text table reader accepts any text; then the readers that
-    know the suffix.
+    Readers of other packages are tried first, because the built-in text table reader accepts any text. Next come the
+    built-in readers that know the suffix.
     """
     content = read_bytes(path)
     suffix, head = Path(path).suffix.lower(), content[:_HEAD]
@@ -309,11 +315,12 @@ def _reader_of(path: str) -> Reader:
     by_suffix = [name for name in names if suffix in READERS[name].suffixes]
     if by_suffix and name not in by_suffix and not any(READERS[name]().recognises(head) for name in by_suffix):
         raise FileFormatError(
-            f"{path}: named {suffix} ({by_suffix[0]}), but its content is {kind} ({name}); give it the right name"
+            f"{path}: named {suffix} ({by_suffix[0]}), but its content is {kind} ({name}); rename the file with the "
+            f"suffix of its format"
         )
     return READERS[name]()
 
 
 def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Return a sort key that compares numbers in names as numbers."""
+    """Return a sort key for a file name; numbers in names are compared by their values, so that 2 comes before 10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", path.name)]

@@ -1,4 +1,4 @@
-"""DemonstrationRecorder: writes a motion to a file during the motion; a killed program loses no sample."""
+"""DemonstrationRecorder: writes a motion to a file sample by sample, so that a killed program loses no sample."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Array = NDArray[np.float64]
 
 
 class DemonstrationRecorder:
-    """Writes each sample as a line of ``PATH.part``, which becomes the demonstration file when the recorder is closed.
+    """Writes each sample as a line of ``PATH.part``; closing the recorder converts this file to ``PATH``.
 
-    Each line is handed to the operating system before :meth:`write` returns: a program that is killed leaves
-    ``PATH.part``, which :meth:`Demonstration.load <imitarm.trajectory.Demonstration.load>` can read. An older file
-    ``PATH`` stays intact until the new one is complete.
+    Each line is handed to the operating system before :meth:`write` returns. If the program is killed, ``PATH.part``
+    remains, and :meth:`Demonstration.load <imitarm.trajectory.Demonstration.load>` can read it. An older file ``PATH``
+    stays intact until the new one is complete.
 
     Args:
         path: the file to write.
@@ -35,8 +35,8 @@ class DemonstrationRecorder:
         n_samples: number of samples written so far.
 
     Raises:
-        InputError: when the file exists and may not be replaced, ``PATH.part`` exists (left by another recorder, or
-            being written), or the file can't be written.
+        InputError: when the file exists and may not be replaced, when ``PATH.part`` exists (an earlier recorder left
+            it, or another program is writing it), or when the file can't be written.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class DemonstrationRecorder:
         return "\n".join([*(f"# {key}: {value}" for key, value in remarks.items()), ",".join(names), ""])
 
     def write(self, time: float, q: Array) -> None:
-        """Add a sample. A sample that is not later than the last sample is ignored.
+        """Add a sample. A sample that is not later than the previous sample is ignored.
 
         Args:
             time: [s].

@@ -1,7 +1,8 @@
 """Readers of text tables: imitarm's own CSV, and any other table of numbers.
 
-Column names are read from a separate row or from a remark. The number of columns decides only when nothing in the file
-looks like column names. A name, unit or remark that is not understood is an error.
+Column names are read from a separate row or from a remark (a line that starts with ``#`` or ``%``). If nothing in the
+file looks like column names, the number of columns gives their meaning. An unknown unit is an error, and so is a remark
+that looks like column names but can't be understood.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _NATIVE_MARK = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s*[#%][^\n]*\n)*?\s*[#%]\s*for
 
 
 class ImitarmReader(Reader):
-    """imitarm's own CSV: remarks with units and frame, columns t x y z, a quaternion, joints by name."""
+    """imitarm's own CSV format: remarks with units and frame; columns t x y z, quaternion and joints."""
 
     suffixes = (".csv",)
 
@@ -44,7 +45,7 @@ class ImitarmReader(Reader):
         """Return the demonstration in the file; its numbers are not checked."""
         table = read_demonstration_table(path)
         if options.units not in (None, "m") or options.time_units not in (None, "s"):
-            raise InputError(f"{path}: is in m and s, as its header says; leave out units")
+            raise InputError(f"{path}: its header states m and s; leave out the options for units")
         names = table.names or ()
         n_pose = 8 if "qw" in names else 4
         raw = RawDemonstration(
@@ -80,15 +81,15 @@ class TextTableReader(Reader):
         raw = named_columns(path, names, table.values, options, said) if names else None
         raw = raw or unnamed_columns(path, table.values, options, said)
         if raw.positions is None and options.units is not None:
-            raise InputError(f"{path}: holds joint angles and no lengths; leave out units")
+            raise InputError(f"{path}: holds joint angles but no lengths; leave out the option units")
         limbs = {name.partition("_")[0] for name in raw.joint_names if re.fullmatch(r"(left|right)_.*", name)}
         if len(limbs) > 1:
-            raise FileFormatError(f"{path}: holds joints of two limbs, left and right; keep the columns of one")
+            raise FileFormatError(f"{path}: holds joints of two arms, left and right; keep the columns of one arm")
         return [replace(raw, lines=table.lines, task=table.remarks.get("task", "") or raw.task)]
 
 
 def _said_units(table: Table) -> SaidUnits:
-    """Return the units (``# units: cm``, ``# time unit: ms``) and the order of quaternions that the remarks state."""
+    """Return the units and the quaternion order that remarks state, such as ``# units: cm`` or ``# time unit: ms``."""
     words: list[str] = []
     for _, text in table.remark_lines:
         if (match := _UNITS_REMARK.fullmatch(text.strip().lower())) is not None:
@@ -101,19 +102,19 @@ def _said_units(table: Table) -> SaidUnits:
         kind, unit = known.get(word, ("", ""))
         if not kind or found.setdefault(kind, unit) != unit:
             units = ", ".join(dict.fromkeys(unit for kind, unit in known.values() if kind != "rotation"))
-            what = f"says two units of {kind}" if kind else f"says its unit is {word!r}"
+            what = f"its remarks state two units of {kind}" if kind else f"a remark states the unknown unit {word!r}"
             raise FileFormatError(f"{table.path}: {what}; known: {units}")
     orders = {match.lower() for _, text in table.remark_lines for match in _ORDER.findall(text)}
     if len(orders) > 1:
-        raise FileFormatError(f"{table.path}: its remarks say both wxyz and xyzw; keep one")
+        raise FileFormatError(f"{table.path}: its remarks state both quaternion orders, wxyz and xyzw; keep one")
     return SaidUnits(found.get("length"), found.get("time"), found.get("angle"), next(iter(orders), None))
 
 
 def _names_of(table: Table) -> tuple[str, ...] | None:
-    """Return the column names in a row or a remark; None if nothing in the file looks like names.
+    """Return the column names from a row or a remark; None if nothing in the file looks like column names.
 
     Raises:
-        FileFormatError: when a remark looks like column names and does not fit the columns.
+        FileFormatError: when a remark looks like column names, but does not fit the columns.
     """
     if table.named_by_row:
         return table.names
@@ -157,7 +158,7 @@ def _looks_like_names(words: Sequence[str]) -> bool:
 
 
 def _run_of_names(words: Sequence[str], width: int) -> tuple[str, ...] | None:
-    """Return ``width`` known names that are consecutive words of a remark and the only names in it."""
+    """Return ``width`` consecutive words of a remark that are its only known column names; None if there are none."""
     known = [bool(column_of(word).what) for word in words]
     starts = [i for i, here in enumerate(known) if here and (i == 0 or not known[i - 1])]
     runs = [words[i : i + next((k for k, here in enumerate(known[i:]) if not here), len(words))] for i in starts]
@@ -166,14 +167,14 @@ def _run_of_names(words: Sequence[str], width: int) -> tuple[str, ...] | None:
 
 
 def _other_units(words: Sequence[str], run: Sequence[str], text: str) -> bool:
-    """Return whether the other words contain a unit that :func:`_said_units` does not use."""
+    """Return whether the words beside the column names contain a unit that :func:`_said_units` misses."""
     beside = {word.lower() for word in words} - {word.lower() for word in run} - set(_PROSE_UNIT.findall(text.lower()))
     units = {word: unit for known in UNITS.values() for word, unit in known.items()}
     return any(units.get(word, "m") not in ("m", "s", "rad") for word in beside - {"in"})
 
 
 def _listed_name(text: str) -> str | None:
-    """Return the name in a remark about one column: ``1: t [s]``, ``column 2: x``, or only ``x``."""
+    """Return the column name in a remark about one column, such as ``1: t [s]``, ``column 2: x`` or ``x``."""
     match = _NUMBERED.fullmatch(text.strip())
     names = split_names(match["name"] if match is not None else text.strip())
     alone = bool(names) and (match is not None or len(names) == 1)

@@ -1,1 +1,1 @@
-"""Text and numbers on disk: one atomic writer, tables, files that grow line by line."""
+"""Text and numbers on disk: writing files atomically, reading tables, and files that grow line by line."""

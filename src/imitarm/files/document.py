@@ -1,4 +1,4 @@
-"""Documents on disk: atomic writing of text, and checking of contents against a schema."""
+"""Documents on disk: write text files atomically, and check the content of documents against a schema."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Document = TypeVar("Document")
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file to a temporary file, which is then renamed; an existing file stays intact until then.
+    """Write text to a temporary file, then rename it to ``path``; an existing file stays intact until the renaming.
 
     Args:
         path: file to write; an existing file is replaced.
@@ -48,13 +48,13 @@ def _umask() -> int:
 
 
 def as_document(content: Any, kind: type[Document], path: str | os.PathLike[str], remedy: str) -> Document:
-    """Return plain values (dictionaries, lists, numbers, texts) as an object of a ``msgspec.Struct``.
+    """Convert plain values (dictionaries, lists, numbers, texts) to an object of the class ``kind``.
 
     Args:
         content: result of a JSON or YAML reader.
-        kind: Struct that describes the fields and their types.
+        kind: subclass of ``msgspec.Struct`` that describes the fields and their types.
         path: path of the file, for messages.
-        remedy: remedy for a wrong field, for messages.
+        remedy: what the user should do about a wrong field; it is added to the message.
 
     Raises:
         FileFormatError: when a field is missing or of another type; the message names the field.

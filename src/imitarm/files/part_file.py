@@ -14,10 +14,10 @@ PART = ".part"
 
 
 class PartFile:
-    """A text file for recorders with the name ``PATH.part`` until it is finished.
+    """A text file for recorders, which is called ``PATH.part`` until it is finished, and ``PATH`` afterwards.
 
-    Each text is handed to the operating system before :meth:`write` returns: if the program is killed, ``PATH.part``
-    contains all written text. An older file ``PATH`` stays intact until the new one is complete.
+    :meth:`write` hands its text to the operating system before it returns. If the program is killed, ``PATH.part``
+    therefore contains all written text. An older file ``PATH`` stays intact until the new one is complete.
 
     Args:
         path: final name.
@@ -26,18 +26,18 @@ class PartFile:
 
     Attributes:
         path: final name.
-        part: name until the file is finished.
+        part: path of the file until it is finished.
 
     Raises:
-        InputError: when the path is a folder, the file exists and may not be replaced, ``PATH.part`` exists (left by
-            another program, or being written), or the file can't be written.
+        InputError: when the path is a folder, when the file exists and may not be replaced, when ``PATH.part`` exists
+            (an earlier program left it, or another program is writing it), or when the file can't be written.
     """
 
     def __init__(self, path: str | Path, begin: str, *, replace: bool = False) -> None:
         self.path = Path(path)
         self.part = self.path.with_name(self.path.name + PART)
         if self.path.is_dir():
-            raise InputError(f"{path}: is a folder; name a file in it")
+            raise InputError(f"{path}: is a folder; name a file in that folder")
         if self.path.exists() and not replace:
             raise InputError(f"{path}: already exists; name another file, or allow it to be replaced")
         try:
@@ -46,8 +46,8 @@ class PartFile:
             self._file.flush()
         except FileExistsError as error:
             raise InputError(
-                f"{self.part}: was left by a recording that was not closed, or is being written; rename it to "
-                "keep it, or remove it"
+                f"{self.part}: an earlier recording left this file unfinished, or another program is writing it; "
+                f"rename the file to keep it, or remove it"
             ) from error
         except OSError as error:
             raise InputError(f"{self.part}: can't be written: {error.strerror or error}") from error
@@ -67,18 +67,18 @@ class PartFile:
             raise InputError(f"{self.part}: can't be written: {error.strerror or error}") from error
 
     def finish(self, take: Callable[[Path], bool], *, begin: str = "") -> None:
-        """Write everything to the disk, then rename the file or remove it.
+        """Write all text to the disk, then rename ``PATH.part`` to ``PATH``, or let ``take`` create ``PATH`` from it.
 
-        A second call does nothing.
+        Calling this method again does nothing.
 
         Args:
-            take: function called with ``part``, which may create ``path`` from it, and returns whether it renamed
-                ``part``. If it did not rename the file, ``part`` is removed. If it did, a file of that name now belongs
-                to another recorder and is not touched.
+            take: function that is called with the path ``part``. It may create ``PATH`` from that file, and returns
+                whether it renamed the file. If it returns False, ``part`` is removed. If it returns True, nothing is
+                removed, because a new file called ``PATH.part`` would belong to another recorder.
             begin: text that replaces the ``begin`` given to the constructor; both must have the same length.
 
         Raises:
-            InputError: when this fails; the written text stays in ``part``.
+            InputError: when the file can't be completed; the written text stays in ``part``.
         """
         if self._file is None:
             return

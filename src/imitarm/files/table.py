@@ -1,7 +1,7 @@
-"""Tables of numbers in text files. Errors name the line, and writing never leaves an incomplete file.
+"""Tables of numbers in text files. Error messages name the line, and writing never leaves an incomplete file.
 
-A table is lines of numbers, separated by comma, semicolon, tab or spaces. A row of column names may come first, and a
-row of their units below it. Between semicolons or tabs, numbers may have decimal commas.
+A table consists of lines of numbers that are separated by commas, semicolons, tabs or spaces. A row of column names may
+come first, with a row of units below it. If the separator is a semicolon or a tab, numbers may have decimal commas.
 Lines that start with ``#`` or ``%`` are remarks. Remarks before the numbers are kept: they may hold ``key: value``
 pairs or the column names.
 """
@@ -49,13 +49,13 @@ class Table:
     Attributes:
         path: path of the file as given by the caller.
         remarks: the ``key: value`` remarks before the numbers, keys in lower case.
-        names: column names, with the units of a row of units in brackets (``x [mm]``); None when the file has no
-            names. They are in a separate row, or else in the last remark before the numbers that has one word for
-            each column.
-        values: the numbers, shape (n, columns). The numbers may include nan and inf, for which the caller must check.
+        names: column names, from a separate row or from the last remark before the numbers that has one word for each
+            column. Units from a row of units are added in brackets (``x [mm]``). None when the file has no column
+            names.
+        values: the numbers, shape (n, columns). The caller must check for nan and inf.
         lines: line number of each row in the file, from 1, shape (n,).
         ends_in_newline: False when the last line may have been cut off.
-        names_line: the line of ``names``, from 1; None when there are no names.
+        names_line: line number of the column names, from 1; None when there are no names.
         remark_lines: line number and text of each remark before the numbers, without the ``#``.
     """
 
@@ -75,7 +75,7 @@ class Table:
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Return the content of a file.
+    """Return the bytes of a file.
 
     Raises:
         InputError: when it can't be opened.
@@ -86,12 +86,12 @@ def read_bytes(path: str | Path) -> bytes:
     except OSError as error:
         raise InputError(f"{path}: can't be read ({error.strerror or error}); check the path") from error
     if not content.strip():
-        raise FileFormatError(f"{path}: the file is empty; record or copy it again")
+        raise FileFormatError(f"{path}: the file is empty; record or copy the data again")
     return content
 
 
 def kind_of(content: bytes) -> str | None:
-    """Return the kind of a binary file, recognised by its first bytes; None when it looks like text."""
+    """Return what kind of binary file this is, from its first bytes; None when it looks like text."""
     for signature, kind in SIGNATURES.items():
         if content.startswith(signature):
             return kind
@@ -116,7 +116,10 @@ def _text_of(path: str | Path, content: bytes) -> str:
 
 
 def split_names(text: str) -> tuple[str, ...]:
-    """Split a line of column names. A unit in brackets belongs to the name before it: ``t (s) x (m)`` are two names."""
+    """Split a line of column names.
+
+    A unit in brackets belongs to the name before it, so ``t (s) x (m)`` gives two names.
+    """
     separator = _separator(text)
     if separator is not None:
         return tuple(_fields(text, separator))
@@ -124,7 +127,7 @@ def split_names(text: str) -> tuple[str, ...]:
 
 
 def _separator(line: str) -> str | None:
-    """Return the separator of fields in ``line``; None means spaces."""
+    """Return the character that separates the fields of ``line``; None means spaces."""
     return next((s for s in ";\t," if s in line), None)
 
 
@@ -146,7 +149,7 @@ def _row(path: str | Path, number: int, fields: Sequence[str], width: int, last:
     if len(fields) != width:
         remedy = "the file was cut off: record it again or remove its last line" if last else "fix that line"
         if len(fields) == 2 * width:
-            remedy = "if these are decimal commas, write decimal points"
+            remedy = "if the commas are decimal commas, replace them by decimal points"
         raise FileFormatError(f"{path}, line {number}: {len(fields)} values where {width} are expected; {remedy}")
     numbers = [_number(field) for field in fields]
     values = [value for value in numbers if value is not None]
@@ -160,7 +163,7 @@ def _row(path: str | Path, number: int, fields: Sequence[str], width: int, last:
 
 
 def _units_row(names: Sequence[str], line: str) -> list[str] | None:
-    """Return the units in the line below the column names; None when that line is no row of units."""
+    """Return the units in the line below the column names; None when that line does not consist of units."""
     units = [unit.strip("[]()") for unit in _fields(line, _separator(line))]
     if len(units) != len(names) or any(_number(unit) is not None or "," in unit for unit in units) or not any(units):
         return None
@@ -168,15 +171,15 @@ def _units_row(names: Sequence[str], line: str) -> list[str] | None:
 
 
 def _with_units(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
-    """Return the column names with their units in brackets; ``-`` and an empty unit mean that there is none."""
+    """Return the column names with their units in brackets; a column whose unit is ``-`` or empty keeps its name."""
     return tuple(f"{name} [{unit}]" if unit not in ("", "-") else name for name, unit in zip(names, units, strict=True))
 
 
 def _with_decimal_points(path: str | Path, body: Sequence[tuple[int, str]], separator: str) -> list[tuple[int, str]]:
-    """Return rows with decimal points instead of decimal commas; rows without decimal commas are returned as they are.
+    """Replace decimal commas by decimal points in the rows; rows without decimal commas are returned unchanged.
 
     Raises:
-        FileFormatError: when the commas may separate thousands instead.
+        FileFormatError: when the commas could also be separators of thousands.
     """
     fields = {field: number for number, line in body for field in _fields(line, separator)}
     commas = [field for field in fields if _DECIMAL_COMMA.fullmatch(field)]
@@ -194,7 +197,7 @@ def _with_decimal_points(path: str | Path, body: Sequence[tuple[int, str]], sepa
 
 
 def _names_in_remarks(remarks: Sequence[tuple[int, str]], width: int) -> tuple[int | None, tuple[str, ...] | None]:
-    """Return line and words of the last remark with exactly ``width`` words, none of them a number."""
+    """Return the line number and the words of the last remark that has exactly ``width`` words and no number."""
     for number, text in reversed(remarks):
         for part in (text, text.partition(":")[2]):  # "t x y z" as well as "columns: t x y z"
             names = split_names(part)
@@ -208,14 +211,14 @@ def read_table(path: str | Path) -> Table:
 
     Raises:
         InputError: when the file can't be opened.
-        FileFormatError: when it is empty, binary, not UTF-8, holds no rows, a row differs in length from the first one,
-            or an entry is not a number; the message names file and line.
+        FileFormatError: when the file is empty, binary or not UTF-8, has no rows, has rows of different lengths, or
+            contains an entry that is not a number; the message names file and line.
     """
     return parse_table(path, read_bytes(path))
 
 
 def parse_table(path: str | Path, content: bytes) -> Table:
-    """Read a table of numbers from the content of a file, as :func:`read_table` does.
+    """Read a table of numbers from bytes; :func:`read_table` does the same with a file.
 
     Args:
         path: the name of the file, for messages.
@@ -259,14 +262,15 @@ def parse_table(path: str | Path, content: bytes) -> Table:
 def write_table(
     path: str | Path, remarks: Mapping[str, str], names: Sequence[str], values: NDArray[np.float64]
 ) -> None:
-    """Write a table that :func:`read_table` reads back to the last bit.
+    """Write a table; :func:`read_table` reads exactly the same numbers back.
 
-    The table is written to a temporary file, which is then renamed: an existing file stays intact until the new one
-        is complete.
+    The table is written to a temporary file, which is then renamed. An existing file therefore stays intact until the
+    new file is complete.
 
     Args:
         path: file to write; an existing file is replaced.
-        remarks: remarks to write first, one line ``# key: value`` for each; line breaks become spaces.
+        remarks: remarks to write before the numbers, each as a line ``# key: value``; line breaks in values become
+            spaces.
         names: the column names.
         values: the numbers, shape (n, len(names)).
 

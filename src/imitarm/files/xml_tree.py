@@ -1,4 +1,4 @@
-"""XML as a tree whose elements know their line, so that messages can name the line."""
+"""Read XML as a tree of elements that know their line number, so that error messages can name the line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class XmlElement:
         tag: tag as written, with its prefix, for example ``"joint"`` or ``"xacro:macro"``.
         attributes: attributes by name, in the order of the file.
         line: line in which the element begins, counted from 1.
-        children: elements directly inside this one.
+        children: elements directly inside this element.
     """
 
     tag: str
@@ -52,7 +52,7 @@ def read_xml(path: Path, expected: str = "") -> XmlElement:
 
     Args:
         path: the file.
-        expected: expected type of the file, for messages, for example ``"an MJCF or URDF file"``.
+        expected: expected type of the file, for example ``"an MJCF or URDF file"``; used in error messages.
 
     Raises:
         FileFormatError: when the file is not well-formed XML; the message names the line.
