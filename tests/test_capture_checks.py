@@ -60,7 +60,7 @@ def test_gaps():
 @pytest.mark.parametrize(("rate", "severity"), [(5.0, "error"), (15.0, "warning")])
 def test_a_frame_rate_that_is_too_low(rate, severity):
     finding = found(skeletons(60, rate=rate))["frame-rate"]
-    assert finding.severity == severity and f"{rate:.1f} frames a second" in finding.message
+    assert finding.severity == severity and f"{rate:.1f} frames per second" in finding.message
 
 
 def test_time_that_runs_backwards_or_stands_still():
@@ -81,7 +81,7 @@ def test_swapped_sides_are_found_and_mended():
     finding = found(wrong)["sides-swapped"]
     assert finding.frame == 20 and "in 5 frames" in finding.message
     mended, notes = repaired(SkeletonRecording(wrong))
-    assert all(map(same, mended.skeletons, frames)) and notes == ["exchanged left and right back in 5 frames"]
+    assert all(map(same, mended.skeletons, frames)) and notes == ["swapped left and right back in 5 frames"]
 
 
 def test_a_person_with_the_back_to_the_sensor():
@@ -94,7 +94,7 @@ def test_a_second_person_and_the_one_who_is_kept():
     finding = found(frames)["several-persons"]
     assert "3 (60 frames), 8 (20 frames)" in finding.message and finding.frame == 16
     mended, notes = repaired(SkeletonRecording(frames))
-    assert mended.persons == (3,) and notes == ["kept person 3; 20 frames of others dropped"]
+    assert mended.persons == (3,) and notes == ["kept person 3; 20 frames of other persons dropped"]
 
 
 def test_limbs_of_changing_length_and_of_impossible_length():
@@ -133,7 +133,7 @@ def test_errors_come_first_and_read_well():
     )
     assert str(findings[0]) == (
         "error arm-lost: frame 0 (0.00 s): the right arm is lost in 80 % of the frames; "
-        "keep it in view, away from the body"
+        "keep the arm in view, away from the body"
     )
     assert str(RecordingIssue("note", "x", "all is well")) == "note x: all is well"
 

@@ -20,7 +20,9 @@ def apart(tmp_path, monkeypatch):
 
 
 def test_the_variable_goes_before_folders_and_a_folder_counts_when_it_is_finished(apart, monkeypatch):
-    with pytest.raises(InputError, match=r"make it, once: '.* -m imitarm\.capture\.mediapipe_environment'.*IMITARM_M"):
+    with pytest.raises(
+        InputError, match=r"create it once by '.* -m imitarm\.capture\.mediapipe_environment'.*IMITARM_M"
+    ):
         find_python()
     for name in ("one", "two"):
         (apart / name).mkdir()
@@ -90,5 +92,5 @@ def test_a_python_that_fits_is_chosen(monkeypatch):
     monkeypatch.setattr("shutil.which", lambda name: f"/bin/{name}" if name in {"python3.10", "python3.9"} else None)
     assert suitable_python() == "/bin/python3.10"
     monkeypatch.setattr("shutil.which", lambda _: None)
-    with pytest.raises(InputError, match=r"exists for Python 3\.9 to 3\.12; this is 3\.14"):
+    with pytest.raises(InputError, match=r"supports Python 3\.9 to 3\.12; this is Python 3\.14"):
         suitable_python()

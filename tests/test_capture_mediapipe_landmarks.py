@@ -137,7 +137,7 @@ def test_nobody_who_can_be_placed_is_nobody():
 
 def test_landmarks_that_are_none_are_refused():
     good = seen(standing(), PLACE)
-    with pytest.raises(InputError, match="33 of them"):
+    with pytest.raises(InputError, match="33 landmarks"):
         PoseLandmarks(0.0, good.world[:32], good.image, good.visibility)
     with pytest.raises(InputError, match="finite"):
         PoseLandmarks(0.0, good.world * np.inf, good.image, good.visibility)

@@ -116,8 +116,8 @@ def test_times_always_increase(film, expected, libraries):
     ("film", "message"),
     [
         (None, "error is not a video that can be read"),
-        ({"pictures": 0, "times": []}, "error it holds no image"),
-        ({"pictures": 4, "times": [], "rate": 0.0}, "error has neither times nor a frame rate"),
+        ({"pictures": 0, "times": []}, "error the video contains no image"),
+        ({"pictures": 4, "times": [], "rate": 0.0}, "error has neither time stamps nor a frame rate"),
         ({"pictures": 40, "announced": 100, "rate": 30.0, "times": []}, "error ends after 40 of 100 images"),
     ],
 )
@@ -145,7 +145,7 @@ def test_a_mediapipe_that_will_not_do_is_named(libraries, monkeypatch):
     assert "mediapipe 1.0 has no module 'solutions'" in lines("video", "a.mp4")[1][0]
     monkeypatch.setitem(sys.modules, "cv2", None)
     assert "has no usable cv2" in lines("video", "a.mp4")[1][0]
-    assert "expects: video FILE" in lines("film")[1][0]
+    assert "expected arguments: video FILE" in lines("film")[1][0]
 
 
 def test_an_unforeseen_failure_is_one_line_and_a_traceback_for_the_log(libraries):

@@ -95,7 +95,7 @@ def test_a_cut_off_file_is_refused_wherever_it_was_cut(saved, tmp_path):
 
 def test_a_file_cut_between_two_rows_knows_how_many_there_were(saved):
     saved.write_text("".join(saved.read_text().splitlines(keepends=True)[:-2]))
-    with pytest.raises(FileFormatError, match=r"wave\.csv, line 19: ends after 10 frames where 12 are announced.*copy"):
+    with pytest.raises(FileFormatError, match=r"wave\.csv, line 19: ends after 10 frames, but the header announces 12.*copy"):
         read_recording(saved)
 
 
@@ -182,7 +182,7 @@ def test_a_truncated_kinect_table_names_file_line_and_remedy(tmp_path):
     ("content", "message"),
     [
         (b"", "empty"),
-        (b"t,x,y,z\n0,1,2,3\n1,2,3,4\n", "line 2: 4 columns; a recording of skeletons is .* 101 columns"),
+        (b"t,x,y,z\n0,1,2,3\n1,2,3,4\n", "line 2: 4 columns, so this is no recording of skeletons.* 101 columns"),
         (b"Frame\tTime\tx\n1\t0.0\t2\n", "line 2: 3 columns"),
         (b"\x89PNG\0\0\0", "binary"),
         (b"PK\x03\x04abc", "zip"),

@@ -116,7 +116,7 @@ def test_capture_records_and_checks_a_real_video(tmp_path, capsys):
     out = tmp_path / "cam01.csv"
     assert main(["capture", f"video:{VIDEOS / 'cam01.mp4'}", "--check", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
-    assert "60.0 frames a second" in shown and "0 errors" in shown
+    assert "60.0 frames per second" in shown and "0 errors" in shown
     assert len(read_recording(out)) == len(video_recording(1))
 
 

@@ -1,7 +1,8 @@
 """Capture: skeletons of a person, and the sources that deliver them.
 
-``SOURCES`` is the registry. To add a source, write one class and register it here, or by an entry point of another
-package (group ``imitarm.sources``). The source then appears in the ``--help`` of every command that takes a source.
+``SOURCES`` lists all sources by name. To add a source, write one class and register it here, or by an entry point of
+another package (group ``imitarm.sources``). The source then appears in the ``--help`` of every command that takes a
+source.
 """
 
 from imitarm.capture.skeleton import Arm, HandState, Skeleton, SkeletonSource, Tracking
@@ -20,6 +21,6 @@ SOURCES: Registry[type[SkeletonSource]] = Registry(
         "azure": "imitarm.capture.kinect:AzureKinectSource",
     },
 )
-"""All sources by name; a user writes ``NAME`` or ``NAME:ARGUMENT``, and for ``file`` just the file's name."""
+"""All sources by name. A user selects one as ``NAME`` or ``NAME:ARGUMENT``; a file is selected by its name alone."""
 
 __all__ = ["SOURCES", "Arm", "HandState", "Skeleton", "SkeletonSource", "Tracking"]

@@ -54,7 +54,7 @@ _IN_LINE = math.radians(3.0)  # a hand that is this close to the line of sight t
 
 
 def _mixing() -> Array:
-    """Return the matrix (25, 25) that correlates independent errors of the joints; its rows have unit length."""
+    """Return the matrix M, shape (25, 25), which correlates the errors of the joints; its rows have unit length."""
     rows = np.eye(len(JOINTS))
     sides = [
         (near if near in JOINT else f"{near}_{side}", f"{far}_{side}", correlation)
@@ -68,7 +68,7 @@ def _mixing() -> Array:
 
 
 def _white_ratios() -> Array:
-    """Return the white noise relative to sigma: its value at rest and its increase per m/s, shape (2, 25)."""
+    """Return the white noise of each joint relative to sigma: at rest, and its increase per m/s, shape (2, 25)."""
     return np.array([_WHITE.get(name.removesuffix("_left").removesuffix("_right"), _WHITE_BODY) for name in JOINTS]).T
 
 
@@ -81,36 +81,38 @@ class SkeletonCamera:
 
     The page docs/capture.md describes how these errors were measured.
 
-    A joint at x is measured at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma`` on each
-    axis across the line of sight and ``1.4 sigma`` along it; both are 1.5 times as large for finger tips and thumbs. It
-    is a Matern process of order 3/2 over time t and path length :math:`|dx|` together,
+    A joint at position x is measured at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma``
+    on each axis across the line of sight, and ``1.4 sigma`` along the line of sight. For finger tips and thumbs, both
+    values are 1.5 times as large. The slow error is a Matern process of order 3/2 over a variable u that combines time
+    t and path length :math:`|dx|`,
 
     .. math:: du = dt / 5\,\mathrm{s} + |dx| / 8\,\mathrm{cm}, \qquad
               \mathrm{E}\,[c(0)\,c(u)] = \sigma^2 (1 + u)\,e^{-u},
 
     because in recordings of a Kinect v2 the length of a bone hardly changes while the arm is at rest, and changes by 1
-    to 2 cm while the joint moves by 10 to 20 cm. ``M`` correlates the errors of neighbouring joints: a forearm's length
-    varies less than an upper arm's. ``n`` is white noise and grows with the joint's speed: for elbow and
-    wrist and ``sigma`` of 12 mm, it is 0.2 mm at rest plus 5 mm per m/s. ``b`` is a bias of the elbow's depth.
+    to 2 cm while the joint moves by 10 to 20 cm. The matrix ``M`` correlates the errors of neighbouring joints, so that
+    the length of the forearm varies less than that of the upper arm. The white noise ``n`` grows with the joint's
+    speed: with ``sigma`` of 12 mm, its standard deviation for elbow and wrist is 0.2 mm at rest plus 5 mm per m/s. The
+    bias ``b`` is a constant error of the elbow's depth.
 
-    * Frames arrive at ``rate`` with ``jitter``; 3 % of the intervals are twice as long, and 1 % of the frames show
-      nobody.
-    * Dropouts: ``dropout`` times per second an arm is inferred (error three times as large), or lost, or the whole
-      person is lost, for 2 to 20 frames.
-    * Occlusion: a forearm behind the torso, and an elbow behind its own hand, are inferred.
-    * Occasionally the hand state is wrong for one or two frames.
+    * Timing: frames arrive at ``rate`` with ``jitter``. 3 % of the intervals are twice as long, and 1 % of the frames
+      show nobody.
+    * Dropouts: ``dropout`` times per second on average, for 2 to 20 frames, an arm is inferred (with three times the
+      error), an arm is lost, or the whole person is lost.
+    * Occlusion: the joints of a forearm behind the torso, and an elbow behind the hand of the same arm, are inferred.
+    * Hand states: occasionally, the state of a hand is wrong for one or two frames.
 
     Args:
         seed: seed of all random values.
         sigma: standard deviation of the slow error [m].
         rate: frames per second [Hz].
         jitter: standard deviation of the time between frames [s].
-        dropout: dropouts of each arm per second [Hz].
-        occlusion: whether hidden joints are inferred.
-        elbow_bias: largest bias of the elbow's depth [m]; the actual bias is drawn uniformly within it.
+        dropout: mean number of dropouts of each arm per second [Hz].
+        occlusion: whether joints that are hidden behind the body are inferred; otherwise, they are tracked.
+        elbow_bias: largest magnitude of the elbow's depth bias [m]; the actual bias is drawn from a uniform
+            distribution.
         faultless: whether to omit dropouts, occlusions, jitter and wrong hand states; with ``sigma=0`` and
-            ``elbow_bias=0`` the
-            camera reports the truth.
+            ``elbow_bias=0``, the camera reports the truth.
 
     Raises:
         InputError: when a value is out of range.
@@ -149,12 +151,12 @@ class SkeletonCamera:
 
     @classmethod
     def from_seed(cls, seed: int, *, rate: float = 30.0) -> SkeletonCamera:
-        """Return camera number ``seed``: its sigma is between 1 and 2 cm, and all other values are the defaults."""
+        """Return a camera with a random sigma between 1 and 2 cm and default values for everything else."""
         return cls(seed, sigma=float(np.random.default_rng([30314, seed]).uniform(0.01, 0.02)), rate=rate)
 
     @classmethod
     def ideal(cls, rate: float = 30.0) -> SkeletonCamera:
-        """Return a camera that reports the truth."""
+        """Return a camera that reports the true positions without any error."""
         return cls(0, sigma=0.0, rate=rate, jitter=0.0, dropout=0.0, elbow_bias=0.0, faultless=True)
 
     def next_time(self, time: float) -> float:
@@ -194,7 +196,7 @@ class SkeletonCamera:
         return Skeleton(truth.time, positions, tracking, hands, truth.person)
 
     def _error(self, points: Array, period: float) -> Array:
-        """Return the errors of this frame relative to sigma and scale, shape (25, 3)."""
+        """Return the errors M c + n of this frame, relative to sigma and to the axis factors, shape (25, 3)."""
         step = points - self._last if period > 0.0 else np.zeros(_SHAPE)
         path = np.nan_to_num(np.sqrt(np.sum(step * step, axis=1)))[:, None]
         u = period / MEMORY + path / MEMORY_LENGTH

@@ -1,4 +1,4 @@
-"""Find faults in a recording of a person (``check``), and fix those that need no guess (``repaired``)."""
+"""Find faults in a recording of a person (``check``), and fix those that need no guessing (``repaired``)."""
 
 from __future__ import annotations
 
@@ -77,11 +77,12 @@ def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]
     """Fix the faults that can be fixed without guessing, and report each change.
 
     If there are several persons, the one with the most frames is kept. A frame is dropped when it is not later than the
-    previous frame or repeats it exactly. Joints in a spike count as lost, and so do the joints of an arm that is frozen
-    while the body moves. If left and right were exchanged from one frame to the next, they are exchanged back.
+    previous frame or repeats it exactly. Joints that jump away for a few frames (a spike) count as lost, and so do the
+    joints of an arm that is frozen while the body moves. If the camera swapped left and right from one frame to the
+    next, the swap is undone.
 
     Returns:
-        The repaired recording, and one line for each kind of change; no lines if nothing was changed.
+        The repaired recording, and one line of text for each kind of change; no lines if nothing was changed.
     """
     notes: list[str] = []
     frames = recording.skeletons
@@ -89,7 +90,7 @@ def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]
         counts = {person: sum(s.person == person for s in frames) for person in recording.persons}
         main = max(counts, key=lambda person: counts[person])
         frames = tuple(s for s in frames if s.person == main)
-        notes.append(f"kept person {main}; {len(recording) - len(frames)} frames of others dropped")
+        notes.append(f"kept person {main}; {len(recording) - len(frames)} frames of other persons dropped")
     kept: list[Skeleton] = []
     for skeleton in frames:
         if not kept or skeleton.time > kept[-1].time:
@@ -100,7 +101,7 @@ def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]
     memory = SideMemory()
     right = [memory.update(skeleton) for skeleton in kept]
     if memory.swaps:
-        notes.append(f"exchanged left and right back in {memory.swaps} frames")
+        notes.append(f"swapped left and right back in {memory.swaps} frames")
     return recording.with_skeletons(_without_spikes(right, notes)), notes
 
 
@@ -118,7 +119,7 @@ def _without_repeats(frames: list[Skeleton], notes: list[str]) -> list[Skeleton]
     lost[1:][whole] = False
     if whole.any():
         longest = max(float(times[last] - times[first]) for first, last in runs(whole))
-        note = f"dropped {int(whole.sum())} frames that repeat the one before, for up to {longest:.2f} s on end"
+        note = f"dropped {int(whole.sum())} frames that repeat the previous frame, for up to {longest:.2f} s at a time"
         notes.append(note)
     if lost.any():
         notes.append(f"marked an arm as lost in {int(lost.any(axis=1).sum())} frames in which it was frozen")
@@ -133,7 +134,9 @@ def _without_spikes(frames: list[Skeleton], notes: list[str]) -> list[Skeleton]:
     spikes, _ = find_spikes(times, np.array([skeleton.positions for skeleton in frames]))
     if not spikes.any():
         return frames
-    notes.append(f"marked joints as lost in {int(spikes.any(axis=1).sum())} frames with a spike")
+    notes.append(
+        f"marked joints as lost in {int(spikes.any(axis=1).sum())} frames with a spike (joints that jump away and back)"
+    )
     return [_with_lost(skeleton, joints) for skeleton, joints in zip(frames, spikes, strict=True)]
 
 
@@ -146,7 +149,7 @@ def _with_lost(skeleton: Skeleton, joints: Mask) -> Skeleton:
 
 
 class _View:
-    """The recording of the person with the most frames, as arrays."""
+    """The skeletons of the person who appears in the most frames of a recording, as arrays."""
 
     def __init__(self, recording: SkeletonRecording, side: str) -> None:
         everybody = [skeleton.person for skeleton in recording.skeletons]
@@ -175,22 +178,22 @@ class _View:
         self.other_axes = axes_that_fit(self.positions)
 
     def issue(self, severity: Severity, code: str, message: str, remedy: str, i: int | None = None) -> RecordingIssue:
-        """Build an issue about sample ``i``."""
+        """Build an issue about skeleton ``i`` of this view; None: about the whole recording."""
         if i is None:
             return RecordingIssue(severity, code, message, remedy=remedy)
         return RecordingIssue(severity, code, message, self.frames[i], float(self.times[i] - self.times[0]), remedy)
 
     def unit_remedy(self) -> str:
-        """Return a remedy: the unit of time that fits or, if no unit fits, what to check instead."""
+        """Return a remedy for implausible times: the unit that fits or, if no unit fits, what to check instead."""
         fit = time_unit_that_fits(1.0 / self.period, self.time_unit)
         if fit is None:
             return (
-                "check the spikes and jumps, the frame rate from which the times were computed, and the unit of length"
+                "check the joints that jump, the frame rate from which the times were computed, and the unit of length"
             )
         name, factor = fit
         return (
             f"the times were read in units of {time_unit_name(self.time_unit)}, but are plausible in {name} "
-            f"({1.0 / (factor * self.period):.1f} frames a second): multiply them by {factor:.10g}"
+            f"({1.0 / (factor * self.period):.1f} frames per second): multiply them by {factor:.10g}"
         )
 
 
@@ -200,7 +203,7 @@ def _people(recording: SkeletonRecording) -> Iterator[RecordingIssue]:
         message = f"nobody is visible in any of {n} frames" if n else "holds no frames"
         remedy = "stand 1.5 to 3 m in front of the sensor and record again"
         if any(issue.code == "far-joint" for issue in recording.issues):
-            remedy = "convert the positions to metres (see far-joint)"
+            remedy = "convert the positions to metres, as the issue 'far-joint' says"
         yield RecordingIssue("error", "nobody", message, remedy=remedy)
         return
     if len(recording.persons) > 1:
@@ -210,10 +213,10 @@ def _people(recording: SkeletonRecording) -> Iterator[RecordingIssue]:
         yield RecordingIssue(
             "warning",
             "several-persons",
-            f"{len(recording.persons)} persons: {shown}; all other issues are about the person seen most",
+            f"{len(recording.persons)} persons: {shown}; all other issues are about the person with the most frames",
             second,
             recording.skeletons[second].time - recording.skeletons[0].time,
-            "choose one by --person, or .person(number)",
+            "choose one person by --person in a command, or by .person(number) in Python",
         )
 
 
@@ -221,9 +224,9 @@ def _times(view: _View) -> Iterator[RecordingIssue]:
     steps = np.diff(view.times)
     if (steps <= 0.0).any():
         i = int(np.argmax(steps <= 0.0)) + 1
-        message = f"the time stamp is not later than the previous one {int((steps <= 0.0).sum())} times, "
+        message = f"in {int((steps <= 0.0).sum())} frames, the time stamp is not later than in the previous frame; "
         back = 1e3 * float(-steps.min())
-        message += f"and goes back by up to {back:.0f} ms" if back > 0.0 else "but repeats it"
+        message += f"it goes back by up to {back:.0f} ms" if back > 0.0 else "it is the same"
         yield view.issue("error", "time-backwards", message, "repair drops these frames", i)
     if len(view.times) < _FEW:
         yield view.issue("error", "few-frames", f"{len(view.times)} frames only", "record for longer")
@@ -233,7 +236,7 @@ def _rate(view: _View) -> Iterator[RecordingIssue]:
     if view.period == 0.0:
         return
     rate = 1.0 / view.period
-    message = f"{rate:.1f} frames a second"
+    message = f"{rate:.1f} frames per second"
     if rate > PLAUSIBLE_RATE[1]:
         speed = view.hand_speed
         quick = speed > _QUICK_HAND
@@ -241,27 +244,29 @@ def _rate(view: _View) -> Iterator[RecordingIssue]:
         message += f"; the hands move at up to {speed:.1f} m/s" if quick else ""
         yield view.issue("error" if quick else "warning", "frame-rate", message, view.unit_remedy())
     elif rate < _LOW_RATE[1]:
-        message += ": a robot that follows would brake between two frames"
+        message += "; a robot that follows this recording would brake between two frames"
         fits = time_unit_that_fits(rate, view.time_unit) is not None
-        remedy = view.unit_remedy() if fits else "use a faster camera or computer; 30 are usual"
+        remedy = view.unit_remedy() if fits else "use a faster camera or computer; 30 frames per second are usual"
         yield view.issue("error", "frame-rate", message, remedy)
     elif rate < _LOW_RATE[0]:
-        yield view.issue("warning", "frame-rate", message, "use more light or a smaller model; 30 are usual")
+        yield view.issue(
+            "warning", "frame-rate", message, "use more light or a smaller model; 30 frames per second are usual"
+        )
 
 
 def _hand_speed(view: _View) -> Iterator[RecordingIssue]:
     speed = view.hand_speed
     if speed > FASTEST_HAND:
-        message = f"the hands move at {speed:.0f} m/s (90th percentile over three frames), faster than a person"
+        message = f"the hands move at {speed:.0f} m/s (90th percentile over three frames), faster than a person can"
         yield view.issue("error", "hand-speed", message, view.unit_remedy())
 
 
 def _axes(view: _View) -> Iterator[RecordingIssue]:
     if view.other_axes is not None:
         fault, fit = view.other_axes
-        remedy = "x must point to the sensor's left, y up, z away from it"
+        remedy = "x must point to the sensor's left, y up, and z away from the sensor"
         if fit:
-            remedy += f"; for a person who faces the sensor, take {fit} of the file as x, y, z"
+            remedy += f"; if the person faces the sensor, use the axes {fit} of the file as x, y, z"
         yield view.issue("error", "axes", fault, remedy)
 
 
@@ -284,9 +289,9 @@ def _frozen(view: _View) -> Iterator[RecordingIssue]:
         ]
         if lasting:
             longest, first = max(lasting)
-            message = f"the {what} is exactly the same for {longest:.2f} s"
-            message += f", and in {len(lasting) - 1} other places" if len(lasting) > 1 else ""
-            remedy = "repair drops these frames, which leaves a gap; record again if the motion is in it"
+            message = f"the positions of the {what} are exactly the same for {longest:.2f} s"
+            message += f", and at {len(lasting) - 1} other times" if len(lasting) > 1 else ""
+            remedy = "repair drops these frames, which leaves a gap; record again if you need the motion in the gap"
             yield view.issue("error" if longest > _STOP else "warning", "frozen", message, remedy, first)
             return
     fraction = whole.sum() / len(view.times)
@@ -305,8 +310,8 @@ def _spikes(view: _View) -> Iterator[RecordingIssue]:
         frames = np.flatnonzero(spikes.any(axis=1))
         i, joint = divmod(int(np.argmax(size)), len(joints))
         message = f"single-frame spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints jump away and "
-        message += f"back, {JOINTS[joints[joint]]} by {size[i, joint]:.2f} m"
-        remedy = "repair marks these joints as lost there"
+        message += f"back, at most by {size[i, joint]:.2f} m ({JOINTS[joints[joint]]})"
+        remedy = "repair marks these joints as lost in these frames"
         severity = _severity_of(joints, spikes)
         yield view.issue(severity, "spike", message, remedy, int(view.later[frames[0]]))
 
@@ -321,7 +326,7 @@ def _jumps(view: _View) -> Iterator[RecordingIssue]:
         size = np.where(jump, step[:, joints], 0.0)
         i, joint = divmod(int(np.argmax(size)), len(joints))
         count = int(jump.any(axis=1).sum())
-        message = f"{count} jump{'' if count == 1 else 's'} without return, the largest {size[i, joint]:.2f} m from "
+        message = f"{count} jump{'' if count == 1 else 's'} without return, the largest of {size[i, joint]:.2f} m from "
         message += f"one frame to the next ({JOINTS[joints[joint]]}, {speed[i, joints[joint]]:.0f} m/s)"
         remedy = "cut there by trim, or record again"
         first = int(np.argmax(jump.any(axis=1))) + 1
@@ -329,12 +334,12 @@ def _jumps(view: _View) -> Iterator[RecordingIssue]:
 
 
 def _followed(view: _View) -> list[int]:
-    """Return the joints that affect a robot: those of the arm and of the trunk."""
+    """Return the joints that affect the robot: the joints of the arm and of the trunk."""
     return [*_ARM[view.side].tolist(), *_TRUNK.tolist()]
 
 
 def _severity_of(joints: list[int], found: Mask) -> Severity:
-    """Return a warning when only finger tips and thumbs jump: they rotate the tool, but do not move it."""
+    """Return ``"warning"`` when only finger tips and thumbs jump, because they can rotate the tool but not move it."""
     return "error" if any(found[:, i].any() for i, joint in enumerate(joints) if joint not in _TIPS) else "warning"
 
 
@@ -344,23 +349,25 @@ def _arm(view: _View) -> Iterator[RecordingIssue]:
     if lost.mean() > _LOST[0]:
         severity: Severity = "error" if lost.mean() > _LOST[1] else "warning"
         message = f"the {view.side} arm is lost in {100 * lost.mean():.0f} % of the frames"
-        yield view.issue(severity, "arm-lost", message, "keep it in view, away from the body", int(np.argmax(lost)))
+        yield view.issue(
+            severity, "arm-lost", message, "keep the arm in view, away from the body", int(np.argmax(lost))
+        )
     elif lost.any():
         message = f"the {view.side} arm is lost in {int(lost.sum())} of {len(lost)} frames"
         yield view.issue("note", "arm-lost", message, "none needed", int(np.argmax(lost)))
     if inferred.mean() > _INFERRED:
         message = (
-            f"a joint of the {view.side} arm is inferred, not seen, in {100 * inferred.mean():.0f} % of the frames"
+            f"a joint of the {view.side} arm is inferred, not tracked, in {100 * inferred.mean():.0f} % of the frames"
         )
-        yield view.issue("warning", "arm-inferred", message, "keep it in view", int(np.argmax(inferred)))
+        yield view.issue("warning", "arm-inferred", message, "keep the arm in view", int(np.argmax(inferred)))
 
 
 def _hand(view: _View) -> Iterator[RecordingIssue]:
     lost = view.confidence[:, [2, 4, 5]].min(axis=1) < 1.0
     if lost.mean() > _HAND_LOST:
         message = f"wrist, hand tip and thumb are not all tracked in {100 * lost.mean():.0f} % of the frames; the tool "
-        message += "will not rotate with the hand there"
-        yield view.issue("note", "hand-lost", message, "use orientation 'fixed', or spread the thumb")
+        message += "will not rotate with the hand in these frames"
+        yield view.issue("note", "hand-lost", message, "use orientation 'fixed', or spread the thumb while recording")
 
 
 def _limbs(view: _View) -> Iterator[RecordingIssue]:
@@ -375,18 +382,20 @@ def _limbs(view: _View) -> Iterator[RecordingIssue]:
         deviation = _MAD_TO_SIGMA * float(np.median(np.abs(seen - length)))
         if not _LIMB[0] <= length <= _LIMB[1]:
             unit = length_unit_that_fits(length)
-            remedy = "is this an arm?" if unit is None else f"these are plausible in {unit}: convert them"
+            remedy = (
+                "check the joints" if unit is None else f"the lengths are plausible in {unit}: convert the positions"
+            )
             message = f"the {name} is {length:.2f} m long"
             yield view.issue("error", "limb-length", message, f"positions must be in metres; {remedy}")
         elif deviation > _SPREAD * length and len(tracked) >= _FEW:
             message = f"the {name}'s length varies by {100 * deviation / length:.0f} % about {100 * length:.0f} cm"
-            yield view.issue("warning", "limb-length", message, "more light, or face the sensor")
+            yield view.issue("warning", "limb-length", message, "record with more light, or face the sensor")
 
 
 def _sides(view: _View) -> Iterator[RecordingIssue]:
     if view.swapped:
-        message = f"left and right are exchanged in {len(view.swapped)} frames"
-        yield view.issue("warning", "sides-swapped", message, "repair exchanges them back", view.swapped[0])
+        message = f"left and right are swapped in {len(view.swapped)} frames"
+        yield view.issue("warning", "sides-swapped", message, "repair swaps them back", view.swapped[0])
     if view.other_axes is not None:
         return
     across = view.positions[:, JOINT["shoulder_right"], 0] - view.positions[:, JOINT["shoulder_left"], 0]
@@ -394,7 +403,9 @@ def _sides(view: _View) -> Iterator[RecordingIssue]:
     turned = seen & (across < 0.0)
     if seen.any() and turned.sum() > max(_TURNED * seen.sum(), len(view.swapped)):
         message = (
-            f"left and right shoulder are at each other's positions in {100 * turned.sum() / seen.sum():.0f} % of the "
+            f"the left shoulder is where the right one should be in {100 * turned.sum() / seen.sum():.0f} % of the "
         )
-        message += "frames: the person has the back to the sensor, or the image is mirrored"
-        yield view.issue("warning", "turned-away", message, "face the sensor; do not mirror", int(np.argmax(turned)))
+        message += "frames: the person faces away from the sensor, or the image is mirrored"
+        yield view.issue(
+            "warning", "turned-away", message, "face the sensor, and do not mirror the image", int(np.argmax(turned))
+        )

@@ -1,4 +1,4 @@
-"""Sources that filter another source: select one person, correct exchanged sides, or play in real time."""
+"""Sources that filter another source: they select one person, undo swaps of left and right, or replay in real time."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ _TORSO = np.array([JOINT[name] for name in ("spine_shoulder", "spine_mid", "neck
 
 
 class PersonFilter(SkeletonSource):
-    """Selects one person of a source that may see several.
+    """Selects one person from a source that may deliver several persons.
 
-    The first person seen is followed until they have been out of view for more than ``patience`` on the source's clock;
-    everybody else is ignored. Another person is followed only after that time; by then every retargeter has stopped and
-    must engage again. A source that tracks only one person may give the next person the same number. Therefore, a
-    person who appears farther away than the followed person can have walked is ignored too.
+    The filter follows the first person who appears, and ignores everybody else. It follows another person only after
+    the first person has been out of view for more than ``patience`` on the source's clock; by then, every retargeter
+    has stopped and must engage again. A camera that tracks only one person at a time may give the next person the same
+    number. The filter therefore also ignores a person who appears farther away than the followed person can have
+    walked.
 
     Args:
         source: the source to filter.
         person: number, in the source, of the only person to follow; None: the first person who is seen.
-        patience: [s].
+        patience: time out of view after which another person may be followed [s].
 
     Attributes:
         followed: number of the followed person; None before a person is followed.
@@ -114,7 +115,7 @@ def _distance(a: Array, b: Array) -> float:
 
 
 def _torso(skeleton: Skeleton) -> Array | None:
-    """Return the position of a person: the first visible joint of the torso, else the middle of the shoulders."""
+    """Return the position of a person: the first visible joint of the torso, or else the middle of the shoulders."""
     for point in skeleton.positions[_TORSO]:
         if point[0] == point[0]:  # not nan
             return np.asarray(point)
@@ -148,29 +149,30 @@ _DECIDING = _pairs(("shoulder", "hip", "elbow", "wrist"))
 def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     r"""Return the skeleton with left and right assigned as in the previous frame.
 
-    Let :math:`l, r` be the positions of a left and a right joint and :math:`l', r'` those in the previous frame, a time
-    t earlier. The sides are exchanged back when this shortens the motion since the previous frame by more than limbs
-    can move:
+    Let :math:`l, r` be the positions of a left and a right joint, and :math:`l', r'` their positions in the previous
+    frame, a time t earlier. Left and right are swapped back when this makes the motion since the previous frame shorter
+    by more than the limbs can have moved:
 
     .. math:: \sum_j |l_j - l'_j| + |r_j - r'_j| > \sum_j |l_j - r'_j| + |r_j - l'_j| + n\,\max(0.15, v t)
 
-    summed over the n pairs of joints that are visible in both frames. Shoulders and hips (v = 0.5 m/s) decide about the
-    whole body; then the hands, with or without elbows (v = 4 m/s), decide about arms that were exchanged while the rest
-    of the body was not. Hands that meet are too close to each other to fulfil the inequality and are not exchanged. If
-    one joint of a pair is lost, only the other joint is used.
+    summed over the n pairs of joints that are visible in both frames. First, the inequality for shoulders and hips (v =
+    0.5 m/s) decides about the whole body. Then the inequality for the hands, with or without the elbows (v = 4 m/s),
+    decides about arms that were swapped while the rest of the body was not. Hands that touch are too close to each
+    other to satisfy the inequality, so they are not swapped. If one joint of a pair is lost, only the other joint is
+    used.
 
     Args:
         skeleton: skeleton as the camera reports it.
-        before: previous frame, with correct sides.
+        before: previous frame, with left and right assigned correctly.
 
     Returns:
-        The same skeleton when nothing was exchanged.
+        The corrected skeleton; the same object if left and right were not swapped.
     """
     return _kept(skeleton, before.positions, abs(skeleton.time - before.time))
 
 
 def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
-    """Return the skeleton with left and right as in ``before``, the positions (25, 3) [m] a ``period`` earlier."""
+    """Return the skeleton with left and right as in ``before``, the positions a ``period`` [s] earlier (25, 3) [m]."""
     if not (_gain(skeleton.positions, before, _DECIDING, _LEAST) > 0.0).any():  # nearly always
         return skeleton
     order = np.arange(len(JOINTS))
@@ -193,16 +195,16 @@ def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
 
 
 def _gain(now: Array, before: Array, pairs: NDArray[np.int64], margin: float) -> Array:
-    """Return how much closer each joint is to the other side's previous position than to its own, less ``margin / 2``.
+    """Return by how much a swap shortens the motion of each joint, minus ``margin / 2``.
 
     Args:
         now: positions (25, 3) [m].
-        before: likewise.
-        pairs: joints of the left and the right side, shape (2, n).
-        margin: margin of each pair [m].
+        before: positions in the previous frame, shape (25, 3) [m].
+        pairs: indices of the joints of the left and the right side, shape (2, n).
+        margin: distance by which the swap must shorten the motion of a pair of joints [m].
 
     Returns:
-        shape (2, n) [m]; nan where a joint is lost, or was lost in the previous frame.
+        The difference for each joint, shape (2, n) [m]; nan for a joint that is lost in one of the two frames.
     """
     there, here = before[pairs], now[pairs]
     straight, crossed = here - there, here - there[::-1]
@@ -212,10 +214,10 @@ def _gain(now: Array, before: Array, pairs: NDArray[np.int64], margin: float) ->
 
 
 class SideMemory:
-    """Corrects exchanged sides of one person, frame by frame.
+    """Undoes swaps of left and right for one person, frame by frame.
 
     Attributes:
-        swaps: frames in which sides were exchanged back.
+        swaps: number of frames in which left and right were swapped back.
     """
 
     def __init__(self) -> None:
@@ -225,7 +227,7 @@ class SideMemory:
         self._seen = np.full(len(JOINTS), -np.inf)
 
     def update(self, skeleton: Skeleton) -> Skeleton:
-        """Return the next skeleton with correct sides."""
+        """Return the next skeleton, with left and right assigned correctly."""
         right = skeleton
         period = abs(skeleton.time - self._time)
         if period <= MEMORY:
@@ -239,14 +241,13 @@ class SideMemory:
 
 
 class SideFilter(SkeletonSource):
-    """Corrects exchanged left and right sides in a source, for each person; see :func:`unswapped`.
+    """Undoes swaps of left and right in a source, separately for each person; see :func:`unswapped`.
 
-    The filter uses only motion: it assumes that the sides of the first frame are correct. After half a second
-        without frames,
-        it restarts; by then every retargeter has stopped.
+    The filter uses only motion, and assumes that left and right are correct in the first frame. After half a second
+    without frames, it restarts; by then every retargeter has stopped.
 
     Args:
-        source: a source that may exchange left and right.
+        source: a source that may swap left and right.
     """
 
     def __init__(self, source: SkeletonSource) -> None:
@@ -256,7 +257,7 @@ class SideFilter(SkeletonSource):
 
     @property
     def swaps(self) -> int:
-        """Frames in which sides were exchanged back."""
+        """Number of frames in which left and right were swapped back."""
         return sum(memory.swaps for memory in self._memory.values())
 
     @property
@@ -269,7 +270,7 @@ class SideFilter(SkeletonSource):
         self._source.close()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton with correct sides; None when none arrived within ``timeout`` seconds."""
+        """Return the next skeleton, with correct left and right; None when none arrived within ``timeout`` seconds."""
         skeleton = self._source.read(timeout)
         if skeleton is None:
             return None
@@ -279,7 +280,7 @@ class SideFilter(SkeletonSource):
 class RealtimeSource(SkeletonSource):
     """Delays a source so that it runs in real time.
 
-    It returns no skeleton earlier than its time since the first skeleton.
+    Each skeleton is returned no earlier than its time stamp, counted from the first skeleton.
 
     Args:
         source: source that returns skeletons as fast as they are read.

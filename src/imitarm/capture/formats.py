@@ -1,4 +1,4 @@
-"""Files of skeletons: imitarm's own text format, tables from Kinect SDK programs, and motion capture of an arm."""
+"""Files of skeletons: imitarm's own text format, tables exported with the Kinect SDK, and motion capture of an arm."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NAMES = (
     *(f"{joint}_{part}" for joint in JOINTS for part in ("x", "y", "z", "tracking")),
 )
 UNFINISHED = "not closed"
-"""Placeholder for the number of frames in the header of a file that is still being written."""
+"""Placeholder that stands for the number of frames in the header of a file that is still being written."""
 
 TICK = 1e-7  # [s] time unit of the Kinect SDK
 _KINECT_COLUMNS = 1 + 4 * len(JOINTS)
@@ -51,12 +51,12 @@ _UPPER_ARM = (0.1, 0.6)  # [m] of motion capture
 
 
 def is_native(head: bytes) -> bool:
-    """Return whether a file begins with the remark ``# format: imitarm-skeletons`` of imitarm's own format."""
+    """Return whether a file begins with ``# format: imitarm-skeletons``, as imitarm's own format does."""
     return _MARK.match(head.replace(b"\r\n", b"\n").replace(b"\r", b"\n")) is not None
 
 
 def native_header(source: str, frames: str) -> str:
-    """Return the header: the lines before the first skeleton.
+    """Return the header of imitarm's own format: the lines before the first skeleton.
 
     Args:
         source: origin of the skeletons.
@@ -77,7 +77,7 @@ def native_header(source: str, frames: str) -> str:
 
 
 def native_line(skeleton: Skeleton) -> str:
-    """Return a skeleton as one line of text, from which it is read back bit for bit."""
+    """Return a skeleton as one line of text, from which exactly the same numbers can be read back."""
     left, right = skeleton.hand_states
     fields = [repr(skeleton.time), str(skeleton.person), str(int(left)), str(int(right))]
     for (x, y, z), tracking in zip(skeleton.positions.tolist(), skeleton.tracking.tolist(), strict=True):
@@ -88,18 +88,18 @@ def native_line(skeleton: Skeleton) -> str:
 def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read imitarm's own format.
 
-    If the recording was not closed because its writer was killed or is still running, it is read up to the last
-    complete line, and an issue reports the loss.
+    If the recording was not closed, because its writer was killed or is still running, it is read up to the last
+    complete line, and an issue reports this.
 
     Args:
-        path: path for messages.
+        path: path of the file, for messages.
         content: content of the file.
 
     Returns:
-        the skeletons, and notes about the file.
+        The skeletons, and the issues found while reading.
 
     Raises:
-        FileFormatError: when the file was cut off after it was closed, has another version, or a line is not a
+        FileFormatError: when a complete file was cut off later, the file has another format version, or a line is not a
             skeleton; the message names file and line.
     """
     unfinished = _is_unfinished(content)
@@ -107,23 +107,27 @@ def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[Recordi
     if torn:
         content = content[: content.rfind(b"\n") + 1]
     if unfinished and content.rstrip().endswith(NAMES[-1].encode()):
-        raise FileFormatError(f"{path}: was not closed and holds no whole frame; record it again")
+        raise FileFormatError(f"{path}: was not closed and holds no whole frame (no complete line); record it again")
     table = parse_table(path, content)
     version = table.remarks.get("version", "")
     if version != str(VERSION):
-        raise FileFormatError(f"{path}: is of version {version!r}, this imitarm reads {VERSION}; update imitarm")
+        raise FileFormatError(
+            f"{path}: has format version {version!r}, but this imitarm reads version {VERSION}; update imitarm"
+        )
     if table.names != NAMES:
-        raise FileFormatError(f"{path}: its columns are not those of version {VERSION}; record or convert it again")
+        raise FileFormatError(
+            f"{path}: the columns are not those of format version {VERSION}; record or convert the file again"
+        )
     n = len(table.values)
     announced = table.remarks.get("frames", "")
     if not unfinished and announced != str(n):
         raise FileFormatError(
-            f"{path}, line {int(table.lines[-1])}: ends after {n} frames where {announced} are announced: the file was "
-            "cut off; copy it again, or correct the number after '# frames:'"
+            f"{path}, line {int(table.lines[-1])}: ends after {n} frames, but the header announces {announced}; "
+            "the file was cut off: copy it again, or correct the number after '# frames:'"
         )
     issues = []
     if unfinished:
-        lost = " and the frame that was being written is lost" if torn else ""
+        lost = "; the frame that was being written is lost" if torn else ""
         message = f"was not closed: its writer was stopped or is still running; {n} whole frames were read{lost}"
         issues.append(
             RecordingIssue("note", "not-closed", message, n - 1, remedy="save it under another name to keep it")
@@ -140,7 +144,7 @@ def _is_unfinished(content: bytes) -> bool:
 
 
 def _persons(table: Table, content: bytes) -> list[int]:
-    """Return the column of persons as integers; the body numbers of the Kinect SDK are too large for a float."""
+    """Return the person numbers as integers, because the Kinect SDK's body numbers are too large for a float."""
     lines = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n")
     fields = [lines[line - 1].split(b",")[1].strip() for line in table.lines]
     _refuse(table, np.array([_WHOLE.fullmatch(field) is None for field in fields]), "the person is not a whole number")
@@ -151,39 +155,39 @@ def _persons(table: Table, content: bytes) -> list[int]:
 
 
 def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
-    """Read a table of 101 columns: time in units of 100 ns, then x, y, z [m] and state of 25 joints in SDK order.
+    """Read a Kinect SDK table of 101 columns: time [100 ns], then x, y, z [m] and state of 25 joints in SDK order.
 
-    Times are counted from the first frame. Such a file contains neither person numbers nor hand states. A comma at the
-    end of a line is accepted.
+    Times are counted from the first frame. A table of this kind contains neither person numbers nor hand states. A
+    comma at the end of a line is accepted.
 
     Args:
-        path: path for messages.
+        path: path of the file, for messages.
         content: content of the file.
 
     Returns:
-        the skeletons, and notes about the file.
+        The skeletons, and the issues found while reading.
 
     Raises:
-        FileFormatError: when the file is another table, was cut off, or a field is not a number; the message names
-            file and line.
+        FileFormatError: when the file is not a Kinect SDK table, was cut off, or has a field that is not a number; the
+            message names file and line.
     """
     table = parse_table(path, content)
     n, columns = table.values.shape
     if columns != _KINECT_COLUMNS:
         raise FileFormatError(
-            f"{path}, line {int(table.lines[0])}: {columns} columns; a recording of skeletons is imitarm's own, which "
-            f"begins with '# format: imitarm-skeletons', or a Kinect SDK table of {_KINECT_COLUMNS} columns (time, "
-            "then x, y, z and state of 25 joints); export it as one of these"
+            f"{path}, line {int(table.lines[0])}: {columns} columns, so this is no recording of skeletons; export it "
+            "in imitarm's own format, which begins with '# format: imitarm-skeletons', or as a Kinect SDK table of "
+            f"{_KINECT_COLUMNS} columns (time, then x, y, z and state of 25 joints)"
         )
     times = (table.values[:, 0] - table.values[0, 0]) * TICK
     skeletons, issues = _skeletons(table, times, table.values[:, 1:].reshape(n, len(JOINTS), 4))
     period = abs(float(times[-1])) / max(n - 1, 1)
     if n > 1 and period < 1.0 / _FASTEST_RATE:
         fit = time_unit_that_fits(1.0 / period, TICK) if period > 0.0 else None
-        unit = "" if fit is None else f"they are plausible in {fit[0]}: multiply them by {fit[1]:.10g}; or "
+        unit = "" if fit is None else f"they are plausible in {fit[0]}: multiply them by {fit[1]:.10g}; "
         raise FileFormatError(
-            f"{path}: {n} frames within {abs(float(times[-1])):.3g} s; its times are not in units of 100 ns as the "
-            f"Kinect SDK writes them; {unit}multiply seconds by 10 000 000"
+            f"{path}: {n} frames within {abs(float(times[-1])):.3g} s; the times are not in units of 100 ns, in "
+            f"which the Kinect SDK writes them; {unit}if they are in seconds, multiply them by 10 000 000"
         )
     return skeletons, issues
 
@@ -194,17 +198,17 @@ def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[R
 def _skeletons(
     table: Table, times: Array, joints: Array, hands: Array | None = None, persons: Sequence[int] | None = None
 ) -> tuple[list[Skeleton], list[RecordingIssue]]:
-    """Build skeletons from columns.
+    """Build skeletons from the columns of a table.
 
     Args:
-        table: table that was read, for messages.
+        table: table from which the columns were read, for messages.
         times: time stamps, shape (n,) [s].
         joints: x, y, z [m] and tracking state of each joint, shape (n, 25, 4).
-        hands: state of the left and of the right hand, shape (n, 2); None: not in the file.
-        persons: number of each person; None: not in the file.
+        hands: states of the left and the right hand, shape (n, 2); None: the file has no hand states.
+        persons: number of the person in each frame; None: the file has no person numbers.
 
     Raises:
-        FileFormatError: when a time is not finite, or a state does not exist; the message names file and line.
+        FileFormatError: when a time is not finite, or a state has an unknown number; the message names file and line.
     """
     states = np.zeros((len(times), 2)) if hands is None else hands
     _refuse(table, ~np.isfinite(times), "the time is not a finite number")
@@ -234,17 +238,17 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
     frame = int(np.argmax(far.any(axis=1)))
     message = (
         f"{int(far.sum())} joints in {int(far.any(axis=1).sum())} frames are not finite or farther than "
-        f"{FARTHEST:.0f} m, first {JOINTS[int(np.argmax(far[frame]))]} in line {int(table.lines[frame])}; "
-        "they count as lost"
+        f"{FARTHEST:.0f} m, the first is {JOINTS[int(np.argmax(far[frame]))]} in line {int(table.lines[frame])}; "
+        "these joints count as lost"
     )
-    remedy = "check units and sensor"
+    remedy = "check the unit of length and the sensor"
     if far.mean() > 0.5:
         with np.errstate(invalid="ignore", over="ignore"):
             lengths = [np.linalg.norm(joints[:, a, :3] - joints[:, b, :3], axis=1) for a, b in _LIMBS]
         finite = np.concatenate(lengths)[np.isfinite(np.concatenate(lengths))]
         unit = length_unit_that_fits(float(np.median(finite))) if len(finite) else None
         if unit is not None:
-            remedy = f"positions must be in metres; these are plausible in {unit}: convert them"
+            remedy = f"positions must be in metres; these positions are plausible in {unit}: convert them"
     return [RecordingIssue("warning", "far-joint", message, frame, float(times[frame] - times[0]), remedy)]
 
 
@@ -252,22 +256,22 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
 
 
 def is_motion_capture(head: bytes) -> bool:
-    """Return whether a file begins like a motion capture export of QTM, a tab-separated table of markers."""
+    """Return whether a file begins like a tab-separated table of markers from QTM (Qualisys Track Manager)."""
     return head.startswith(b"NO_OF_FRAMES\t") and b"\nMARKER_NAMES\t" in head
 
 
 def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]]:
-    """Read markers like :meth:`MotionCapture.load`, and add a body to the arm.
+    """Read a motion capture of an arm with :meth:`MotionCapture.load`, and add a synthetic body to the arm.
 
-    The right arm is the captured arm with its measured bone lengths, and is marked as tracked. The rest of the body was
-    not captured. It is synthesised as an average person who stands upright in front of a sensor, and is marked as
+    The right arm is the captured arm with its measured bone lengths, and is marked as tracked. The rest of the body,
+    which was not captured, is that of an average person who stands upright in front of a sensor, and is marked as
     inferred.
 
     Args:
         path: path of the file.
 
     Returns:
-        the skeletons, and notes about the file.
+        The skeletons, and the issues found while reading.
 
     Raises:
         FileFormatError: when the file is damaged or lacks a marker of the right arm; the message names the line.
@@ -300,15 +304,16 @@ class MotionCapture:
     def load(cls, path: str | Path, *, to_body: ArrayLike | None = None) -> MotionCapture:
         """Read markers of a right arm from a file of tab-separated values in millimetres.
 
-        The wrist is midway between the two markers at the proximal end of the hand.
+        The wrist is taken as the midpoint of the two markers at the end of the hand that is closer to the forearm.
 
         Args:
             path: the file.
-            to_body: rotation from the file's axes to forward, left and up of the person, shape (3, 3); None: the
-                file has these axes.
+            to_body: rotation from the file's axes to the person's axes (x forward, y left, z up), shape (3, 3); None:
+                the file already uses the person's axes.
 
         Raises:
-            FileFormatError: when the file is not such a recording; the message names the fault and the line.
+            FileFormatError: when the file is not a motion capture of a right arm; the message names the fault and the
+                line.
             InputError: when ``to_body`` is not a rotation.
         """
         rotation = np.eye(3) if to_body is None else np.array(to_body, dtype=float)
@@ -319,15 +324,21 @@ class MotionCapture:
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError) as error:
-            raise FileFormatError(f"{path}: can't be read as text ({error}); give a motion capture export") from error
+            raise FileFormatError(
+                f"{path}: can't be read as text ({error}); give a motion capture export as .tsv"
+            ) from error
         header = next((i for i, line in enumerate(lines) if line.startswith("MARKER_NAMES")), None)
         first = next((i for i, line in enumerate(lines) if line.startswith("Frame\tTime")), None)
         if header is None or first is None:
-            raise FileFormatError(f"{path}: has no lines MARKER_NAMES and Frame; give a motion capture export as .tsv")
+            raise FileFormatError(
+                f"{path}: has no lines that begin with MARKER_NAMES and Frame; give a motion capture export as .tsv"
+            )
         names = lines[header].split("\t")[1:]
         missing = [name for name in _MARKERS if name not in names]
         if missing:
-            raise FileFormatError(f"{path}, line {header + 1}: marker {missing[0]!r} is missing")
+            raise FileFormatError(
+                f"{path}, line {header + 1}: marker {missing[0]!r} is missing; export all markers of the arm"
+            )
         columns = [2 + 3 * names.index(name) for name in _MARKERS]
         filled = [i for i in range(first + 1, len(lines)) if lines[i].strip()]
         if len(filled) < 2:
@@ -335,7 +346,9 @@ class MotionCapture:
         table = np.array([_row(path, i + 1, lines[i], columns) for i in filled])
         back = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
         if len(back):
-            raise FileFormatError(f"{path}, line {filled[back[0] + 1] + 1}: time does not increase; sort the frames")
+            raise FileFormatError(
+                f"{path}, line {filled[back[0] + 1] + 1}: the time does not increase; sort the frames by time"
+            )
         s, e, left, right, tip, thumb = np.moveaxis(table[:, 1:].reshape(len(table), -1, 3) * 1e-3 @ rotation.T, 1, 0)
         upper = float(np.median(np.linalg.norm(e - s, axis=1)))
         if not _UPPER_ARM[0] < upper < _UPPER_ARM[1]:
@@ -346,10 +359,10 @@ class MotionCapture:
         return cls(table[:, 0], np.stack([s, e, 0.5 * (left + right), tip, thumb], axis=1), path.name)
 
     def truth(self, person: Person) -> Truth:
-        """Return the motion as if ``person`` made it in front of a sensor; the arm keeps its captured bone lengths.
+        """Return the motion as if ``person`` made it in front of a sensor, with the bone lengths of the captured arm.
 
-        The arm is interpolated linearly between frames and rests before the first and after the last frame. The rest of
-        the body stands upright at the person's position.
+        The arm is interpolated linearly between frames, and is at rest before the first and after the last frame. The
+        rest of the body stands upright at the person's position.
         """
         to_sensor = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
         points = self.points @ to_sensor.T
@@ -382,5 +395,5 @@ def _row(path: Path, number: int, line: str, columns: list[int]) -> list[float]:
             f"{path}, line {number}: not a frame of numbers ({error}); is the file complete?"
         ) from error
     if not np.isfinite(values).all():
-        raise FileFormatError(f"{path}, line {number}: a marker of the arm has a gap; fill it before exporting")
+        raise FileFormatError(f"{path}, line {number}: a marker of the arm has a gap; fill the gap before exporting")
     return values

@@ -17,10 +17,10 @@ from imitarm.capture.skeleton import JOINTS, SIDES, HandState, Skeleton, Skeleto
 from imitarm.errors import InputError, TaskFailedError
 
 INSTEAD = (
-    "alternatives: record elsewhere as a table of the Kinect SDK and open the file, receive udp:PORT from a machine "
-    "that has the camera, or use webcam:NUMBER or video:FILE"
+    "alternatives: record a Kinect SDK table on another machine and open the file, receive skeletons from another "
+    "machine with udp:PORT, or use webcam:NUMBER or video:FILE"
 )
-"""Alternatives when a camera can't be opened."""
+"""What a user can do when a camera can't be opened."""
 
 _SILENT = 3.0  # [s] without a frame: the camera is gone, since it sends frames with or without a person
 _LONGEST_WAIT = 0.5  # [s] for one call of the driver, so that Ctrl-C is noticed
@@ -89,10 +89,10 @@ class BodyCamera(SkeletonSource):
         return True
 
     def _wait_for_first(self, seconds: float, missing: str) -> None:
-        """Wait for the very first frame.
+        """Wait until the camera delivers its first frame.
 
         Raises:
-            InputError: when no frame arrived within ``seconds``, or the driver fails; the camera is released.
+            InputError: when no frame arrived within ``seconds``, or the driver fails; the camera is released first.
         """
         until = clock.monotonic() + seconds
         try:
@@ -106,7 +106,7 @@ class BodyCamera(SkeletonSource):
             raise
 
     def _number(self, driver_id: int) -> int:
-        """Return the person's number for a driver's body number; persons are counted from 0."""
+        """Return the person's number for the driver's body number; persons are numbered from 0 as they appear."""
         return self._numbers.setdefault(int(driver_id), len(self._numbers))
 
     def _failed(self, why: str) -> TaskFailedError:
@@ -127,10 +127,11 @@ _V2_START = 10.0  # [s] within which the first frame must come: a cold camera ta
 class KinectV2Source(BodyCamera):
     """Skeletons of all persons in front of a Kinect v2, with the states of their hands.
 
-    Coordinate frame and joints are defined by the SDK. A hand state is used when the SDK reports high confidence. Times
-    are on the sensor's clock.
+    The SDK defines the coordinate frame and the joints; they are those of :class:`~imitarm.capture.skeleton.Skeleton`.
+    A hand state is used only when the SDK reports high confidence in it; otherwise the state is unknown. Times are on
+    the sensor's clock.
 
-    It was written from the documentation of `kinect-next` 3.0 and has not been tested on a device.
+    This class was written from the documentation of `kinect-next` 3.0 and has not been tested with a real camera.
 
     Raises:
         InputError: when driver or camera is missing; the message says which, and what to do.
@@ -193,7 +194,7 @@ _TRACKING = np.array([Tracking.LOST, Tracking.INFERRED, Tracking.TRACKED, Tracki
 
 
 def _joint_indices() -> tuple[tuple[int, ...], ...]:
-    """Return, for each of the 25 joints, the indices of the two SDK joints between which it is midway."""
+    """Return, for each of the 25 joints of a skeleton, the two SDK joints whose midpoint it is."""
     named: dict[str, tuple[int, ...]] = {"spine_base": (0,), "spine_mid": (1,), "spine_shoulder": (4, 11)}
     named |= {"neck": (3,), "head": (26,)}  # spine_shoulder: between the clavicles
     arm = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
@@ -210,13 +211,13 @@ class AzureKinectSource(BodyCamera):
     """Skeletons of all persons in front of an Azure Kinect.
 
     The SDK's 32 joints are converted to the 25 joints of the Kinect v2, and the depth camera's frame (x right, y down,
-    millimetres) to the frame of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK can't tell open from closed hands,
-    so hand states are unknown. Times are on the device's clock.
+    millimetres) to the frame of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK does not detect whether a hand is
+    open or closed, so hand states are unknown. Times are on the device's clock.
 
-    `pykinect-azure` ends the program when the SDK fails; this class raises an error instead. Frames are fetched by the
-    C functions that it wraps, because these distinguish a late frame from a failure.
+    When the SDK fails, `pykinect-azure` ends the program, but this class raises an error instead. It fetches frames
+    with the C functions of the SDK, because these distinguish a late frame from a failure.
 
-    It was written from the documentation of the SDKs and has not been tested on a device.
+    This class was written from the documentation of the SDKs and has not been tested with a real camera.
 
     Raises:
         InputError: when driver, SDK or camera is missing; the message says which, and what to do.
@@ -242,7 +243,7 @@ class AzureKinectSource(BodyCamera):
         except BaseException:
             self.close()
             raise
-        self._wait_for_first(_AZURE_START, "does the body tracking SDK find its graphics card or, slower, its CPU mode")
+        self._wait_for_first(_AZURE_START, "can the body tracking SDK use a graphics card or, more slowly, the CPU")
 
     def _opened(self, driver: Any) -> None:
         self._call_driver("find the SDKs", lambda: driver.initialize_libraries(track_body=True))
@@ -293,7 +294,7 @@ class AzureKinectSource(BodyCamera):
         return self._pending
 
     def _came(self, result: int, what: str) -> bool:
-        """Return whether a call succeeded; False when it timed out.
+        """Return whether a call of the SDK succeeded; False when it timed out.
 
         Raises:
             TaskFailedError: when the driver reports a failure.

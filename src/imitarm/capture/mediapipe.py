@@ -1,9 +1,9 @@
 r"""MediaPipe: skeletons of a person in a video or in front of a webcam, converted from MediaPipe's 33 landmarks.
 
-MediaPipe gives each landmark twice: in the image, and in metres relative to the middle of the hips (x to the image's
-right, y down, z away), for a camera that looks straight at the person. The sensor frame of
-:class:`~imitarm.capture.skeleton.Skeleton` (x to the sensor's left, y up, z away) is MediaPipe's frame rotated by 180
-degrees about z.
+MediaPipe reports two positions of each landmark: in the image, and in metres relative to the middle of the hips (x to
+the image's right, y down, z away). The position in metres assumes a camera that looks straight at the person. The
+sensor frame of :class:`~imitarm.capture.skeleton.Skeleton` (x to the sensor's left, y up, z away) is MediaPipe's frame
+rotated by 180 degrees about z.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _LEAST_WEIGHT = 2.0  # sum of the visibilities needed to locate a person
 
 
 def _joint_weights() -> Array:
-    """Return the weights that compute joints from landmarks, joints = weights @ landmarks, shape (25, 33)."""
+    """Return the weights, shape (25, 33), that compute joints from landmarks: joints = weights @ landmarks."""
     mixed: dict[str, dict[int, float]] = {
         "spine_base": {23: 0.5, 24: 0.5},
         "spine_mid": {11: 0.25, 12: 0.25, 23: 0.25, 24: 0.25},
@@ -69,9 +69,9 @@ class PoseLandmarks:
 
     Attributes:
         time: time of the image [s].
-        world: positions relative to the middle of the hips, x to the image's right, y down, z away, shape (33, 3) [m].
-        image: position in the image, 0 to 1 from the left and from the top, shape (33, 2); outside this range when
-            not in view.
+        world: positions relative to the middle of the hips (x to the image's right, y down, z away), shape (33, 3) [m].
+        image: positions in the image, from 0 (left, top) to 1 (right, bottom), shape (33, 2); outside this range for a
+            landmark that is not in view.
         visibility: visibility of each landmark, 0 to 1, shape (33,).
 
     Raises:
@@ -86,30 +86,31 @@ class PoseLandmarks:
     def __post_init__(self) -> None:
         n = N_LANDMARKS
         if self.world.shape != (n, 3) or self.image.shape != (n, 2) or self.visibility.shape != (n,):
-            raise InputError(f"PoseLandmarks: there must be {n} of them, with 3, 2 and 1 numbers each")
+            raise InputError(
+                f"PoseLandmarks: needs {n} landmarks, with 3 numbers each in world, 2 in image and 1 in visibility"
+            )
         finite = all(np.isfinite(part).all() for part in (self.time, self.world, self.image, self.visibility))
         if not finite:
-            raise InputError("PoseLandmarks: all numbers must be finite")
+            raise InputError("PoseLandmarks: time, world, image and visibility must be finite numbers")
 
 
 class LandmarkConverter:
     r"""Converts landmarks to skeletons.
 
-    **Where the person stands.** MediaPipe's positions in metres are relative to the hips, so a motion of the hips would
-    move a hand that is at rest. The translation t of the hips is chosen so that the landmarks :math:`X_j, Y_j, Z_j`
-    agree with the
-    image. With image coordinates :math:`u, v` from the middle, in units of the focal length, and visibility :math:`k`,
+    **Where the person stands.** MediaPipe's positions in metres are relative to the hips. Without a correction, a hand
+    at rest would therefore seem to move whenever the hips move. The translation t of the hips is chosen so that the
+    landmarks :math:`X_j, Y_j, Z_j` agree with the image. With image coordinates :math:`u, v` relative to the image's
+    middle, in units of the focal length, and visibility :math:`k`, t minimises
 
     .. math:: \min_t \sum_j k_j^2 \left( (X_j + t_x - u_j (Z_j + t_z))^2 + (Y_j + t_y - v_j (Z_j + t_z))^2 \right)
 
-    which is linear in t. Across the line of sight, t is accurate to centimetres. Along the line of sight, the accuracy
-    of t depends on MediaPipe's scale and on the field of view, and t is noisy. Therefore the distance is averaged over
-    0.1 s before x and y are fitted again. All joints move by the same t, so positions relative to other joints do not
-    change.
+    a linear least-squares problem. Across the line of sight, t is accurate to centimetres. Along the line of sight, t is noisy,
+    and its accuracy depends on MediaPipe's scale and on the field of view. The distance along the line of sight is
+    therefore averaged over 0.1 s, and the other two components of t are then fitted again. All joints move by the same
+    t, so positions relative to other joints do not change.
 
-    **Perspective.** MediaPipe's positions in metres assume a camera that looks straight at the person. They are rotated
-    by the
-    angle between the camera's axis and the line of sight to the hips.
+    **Perspective.** MediaPipe's positions in metres assume a camera that looks straight at the person. They are
+    therefore rotated by the angle between the camera's axis and the line of sight to the hips.
 
     Args:
         size: width and height of the image [pixels]; only their ratio matters.
@@ -132,9 +133,9 @@ class LandmarkConverter:
     def skeleton(self, landmarks: PoseLandmarks) -> Skeleton | None:
         """Return the skeleton; None when the image shows too little of the person to locate them.
 
-        A joint is tracked, inferred or lost according to the smallest visibility of the landmarks from which it is
-        computed; outside the image it is inferred or lost. MediaPipe can't tell open from closed hands, so hand states
-        are unknown.
+        The smallest visibility of the landmarks from which a joint is computed decides whether the joint is tracked,
+        inferred or lost. A joint outside the image is never tracked. MediaPipe does not detect whether a hand is open
+        or closed, so hand states are unknown.
         """
         uv = (landmarks.image - 0.5) * self._scale
         world, place = landmarks.world, None
@@ -171,7 +172,7 @@ class LandmarkConverter:
         return np.asarray(place)
 
     def _averaged(self, time: float, depth: float) -> float:
-        """Return the distance to the hips averaged over the last images [m]."""
+        """Return the distance from the camera to the hips, averaged over the last images [m]."""
         if self._distance is not None and 0.0 < time - self._distance[0] <= _GAP:
             before, past = self._distance
             depth = past + (1.0 - math.exp(-(time - before) / DEPTH_MEMORY)) * (depth - past)
@@ -213,23 +214,24 @@ class MediaPipeSource(SkeletonSource):
 
     MediaPipe tracks one person. It runs in another process, in another environment (see
     :mod:`imitarm.capture.mediapipe_environment`), and sends its landmarks as lines of text, which
-    :class:`LandmarkConverter` converts to skeletons. Times are video times, from 0 s; for a webcam, times on the
-    monotonic clock at which the images arrived.
+    :class:`LandmarkConverter` converts to skeletons. In a video, times are counted from its start. For a webcam, they
+    are the times on the monotonic clock at which the images arrived.
 
     Args:
-        film: path of a video file, or number of a webcam.
-        realtime: whether to return a video's skeletons no earlier than the video would show them; otherwise as fast
-            as they are tracked.
+        film: path of a video file, or the number of a webcam.
+        realtime: whether to return the skeletons of a video at the speed of the video; otherwise, they are returned as
+            fast as MediaPipe tracks them.
         field_of_view: field of view of the longer side of the image [deg].
-        python: Python interpreter with MediaPipe; None: :func:`~imitarm.capture.mediapipe_environment.find_python`.
+        python: Python interpreter in whose environment MediaPipe is installed; None: the interpreter that
+            :func:`~imitarm.capture.mediapipe_environment.find_python` finds.
 
     Attributes:
         images: number of images processed so far.
 
     Raises:
         InputError: when MediaPipe is not installed, the file is not a video, or there is no such webcam.
-        TaskFailedError: from :meth:`read`, when MediaPipe's process dies, hangs or sends invalid lines, the video is
-            cut off, or the webcam is gone. Skeletons returned earlier remain valid.
+        TaskFailedError: from :meth:`read`, when MediaPipe's process dies, hangs or sends invalid lines, when the video
+            is cut off, or when the webcam is unplugged. Skeletons returned earlier remain valid.
     """
 
     def __init__(
@@ -293,7 +295,7 @@ class MediaPipeSource(SkeletonSource):
         return None
 
     def _due(self, time: float, until: float) -> bool:
-        """In real time, wait until a skeleton is due; return False when it is due later than ``until``."""
+        """In real time, wait until a skeleton is due; return False if that is later than ``until``."""
         if not self._realtime:
             return True
         if self._began == -np.inf:
@@ -303,7 +305,7 @@ class MediaPipeSource(SkeletonSource):
         return wait <= 0.0 or clock.monotonic() >= self._began + time
 
     def _line(self, timeout: float) -> list[bytes] | None:
-        """Return the words of the next line; None when no line arrived in time."""
+        """Return the words of the next line from MediaPipe's process; None when no line arrived in time."""
         before = clock.monotonic()
         try:
             line = self._process.line(min(timeout, max(_SILENT - self._silent, 0.0) + _TICK))
@@ -318,7 +320,7 @@ class MediaPipeSource(SkeletonSource):
         return None
 
     def _greeting(self, python: Path) -> tuple[int, int]:
-        """Return width and height of the images, which the process sends first."""
+        """Return width and height of the images, which MediaPipe's process sends in its first line."""
         until = clock.monotonic() + _START
         try:
             line = self._process.line(_START)
@@ -327,18 +329,20 @@ class MediaPipeSource(SkeletonSource):
                 f"{self._shown_name}: MediaPipe does not start with {python} ({self._process.ended()}); {_ANEW}"
             ) from None
         if line is None or clock.monotonic() > until:
-            raise InputError(f"{self._shown_name}: no image within {_START:g} s; MediaPipe's process was ended")
+            raise InputError(
+                f"{self._shown_name}: MediaPipe processed no image within {_START:g} s, and was ended; try again"
+            )
         words = line.split(b" ")
         if words[0] == b"error":
             raise InputError(f"{self._shown_name}: {_text(words[1:])}")
         if words[:2] != [b"imitarm-mediapipe", str(PROTOCOL).encode()] or len(words) != 4:
             raise InputError(f"{python} does not send the lines of MediaPipe's process: {_text(words)[:80]!r}")
         if not (words[2].isdigit() and words[3].isdigit()):
-            raise InputError(f"{python} gives no image size: {_text(words)[:80]!r}")
+            raise InputError(f"{python} sends no image size: {_text(words)[:80]!r}")
         return int(words[2]), int(words[3])
 
     def _parsed(self, words: list[bytes]) -> Skeleton | None:
-        """Return the skeleton in a line, None when nobody is in the image; close the source after the last line."""
+        """Return the skeleton in a line, or None when the image shows nobody; close the source after the last line."""
         kind = words[0]
         if kind == b"error":
             raise self._failed(_text(words[1:]))
@@ -360,7 +364,7 @@ class MediaPipeSource(SkeletonSource):
         return self._converter.skeleton(PoseLandmarks(self._last, each[:, :3], each[:, 3:5], each[:, 5]))
 
     def _failed(self, why: str) -> TaskFailedError:
-        """Close the source, and return the error with the reason."""
+        """Close the source, and return the error to raise."""
         self.close()
         return TaskFailedError(f"{self._shown_name}: {why}; {self.images} images were processed before")
 
@@ -377,7 +381,7 @@ class VideoSource(MediaPipeSource):
         """Open the video file that a user wrote after the colon.
 
         Raises:
-            InputError: when there is no such file, it is not a video, or MediaPipe is not installed.
+            InputError: when the file does not exist or is not a video, or when MediaPipe is not installed.
         """
         if not Path(argument).is_file():
             raise InputError(f"source video:{argument}: there is no such file; check the path")
@@ -396,7 +400,8 @@ class WebcamSource(MediaPipeSource):
         """Open the webcam whose number a user wrote after the colon.
 
         Raises:
-            InputError: when it is not a number, there is no such webcam, or MediaPipe is not installed.
+            InputError: when the text is not a number, there is no webcam with this number, or MediaPipe is not
+                installed.
         """
         return cls(number_after_colon("webcam", cls.argument, argument, 63))
 

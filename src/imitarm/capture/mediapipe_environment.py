@@ -1,9 +1,9 @@
 """MediaPipe's own Python environment.
 
-Find it, create it, and run MediaPipe in it as a process that writes lines of text.
+This module finds the environment, creates it, and runs MediaPipe in it as a process that writes lines of text.
 
-MediaPipe 0.10.21, the last version that includes its models, needs numpy below 2; imitarm needs numpy 2. MediaPipe is
-therefore installed in another environment, without imitarm::
+MediaPipe 0.10.21, the last version that includes its models, needs numpy below 2, but imitarm needs numpy 2. MediaPipe
+is therefore installed in an environment of its own, without imitarm::
 
     python -m imitarm.capture.mediapipe_environment            # creates it where imitarm looks for it
 """
@@ -27,7 +27,9 @@ from typing import IO
 from imitarm.errors import ImitarmError, InputError, TaskFailedError
 
 VARIABLE = "IMITARM_MEDIAPIPE_PYTHON"
-"""Environment variable that names the Python that has MediaPipe; it takes precedence over the folders."""
+"""Environment variable with the path of a Python interpreter that can import MediaPipe; it takes precedence over
+:func:`folders`.
+"""
 
 VERSION = "0.10.21"
 VERSIONS = ((3, 9), (3, 12))  # versions of Python for which it exists
@@ -40,9 +42,10 @@ REQUIREMENTS = (
     "flatbuffers>=2.0",
     "matplotlib",
 )
-"""Packages needed for pose tracking. MediaPipe also requires jax, sentencepiece and sounddevice, which serve other
-tasks, and
-an OpenCV with windows; therefore it is installed without its requirements."""
+"""Packages needed for pose tracking. MediaPipe also declares requirements that pose tracking does not need: jax,
+sentencepiece, sounddevice, and an OpenCV with windows. It is therefore installed without its declared requirements, and
+these packages are installed instead.
+"""
 
 _STAMP = "imitarm-mediapipe.txt"  # written last: without it the environment is incomplete
 _COMMAND = "-m imitarm.capture.mediapipe_environment"
@@ -50,27 +53,31 @@ _TRIAL = "import cv2, mediapipe; mediapipe.solutions.pose.Pose(model_complexity=
 
 
 def find_python() -> Path:
-    """Return the Python with MediaPipe: ``IMITARM_MEDIAPIPE_PYTHON``, or a Python in :func:`folders`.
+    """Return the Python interpreter that can import MediaPipe: ``IMITARM_MEDIAPIPE_PYTHON``, or one in :func:`folders`.
 
     Raises:
-        InputError: when no such Python is found; the message says how to create the environment.
+        InputError: when there is no interpreter that can import MediaPipe; the message says how to create the
+            environment.
     """
     named = os.environ.get(VARIABLE)
     if named:
         if not Path(named).is_file():
-            raise InputError(f"{VARIABLE}: {named} is not a file; name a Python that has mediapipe {VERSION}")
+            raise InputError(
+                f"{VARIABLE}: {named} is not a file; set it to the path of a Python that has mediapipe {VERSION}"
+            )
         return Path(named)
     for folder in folders():
         if (folder / _STAMP).is_file():
             return python_of(folder)
     raise InputError(
-        f"video and webcam need MediaPipe in an environment of its own; make it, once: '{sys.executable} {_COMMAND}' "
-        f"(130 MB to fetch, 410 MB on disk), or set {VARIABLE} to a Python that has mediapipe {VERSION}"
+        f"the sources video and webcam need MediaPipe in an environment of its own; create it once by "
+        f"'{sys.executable} {_COMMAND}' (130 MB to download, 410 MB on disk), or set {VARIABLE} to a Python that has "
+        f"mediapipe {VERSION}"
     )
 
 
 def folders() -> list[Path]:
-    """Return the folders searched: in a checkout, then in the user's data folder.
+    """Return the possible folders of the environment: in a checkout of the repository, then in the user's data.
 
     A new environment is created in the first folder.
     """
@@ -86,38 +93,38 @@ def folders() -> list[Path]:
 
 
 def python_of(folder: Path) -> Path:
-    """Return the Python of a virtual environment."""
+    """Return the path of the Python interpreter of a virtual environment."""
     return folder / "Scripts" / "python.exe" if sys.platform == "win32" else folder / "bin" / "python"
 
 
 def make(folder: Path) -> Path:
-    """Create the environment, from scratch if it exists; return its Python.
+    """Create the environment, replacing an existing one, and return the path of its Python interpreter.
 
     Args:
-        folder: folder to create; it must not contain anything else.
+        folder: folder of the environment; it must be new, empty, or an existing environment.
 
     Raises:
-        InputError: when the folder holds something else, or this machine has no suitable Python.
+        InputError: when the folder holds anything other than an environment, or this machine has no suitable Python.
         TaskFailedError: when a step fails; the message ends with the output of that step.
     """
     if folder.exists() and any(folder.iterdir()) and not (folder / "pyvenv.cfg").is_file():
-        raise InputError(f"{folder}: exists and is not a Python environment; name a new folder")
+        raise InputError(f"{folder}: exists and is not a Python environment; choose a new folder")
     python = python_of(folder)
     (folder / _STAMP).unlink(missing_ok=True)
-    _run("make an environment", [suitable_python(), "-m", "venv", "--clear", str(folder)])
+    _run("create an environment", [suitable_python(), "-m", "venv", "--clear", str(folder)])
     install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     _run("fetch mediapipe", [*install, "--no-deps", f"mediapipe=={VERSION}"])
-    _run("fetch what mediapipe needs", [*install, *REQUIREMENTS])
+    _run("fetch the packages that mediapipe needs", [*install, *REQUIREMENTS])
     _run("start mediapipe", [str(python), "-I", "-c", _TRIAL])
     (folder / _STAMP).write_text(f"mediapipe {VERSION}, made by imitarm\n", encoding="utf-8")
     return python
 
 
 def suitable_python() -> str:
-    """Return a Python version for which MediaPipe exists: the running one, else one on the path.
+    """Return the command of a Python version that MediaPipe supports: the running version, or else one on the path.
 
     Raises:
-        InputError: when no such Python is found.
+        InputError: when this machine has no Python version that MediaPipe supports.
     """
     (major, oldest), (_, newest) = VERSIONS
     if VERSIONS[0] <= sys.version_info[:2] <= VERSIONS[1]:
@@ -127,8 +134,8 @@ def suitable_python() -> str:
         if found:
             return found
     raise InputError(
-        f"mediapipe {VERSION} exists for Python {major}.{oldest} to {major}.{newest}; this is "
-        f"{sys.version_info[0]}.{sys.version_info[1]} and none of these is on the path; install one, or set "
+        f"mediapipe {VERSION} supports Python {major}.{oldest} to {major}.{newest}; this is Python "
+        f"{sys.version_info[0]}.{sys.version_info[1]} and no supported version is on the path; install one, or set "
         f"{VARIABLE} to a Python that has mediapipe"
     )
 
@@ -141,7 +148,7 @@ def _run(what: str, command: list[str]) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Create the environment in the given folder, else where imitarm looks for it; return the exit status."""
+    """Create the environment in the given folder, or by default where imitarm looks for it; return the exit status."""
     folder = Path(arguments[0]) if arguments else folders()[0]
     try:
         sys.stdout.write(f"made {make(folder)}\n")
@@ -161,15 +168,15 @@ _READ, _TAIL = 20000, 600  # [characters] of its last output that are read, and 
 class LineProcess:
     """Another program whose standard output is read line by line, with a timeout.
 
-    The program must end when its standard input ends, so that it also ends when this process is killed.
-    :meth:`close` ends it in any case, and so does deleting this object.
+    The program must end when its standard input ends, so that it also ends when this process is killed. :meth:`close`
+    ends the program in any case, and so does deleting this object.
 
     Args:
         command: command with all its arguments.
-        keep: largest number of unread lines.
-        newest: whether to drop the oldest unread line (but never the very first line) when the limit is exceeded;
-            otherwise the program waits.
-        chatter: regular expression for lines of the standard error to leave out of :meth:`ended`.
+        keep: largest number of unread lines to store.
+        newest: what happens when ``keep`` unread lines are stored: True: the oldest unread line is dropped, but never
+            the program's first line; False: the program waits until a line is read.
+        chatter: regular expression for lines on standard error that :meth:`ended` leaves out.
 
     Raises:
         OSError: when the program can't be started.
@@ -227,7 +234,7 @@ class LineProcess:
 
 
 class _Lines:
-    """A queue of lines, filled by one thread and emptied by another."""
+    """A queue of lines that one thread fills and another thread empties."""
 
     def __init__(self, keep: int, newest: bool) -> None:
         self._waiting: deque[bytes] = deque()
@@ -270,7 +277,7 @@ class _Lines:
 
 
 def _finish(process: subprocess.Popen[bytes], lines: _Lines, thread: threading.Thread, errors: IO[bytes]) -> None:
-    """End a process, first by request, then by force, and release its resources."""
+    """Ask a process to end, kill it if it does not, and release its resources."""
     lines.stop()
     with contextlib.suppress(OSError):
         assert process.stdin is not None

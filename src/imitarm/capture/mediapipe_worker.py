@@ -1,4 +1,4 @@
-"""The process that runs MediaPipe: reads images, writes landmarks as lines of text.
+"""The process that runs MediaPipe: it reads images and writes landmarks as lines of text.
 
 It runs in another Python environment (3.9 to 3.12) that has mediapipe 0.10.21 but not imitarm, so it must not import
 imitarm. :mod:`imitarm.capture.mediapipe` starts it and reads its standard output::
@@ -32,14 +32,14 @@ _SLIP = 1e-4  # [s] each image must be later than the one before by more than th
 
 
 class StopError(Exception):
-    """A reason to stop; its text is one line."""
+    """Raised when the process must stop; the text is the reason, in one line."""
 
 
 def main(arguments: list[str], out: TextIO) -> int:
     """Write the landmarks of ``video FILE`` or ``webcam NUMBER``; return the exit status."""
     try:
         if len(arguments) != 2 or arguments[0] not in {"video", "webcam"}:
-            raise StopError("expects: video FILE, or webcam NUMBER")
+            raise StopError("expected arguments: video FILE, or webcam NUMBER")
         cv2, pose = _imported("cv2"), _pose(_imported("mediapipe"))
         images = _film(cv2, arguments[1]) if arguments[0] == "video" else _webcam(cv2, int(arguments[1]))
         count = -1
@@ -49,7 +49,7 @@ def main(arguments: list[str], out: TextIO) -> int:
                 _say(out, f"imitarm-mediapipe {VERSION} {width} {height}")
             _say(out, _line(when, pose.process(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))))
         if count < 0:
-            raise StopError("it holds no image")
+            raise StopError("the video contains no image")
         _say(out, f"end {count + 1}")
         return 0
     except StopError as error:
@@ -73,7 +73,7 @@ def _imported(name: str) -> Any:
 
 
 def _pose(mediapipe: Any) -> Any:
-    """Return the tracker with model 1, which is in the package; models 0 and 2 would be downloaded."""
+    """Return a pose tracker with model 1, which is part of the package; models 0 and 2 would be downloaded."""
     if not hasattr(mediapipe, "solutions"):
         version = getattr(mediapipe, "__version__", "of unknown version")
         raise StopError(f"mediapipe {version} has no module 'solutions' with the models; version 0.10.21 is needed")
@@ -91,7 +91,7 @@ def _line(when: float, result: Any) -> str:
 
 
 def _film(cv2: Any, path: str) -> Iterator[tuple[float, Any]]:
-    """Yield the images of a video and their times [s], which always increase."""
+    """Yield each image of a video with its time [s]; the times always increase."""
     film = cv2.VideoCapture(path)
     if not film.isOpened():
         raise StopError("is not a video that can be read (damaged, cut off, or of an unknown kind)")
@@ -103,13 +103,15 @@ def _film(cv2: Any, path: str) -> Iterator[tuple[float, Any]]:
             known, image = film.read()
             if not known:
                 if 0 < count < _WHOLE * announced:
-                    raise StopError(f"ends after {count} of {announced:.0f} images: it is cut off or damaged there")
+                    raise StopError(
+                        f"ends after {count} of {announced:.0f} images: the file is cut off or damaged there"
+                    )
                 return
             count += 1
             when = film.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
             if last is not None and when <= last + _SLIP:  # a file without times of its own
                 if period is None:
-                    raise StopError("has neither times nor a frame rate; convert it, for example to mp4")
+                    raise StopError("has neither time stamps nor a frame rate; convert it, for example to mp4")
                 when = last + period
             last = when
             yield when, image
@@ -146,7 +148,7 @@ def _webcam(cv2: Any, number: int) -> Iterator[tuple[float, Any]]:
 
 
 def _end_with(parent: TextIO, leave: Callable[[int], Any] = os._exit) -> None:
-    """End this process as soon as the process that started it closes our standard input, or ends."""
+    """End this process as soon as its standard input is closed, which also happens when its parent process ends."""
     parent.read()
     leave(0)
 

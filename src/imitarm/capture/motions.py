@@ -1,4 +1,4 @@
-"""Motions of a synthetic person's hand: seeded reaches, and shapes drawn repeatedly."""
+"""Motions of a synthetic person's hand: random reaches, and shapes that the hand draws repeatedly; seeded."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from imitarm.validation import finite_number
 
 Array = NDArray[np.float64]
 Truth = Callable[[float], Skeleton]
-"""A moving person: a function from a time [s] to the true position of every joint."""
+"""A moving person: a function that returns the true position of every joint at a time [s]."""
 
 REACHES = ("inside", "edge")
 REST = 1.0  # [s] the hand is still at the beginning, so that a robot can engage
@@ -44,8 +44,8 @@ def reaching(person: Person, seed: int, *, duration: float = 12.0, kind: str = "
         person: who moves.
         seed: seed of the points and the speeds.
         duration: duration of the motion [s]; the hand is at rest during the first second.
-        kind: ``"inside"``: reaches well within the workspace. ``"edge"``: every second reach stretches the arm fully
-            and stays there for some time, at or beyond the reach of a robot of the same proportions.
+        kind: ``"inside"``: all reaches end well within the workspace. ``"edge"``: every second reach stretches the arm
+            fully and stays there for some time, at or beyond the reach of a robot with the same proportions.
 
     Raises:
         UnknownNameError: when there is no such kind.
@@ -110,14 +110,14 @@ DRAWINGS: dict[str, tuple[_Shape, tuple[float, float, float], tuple[float, float
     "eight": (_eight, (0.05, -0.15, 0.65), (0.10, 0.18), (3.0, 5.0)),
     "wave": (_wave, (0.40, 0.35, 0.35), (0.06, 0.12), (0.7, 1.2)),
 }
-"""Shapes that a hand draws in a plane perpendicular to the line of sight, by name."""
+"""Shapes that a hand can draw in a plane perpendicular to the line of sight, by name."""
 
 
 def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "circle") -> Truth:
     r"""Return the motion of a person who draws a shape repeatedly with the right hand.
 
-    The angle along the shape is :math:`\omega\,s(t)`. The warped time s is constant during the first second and at the
-    end, and advances like t in between. The transitions have a minimum-jerk profile.
+    The angle along the shape is :math:`\omega\,s(t)`. The warped time s stands still during the first second and at the
+    end, and advances as fast as the time t in between. In the transitions, its rate follows a minimum-jerk profile.
 
     Args:
         person: who moves.
@@ -145,7 +145,7 @@ def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "c
 
 
 def _warped_time(time: float, duration: float) -> float:
-    """Return the warped time [s] of a hand that begins and ends at rest."""
+    """Return the warped time s [s], which stands still at the beginning and at the end."""
     begun = min(max(time, REST), duration) - REST
     ended = begun - (duration - REST - _RAMP)
     passed = max(begun - _RAMP, 0.0) + _RAMP * _ramped(min(begun / _RAMP, 1.0))
@@ -153,5 +153,5 @@ def _warped_time(time: float, duration: float) -> float:
 
 
 def _ramped(u: float) -> float:
-    """Return the integral of the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
+    """Return the integral from 0 to u of the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
     return u**4 * (2.5 - 3.0 * u + u * u)

@@ -45,26 +45,26 @@ _TO_HAND, _TO_TIP, _TO_THUMB = (
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    r"""A synthetic person who faces a sensor, upright, in the sensor's frame (x left, y up, z away).
+    r"""A synthetic person who stands upright and faces a sensor, in the sensor's frame (x left, y up, z away).
 
-    An arm consists of two straight bones with lengths :math:`L_U` and :math:`L_F`. For a given shoulder S and wrist W
-    the elbow E lies on a circle about the line from S to W. With :math:`\hat w` along that line, and :math:`\hat d`
-    (down) and :math:`\hat o` (outwards) perpendicular to it (both rotate with the arm from their directions for an arm
-    that points forward), the elbow is at
+    An arm consists of two straight bones with lengths :math:`L_U` and :math:`L_F`. For a given shoulder S and wrist W,
+    the elbow E lies on a circle about the line from S to W. Let :math:`\hat w` be the unit vector along this line, and
+    :math:`\hat d` and :math:`\hat o` two unit vectors perpendicular to it. When the arm points forward, :math:`\hat d`
+    points down and :math:`\hat o` points outwards; both rotate with the arm. The elbow is at
 
     .. math:: E = S + a\,\hat w + h\,(\cos\psi\,\hat d + \sin\psi\,\hat o), \qquad
               a = \frac{L_U^2 + r^2 - L_F^2}{2r},\quad h = \sqrt{L_U^2 - a^2},\quad r = |W - S| .
 
     Attributes:
-        seed: seed of all attributes below, for a person created by :meth:`from_seed`.
+        seed: seed from which :meth:`from_seed` computed the other attributes.
         stature: height [m].
         upper_arm: shoulder to elbow [m].
         forearm: elbow to wrist [m].
         hand: distance from wrist to finger tip [m].
         position: position of the point on the floor between the feet, x and z in the sensor's frame, shape (2,) [m].
-        swivel: psi, angle by which the elbow points outwards from straight down while the hand is low [rad].
-        lift: increase of psi per height of the hand [rad/m].
-        tremor: amplitude [m], frequency [rad/s] and phase [rad] of the hand's tremor, for each of n waves and each
+        swivel: psi while the hand is low: angle of the elbow, outwards from straight down [rad].
+        lift: increase of psi with the height of the hand [rad/m].
+        tremor: amplitude [m], frequency [rad/s] and phase [rad] of the hand's tremor, for each of n sine waves and each
             axis, shape (3, n, 3).
         sway: amplitude [m], frequency [rad/s] and phase [rad] of the body's sway along x and z, shape (3, 2).
     """
@@ -82,9 +82,9 @@ class Person:
 
     @classmethod
     def from_seed(cls, seed: int) -> Person:
-        """Return synthetic person number ``seed``.
+        """Return a random person determined by ``seed``.
 
-        Limb lengths deviate by up to 15 percent from the average for the stature.
+        The limb lengths deviate by up to 15 % from the average lengths for the person's stature.
         """
         rng = np.random.default_rng([30310, whole_number(seed, "Person.from_seed: seed", at_least=0)])
         stature = float(np.clip(rng.normal(1.72, 0.09), 1.50, 1.95))
@@ -135,13 +135,14 @@ class Person:
         closed: bool = False,
         side: str = "right",
     ) -> Skeleton:
-        """Return the true positions of all joints while the wrist is held at ``wrist``; the other arm hangs down.
+        """Return the true positions of all joints when the wrist is at ``wrist``; the other arm hangs down.
 
         Args:
-            time: time for tremor and sway [s].
+            time: time at which tremor and sway are evaluated [s].
             wrist: desired position of the wrist in the sensor's frame, shape (3,) [m]; if the position is out of
                 reach, the arm stretches towards it.
-            swivel: angle psi [rad]; None: this person's habit, from :attr:`swivel` and :attr:`lift`.
+            swivel: angle psi of the elbow [rad]; None: this person's usual angle, computed from :attr:`swivel` and
+                :attr:`lift`.
             hand: rotation of the hand in the sensor's frame, shape (3, 3), with x along the hand and y towards the
                 thumb; None: in line with the forearm, with the thumb up as far as possible.
             closed: whether the hand is a fist.
@@ -170,7 +171,7 @@ class Person:
         return Skeleton(time, points, hand_states=(states["left"], states["right"]))
 
     def elbow(self, shoulder: Array, wrist: Array, swivel: float, side: str = "right") -> tuple[Array, Array]:
-        """Return elbow and wrist (3,) [m]: the wrist moved into reach, the elbow on its circle at ``swivel`` [rad]."""
+        """Return the elbow at angle ``swivel`` [rad] and the wrist, moved into reach if necessary, (3,) each [m]."""
         to_wrist = wrist - shoulder
         distance = math.sqrt(to_wrist @ to_wrist)
         along = to_wrist / distance if distance > 1e-6 else _FORWARD
@@ -241,23 +242,23 @@ def _is_rotation(matrix: Array) -> bool:
 
 
 def _hand_along(forearm: Array) -> Array:
-    """Return the rotation of a hand in line with the forearm; the thumb is up when the forearm points forward."""
+    """Return the rotation of a hand in line with the forearm; if the forearm points forward, the thumb points up."""
     x = forearm / math.sqrt(forearm @ forearm)
     y = _rotated(_UP, x)
     return np.array([x, y, _cross(x, y)]).T
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return the cross product of two vectors (3,); numpy's is slow for a single pair."""
+    """Return the cross product of two vectors (3,), faster than ``np.cross``."""
     (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
     return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
 def _rotated(vector: Array, direction: Array) -> Array:
-    """Return a vector, perpendicular to forward, after the smallest rotation from forward to ``direction``.
+    """Rotate a vector, perpendicular to forward, by the smallest rotation that takes forward to ``direction``.
 
-    Directions defined for an arm that points forward thus change continuously as the arm moves, except when the arm
-    points straight backwards.
+    A direction that is defined for an arm pointing forward thus changes continuously as the arm moves, except when the
+    arm points straight backwards.
     """
     both = direction + _FORWARD
     square = float(both @ both)

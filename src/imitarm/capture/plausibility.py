@@ -1,4 +1,4 @@
-"""Checks whether a recording can show a person in front of a sensor: units, axes, repeated frames, spikes."""
+"""Checks whether a recording can show a person in front of a sensor: units, axes, repeated frames and spikes."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ _BONES = np.array(
 
 
 def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
-    """Return the unit in which time stamps give a plausible frame rate.
+    """Return the unit of time in which the time stamps would give a plausible frame rate.
 
     Args:
-        rate: frame rate if the time stamps are in ``unit`` [Hz].
-        unit: unit in which the time stamps were read [s].
+        rate: frame rate that results if the time stamps are in ``unit`` [Hz].
+        unit: length of the unit in which the time stamps were read [s].
 
     Returns:
-        the name of the unit, and the factor by which the times must be multiplied. The result is None when no other
-        unit fits.
+        The name of the unit, and the factor by which the times must be multiplied. None when no other unit gives a
+        plausible frame rate.
     """
     low, high = PLAUSIBLE_RATE
     fits = [
@@ -62,15 +62,15 @@ def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
 
 
 def time_unit_name(unit: float) -> str:
-    """Return the name of a unit of time [s]: ``"s"``, ``"100 ns"`` and so on."""
+    """Return the name of a unit of time of this length [s]: ``"s"``, ``"100 ns"`` and so on."""
     return next((name for name, other in _TIME_UNITS.items() if math.isclose(other, unit)), f"{unit:g} s")
 
 
 def length_unit_that_fits(limb: float) -> str | None:
-    """Return the unit in which the length of a limb is plausible for a person; None when no unit fits.
+    """Return the unit of length in which a limb has a plausible length; None when no unit fits.
 
     Args:
-        limb: length of an upper arm or a forearm as read, which is not plausible in metres.
+        limb: length of an upper arm or a forearm as read from a file; it is not plausible in metres.
     """
     low, high = PLAUSIBLE_LIMB
     fits = [name for name, unit in _LENGTH_UNITS.items() if low <= limb * unit <= high]
@@ -81,12 +81,11 @@ def length_unit_that_fits(limb: float) -> str | None:
 
 
 def axes_that_fit(positions: Array) -> tuple[str, str] | None:
-    """Return the fault in the axes of positions (n, 25, 3), and the axes that fit; None when the axes are correct.
+    """Return what is wrong with the axes of positions (n, 25, 3), and the axes to use; None when the axes are correct.
 
-    In the sensor's frame the spine points up (y), and the trunk is in front of the sensor (z above 0). Of all axes in
-    which both hold, the function proposes those in which the person also faces the sensor: the right shoulder has a
-        larger x
-    than the left one. A right-handed choice is preferred to a mirrored choice.
+    The axes are correct when the spine points up (y) and the trunk is in front of the sensor (z above 0). Among the
+    axes that meet these two conditions, the function proposes axes in which the person also faces the sensor, so that
+    the right shoulder has a larger x than the left shoulder. Right-handed axes are preferred to left-handed axes.
     """
     spine = _median(_mean(positions[:, _UPPER]) - _mean(positions[:, _LOWER]))
     trunk = _median(_mean(positions[:, _TRUNK]))
@@ -101,8 +100,8 @@ def axes_that_fit(positions: Array) -> tuple[str, str] | None:
         fault = f"the person is behind the sensor (z = {trunk[2]:.2f} m)"
     else:
         axis = int(np.argmax(np.abs(spine)))
-        fault = f"the head is not above the hips: from hips to head is {'-' if spine[axis] < 0.0 else ''}"
-        fault += f"{'xyz'[axis]} where it should be y"
+        fault = f"the head is not above the hips: the direction from hips to head is {'-' if spine[axis] < 0.0 else ''}"
+        fault += f"{'xyz'[axis]}, but should be y"
     best: tuple[float, str] | None = None
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         axes, sign = list(order), np.array(signs)
@@ -119,7 +118,7 @@ def axes_that_fit(positions: Array) -> tuple[str, str] | None:
 
 
 def _mean(points: Array) -> Array:
-    """Return the mean over the visible joints, shape (n, 3); nan in frames without visible joints."""
+    """Return the mean position of the visible joints of each frame, shape (n, 3); nan where no joint is visible."""
     seen: Mask = np.all(np.isfinite(points), axis=2, keepdims=True)
     count = seen.sum(axis=1)
     total = np.where(seen, points, 0.0).sum(axis=1)
@@ -127,7 +126,7 @@ def _mean(points: Array) -> Array:
 
 
 def _median(points: Array) -> Array:
-    """Return the median over the frames without nan, shape (3,); nan when all frames have nan."""
+    """Return the median over the frames that contain no nan, shape (3,); nan when all frames contain nan."""
     known = points[np.isfinite(points).all(axis=1)]
     return np.median(known, axis=0) if len(known) else np.full(3, np.nan)
 
@@ -143,20 +142,20 @@ def repeats_previous(positions: Array) -> Mask:
 
 
 def runs(repeated: Mask) -> list[tuple[int, int]]:
-    """Return the first and the last frame of each run of equal frames."""
+    """Return the first and the last frame of each run of identical frames."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], repeated.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def joint_steps(times: Array, positions: Array) -> tuple[Array, Array]:
-    """Return the distance [m] and speed [m/s] of each joint from each frame to the next, shape (n - 1, 25)."""
+    """Return how far [m] and how fast [m/s] each joint moves from each frame to the next, shape (n - 1, 25)."""
     step = np.linalg.norm(np.diff(positions, axis=0), axis=2)
     period = np.diff(times)[:, None]
     return step, np.where(period > 0.0, step / np.where(period > 0.0, period, 1.0), 0.0)
 
 
 def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
-    """Return the speed of the faster hand [m/s]: the 90th percentile over three frames, without spikes.
+    """Return the speed of the faster hand [m/s]: the 90th percentile of its speed over three frames, without spikes.
 
     Args:
         times: time stamps, shape (n,) [s], increasing.
@@ -164,7 +163,7 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
         spikes: whether each joint is in a spike, shape (n, 25).
 
     Returns:
-        The speed; nan when no hand is visible at 10 or more positions.
+        The speed; nan when neither hand is visible at 10 or more positions.
     """
     speeds = []
     for wrist in (JOINT[f"wrist_{side}"] for side in SIDES):
@@ -178,17 +177,18 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
 def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
     r"""Find joints that jump away for one to three frames and come back.
 
-    A joint is in a spike when it is more than 0.2 m from the straight line between the frames before and after, these
-    two are less than half as far apart, and one of two conditions holds: the joint moves there and back faster than 10
-    m/s, or an arm bone that ends at the joint is more than 0.12 m longer or shorter than in those two frames. At both
-    ends of a recording, a jump of more than 0.3 m faster than 10 m/s is enough.
+    Consider the last frame before and the first frame after a possible spike. A joint is in a spike if it is more than
+    0.2 m from the straight line between its positions in these two frames, if these positions are less than half as far
+    from each other, and if at least one of two conditions holds: the joint moves there and back faster than 10 m/s, or
+    an arm bone that ends at the joint is more than 0.12 m longer or shorter than in these two frames. At the beginning
+    and at the end of a recording, any jump of more than 0.3 m at more than 10 m/s is a spike.
 
     Args:
         times: time stamps, shape (n,) [s], increasing.
         positions: shape (n, 25, 3) [m].
 
     Returns:
-        whether each joint is in a spike, shape (n, 25), and how far it jumps there, shape (n, 25) [m].
+        Whether each joint is in a spike, shape (n, 25), and how far it jumps in that frame, shape (n, 25) [m].
     """
     n = len(times)
     found, size = np.zeros(positions.shape[:2], dtype=bool), np.zeros(positions.shape[:2])

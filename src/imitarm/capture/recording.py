@@ -1,4 +1,4 @@
-"""SkeletonRecording: recorded skeletons that can be inspected, cut, slowed down, replayed and saved."""
+"""SkeletonRecording: recorded skeletons, to be inspected, cut, slowed down, replayed and saved."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ _GAP: Final = 0.25  # [s] a longer gap in a recording is not filled with frames
 
 
 class SkeletonRecording(SkeletonSource):
-    """Skeletons in the order in which they were recorded; used as a source, a recording is replayed once.
+    """Skeletons in the order in which they were recorded; as a source, a recording is replayed once.
 
     Skeletons are neither checked nor changed: times may decrease, and there may be several persons.
-        :func:`~imitarm.capture.checks.check` lists the faults.
+    :func:`~imitarm.capture.checks.check` lists the faults.
 
     Args:
-        skeletons: skeletons in the order of arrival.
+        skeletons: skeletons in the order in which they were recorded.
         name: name for messages, for example the file's name.
         realtime: whether to replay at the recorded speed; otherwise as fast as skeletons are read.
         issues: issues found while reading.
-        time_unit: unit of the file's time stamps [s], for messages about times that are not plausible.
+        time_unit: length of the unit of the file's time stamps [s]; used in messages about implausible times.
 
     Attributes:
         skeletons: all skeletons, in the order in which they were recorded.
         issues: issues found while reading.
-        time_unit: unit of the file's time stamps, as given [s].
+        time_unit: length of the unit of the file's time stamps [s].
     """
 
     argument = "FILE"
@@ -65,7 +65,7 @@ class SkeletonRecording(SkeletonSource):
         issues: Iterable[RecordingIssue] = (),
         time_unit: float = 1.0,
     ) -> None:
-        self.skeletons = tuple(instance(s, Skeleton, "SkeletonRecording: each of skeletons") for s in skeletons)
+        self.skeletons = tuple(instance(s, Skeleton, "SkeletonRecording: each item of skeletons") for s in skeletons)
         self.issues = tuple(issues)
         self.time_unit = time_unit
         self.name = name
@@ -112,14 +112,14 @@ class SkeletonRecording(SkeletonSource):
         return self.with_skeletons(kept)
 
     def trim(self, start: float = 0.0, end: float | None = None) -> SkeletonRecording:
-        """Return the part of the recording between two times; time stamps do not change.
+        """Return the part of the recording between two times; the time stamps do not change.
 
         Args:
-            start: start of the part, since the first frame [s].
-            end: end of the part, since the first frame [s]; None: the last frame.
+            start: start of the part, counted from the first frame [s].
+            end: end of the part, counted from the first frame [s]; None: the last frame.
 
         Raises:
-            InputError: when no frame is left.
+            InputError: when there is no frame between the two times.
         """
         start = finite_number(start, "SkeletonRecording.trim: start", "s")
         first = min((skeleton.time for skeleton in self.skeletons), default=0.0)
@@ -132,17 +132,16 @@ class SkeletonRecording(SkeletonSource):
         return self.with_skeletons(kept)
 
     def with_skeletons(self, skeletons: Iterable[Skeleton]) -> SkeletonRecording:
-        """Return a recording with other skeletons and the same name and time unit."""
+        """Return a recording with the given skeletons, and with the name and the time unit of this recording."""
         return SkeletonRecording(
             skeletons, name=self.name, realtime=self._realtime, issues=self.issues, time_unit=self.time_unit
         )
 
     def save(self, path: str | Path, *, replace: bool = True) -> None:
-        """Write imitarm's own format, from which every skeleton is read back bit for bit.
+        """Write the recording in imitarm's own format, from which exactly the same numbers can be read back.
 
         Args:
-            path: file to write; the recording is written under another name, and the file is renamed when it is
-                complete.
+            path: file to write; it appears under this name only when it is complete.
             replace: whether an existing file may be replaced.
 
         Raises:
@@ -157,7 +156,7 @@ class SkeletonRecording(SkeletonSource):
     # --- as a source
 
     def rewind(self) -> None:
-        """Replay from the first frame again."""
+        """Restart the replay at the first frame."""
         self._next = 0
         self._began: float | None = None
 
@@ -172,7 +171,7 @@ class SkeletonRecording(SkeletonSource):
         return self._next >= len(self.skeletons)
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton; None at the end, or when in real time it is not due within ``timeout`` seconds."""
+        """Return the next skeleton; None at the end, or when it is not due within ``timeout`` seconds in real time."""
         if self.over:
             return None
         skeleton = self.skeletons[self._next]
@@ -198,7 +197,7 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
 
     Raises:
         InputError: when there is no such file.
-        FileFormatError: when it is not a recording of skeletons or was cut off; the message names file, line and
+        FileFormatError: when the file is not a recording of skeletons or was cut off; the message names file, line and
             remedy.
     """
     path = Path(path)
@@ -223,13 +222,13 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
 class SkeletonRecorder:
     """Writes each skeleton as a line of ``PATH.part``, and renames the file to ``PATH`` when the recorder is closed.
 
-    Each line is handed to the operating system before :meth:`write` returns: a program that is killed loses at most the
-    frame that it was writing, and :func:`read_recording` reads ``PATH.part``. An older file ``PATH`` stays intact until
-    the new one is complete.
+    Each line is handed to the operating system before :meth:`write` returns. A program that is killed therefore loses
+    at most the frame that it was writing, and :func:`read_recording` can read the remaining ``PATH.part``. An older
+    file ``PATH`` stays intact until the new one is complete.
 
     Args:
         path: path of the file.
-        source: origin of the skeletons, written into the file.
+        source: where the skeletons come from; this text is written into the file.
         replace: whether an existing file may be replaced.
 
     Attributes:
@@ -237,8 +236,8 @@ class SkeletonRecorder:
         n_frames: number of frames written so far.
 
     Raises:
-        InputError: when the file exists and may not be replaced, another recorder has left or is writing
-            ``PATH.part``, or it can't be written.
+        InputError: when the file exists and may not be replaced, when ``PATH.part`` exists because another recorder is
+            writing it or was killed, or when the file can't be written.
     """
 
     def __init__(self, path: str | Path, *, source: str = "", replace: bool = False) -> None:
@@ -278,11 +277,11 @@ class SkeletonRecorder:
 
 
 def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
-    """Return a recording at a fraction of its speed, for a robot whose joints are slower than a person's.
+    """Slow a recording down, for a robot whose joints are slower than a person's.
 
-    Frames are inserted, so that the frame rate stays about the same: joints are interpolated linearly between two
-        frames, and a joint that is lost in one of them keeps its earlier position. Gaps are not filled; they become
-        longer.
+    Frames are inserted so that the frame rate stays about the same. In an inserted frame, the joints are interpolated
+    linearly; a joint that is lost in one of the two original frames keeps its position from the earlier frame. Gaps
+    between frames are not filled, and become longer.
 
     Args:
         skeletons: skeletons in the order of their times.
@@ -305,7 +304,7 @@ def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
 
 
 def _between(before: Skeleton, after: Skeleton, fraction: float) -> Skeleton:
-    """Return the person between two frames, at ``fraction`` of the time from the first to the second."""
+    """Return a skeleton between two skeletons, at ``fraction`` of the time from the first to the second."""
     tracking = np.minimum(before.tracking, after.tracking)
     lost = tracking == Tracking.LOST
     positions = before.positions + fraction * (after.positions - before.positions)

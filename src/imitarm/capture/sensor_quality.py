@@ -1,4 +1,4 @@
-"""Quality of a skeleton camera, measured on its skeletons: noise, bone lengths, frame intervals, agreement of views.
+"""Quality of a skeleton camera, estimated from its skeletons: noise, bone lengths, frame intervals, agreement of views.
 
 Run as a program, it measures how well MediaPipe tracks a person in videos, and how well several views of one motion
 agree::
@@ -40,20 +40,20 @@ _MAD_TO_SIGMA = 1.4826
 class SensorNoise:
     r"""Noise of a skeleton camera, estimated from its skeletons alone.
 
-    White noise is estimated from fifth-order differences of neighbouring frames, in which a person's motion nearly
-    vanishes: noise of standard deviation :math:`\sigma` gives differences of standard deviation
-    :math:`\sqrt{252}\,\sigma`. The median of their size is taken, so that single jumps don't count. Slow errors appear
-    as changing bone lengths.
+    White noise is estimated from fifth-order differences over successive frames, in which a person's motion nearly
+    vanishes. Noise of standard deviation :math:`\sigma` gives differences of standard deviation
+    :math:`\sqrt{252}\,\sigma`. The estimate uses the median of the absolute differences, so that single jumps have
+    little effect. Slow errors are not part of the white noise, but they change the bone lengths.
 
     Attributes:
         n_frames: number of skeletons.
         median_interval: median time between frames [s].
-        jitter: standard deviation of the intervals, excluding late frames [s].
+        jitter: standard deviation of the time between frames, excluding late frames [s].
         late: fraction of the intervals that are longer than 1.4 times the median interval.
         longest_interval: [s].
-        at_rest: white noise of each joint while it is slower than 0.1 m/s, root mean square over the axes, shape
-            (25,) [m]; nan if the joint was not slow for long enough.
-        in_motion: white noise of each joint while it is faster than 0.4 m/s, shape (25,) [m].
+        at_rest: white noise of each joint while it moves slower than 0.1 m/s, as the root mean square over the three
+            axes, shape (25,) [m]; nan if the joint did not move slowly for long enough.
+        in_motion: white noise of each joint while it moves faster than 0.4 m/s, shape (25,) [m].
         bones: mean and standard deviation of the length of each bone of both arms, by name (``"left forearm"``) [m].
         inferred: fraction of the frames in which each joint is inferred or lost, shape (25,).
     """
@@ -92,7 +92,7 @@ def measure_noise(skeletons: Iterable[Skeleton]) -> SensorNoise:
         skeletons: skeletons of one person, in the order of their times; at least 20, some of them at rest.
 
     Raises:
-        InputError: when there are too few, or their times don't increase.
+        InputError: when there are too few skeletons, or their times don't increase.
     """
     seen = list(skeletons)
     if len(seen) < _LEAST_FRAMES:
@@ -136,7 +136,7 @@ def _white(times: Array, points: Array, usual: NDArray[np.bool_]) -> tuple[Array
 
 
 def _bone(points: Array, inner: str, outer: str, side: str) -> tuple[float, float]:
-    """Return mean and standard deviation of the length of a bone over the frames that show it [m]; nan if none does."""
+    """Return mean and standard deviation of a bone's length [m]; nan if no frame shows the bone."""
     length = np.linalg.norm(points[:, JOINT[f"{outer}_{side}"]] - points[:, JOINT[f"{inner}_{side}"]], axis=1)
     length = length[np.isfinite(length)]
     return (float(length.mean()), float(length.std())) if len(length) else (math.nan, math.nan)
@@ -149,7 +149,7 @@ _LIMBS = {"upper arm": (0, 1), "forearm": (1, 2)}
 
 
 def guarded(recording: SkeletonRecording) -> SkeletonRecording:
-    """Return a recording filtered by :class:`SideFilter`, the input of a retargeter."""
+    """Return a recording filtered by :class:`SideFilter`, as a retargeter receives it."""
     return SkeletonRecording(list(SideFilter(recording)), name=recording.name)
 
 
@@ -170,7 +170,7 @@ def bone(recording: SkeletonRecording, side: str, name: str) -> tuple[float, flo
 
 
 def arm_raised(recording: SkeletonRecording, side: str) -> dict[float, float]:
-    """Return the angle between arm (shoulder to wrist) and spine, by time rounded to a millisecond [rad].
+    """Return, for each time [ms], the angle between the spine and the line from shoulder to wrist [rad].
 
     The angle does not depend on the position of the camera; times at which the arm is not tracked are left out.
     """
@@ -178,7 +178,7 @@ def arm_raised(recording: SkeletonRecording, side: str) -> dict[float, float]:
 
 
 def elbow_bent(recording: SkeletonRecording, side: str) -> dict[float, float]:
-    """Return the angle between forearm and upper arm [rad], by time in milliseconds; see :func:`arm_raised`."""
+    """Return, for each time [ms], the angle between forearm and upper arm [rad], as :func:`arm_raised` does."""
     return _angles(recording, (f"elbow_{side}", f"wrist_{side}"), (f"elbow_{side}", f"shoulder_{side}"), side)
 
 
@@ -197,7 +197,7 @@ def _angles(
 
 
 def agreement(one: dict[float, float], other: dict[float, float]) -> tuple[float, int]:
-    """Return the correlation of two signals at their common times, and the number of these times.
+    """Return the correlation coefficient of two signals at their common times, and the number of common times.
 
     The correlation is nan when there are fewer than 20 common times.
     """
@@ -209,10 +209,11 @@ def agreement(one: dict[float, float], other: dict[float, float]) -> tuple[float
 
 
 def wrist_difference(one: SkeletonRecording, other: SkeletonRecording) -> float:
-    """Return the root mean square difference of two views of the wrists, relative to the shoulders [m].
+    """Return the root mean square difference between two views of the wrists, each relative to its shoulder [m].
 
-    First, one rotation that aligns the views best over the whole recording is removed, so the cameras' positions and
-    axes have no effect. The result is the combined error of both views; nan when they have fewer than 20 common frames.
+    The function first aligns the two views by the one rotation that fits best over the whole recording, so the
+    positions and axes of the cameras have no effect. The result is the combined error of both views; nan if they have
+    fewer than 20 common frames.
     """
     found = [{round(s.time, 3): s for s in view.skeletons} for view in (one, other)]
     pairs: list[tuple[Array, Array]] = []
@@ -230,8 +231,8 @@ def wrist_difference(one: SkeletonRecording, other: SkeletonRecording) -> float:
 
 def _describe(recording: SkeletonRecording, images: int, seconds: float, swaps: int) -> str:
     lines = [
-        f"{recording.name}: {images} images, {len(recording)} with a person, {images / seconds:.0f} a second, "
-        f"sides exchanged in {swaps}"
+        f"{recording.name}: {images} images, {len(recording)} with a person, {images / seconds:.0f} images per second, "
+        f"left and right swapped back in {swaps}"
     ]
     noise = measure_noise(recording.skeletons).in_motion if len(recording) >= _LEAST_COMMON else None
     for side in SIDES:
@@ -249,7 +250,7 @@ def _describe(recording: SkeletonRecording, images: int, seconds: float, swaps: 
 
 
 def main(arguments: list[str]) -> int:
-    """Print the quality of video files, and how well they agree; return the exit status."""
+    """Print how well MediaPipe tracks each video, and how well the videos agree; return the exit status."""
     try:
         if not arguments:
             raise InputError("name one or more video files")
@@ -269,7 +270,7 @@ def main(arguments: list[str]) -> int:
                 for side in SIDES:
                     alike, n = agreement(signal(one, side), signal(other, side))
                     parts.append(f"{side} {what} {alike:.2f} ({n})")
-            parts.append(f"wrists differ by {100.0 * wrist_difference(one, other):.0f} cm")
+            parts.append(f"wrist positions differ by {100.0 * wrist_difference(one, other):.0f} cm")
             sys.stdout.write(f"{one.name} and {other.name}: {', '.join(parts)}\n")
     except ImitarmError as error:
         sys.stderr.write(f"error: {error}\n")

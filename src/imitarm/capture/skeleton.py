@@ -43,7 +43,9 @@ JOINTS = (
     "hand_tip_right",
     "thumb_right",
 )
-"""Names of the 25 joints, in the order of the Kinect v2 SDK; left and right are the person's own."""
+"""Names of the 25 joints, in the order of the Kinect v2 SDK; left and right are those of the person, not of the
+image.
+"""
 
 JOINT = {name: index for index, name in enumerate(JOINTS)}
 """Index of each joint."""
@@ -56,7 +58,7 @@ ARM_JOINTS = {side: np.array([JOINT[f"{part}_{side}"] for part in _ARM_PARTS]) f
 
 
 class Tracking(IntEnum):
-    """Whether a camera sees a joint, infers its position, or has lost it; numbered as in the Kinect SDK."""
+    """Whether a camera tracks a joint, infers its position, or has lost it; numbered as in the Kinect SDK."""
 
     LOST = 0
     INFERRED = 1
@@ -77,7 +79,9 @@ class HandState(IntEnum):
 
 
 CONFIDENCE = np.array([0.0, 0.2, 1.0])
-"""Weight of a position in estimates, by its :class:`Tracking`; docs/retargeting.md describes the estimates."""
+"""Confidence of a joint's position for each state of :class:`Tracking`; docs/retargeting.md describes how it is
+used.
+"""
 CONFIDENCE.setflags(write=False)
 
 
@@ -125,18 +129,18 @@ class Skeleton:
     The coordinate frame is that of the Kinect v2: origin in the sensor, x to the sensor's left, y up, z away from the
     sensor, right-handed. The right hand of a person who faces the sensor has a larger x than the left hand.
 
-    A position that can't have been measured (not finite, or farther than 20 m) counts as lost. Every lost position
-    is nan, so that it can't be used by mistake.
+    A joint counts as lost if its position can't have been measured, because it is not finite or farther than 20 m away.
+    The position of every lost joint is nan, so that it can't be used by mistake.
 
     Attributes:
         time: time of the exposure, on the source's clock [s].
         positions: positions of the joints :data:`JOINTS`, shape (25, 3) [m]; nan where lost.
         tracking: :class:`Tracking` of each joint, shape (25,).
         hand_states: states of the left and the right hand.
-        person: number of the person, given by the source.
+        person: number that the source gives to the person.
 
     Raises:
-        InputError: when a shape is wrong, the time is not finite, or a state does not exist.
+        InputError: when a shape is wrong, the time is not finite, or a state has an unknown number.
     """
 
     time: float
@@ -206,7 +210,7 @@ def number_after_colon(word: str, what: str, text: str, largest: int) -> int:
     """Return the number that a user wrote after the colon of a source.
 
     Raises:
-        InputError: when it is not a whole number from 0 to ``largest``.
+        InputError: when the text is not a whole number from 0 to ``largest``.
     """
     if not text.isdecimal() or int(text) > largest:
         raise InputError(f"source {word}:{text}: {what} must be a whole number from 0 to {largest}")
@@ -235,9 +239,10 @@ class SkeletonSource(ABC):
     Attributes:
         name: name for messages and for recordings, for example the file's name.
         argument: text that a user writes after the colon, for example ``"SEED"``; empty if there is no colon.
-        description: description in one line for ``--help``.
+        description: one line that describes the source in ``--help``.
         live: whether the source runs until it is stopped.
-        has_realtime: whether :meth:`open` implements ``realtime``; if not, the commands delay its skeletons.
+        has_realtime: whether :meth:`open` implements ``realtime``; if not, the commands replay the source in real time
+            themselves.
     """
 
     name: str = "skeletons"
@@ -250,11 +255,11 @@ class SkeletonSource(ABC):
     def open(cls, argument: str, *, realtime: bool = False) -> SkeletonSource:
         """Open the source with the argument that a user wrote after the colon.
 
-        By default it is passed to the constructor.
+        The default implementation passes this argument to the constructor.
 
         Args:
             argument: the text after the colon; empty when :attr:`argument` is empty.
-            realtime: whether a source that is not live returns each skeleton at its time.
+            realtime: whether a source that is not live returns its skeletons at the recorded speed.
 
         Raises:
             InputError: when the argument is wrong, or a device or a program is missing.

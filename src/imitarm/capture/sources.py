@@ -15,10 +15,10 @@ def open_source(word: str | Path, *, realtime: bool = False) -> SkeletonSource:
     """Open a source of skeletons by name.
 
     Args:
-        word: name of a file, or ``NAME`` or ``NAME:ARGUMENT`` of one of :data:`~imitarm.capture.SOURCES`; an existing
-            file of that name takes precedence.
-        realtime: whether to replay a source that is not live at the recorded speed; otherwise as fast as skeletons
-            are read.
+        word: path of a file, or ``NAME`` or ``NAME:ARGUMENT`` for one of :data:`~imitarm.capture.SOURCES`; if there is
+            a file with this name, the file is opened.
+        realtime: for a source that is not live, whether to replay it at the recorded speed; otherwise, it is replayed
+            as fast as the skeletons are read.
 
     Raises:
         UnknownNameError: when there is neither such a file nor such a source.
@@ -35,7 +35,8 @@ def find_source(word: str | Path) -> tuple[type[SkeletonSource], str]:
 
     Raises:
         UnknownNameError: when there is neither such a file nor such a source.
-        InputError: when an argument is missing or not allowed, or the package that adds the source is faulty.
+        InputError: when the source's argument is missing or not allowed, or the package that provides the source is
+            faulty.
     """
     text = str(word)
     name, colon, argument = text.partition(":")
@@ -55,10 +56,10 @@ def find_source(word: str | Path) -> tuple[type[SkeletonSource], str]:
 
 
 def _class_of(name: str) -> type[SkeletonSource]:
-    """Return a source of the registry.
+    """Import the class of a source and check it.
 
     Raises:
-        InputError: when it is not a SkeletonSource.
+        InputError: when the class is not derived from SkeletonSource.
     """
     source = SOURCES[name]
     if not (isinstance(source, type) and issubclass(source, SkeletonSource)):
@@ -70,7 +71,7 @@ def _class_of(name: str) -> type[SkeletonSource]:
 
 
 def source_words() -> dict[str, str]:
-    """Return the syntax of each source's name, with a description; this imports all sources."""
+    """Return what a user writes to select each source, and a description of the source; this imports all sources."""
     words = {}
     for name in SOURCES:
         try:
@@ -84,7 +85,7 @@ def source_words() -> dict[str, str]:
 
 
 def is_live(word: str | Path) -> bool:
-    """Return whether the source of this name runs until it is stopped, without opening it.
+    """Return whether the source of this name is live, which means that it runs until it is stopped; do not open it.
 
     Raises:
         InputError: for the same reasons as :func:`find_source`.
@@ -93,7 +94,7 @@ def is_live(word: str | Path) -> bool:
 
 
 def followed(source: SkeletonSource, *, person: int | None = None) -> PersonFilter:
-    """Return one person of a source, with exchanged sides corrected: the source to give to a retargeter.
+    """Return a source with the skeletons of one person, with swaps of left and right undone, as a retargeter needs it.
 
     Args:
         source: opened source.

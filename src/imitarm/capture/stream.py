@@ -1,4 +1,4 @@
-"""Skeletons over UDP: SkeletonSender sends the skeletons of a source, UdpSource receives them."""
+"""Skeletons over UDP: SkeletonSender sends the skeletons of a source, and UdpSource receives them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _LONGEST_WAIT = 60_000_000_000  # [ns] the longest that a datagram can state
 
 
 class SkeletonSender:
-    """Sends skeletons to one address, one datagram for each, without waiting and without repetition.
+    """Sends skeletons to one address, each in one datagram, without waiting for an answer.
 
-    A lost skeleton is not sent again, because the next one follows within 1/30 s.
+    A lost datagram is not sent again, because the next skeleton follows within 1/30 s.
 
     Args:
         address: host and port of the receiver.
@@ -66,7 +66,7 @@ class SkeletonSender:
 
 
 def frame_of(skeleton: Skeleton, waited_ns: int = 0) -> SkeletonFrame:
-    """Return the message for a skeleton; lost positions are 0, because a datagram must not contain nan.
+    """Return the message for a skeleton; positions of lost joints are 0, because a datagram must not contain nan.
 
     Args:
         skeleton: skeleton to send.
@@ -79,12 +79,13 @@ def frame_of(skeleton: Skeleton, waited_ns: int = 0) -> SkeletonFrame:
 
 
 class Arrival(NamedTuple):
-    """How the last skeleton arrived.
+    """Times at which the last skeleton was sent and received.
 
     Attributes:
         waited: time between exposure and sending [s].
-        queued: time between sending and receiving [s]; from another machine, the excess over the shortest time so far.
-        received_ns: time of receiving [ns].
+        queued: time between sending and receiving [s]; if another machine sent the skeleton, by how much this time
+            exceeds the shortest time of the last one to two minutes.
+        received_ns: time of receiving, on this machine's clock [ns].
     """
 
     waited: float
@@ -95,26 +96,25 @@ class Arrival(NamedTuple):
 class UdpSource(SkeletonSource):
     """Live skeletons from a :class:`SkeletonSender`.
 
-    Datagrams that are late, damaged, foreign or hostile are dropped and counted by a
-    :class:`~imitarm.transmission.datagram_filter.DatagramFilter`. A sender that is killed and started again is
-    accepted after half a second of silence; its times are shifted so that they continue after the gap, and every
-    retargeter engages again.
+    A :class:`~imitarm.transmission.datagram_filter.DatagramFilter` drops and counts datagrams that are late, damaged,
+    hostile, or from another sender. A sender that is killed and started again is accepted after half a second of
+    silence. Its times are shifted so that they continue after the gap, and every retargeter engages again.
 
     Args:
         port: port to listen on; 0: any free port.
         host: address of this machine to listen on; by default, only this machine can send.
-        clock_ns: clock for the time of receiving [ns].
+        clock_ns: function that returns the time of receiving [ns].
 
     Attributes:
-        gate: filter that selects the datagrams to use, and counts the dropped datagrams.
-        arrival: how the last skeleton arrived; None before the first.
+        datagram_filter: filter that selects the datagrams to use, and counts the dropped datagrams.
+        arrival: times at which the last skeleton was sent and received; None before the first skeleton.
 
     Raises:
-        InputError: when the port is taken, or the address is not one of this machine's.
+        InputError: when another program uses the port, or the address does not belong to this machine.
     """
 
     argument = "PORT"
-    description = "skeletons from 'imitarm capture --send'; udp:ADDRESS:PORT also accepts other machines"
+    description = "skeletons from 'imitarm capture --send'; udp:ADDRESS:PORT also accepts skeletons from other machines"
     live = True
 
     def __init__(self, port: int, host: str = LOOPBACK, *, clock_ns: Callable[[], int] = now_ns) -> None:
@@ -133,7 +133,8 @@ class UdpSource(SkeletonSource):
         """Listen on the port, and optionally the address, that a user wrote after the colon.
 
         Raises:
-            InputError: when the port is not a number, is taken, or the address is not one of this machine's.
+            InputError: when the port is not a number or is used by another program, or the address does not belong to
+                this machine.
         """
         host, colon, port = argument.rpartition(":")
         number = number_after_colon("udp", cls.argument, port, 65535)
@@ -150,7 +151,7 @@ class UdpSource(SkeletonSource):
         self._socket.close()
 
     def flush(self) -> None:
-        """Discard all skeletons that have arrived, so that the next skeleton is new."""
+        """Discard all skeletons that have already arrived, so that :meth:`read` returns a newer one."""
         for _ in waiting(self._socket):
             pass
 
@@ -172,7 +173,7 @@ class UdpSource(SkeletonSource):
         return None
 
     def _skeleton(self, frame: SkeletonFrame, now: int, queued: float) -> Skeleton:
-        """Return the received skeleton, with a time that still increases when the sender is restarted."""
+        """Return the received skeleton, with a time that keeps increasing when the sender is restarted."""
         if self.datagram_filter.n_sessions != self._sessions:
             self._sessions = self.datagram_filter.n_sessions
             silent = 0.0 if self.arrival is None else 1e-9 * (now - self.arrival.received_ns)

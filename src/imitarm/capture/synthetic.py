@@ -26,15 +26,13 @@ class SyntheticSource(SkeletonSource):
     The measured positions can be compared with the true ones::
 
         source = SyntheticSource.from_seed(3, kind="edge")
-        for seen in source:
-            error = seen.positions - source.truth(seen.time).positions
+        for skeleton in source: error = skeleton.positions - source.truth(skeleton.time).positions
 
     Args:
         truth: true positions of all joints, as a function of time.
         camera: the simulated camera.
         duration: [s].
-        realtime: whether to return each skeleton at its time, as a camera does; otherwise as fast as skeletons are
-            read.
+        realtime: whether to return the skeletons in real time, as a camera does; otherwise as fast as they are read.
         name: name for messages.
 
     Attributes:
@@ -67,13 +65,13 @@ class SyntheticSource(SkeletonSource):
     def from_seed(
         cls, seed: int, *, duration: float = 12.0, kind: str = "inside", realtime: bool = False
     ) -> SyntheticSource:
-        """Return person number ``seed`` in motion in front of camera number ``seed``, whose noise is 1 to 2 cm.
+        """Return a random person, motion and camera, all determined by ``seed``; the camera's noise is 1 to 2 cm.
 
         Args:
             seed: seed of person, motion and camera.
             duration: duration of the motion [s]; the hand is at rest during the first second.
             kind: kind of motion, one of :data:`MOTIONS`.
-            realtime: whether to return each skeleton at its time.
+            realtime: whether to return the skeletons in real time.
 
         Raises:
             UnknownNameError: when there is no such motion.
@@ -95,7 +93,7 @@ class SyntheticSource(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether the duration is over."""
+        """Whether the duration has elapsed."""
         return self._next > self._duration
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:

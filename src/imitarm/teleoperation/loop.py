@@ -34,12 +34,12 @@ _MAX_UNANSWERED = 256  # commands for which the skeleton they were computed from
 
 @dataclass(frozen=True, eq=False)
 class StepInfo:
-    """One control step, the argument of ``on_step``.
+    """What happened in one control step; ``on_step`` receives this object.
 
     Attributes:
         time: time since the start [s].
         skeleton: newest skeleton that arrived in this step; None if no skeleton arrived.
-        command: result of the retargeter.
+        command: command that the retargeter computed.
         state: measured state of the robot.
         engagement: state of the retargeter; None while the robot cannot be controlled.
         problem: why the robot cannot be controlled; empty if it can.
@@ -60,18 +60,18 @@ class Summary:
     Attributes:
         duration: duration [s].
         steps: number of control steps.
-        overruns: number of control steps missed because the machine was busy.
-        skeletons: number of skeletons used.
-        engagement: number of steps in each state of the retargeter.
+        overruns: number of control steps that were skipped because the computer was busy.
+        skeletons: number of skeletons that the retargeter processed.
+        engagement: number of steps that the retargeter spent in each of its states.
         interrupted: number of steps in which the robot could not be controlled.
-        clamped: number of steps in which a limit of the robot changed the command, for each limit.
-        filtered: number of steps in which the safety filter changed the command to keep a clearance.
-        unsafe: number of steps in which no joint velocity kept every limit and clearance.
-        speed: largest velocity of the set-point, as a fraction of its limit.
-        acceleration: largest acceleration of the set-point, as a fraction of its limit.
-        interruptions: number of times that control of the robot was lost.
+        clamped: for each limit of the robot, the number of steps in which it changed the command.
+        filtered: number of steps in which the safety filter changed the command.
+        unsafe: number of steps in which no joint velocity could satisfy all limits and clearances.
+        speed: largest joint velocity of the set-point, as a fraction of the joint's velocity limit.
+        acceleration: largest joint acceleration of the set-point, as a fraction of the joint's acceleration limit.
+        interruptions: number of times that the robot became impossible to control.
         reason: why the teleoperation has ended; empty while it runs.
-        latency: duration of each stage for each skeleton.
+        latency: duration of each processing stage, for each skeleton.
     """
 
     duration: float = 0.0
@@ -93,25 +93,26 @@ class Summary:
 class Teleoperation:
     """Lets a person move a robot in real time, at the retargeter's control period.
 
-    In each period, the retargeter processes the newest skeleton, the safety filter processes the retargeter's result,
-    and the filtered joint velocity is passed to :meth:`Robot.move <imitarm.robots.robot.Robot.move>`. If the robot
-    could not be controlled for some time, because it was stopped, slowed down or did not answer, it is first brought to
-    rest. The retargeter then starts from the arm's position and engages again, so the arm never jumps.
+    In each period, the retargeter turns the newest skeleton into a joint velocity, the safety filter corrects this
+    velocity, and :meth:`Robot.move <imitarm.robots.robot.Robot.move>` sends it to the robot. Sometimes the robot cannot
+    be controlled, because it was stopped, was slowed down or does not answer. When it can be controlled again, it is
+    first brought to rest. The retargeter then starts from the arm's current position and engages again, so the arm
+    never jumps.
 
     Args:
         source: skeletons of one person, live or in real time.
         retargeter: the mapping from human arm to robot arm.
         robot: robot to control.
-        safety: filter for every command, the same for each retargeter; None: a filter that keeps the limits of the
-            arm, a distance of 10 mm between its links, and no contact with the obstacles of the retargeter's scene.
-        stream: stream from which ``source`` reads, for the latencies; None without a stream.
-        recorder: recorder of the robot's motion, from the first time at which a person moves the robot.
-        confirm_enable: function called in each step in which a served robot cannot be controlled, with the reason
-            and whether
-            the robot is stopped; returns whether the robot may move again. None: it must not move again.
+        safety: safety filter that checks every command; None: the default filter, which keeps the arm within its
+            limits, its links at least 10 mm apart, and the arm out of contact with the obstacles of the retargeter's
+            scene.
+        stream: UDP stream from which ``source`` reads, used to measure latencies; None: ``source`` reads no UDP stream.
+        recorder: records the robot's motion, beginning when a person first moves the robot; None: no recording.
+        confirm_enable: function called as ``confirm_enable(reason, stopped)`` in each step in which a robot on a server
+            cannot be controlled. It returns whether the robot may be enabled. None: the robot is never enabled again.
         on_step: function called after every step.
         clock_ns: function that returns the time [ns], on the same clock as ``stream`` and ``robot``.
-        rate_limiter: timer that starts the control steps; None: real time.
+        rate_limiter: timer that starts the control steps; None: a timer in real time.
     """
 
     def __init__(
@@ -143,7 +144,7 @@ class Teleoperation:
         self._origins: dict[int, tuple[int, int]] = {}  # sequence of a command: row of the log, time of exposure [ns]
 
     def run(self, seconds: float | None = None) -> Summary:
-        """Run for some time, until the source ends, the robot has a fault, or the user presses Ctrl-C.
+        """Run until the time is up, the source ends, the robot has a fault, or the user presses Ctrl-C.
 
         The robot is brought to rest in every case.
 
@@ -240,7 +241,7 @@ class Teleoperation:
         return self._remote.problem if not self._remote.ready else ""
 
     def _wait_for_robot(self, problem: str) -> None:
-        """Hold the robot still, and enable it once that is confirmed."""
+        """Hold the robot still, and enable it again once ``confirm_enable`` allows it."""
         self.robot.move(self._zero, self.retargeter.dt)
         remote = self._remote
         if remote is None or self._confirm_enable is None or self.summary.reason:
@@ -252,7 +253,7 @@ class Teleoperation:
     # --- output
 
     def _begin(self) -> None:
-        """Bring the robot to rest, then start the retargeter from its position."""
+        """Bring the robot to rest, then start the retargeter from the robot's position."""
         self.robot.move(self._zero, self.retargeter.dt)
         if not self.robot.velocity.any():
             arm = self.robot.arm
@@ -277,7 +278,7 @@ class Teleoperation:
             self._log_latency(self._arrival, taken, ready, self._clock_ns())
 
     def _grasp(self, closed: bool | None) -> None:
-        """Close or open the gripper if there is one and the person's hand has changed."""
+        """Close or open the gripper, if there is one, when the person has closed or opened the hand."""
         if closed is None or closed == self._closed or not self.robot.widest_opening > 0.0:
             return
         self._closed = closed
@@ -293,7 +294,7 @@ class Teleoperation:
         summary.acceleration = max(summary.acceleration, float(change.max()))
 
     def _log_latency(self, arrival: Arrival, taken: int, ready: int, sent: int) -> None:
-        """Log the latencies of a skeleton that are known when its command has been sent."""
+        """Log those latencies of a skeleton that are known as soon as its command has been sent."""
         log = self.summary.latency
         row = log.add()
         waits = {"expose": arrival.waited, "arrive": arrival.queued, "wait": 1e-9 * (taken - arrival.received_ns)}
@@ -308,7 +309,7 @@ class Teleoperation:
             self._origins[self._remote.sequence] = row, exposed
 
     def _match_echoes(self, remote: UdpRobot) -> None:
-        """Complete the latencies of the commands whose times the robot has reported."""
+        """Add the latencies measured by the robot to the log, for each command that the robot has acknowledged."""
         for echo in remote.echoes():
             origin = self._origins.pop(echo.sequence, None)
             if origin is not None:

@@ -1,8 +1,8 @@
 """Datagrams: messages encoded as bytes, and decoded with every value checked.
 
-A datagram is a header of 28 bytes and a payload whose size depends only on its kind, little-endian;
-docs/transmission.md has the table. Anything else is rejected with a reason. No part of a datagram is executed or used
-as a length, so a hostile datagram has no effect except to be counted.
+A datagram consists of a header of 28 bytes and a payload, both little-endian. The message type alone determines the
+size of the payload; docs/transmission.md has a table of the fields. Anything else is rejected with a reason. No part of
+a datagram is executed or used as a length. The only effect of a hostile datagram is therefore that it is counted.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 def now_ns() -> int:
-    """Return the time for time stamps [ns], from a monotonic clock that all processes of this machine share.
+    """Return the current time [ns] of a monotonic clock that all processes of this machine share.
 
-    It includes the time during which the machine is suspended, if the system has such a clock. Otherwise every
-    datagram sent after a suspension would look delayed.
+    If the operating system allows it, the clock keeps running while the machine is suspended. Otherwise, every datagram
+    that this machine sends after a suspension would look delayed to its receiver.
     """
     return time.clock_gettime_ns(_CLOCK) if _CLOCK is not None else time.monotonic_ns()
 
@@ -39,9 +39,9 @@ class Header:
 
     Attributes:
         kind: number of the message type.
-        flags: bits, whose meaning depends on the kind.
-        session: number drawn by the sender when it starts, u32.
-        sequence: number within the session, u32, wraps around.
+        flags: bits whose meaning depends on the message type.
+        session: random number that the sender draws when it starts, u32.
+        sequence: sequence number of the datagram within the session, u32; wraps around.
         time_ns: time of sending, on the sender's clock, u64 [ns].
     """
 
@@ -56,8 +56,8 @@ class Encoder:
     """Encodes messages as the numbered and time-stamped datagrams of one session.
 
     Args:
-        session: session number; None: drawn at random, never 0, so that a restarted sender is recognized as another
-            one.
+        session: session number; None: a random number other than 0, by which receivers recognize that a sender has
+            restarted.
         first: first sequence number.
     """
 
@@ -66,7 +66,7 @@ class Encoder:
         self.sequence = first
 
     def encode(self, message: Message, time_ns: int) -> bytes:
-        """Return a message as a datagram.
+        """Encode a message as the next datagram of this session.
 
         Args:
             message: message to send.
@@ -92,7 +92,7 @@ def size_of(kind: type[Message]) -> int:
 
 
 def decode(data: bytes) -> tuple[Header, Message]:
-    """Return header and message of a datagram.
+    """Decode a datagram and return its header and its message.
 
     Args:
         data: received bytes, which may be arbitrary.

@@ -20,18 +20,18 @@ Kind = TypeVar("Kind", SkeletonFrame, JointCommand, JointState)
 DROP_REASONS = {
     "length": "wrong length",
     "magic": "not a datagram of imitarm",
-    "version": "another version of the format",
-    "kind": "another kind of message than expected",
+    "version": "of another version of the datagram format",
+    "kind": "not the expected type of message",
     "checksum": "damaged",
-    "range": "a value out of range",
-    "duplicate": "received before",
-    "order": "older than one received before",
+    "range": "with a value that is out of range",
+    "duplicate": "already received",
+    "order": "older than a datagram that was already received",
     "stale": "delayed too long",
     "clock": "time stamp in the future",
-    "foreign": "another sender while one is active",
-    "retired": "a sender that was replaced",
+    "foreign": "from a second sender, while the first is still active",
+    "retired": "from a sender that has been replaced by another",
 }
-"""Meaning of each reason for dropping a datagram, by the key under which it is counted."""
+"""Reasons for dropping a datagram: the key under which each is counted, and its meaning."""
 
 _HALF = 2**31
 _MASK = 2**32 - 1
@@ -45,7 +45,7 @@ _MAX_RETIRED = 64  # replaced sessions that are remembered
 
 @dataclass(slots=True)
 class _Unconfirmed:
-    """An offset far below the confirmed minimum that no other datagram supports, and the evidence against it."""
+    """An unconfirmed sample (see :class:`ClockOffsetEstimator`), with the evidence against it."""
 
     offset: int
     sent: int  # time stamp of its datagram [ns]
@@ -60,19 +60,19 @@ class ClockOffsetEstimator:
     r"""Estimates the offset between two clocks from the time stamps of datagrams.
 
     A datagram that is sent at :math:`t_s` on the sender's clock and received at :math:`t_r` on the receiver's clock
-    gives the sample :math:`t_r - t_s`, which is the clock offset plus the travel time. The minimum over the last one
-    to two minutes is therefore the offset plus the shortest travel time, and a datagram's excess over the minimum is
-    the time that it was delayed.
+    gives the sample :math:`t_r - t_s`. This sample is the clock offset plus the travel time, so the minimum over the
+    last one to two minutes is the offset plus the shortest travel time. The difference between a datagram's sample and
+    this minimum is the delay of the datagram.
 
-    One false time stamp in the future would lower the minimum and make all other datagrams look delayed. A sample is
-    therefore *unconfirmed* while it lies more than ``max_age / 2`` below the confirmed minimum and no datagram that
-    was sent later supports it with a similar sample. It takes effect at once, so that no delayed datagram looks
-    fresh, and is rejected as a false time stamp
+    One false time stamp in the future would lower the minimum and make all other datagrams look delayed. A sample that
+    lies more than ``max_age / 2`` below the confirmed minimum is therefore *unconfirmed* until a datagram that was sent
+    later gives a similar sample. An unconfirmed sample lowers the minimum at once, so that no delayed datagram looks
+    fresh. It is rejected as a false time stamp in two cases:
 
-    * when two later datagrams have an earlier time stamp, since a sender's clock never goes back; or
-    * when, over ``max_age``, three later datagrams are fresh by the confirmed minimum, and this minimum was supported
-      by three datagrams before the sample arrived. This rule applies only while at most four samples are
-      unconfirmed, because a larger number comes from a queue of delayed datagrams.
+    * Two datagrams that arrive later have an earlier time stamp, although a sender's clock never goes back.
+    * Three datagrams that arrive later, over a period of at least ``max_age``, are fresh relative to the confirmed
+      minimum, and three datagrams had supported this minimum before the sample arrived. This rule applies only while at
+      most four samples are unconfirmed, because a larger number comes from a queue of delayed datagrams.
 
     Args:
         max_age: longest accepted delay [ns].
@@ -88,13 +88,13 @@ class ClockOffsetEstimator:
 
     @property
     def minimum(self) -> float:
-        """The smallest sample [ns]; infinite before the first one."""
+        """The smallest sample [ns], confirmed or not; infinite before the first sample."""
         return min(*self._confirmed, self._unconfirmed[0].offset if self._unconfirmed else math.inf)
 
     def too_early(self, offset: int, sent: int, now: int) -> bool:
         """Return whether a time stamp lies more than ``10 * max_age`` in the future.
 
-        Such a sample is used only if the next datagram has a later time stamp.
+        The sample of such a datagram is used only if the next datagram has a still later time stamp.
 
         Args:
             offset: time of receiving minus time stamp [ns].
@@ -141,7 +141,7 @@ class ClockOffsetEstimator:
             self._confirmed[0] = min(self._confirmed[0], self._unconfirmed.pop().offset)
 
     def _reject_false(self, sent: int, now: int, *, fresh: bool) -> None:
-        """Count a datagram as evidence against the unconfirmed samples, and drop the samples that are proved false."""
+        """Count a datagram as evidence against the unconfirmed samples, and drop those that are proved false."""
         few, kept = len(self._unconfirmed) <= _MAX_REJECTED, []
         for one in self._unconfirmed:
             one.contradictions += sent < one.sent
@@ -169,26 +169,28 @@ class ClockOffsetEstimator:
 class DatagramFilter:
     """Accepts the datagrams of one session, each newer than the previous one and delayed by at most ``max_age``.
 
-    *Order.* A sequence number is newer when it is ahead by less than half of all numbers, so it may wrap around.
+    *Order.* A sequence number counts as newer when it is ahead of the previous one by less than half of the number
+    range, so sequence numbers may wrap around.
 
-    *Delay.* The clocks of two machines are not synchronized. The delay is measured against the fastest datagram of
-    the last one to two minutes (:class:`ClockOffsetEstimator`).
+    *Delay.* The clocks of two machines are not synchronized. The delay of a datagram is therefore measured relative to
+    the fastest datagram of the last one to two minutes (:class:`ClockOffsetEstimator`).
 
-    *Sessions.* A sender that restarts begins a new session. It is accepted once the previous session has been silent
-    for ``session_timeout``. Datagrams of two senders are therefore never mixed, and a session that was replaced is
-    never accepted again.
+    *Sessions.* A sender that restarts begins a new session. The new session is accepted once the previous session has
+    been silent for ``session_timeout``. Therefore, the datagrams of two senders are never mixed. A session that was
+    replaced is never accepted again.
 
     Args:
         max_age: longest accepted delay [s].
-        session_timeout: silence after which another session may begin [s]; infinite: only :meth:`start_session`
-            changes the session.
+        session_timeout: duration of silence after which another session is accepted [s]; infinite: only
+            :meth:`start_session` changes the session.
 
     Attributes:
-        session: accepted session; None: the first session that arrives.
-        n_sessions: number of sessions so far.
+        session: number of the accepted session; None: no datagram has arrived yet, and the first session will be
+            accepted.
+        n_sessions: number of sessions accepted so far.
         age: delay of the last accepted datagram [s].
         accepted: number of accepted datagrams.
-        dropped: number of dropped datagrams for each reason, a key of :data:`DROP_REASONS`.
+        dropped: number of dropped datagrams for each reason; the reasons are the keys of :data:`DROP_REASONS`.
 
     Raises:
         InputError: when a time is not positive.
@@ -209,10 +211,10 @@ class DatagramFilter:
         self._clock_offset = ClockOffsetEstimator(self._max_age)
 
     def receive(self, data: bytes, now_ns: int, kind: type[Kind]) -> tuple[Header, Kind] | None:
-        """Return header and message of a datagram; None if it is dropped.
+        """Decode and check a datagram; return its header and its message, or None if it is dropped.
 
         Args:
-            data: data as received.
+            data: bytes of the datagram as received.
             now_ns: time of receiving, on the receiver's clock [ns].
             kind: expected message type.
         """
@@ -227,7 +229,7 @@ class DatagramFilter:
         return (header, message) if self.accept(header, now_ns) else None
 
     def accept(self, header: Header, now_ns: int) -> bool:
-        """Return whether a decoded datagram is accepted, and count it.
+        """Return whether a decoded datagram is accepted, and count it as accepted or dropped.
 
         Args:
             header: header of the datagram.
@@ -241,7 +243,7 @@ class DatagramFilter:
         return not reason
 
     def start_session(self, session: int) -> None:
-        """Accept this session, and no other, from now on."""
+        """Accept only this session from now on."""
         if self.session is not None and self.session != session:
             self._retired.append(self.session)
         self.session, self._last_sequence = session, None
@@ -274,7 +276,7 @@ class DatagramFilter:
         return ""
 
     def _wrong_order(self, header: Header, offset: int, now: int) -> str:
-        """Return why the datagram does not follow the last one."""
+        """Return why the datagram cannot follow the last accepted datagram; empty if it can."""
         if self._last_sequence is None:
             return ""
         step = (header.sequence - self._last_sequence) & _MASK

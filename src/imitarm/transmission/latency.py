@@ -14,18 +14,18 @@ from imitarm.files.table import write_table
 Array = NDArray[np.float64]
 
 STAGES = {
-    "expose": "exposure to sent by the capture process",
-    "arrive": "sent to received",
-    "wait": "received to taken by a control step",
-    "retarget": "taken to command ready",
-    "send": "command ready to sent to the robot",
-    "robot": "sent to received by the robot",
-    "apply": "received by the robot to applied",
-    "total": "exposure to applied",
+    "expose": "from exposure to sending by the capture process",
+    "arrive": "from sending to receiving by the retargeting process",
+    "wait": "from receiving to the start of the next control step",
+    "retarget": "from the start of the control step to the computed command",
+    "send": "from the computed command to its sending",
+    "robot": "from sending the command to receiving by the robot process",
+    "apply": "from receiving by the robot process to applying",
+    "total": "total, from exposure to applying",
 }
-"""The stages of a skeleton, in order, and their meaning.
+"""Processing stages of a skeleton, in order, with the interval that each stage covers.
 
-Between two machines a travel time is measured relative to the fastest datagram.
+Between two machines, the travel time of a datagram is measured relative to that of the fastest datagram.
 """
 
 _CHUNK = 1024
@@ -62,11 +62,11 @@ class LatencyLog:
         return self._n - 1
 
     def record(self, frame: int, **seconds: float) -> None:
-        """Record the durations of stages.
+        """Store the durations of one or more stages of a skeleton.
 
         Args:
             frame: index of the row.
-            **seconds: duration of each stage by its name [s].
+            **seconds: durations [s], one keyword for each stage.
 
         Raises:
             UnknownNameError: when there is no such stage.
@@ -77,7 +77,7 @@ class LatencyLog:
             self._values[frame, self.stages.index(stage)] = value
 
     def statistics(self) -> list[tuple[str, int, float, float, float, float]]:
-        """Return for each measured stage: name, number of values, median, 95th and 99th percentile, maximum [s]."""
+        """Return name, number of values, median, 95th and 99th percentile, and maximum [s] of each measured stage."""
         rows = []
         for stage, column in zip(self.stages, self.values.T, strict=True):
             known = column[np.isfinite(column)]

@@ -1,4 +1,4 @@
-"""Messages between the capture, retargeting and robot processes, with the range that each value may have."""
+"""Messages between the capture, retargeting and robot processes, with the valid range of each value."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MAX_WAIT = 60_000_000_000  # [ns]
 
 
 class DatagramError(InputError):
-    """Bytes that are not a valid datagram; ``reason`` is the key under which they are counted."""
+    """Raised for bytes that are not a valid datagram; ``reason`` is the key under which they are counted."""
 
     def __init__(self, reason: str, what: str) -> None:
         super().__init__(f"datagram: {what}")
@@ -54,11 +54,12 @@ class SkeletonFrame:
 
     Attributes:
         time: time of exposure, on the source's clock [s].
-        positions: positions of the joints, shape (25, 3) [m], at most 20 m; 0 where lost.
+        positions: positions of the joints in the sensor's frame, shape (25, 3) [m]; each coordinate is at most 20 m,
+            and 0 for a lost joint.
         tracking: tracking state of each joint: 0 lost, 1 inferred, 2 tracked, shape (25,).
         hands: states of the left and the right hand, 0 to 4.
         person: identifier of the person, u64.
-        waited_ns: time from exposure to sending [ns], at most a minute.
+        waited_ns: time from exposure to sending [ns]; at most one minute.
     """
 
     KIND: ClassVar[int] = 1
@@ -100,10 +101,10 @@ class JointCommand:
     Attributes:
         mode: kind of command.
         q: commanded joint positions, shape (n_joints,) [rad]; at most 16 joints.
-        velocity: commanded joint velocities at these positions, shape (n_joints,) [rad/s].
-        arm: fingerprint of the arm that the command is for.
-        challenge: with ENABLE, the challenge of the stop that it ends; otherwise 0.
-        opening: commanded opening of the gripper [m], at most 1; None: unchanged.
+        velocity: joint velocities with which the arm should pass these positions, shape (n_joints,) [rad/s].
+        arm: fingerprint of the arm model for which the command was computed.
+        challenge: for ENABLE, the challenge number that the stopped robot sent; otherwise 0.
+        opening: commanded opening of the gripper [m], at most 1 m; None: leave it unchanged.
     """
 
     KIND: ClassVar[int] = 2
@@ -144,21 +145,21 @@ class JointState:
 
     Attributes:
         status: state of the server.
-        time: time of the robot [s].
+        time: time on the robot's clock [s].
         q: measured joint positions, shape (n_joints,) [rad].
         velocity: measured joint velocities, shape (n_joints,) [rad/s].
-        torque: torques of the drives, shape (n_joints,) [N m].
+        torque: torques of the joint drives, shape (n_joints,) [N m].
         set_point: joint positions that the drives track, shape (n_joints,) [rad].
         set_velocity: velocity of the set-point, shape (n_joints,) [rad/s].
-        arm: fingerprint of the arm.
-        challenge: number that ENABLE must contain; 0 if the robot is not stopped.
-        owner: session of the client whose commands are followed; 0 if there is none.
+        arm: fingerprint of the arm model that the robot uses.
+        challenge: number that an ENABLE command must contain; 0 if the robot is not stopped.
+        owner: session of the client whose commands the robot follows; 0 if it follows no client.
         opening: opening of the gripper and its maximum [m]; None without a gripper.
-        echo: sequence number of the last command that was followed.
-        echo_sent_ns: time at which that command was sent, on the client's clock [ns].
-        received_ns: time at which that command was received, on the robot's clock [ns].
-        applied_ns: time at which the drives first received a set-point computed from it, on the robot's clock [ns];
-            0: not yet.
+        echo: sequence number of the last command that the robot followed.
+        echo_sent_ns: time at which the client sent command ``echo``, on the client's clock [ns].
+        received_ns: time at which the robot received command ``echo``, on the robot's clock [ns].
+        applied_ns: time at which the drives first received a set-point computed from command ``echo``, on the robot's
+            clock [ns]; 0: not yet.
         reason: why the robot is stopped or faulty; at most 91 bytes of UTF-8.
     """
 
@@ -219,7 +220,7 @@ Message = SkeletonFrame | JointCommand | JointState
 KINDS: dict[int, type[SkeletonFrame] | type[JointCommand] | type[JointState]] = {
     kind.KIND: kind for kind in (SkeletonFrame, JointCommand, JointState)
 }
-"""Message types by their number in the header."""
+"""Each message type, by the number that stands for it in the header."""
 
 
 def _magnitude(values: Array) -> float:

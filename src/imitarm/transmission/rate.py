@@ -9,10 +9,10 @@ from imitarm.validation import finite_number
 
 
 class RateLimiter:
-    """Starts control periods at multiples of a fixed time after the first one.
+    """Starts control periods on a fixed schedule: at whole multiples of the period after the first start.
 
-    If a period starts a whole period late or more, the missed periods are skipped and counted, and the following ones
-    start on schedule. Running them later in a burst would move an arm faster than intended.
+    If a period starts late by one period or more, the missed periods are skipped and counted, and the following periods
+    start on schedule. Running the missed periods later, in a burst, would move an arm faster than intended.
 
     Args:
         period: length of a period [s].

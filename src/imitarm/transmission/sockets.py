@@ -17,14 +17,14 @@ _AT_ONCE = 256  # datagrams read from a socket before control returns to the cal
 
 
 def parse_address(text: str, *, host: str = LOOPBACK) -> Address:
-    """Return host and port of ``HOST:PORT`` or ``PORT``.
+    """Parse ``HOST:PORT`` or ``PORT``, and return host and port.
 
     Args:
         text: text typed by a user.
         host: host to use when only a port is given.
 
     Raises:
-        InputError: when the text is neither.
+        InputError: when the text is neither ``HOST:PORT`` nor ``PORT``.
     """
     name, colon, port = text.rpartition(":")
     if (colon and not name) or not port.isdecimal() or not 0 < int(port) < 65536:
@@ -46,7 +46,7 @@ def resolved(address: Address) -> Address:
 
 
 def listening(address: Address) -> socket.socket:
-    """Return a socket that receives on an address; port 0: any free port.
+    """Return a socket that receives at an address of this machine; port 0 stands for any free port.
 
     Raises:
         InputError: when the port is in use, or the address does not belong to this machine.
@@ -68,7 +68,7 @@ def listening(address: Address) -> socket.socket:
 
 
 def connected(address: Address) -> socket.socket:
-    """Return a socket that sends to an address, and receives only from there.
+    """Return a socket that sends to an address and receives only from this address.
 
     Raises:
         InputError: when there is no such host, or no route to it.
@@ -86,7 +86,7 @@ def connected(address: Address) -> socket.socket:
 
 
 def waiting(one: socket.socket, most: int = _AT_ONCE) -> Iterator[tuple[bytes, Address]]:
-    """Yield the datagrams that have arrived, each with its sender's address; at most ``most``, without waiting."""
+    """Yield at most ``most`` datagrams that have already arrived, each with its sender's address; never wait."""
     for _ in range(most):
         try:
             yield one.recvfrom(_LARGEST)
@@ -97,12 +97,12 @@ def waiting(one: socket.socket, most: int = _AT_ONCE) -> Iterator[tuple[bytes, A
 
 
 def wait_for(one: socket.socket, seconds: float) -> bool:
-    """Wait until a datagram has arrived; return False if none has after some seconds."""
+    """Wait until a datagram has arrived; return False if none has arrived within the given time."""
     return bool(select.select([one], [], [], max(seconds, 0.0))[0])
 
 
 def try_to_send(one: socket.socket, data: bytes, address: Address | None = None) -> bool:
-    """Send without waiting; return False if nobody listens or the system's buffer is full."""
+    """Send without waiting; return False if nobody listens or the send buffer of the operating system is full."""
     try:
         if address is None:
             one.send(data)
