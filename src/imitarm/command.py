@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class Status(Enum):
-    """State of a reproduction from the view of its policy."""
+    """State of a reproduction, as reported by its policy."""
 
     NOMINAL = "nominal"
     """The motion follows the learned path."""
@@ -34,12 +34,13 @@ class Command:
 
     Attributes:
         twist: twist of the tool in the base frame, linear velocity first, shape (6,) [m/s, rad/s].
-        joint_velocity: velocity of the joints, shape (n_joints,) [rad/s]; it replaces the twist where it is given, for
-            example along a planned joint path. None: the inverse kinematics chooses it.
-        posture: joint positions to drift towards in the freedom that the twist leaves, shape (n_joints,) [rad];
+        joint_velocity: velocity of the joints, shape (n_joints,) [rad/s]; if given, it replaces the twist, for example
+            along a planned joint path. None: the inverse kinematics computes it from the twist.
+        posture: joint positions towards which the arm drifts in the null space of the twist, shape (n_joints,) [rad];
             None: no preference.
-        elbow: SEW angle to which the elbow rotates in the freedom that the twist leaves [rad]; None: no preference.
-        progress: finished fraction of the motion, 0 to 1; nan if unknown.
+        elbow: SEW (shoulder-elbow-wrist) angle to which the elbow rotates in the null space of the twist [rad]; None:
+            no preference.
+        progress: completed fraction of the motion, 0 to 1; nan if unknown.
         status: state of the reproduction.
         reason: reason why the motion is not nominal, with the name of the obstacle; empty when nominal.
     """

@@ -1,7 +1,7 @@
 """The errors that imitarm raises; one base class, so that one ``except`` catches them all.
 
-Every message says what is wrong, where, and what to do about it. Errors are raised at construction or reading, not
-inside a control loop.
+Every message says what is wrong, where, and what to do about it. Arguments and files are checked when an object is
+constructed or a file is read, not inside a control loop.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ class InputError(ImitarmError, ValueError):
 
 
 class FileFormatError(InputError):
-    """A file that is damaged or has another format than expected; the message names the file and the location in it."""
+    """A file that is damaged or has an unexpected format; the message names the file and the location in it."""
 
 
 class UnknownNameError(InputError):
-    """A name that is in no registry; the message lists the known ones."""
+    """A name that is not registered; the message lists the registered names."""
 
     @classmethod
     def among(cls, kind: str, name: object, known: object) -> UnknownNameError:

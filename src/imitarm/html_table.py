@@ -1,4 +1,4 @@
-"""A small HTML table for ``_repr_html_``, which a notebook displays for an object."""
+"""Build the small HTML tables that notebooks display for imitarm's objects (``_repr_html_``)."""
 
 from __future__ import annotations
 

@@ -31,9 +31,10 @@ class SafetyStep:
     Attributes:
         velocity: joint velocity to send, shape (n_joints,) [rad/s].
         changed: norm of the difference between ``velocity`` and the velocity that the command would yield with only
-            the joint limits [rad/s]; 0 when no clearance row was active.
-        slack: largest violation of a clearance row [m/s]; 0 when all rows are kept.
-        safe: whether ``velocity`` keeps every limit and every row; if False, no joint velocity does.
+            the joint limits [rad/s]; 0 when no clearance inequality was active.
+        slack: largest violation of a clearance inequality [m/s]; 0 when all inequalities are kept.
+        safe: whether ``velocity`` keeps every limit and every clearance inequality; if False, no joint velocity keeps
+            them all.
     """
 
     velocity: Array
@@ -46,15 +47,14 @@ class SafetyFilter:
     r"""Converts commands to joint velocities that keep the arm's limits and its clearances.
 
     Each step solves one quadratic program (:class:`~imitarm.kinematics.ik.IKSolver`): it finds the joint velocity
-        closest to the command
+    closest to the command that
 
-    * inside the position, velocity and acceleration limits of the joints, always;
-    * so that no part of the arm approaches an obstacle faster than
-      :class:`~imitarm.scene.clearance.ClearanceLimit` allows, and no link another link faster than
-      :class:`~imitarm.scene.clearance.SelfClearance` allows.
+    * always stays inside the position, velocity and acceleration limits of the joints;
+    * lets no part of the arm approach an obstacle faster than :class:`~imitarm.scene.clearance.ClearanceLimit` allows,
+      and no link approach another link faster than :class:`~imitarm.scene.clearance.SelfClearance` allows.
 
-    Where these rows contradict the joint limits, no safe motion exists: the velocity violates the rows as little as
-        possible, which moves the arm away from objects that are too close, and ``safe`` is False.
+    If these clearance inequalities contradict the joint limits, no safe motion exists. The velocity then violates the
+    inequalities as little as possible, which moves the arm away from objects that are too close, and ``safe`` is False.
 
     The same filter serves every policy and teleoperation.
 
@@ -98,7 +98,7 @@ class SafetyFilter:
         Args:
             command: command of the policy.
             q: joint positions, shape (n_joints,) [rad].
-            velocity: joint velocity that was sent last, shape (n_joints,) [rad/s]; None: unknown, accelerations are
+            velocity: joint velocity that was sent last, shape (n_joints,) [rad/s]; None: unknown, so accelerations are
                 not limited.
             scene: obstacles predicted for the current time, with their velocities.
 
@@ -121,7 +121,7 @@ class SafetyFilter:
         return SafetyStep(allowed, changed, max(missing, 0.0), missing <= _KEPT)
 
     def _admits(self, q: Array, wanted: Array, velocity: ArrayLike | None, rows: list[Rows]) -> bool:
-        """Return whether a joint velocity keeps all limits and rows without a change."""
+        """Return whether a joint velocity already keeps all limits and inequalities."""
         box = self.solver.problem(q, JointVelocityTask(wanted), velocity).box
         inside = bool((wanted >= box.lower).all() and (wanted <= box.upper).all())
         return inside and all(bool((part.matrix @ wanted >= part.lower).all()) for part in rows)

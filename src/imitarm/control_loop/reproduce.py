@@ -59,34 +59,36 @@ def reproduce(
 ) -> Rollout:
     """Let ``policy`` reproduce its skill on ``robot``, and record what happens.
 
-    Every ``dt``: the scene is observed, the policy returns a :class:`~imitarm.command.Command`, the
-    :class:`~imitarm.safety.SafetyFilter` converts it to joint velocities within the arm's limits and clearances, and
-    the robot moves. The motion ends when the policy has finished, when the robot has stopped to protect itself, or at
-    ``timeout``. The robot is always braked to a stop, also after an exception.
+    In every control period ``dt``, ``observe`` returns the scene, and the policy returns a
+    :class:`~imitarm.command.Command`. The :class:`~imitarm.safety.SafetyFilter` converts the command to joint
+    velocities that keep the arm's limits and clearances, and the robot moves. The motion ends when the policy has
+    finished, when the robot has stopped to protect itself, or at ``timeout``. The robot is always braked to a stop,
+    also after an exception.
 
     Args:
         policy: policy that decides the motion; its ``reset`` is called first.
         robot: what moves.
-        observe: function that returns the scene known at a given time since the start [s]. The scene may be older;
-            its ``stamp``
-            says when it was seen.
-        dt: control period [s]; a simulated robot needs a multiple of its timestep.
+        observe: function that takes the time since the start [s] and returns the latest known scene. The scene may have
+            been measured earlier; its ``stamp`` is the time of that measurement [s].
+        dt: control period [s]; for a simulated robot, it must be a multiple of the simulation's timestep.
         timeout: longest duration [s].
-        safety: safety filter; None: a filter for this arm that keeps its limits, keeps links 10 mm apart and touches no
-            obstacle. The filter's ``dt`` must equal this ``dt``.
+        safety: safety filter; None: a filter that keeps the arm within its joint limits, its links 10 mm apart and the
+            whole arm out of contact with obstacles. The filter's ``dt`` must equal this ``dt``.
         on_step: function called after each step, for progress or drawing; an exception in it stops the robot and is
             raised again.
 
     Returns:
         The measured motion from rest to rest. ``success`` means that the motion finished in time, touched nothing, and
-        kept the clearance that the filter requires. ``details`` holds the commanded ``"twists"`` (n, 6), ``"clamped"``:
-        how often each limit changed a command, ``"filtered"``: in how many steps the filter changed one for a
-        clearance, ``"unsafe"``: in how many no safe motion existed, ``"statuses"``: steps by the policy's status, and
-        what the robot has in its :meth:`~imitarm.robots.robot.Robot.report`.
+        kept the clearance that the filter requires. ``details`` holds the commanded ``"twists"`` (n, 6); ``"clamped"``,
+        how often each limit changed a command; ``"filtered"``, the number of steps in which the filter changed a
+        command to keep a clearance; ``"unsafe"``, the number of steps in which no safe motion existed; ``"statuses"``,
+        the number of steps with each status of the policy; and the entries of the robot's
+        :meth:`~imitarm.robots.robot.Robot.report`.
 
     Raises:
         InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not return a Command.
-        InfeasibleError: the arm starts in contact with an obstacle, or the policy refuses; the robot has not moved.
+        InfeasibleError: when the arm starts in contact with an obstacle, or the policy refuses to start; the robot has
+            not moved.
     """
     dt, timeout = finite_number(dt, "reproduce: dt", "s"), finite_number(timeout, "reproduce: timeout", "s")
     if not 0.0 < dt <= timeout:

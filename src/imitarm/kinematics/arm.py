@@ -76,9 +76,9 @@ class ArmModel(ArmKinematics):
     where :math:`M` is the rigid-body inertia. Rotor inertia (``armature``), viscous damping and dry friction of the
     joints, which a simulated arm also has, are not included; their values are in ``spec()``.
 
-    All poses are in the base frame, whose origin is the origin of the file. Jacobians have the linear rows first.
-    All methods take one posture ``q`` of shape (n_joints,) and raise :class:`InputError` if its shape is wrong or a
-    number is not finite. Several threads can use one model.
+    All poses are in the base frame, whose origin is the origin of the robot's file. Jacobians have the linear rows
+    first. All methods take one posture ``q`` of shape (n_joints,) and raise :class:`InputError` if its shape is wrong
+    or a number is not finite. Several threads can use one model.
 
     Attributes:
         name: for example ``"sawyer"``.
@@ -121,14 +121,14 @@ class ArmModel(ArmKinematics):
     ) -> ArmModel:
         """Load a packaged arm, or any MJCF or URDF file.
 
-        Limits come from the file. Where it has none, 2 rad/s and 10 rad/s^2 are assumed (0.2 m/s and 1 m/s^2 for
-        slides), and the torque is unlimited; ``notes`` says so. Speeds and accelerations have no standard place in
-        MJCF: put them into ``<custom><numeric name="max_velocity" data="..."/></custom>`` (and ``max_acceleration``),
-        one value for each joint.
+        Limits come from the file. For limits that the file does not define, the model assumes 2 rad/s and 10 rad/s^2
+        for hinges, 0.2 m/s and 1 m/s^2 for slides, and unlimited torque; ``notes`` lists these assumptions. MJCF has no
+        standard element for speed and acceleration limits, so write them as ``<custom><numeric name="max_velocity"
+        data="..."/></custom>`` (and ``max_acceleration``), one value for each joint.
 
-        ``home`` is the keyframe of that name, else the first keyframe. A file without keyframes gets the middle of the
-        joints' ranges if that is a usable posture: not singular, with 20 mm between the links. Otherwise it gets the
-        best of 1024 postures by these criteria.
+        ``home`` is the keyframe of that name, else the first keyframe. If the file has no keyframe, ``home`` is the
+        middle of the joints' ranges, provided that this posture is not singular and keeps the links 20 mm apart.
+        Otherwise ``home`` is the best of 1024 sampled postures by these criteria.
 
         Args:
             name_or_path: ``"sawyer"``, ``"panda"`` or a path.
@@ -142,7 +142,7 @@ class ArmModel(ArmKinematics):
         Raises:
             UnknownNameError: if an arm, tool or flange of that name is not known.
             FileFormatError: if a file can't be read as a robot.
-            InputError: if the file holds no arm, or several.
+            InputError: if the file contains no arm, or more than one.
         """
         for what, value in (("robot", name_or_path), ("tool", tool)):
             if not isinstance(value, str | Path) and (value is not None or what == "robot"):
@@ -191,7 +191,7 @@ class ArmModel(ArmKinematics):
 
     def __setattr__(self, name: str, value: object) -> None:
         if getattr(self, "_sealed", False):
-            raise AttributeError(f"ArmModel never changes; load another one instead of setting {name!r}")
+            raise AttributeError(f"an ArmModel can't be changed; load another model instead of setting {name!r}")
         object.__setattr__(self, name, value)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -203,12 +203,12 @@ class ArmModel(ArmKinematics):
         return f"ArmModel.load({str(path)!r}, tool={options['tool']!r})"
 
     def spec(self) -> mujoco.MjSpec:
-        """Return a fresh copy of the arm and its tool, for composing worlds; the base stands at the origin.
+        """Return a new MuJoCo spec of the arm and its tool, from which to build a world; the base is at the origin.
 
         Names are taken from the file; names of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
         The flange is the site ``"flange"``. Geoms of group 3 are used for contact, all others only for drawing; a file
-        without this separation is converted. The arm's joints have no actuators, so that a world adds the actuators
-        that it needs (joints carry their torque limit as ``actuatorfrcrange``). A gripper has one actuator,
+        without this separation is converted. The arm's joints have no actuators, so a world must add the actuators that
+        it needs. Each joint has its torque limit as ``actuatorfrcrange``. A gripper has one actuator,
         ``"tool/opening"``, a position servo of its opening [m]. There are no keyframes: use :meth:`posture`.
         """
         return self._spec.copy()
@@ -253,14 +253,15 @@ class ArmModel(ArmKinematics):
     def tool_spheres(self) -> Array:
         """Spheres that cover everything that moves rigidly with the tool: last link, hand and fingers.
 
-        Rows x y z r in the tool's frame, shape (m, 4) [m]; a policy keeps the required clearance for these spheres.
+        Each row is x, y, z and radius in the tool's frame, shape (m, 4) [m]. A policy keeps the required clearance for
+        these spheres.
         """
         centers, radii = self.collision_spheres(self.home)
         rigid = self.cover.follows_last_joint
         return np.column_stack([self.tool_pose(self.home).inverse().apply(centers[rigid]), radii[rigid]])
 
     def sphere_jacobians(self, q: ArrayLike) -> Array:
-        """Return the Jacobians of the spheres' centers, shape (m, 3, n_joints) [m/rad]."""
+        """Return the Jacobians of the centers of :meth:`collision_spheres`, shape (m, 3, n_joints) [m/rad]."""
         return self.cover.jacobians(self.at(q).data)
 
     @property
@@ -272,12 +273,12 @@ class ArmModel(ArmKinematics):
         """Check that every moving link has a mass and an inertia, which torques and simulation need.
 
         Raises:
-            InputError: naming the links that do not, and their lines in the file.
+            InputError: if a link lacks one of them; the message names these links and their lines in the file.
         """
         if self._mass_faults:
             raise InputError(
-                f"{self.name}: {'; '.join(self._mass_faults)}. Kinematics needs neither, but torques and simulation "
-                f"need a mass and an inertia of every moving link: add them to the file (<inertial>)"
+                f"{self.name}: {'; '.join(self._mass_faults)}. Torques and simulation need the mass and inertia of "
+                "every moving link (kinematics does not); add them to the file (<inertial>)"
             )
 
     def gravity_torque(self, q: ArrayLike) -> Array:
@@ -325,7 +326,8 @@ class ArmModel(ArmKinematics):
             tolerance: accepted distance outside a limit [rad].
 
         Raises:
-            InputError: naming the first joint that is outside, its position and its limits.
+            InputError: if a joint is outside its limits; the message names the first such joint, its position and its
+                limits.
         """
         values, slack = self._checked(q, "q"), finite_number(tolerance, "tolerance", "rad", at_least=0.0)
         outside = (values < self.lower - slack) | (values > self.upper + slack)
@@ -350,9 +352,9 @@ class ArmModel(ArmKinematics):
 def _working_model(file: ArmFile, whole: mujoco.MjModel) -> mujoco.MjModel:
     """Return the model that kinematics and dynamics are computed with.
 
-    It has no shapes without mass, which reduces the time of its kinematics to a third. Joints that are not part of the
-    arm, such as those of fingers, are fixed at their position in ``file.home``: the Jacobians then have no other
-    columns. It has no rotor inertia.
+    Shapes without mass are left out, which makes the kinematics about three times as fast. Joints that are not part of
+    the arm, such as those of fingers, are fixed at their position in ``file.home``, so the Jacobians have columns only
+    for the arm's joints. The model has no rotor inertia.
     """
     spec = without_geoms(file.spec, _massless)
     for part in (*spec.actuators, *spec.equalities, *spec.tendons, *spec.sensors):
@@ -377,7 +379,7 @@ def _working_model(file: ArmFile, whole: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def _massless(geom: mujoco.MjsGeom) -> bool:
-    """Return whether leaving out ``geom`` changes no link's mass (an unspecified mass is nan)."""
+    """Return whether ``geom`` has no mass, so that it can be left out (an unspecified mass is nan)."""
     return bool(geom.density == 0.0 and not geom.mass > 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Reading an arm and its tool from MJCF or URDF files, packaged or of the user."""
+"""Read an arm and its tool from MJCF or URDF files: packaged files, or the user's own."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _PLACEHOLDER_MASS, _PLACEHOLDER_INERTIA = 1e-3, 1e-6  # [kg], [kg m^2] of a link
 
 @dataclass(frozen=True, eq=False)
 class ArmFile:
-    """The result of reading: a spec with the tool attached, and values that MuJoCo can't store.
+    """An arm as read from its file: a MuJoCo spec with the tool attached, and values that MuJoCo can't store.
 
     Attributes:
         name: name of the arm.
@@ -138,7 +138,12 @@ def read_arm(
         limits.torque,
         home,
         tool_radius,
-        (*notes, *limits.notes, *home_notes, *(f"{fault}: no torques and no simulation" for fault in faults)),
+        (
+            *notes,
+            *limits.notes,
+            *home_notes,
+            *(f"{fault}, so torques and simulation are not available" for fault in faults),
+        ),
         faults,
     )
 
@@ -224,8 +229,8 @@ def _check_sizes(model: mujoco.MjModel, path: Path, root: XmlElement) -> None:
                 lines = [e.line for e in root.walk() if name and e.get("name") == name]
                 what = f"{'joint' if kind == 'jnt' else kind} {name!r}{f' (line {lines[0]})' if lines else ''}"
                 raise FileFormatError(
-                    f"{path}: {field} of {what} is {values[index]}, which no robot has; correct it (lengths are in "
-                    "metres, masses in kilograms)"
+                    f"{path}: {field} of {what} is {values[index]}, which is not plausible for a robot; correct it "
+                    "(lengths are in metres, masses in kilograms)"
                 )
 
 
@@ -239,7 +244,7 @@ def _name_all(spec: mujoco.MjSpec) -> None:
 
 
 def _replace_unusable_masses(spec: mujoco.MjSpec, path: Path, root: XmlElement) -> tuple[str, ...]:
-    """Give links without a usable mass and inertia placeholders, so that the kinematics can be built.
+    """Insert placeholder values where a link has no usable mass or inertia, so that the kinematics can be built.
 
     Returns:
         A description of the fault for each such link.
@@ -277,7 +282,8 @@ def compiled(spec: mujoco.MjSpec, what: object) -> mujoco.MjModel:
     """Compile a copy of ``spec``.
 
     Raises:
-        FileFormatError: with MuJoCo's message and a remedy for the usual cause.
+        FileFormatError: when MuJoCo can't compile the spec; the message repeats MuJoCo's and adds a remedy for the
+            usual cause.
     """
     try:
         return spec.copy().compile()
@@ -289,7 +295,7 @@ def compiled(spec: mujoco.MjSpec, what: object) -> mujoco.MjModel:
 
 
 def _one_line(error: Exception) -> str:
-    """Return MuJoCo's message in one line, without its remark about the compiled copy."""
+    """Return MuJoCo's message in one line, without its remark that static bodies were fused."""
     return " ".join(str(error).split("The static bodies of the spec were fused")[0].split())
 
 
@@ -298,7 +304,7 @@ def _touches(geom: mujoco.MjsGeom) -> bool:
 
 
 def _separate_contact_shapes(spec: mujoco.MjSpec) -> None:
-    """Put every shape with contact into group 3; if a link has no visual shape, group 2 gets a copy."""
+    """Put every shape with contact into group 3, and copy it into group 2 if its link has no visual shape."""
     for body in spec.bodies:
         touching = [geom for geom in body.geoms if _touches(geom)]
         unseen = len(touching) == len(body.geoms)
@@ -342,8 +348,8 @@ def _set_flange(
     offsets = [float(np.linalg.norm(joint.parent.pos)) for joint in joints[1:]]
     if sum(offsets) > _LONGEST_ARM:
         raise FileFormatError(
-            f"{path}: the joints are {sum(offsets):.3g} m apart from first to last; lengths must be in "
-            "metres: are these millimetres?"
+            f"{path}: the offsets from the first joint to the last add up to {sum(offsets):.3g} m; lengths must be in "
+            "metres, so check whether the file uses millimetres"
         )
     return tuple(joint.name for joint in joints), notes
 

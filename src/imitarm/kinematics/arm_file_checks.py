@@ -1,4 +1,4 @@
-"""Checks of a robot file's own text, for what the engine would drop or read in another way without a message."""
+"""Check the text of a robot's file for entries that MuJoCo would drop or misread without a message."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _RANGES = ("range", "actuatorfrcrange", "ctrlrange", "forcerange")
 
 
 def check_file(path: Path, root: XmlElement) -> None:
-    """Reject a file that is no MJCF or URDF of an arm, and entries that the engine would not report.
+    """Reject a file that is not the MJCF or URDF of an arm, and faulty entries that MuJoCo would not report.
 
     Raises:
-        FileFormatError: naming the element, its line and the remedy.
+        FileFormatError: when an entry is faulty; the message names the element, its line and the remedy.
         InputError: when the base of the arm is not fixed.
     """
     _check_kind(path, root)
@@ -81,7 +81,7 @@ def _check_numbers(path: Path, root: XmlElement) -> None:
     """Reject attributes that are NaN or infinite, and limits that are not numbers.
 
     Raises:
-        FileFormatError: naming the joint, link or body around the attribute, and the line.
+        FileFormatError: when there is one; the message names the joint, link or body that it belongs to, and the line.
     """
     pending = [(root, "")]
     while pending:
@@ -113,7 +113,7 @@ def _numbers(value: str) -> list[float]:
 
 
 def _check_names(path: Path, root: XmlElement) -> None:
-    """Reject joints and links of the same name, and a mimic joint whose leader does not exist."""
+    """Reject duplicate names of joints or links, and a mimic joint whose leader does not exist."""
     if root.tag == "robot":
         elements = [*root.all("link"), *root.all("joint")]
     else:
@@ -136,7 +136,7 @@ def _check_names(path: Path, root: XmlElement) -> None:
 
 
 def _check_ranges(path: Path, root: XmlElement) -> None:
-    """Reject ranges of an MJCF file whose first number is above the second; the engine ignores such a range."""
+    """Reject ranges of an MJCF file whose lower bound is above the upper bound; MuJoCo ignores such a range."""
     for element in root.walk() if root.tag == "mujoco" else ():
         for key in _RANGES:
             numbers = _numbers(element.get(key))
@@ -149,12 +149,12 @@ def _check_ranges(path: Path, root: XmlElement) -> None:
 
 
 def check_key_lengths(n_positions: int, path: Path, root: XmlElement) -> None:
-    """Reject a keyframe with another number of positions than the model, which the engine would fill up."""
+    """Reject a keyframe whose number of positions differs from the model's, which MuJoCo would silently fill up."""
     for key in (e for e in root.walk() if e.tag == "key"):
         n = len(_numbers(key.get("qpos")))
         if n not in (0, n_positions):
             raise FileFormatError(
-                f"{path}: keyframe {key.get('name')!r} (line {key.line}) has {n} positions, the model has "
+                f"{path}: keyframe {key.get('name')!r} (line {key.line}) has {n} positions, but the model has "
                 f"{n_positions}; give one for each joint, or remove the keyframe"
             )
 
@@ -163,7 +163,7 @@ def check_units(model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root
     """Reject limits of hinges that are degrees read as radians, or radians read as degrees.
 
     Raises:
-        FileFormatError: naming a joint and its line.
+        FileFormatError: when the limits are in the wrong unit; the message names a joint and its line.
     """
     limited = [
         name for name in joints if model.joint(name).type[0] == HINGE and model.jnt_limited[model.joint(name).id]
@@ -175,7 +175,7 @@ def check_units(model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root
             remedy = "convert them to radians" if root.tag == "robot" else 'write <compiler angle="degree"/>'
             free = "make it continuous" if root.tag == "robot" else "leave out its range"
             raise FileFormatError(
-                f"{place(path, root, name)}: limits {low:g} to {high:g} rad are {(high - low) / math.tau:.0f} "
+                f"{place(path, root, name)}: limits {low:g} to {high:g} rad span {(high - low) / math.tau:.0f} full "
                 f"rotations; if they are degrees, {remedy}; if the joint has no limits, {free}"
             )
         widest = max(widest, float(high - low))

@@ -25,7 +25,7 @@ _ROTATION_LENGTH = 0.3  # [m/rad] a rotation of 1 rad counts as much as a displa
 def usable_posture(
     model: mujoco.MjModel, joints: tuple[str, ...], home: Mapping[str, float]
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return the middle of the ranges if it is a usable posture, else the best of many, and notes.
+    """Return the middle of the joints' ranges if that posture is usable, else the best of many postures, and notes.
 
     Args:
         model: a compiled model with a site ``flange``.
@@ -89,9 +89,11 @@ class _HomeSearch:
     def bend(self, q: Array) -> float:
         """Return a measure of the distance of a posture from a singularity [m/rad]; 0 at a singularity.
 
-        It is the smallest singular value of the flange's Jacobian, whose rotations are weighted by 0.3 m, and of its
-        linear part: an arm with few joints may lose a direction while it can still rotate. Singular values that are 0
-        in every posture are ignored: an arm with three joints can't move its flange in all directions.
+        The measure is the smaller of two values: the smallest singular value of the flange's Jacobian, with rotations
+        weighted by 0.3 m, and the smallest singular value of its linear part. The linear part counts separately because
+        an arm with few joints may be unable to move in a direction although it can still rotate. Singular values that
+        are 0 in every posture are ignored, because an arm with three joints can never move its flange in all
+        directions.
         """
         return min(float(values[rank - 1]) for values, rank in zip(self._singular_values(q), self._ranks, strict=True))
 
@@ -104,7 +106,7 @@ class _HomeSearch:
         return np.linalg.svd(linear, compute_uv=False), np.linalg.svd(stacked, compute_uv=False)
 
     def score(self, q: Array) -> float:
-        """Return a score of a home posture: higher far from singularities and limits and above the base."""
+        """Return a score of a home posture, which is higher far from singularities and limits and above the base."""
         bend = self.bend(q)
         margin = float(np.min(np.minimum(q - self._low, self._high - q) / (self._high - self._low)))
         below = self._data.site_xpos[self._flange, 2] < 0.0

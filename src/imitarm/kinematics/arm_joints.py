@@ -65,10 +65,9 @@ class _Limb:
 def arm_end(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjsBody, list[str]]:
     """Return the last body of the only arm in ``spec``, and notes on the bodies that were left out.
 
-    An arm ends before jaws and fingers: joints with such names, parallel joints coupled to each other (mimic
-        joints), a short slide at the end, or several short chains that branch off at the end of a longer one. A short
-        branch next to a much
-    longer chain (such as a head or a wheel) is left out.
+    The arm ends before the jaws or fingers of a hand. These are joints with such names, parallel joints coupled to each
+    other (mimic joints), a short slide at the end, or several short chains that branch off at the end of a longer
+    chain. A short branch next to a much longer chain (such as a head or a wheel) is left out.
 
     Raises:
         InputError: when no joint moves a body, or when several chains could be the arm; the message lists them.
@@ -99,7 +98,7 @@ def arm_end(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjsBody, list[str]]
 
 
 def _limbs(body: mujoco.MjsBody, before: tuple[str, ...], hand: frozenset[str], notes: list[str]) -> list[_Limb]:
-    """Return the chains that could be an arm and that pass through ``body``; ``before`` holds the joints before it."""
+    """Return the chains that could be an arm and that pass through ``body``; ``before`` are the joints below it."""
     own = [joint.name for joint in body.joints]
     if hand.intersection(own):
         return []
@@ -127,7 +126,7 @@ def _limbs(body: mujoco.MjsBody, before: tuple[str, ...], hand: frozenset[str], 
 
 
 def _last_fixed(body: mujoco.MjsBody) -> mujoco.MjsBody:
-    """Follow fixed links from the last moving link while there is only one, or one is named tool0 or flange."""
+    """Follow fixed links from the last moving link while the next is the only one, or one is named tool0 or flange."""
     while True:
         fixed = [child for child in body.bodies if not list(child.joints)]
         named = [child for child in fixed if _END_LINK.search(child.name)]
@@ -214,7 +213,7 @@ def check_joints(spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], path: Path,
     """Reject joints that an arm can't have: joints other than hinges and slides, and coupled joints.
 
     Raises:
-        InputError: naming the joint and its line.
+        InputError: when there is such a joint; the message names it and its line.
     """
     names = [joint.name for joint in joints]
     for joint in joints:
@@ -233,9 +232,10 @@ def check_joints(spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], path: Path,
     for follower, leader in mimics(spec):
         if follower in names or leader in names:
             raise InputError(
-                f"{place(path, root, follower)} mimics joint {leader!r}, but imitarm moves every joint of an arm on "
-                "its own. Remove the coupling (<mimic> or <equality>) if the robot takes a command for each of the two "
-                "joints; else name a flange before them with flange=... (--flange on the command line)"
+                f"{place(path, root, follower)} mimics joint {leader!r}, but imitarm commands every joint of an arm "
+                "separately. If the robot takes a command for each of the two joints, remove the coupling (<mimic> or "
+                "<equality>); otherwise name a flange between the base and these joints with flange=... (--flange on "
+                "the command line)"
             )
 
 
@@ -261,7 +261,7 @@ def read_limits(
         root: the elements of the file itself, which include values that MuJoCo drops from a URDF.
 
     Raises:
-        FileFormatError: naming the joint and its line.
+        FileFormatError: when a limit can't be used; the message names the joint and its line.
     """
     scale = np.array([1.0 if model.joint(name).type[0] == HINGE else 0.1 for name in joints])
     velocity, acceleration = np.full(len(joints), np.nan), DEFAULT_MAX_ACCELERATION * scale
@@ -296,7 +296,7 @@ def read_limits(
         velocity = np.where(np.isnan(velocity), DEFAULT_MAX_VELOCITY * scale, velocity)
     if np.isinf(torque).any():
         free = [name for name, value in zip(joints, torque, strict=True) if np.isinf(value)]
-        notes.append(f"no torque limit in the file for {_located(free, joints, root)}: taken as unlimited")
+        notes.append(f"no torque limit in the file for {_located(free, joints, root)}: assumed to be unlimited")
     return FileLimits(velocity, acceleration, torque, tuple(notes))
 
 
@@ -360,7 +360,7 @@ def _torque_limit(model: mujoco.MjModel, name: str) -> float:
 
 
 def _located(names: list[str], all_names: tuple[str, ...], root: XmlElement) -> str:
-    """Return the names of joints with their lines, or "all joints" when the list is complete."""
+    """Return the names of joints with their lines, or "all joints" if no joint is missing."""
     if len(names) == len(all_names):
         return "any joint"
     lines = {e.get("name"): e.line for e in reversed(list(root.walk())) if e.tag == "joint"}
@@ -375,7 +375,7 @@ def _listed(names: list[str]) -> str:
 
 
 def take_keyframe(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[dict[str, float], str]:
-    """Return positions by joint of the keyframe ``home``, else of the first keyframe, and its name.
+    """Return the joint positions of the keyframe ``home``, else of the first keyframe, and the name of that keyframe.
 
     Remove all keyframes.
     """
@@ -398,7 +398,8 @@ def check_keyframe(
     """Reject a keyframe outside the limits of the arm's joints.
 
     Raises:
-        FileFormatError: naming the keyframe, its line, the joint and its limits.
+        FileFormatError: when a joint is outside its limits; the message names the keyframe, its line, the joint and its
+            limits.
     """
     for joint in joints:
         index = model.joint(joint).id
@@ -418,10 +419,10 @@ def complete_home(
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return a position for every joint of ``model``, and notes on the choice.
 
-    Joints with given values keep them. A tool's fingers are open; other joints that do not belong to the arm are
-    in the middle of their ranges; coupled joints follow their leader. The arm's own joints are in the middle
-    of their ranges too where that is a usable posture: away from singularities and with the links apart. Otherwise
-        the best of many postures is taken.
+    A joint in ``given`` keeps its position from there. A tool's fingers are open, other joints that do not belong to
+    the arm are in the middle of their ranges, and coupled joints follow their leader. The arm's own joints are also in
+    the middle of their ranges if that posture is not singular and its links are apart. Otherwise the function chooses
+    the best of many postures.
     """
     home: dict[str, float] = {}
     for index in range(model.njnt):

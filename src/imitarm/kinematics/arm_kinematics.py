@@ -38,15 +38,15 @@ _MOST_RESTARTS = 100_000
 class Landmarks:
     """Shoulder, elbow and wrist of an arm, defined by the sites of these names, and the joints at elbow and wrist.
 
-    The site ``elbow`` is on the link that the elbow's joint moves, the site ``wrist`` on the link that the bending
+    The site ``elbow`` is on the link that the elbow joint moves. The site ``wrist`` is on the link that the bending
     joint of the wrist moves.
 
     Attributes:
         sites: indices of the three sites.
-        elbow: index of the elbow's joint among the arm's.
-        wrist: index of the joint that bends the wrist among the arm's.
-        elbow_straight: position of the elbow's joint at which the arm is stretched and singular [rad], from the
-            file's ``<custom><numeric name="elbow_straight" data="..."/></custom>``, else 0.
+        elbow: index of the elbow joint among the arm's joints.
+        wrist: index of the joint that bends the wrist among the arm's joints.
+        elbow_straight: position of the elbow joint at which the arm is stretched and singular [rad], from the file's
+            ``<custom><numeric name="elbow_straight" data="..."/></custom>``, else 0.
     """
 
     sites: tuple[int, int, int]
@@ -91,7 +91,8 @@ class ArmMemory:
             home: positions of all joints, including fingers, shape (nq,).
             positions: indices of the arm's joints in qpos.
             joints: indices of the arm's joints in qvel.
-            landmarks: sites whose positions :meth:`landmarks` returns, and whose Jacobians :meth:`landmark_jacobians`.
+            landmarks: sites for which :meth:`landmarks` returns positions and :meth:`landmark_jacobians` returns
+                Jacobians.
         """
         self.data = mujoco.MjData(model)
         self.data.qpos[:] = home
@@ -301,7 +302,7 @@ class ArmKinematics:
 
 
 def _columns(indices: NDArray[np.int32]) -> Columns:
-    """Return consecutive indices as a slice, which is several times faster."""
+    """Return consecutive indices as a slice, because slicing an array is several times faster."""
     first = int(indices[0])
     return slice(first, first + len(indices)) if np.all(np.diff(indices) == 1) else indices
 
@@ -334,7 +335,7 @@ def find_posture(
         shape (n_joints,) [rad]; position within 1e-6 m and rotation within 1e-6 rad.
 
     Raises:
-        UnreachableError: naming the pose and the error of the best posture.
+        UnreachableError: if no posture reaches the pose; the message names the pose and the error of the best posture.
         UnknownNameError: if the frame is not known.
         InputError: if another argument can't be used.
     """

@@ -150,12 +150,12 @@ def _remedy(file: str, folder: Path, places: list[Path]) -> str:
     if file.startswith(("package:", "model:")):
         name = file.partition(":")[2].lstrip("/").partition("/")[0]
         return (
-            f"No package {name!r} that holds it lies above or beside {folder}, in package_path or in ROS_PACKAGE_PATH. "
-            f"Say where the package is with package_path=... (--package-path FOLDER on the command line), or leave all "
-            "meshes out with discard_meshes=True (--discard-meshes)"
+            f"No package {name!r} with this mesh was found above or beside {folder}, in package_path or in "
+            "ROS_PACKAGE_PATH. Say where the package is with package_path=... (--package-path FOLDER on the command "
+            "line), or leave all meshes out with discard_meshes=True (--discard-meshes)"
         )
     looked = ", ".join(dict.fromkeys(str(place) for place in places))
     return (
-        f"It was looked for at {looked}. Put it there, name its folder with package_path=... (--package-path FOLDER on "
-        "the command line), or leave all meshes out with discard_meshes=True (--discard-meshes)"
+        f"The mesh was searched for at {looked}. Put it there, name its folder with package_path=... (--package-path "
+        "FOLDER on the command line), or leave all meshes out with discard_meshes=True (--discard-meshes)"
     )

@@ -1,6 +1,7 @@
 """Inverse kinematics with damping: damped least squares, and the filtered singular value decomposition.
 
-:class:`~imitarm.kinematics.ik.IKSolver` explains these methods. They take one task for the tool, and boxes.
+:class:`~imitarm.kinematics.ik.IKSolver` explains these methods. They accept one task for the tool, and as limits only
+bounds on each joint velocity (boxes).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _EYE = np.eye(6)
 
 
 def damped_least_squares(problem: IKProblem) -> Array:
-    """Solve thesis Eq 3.8 and 3.9: the least isotropic damping that keeps the joint speeds in bounds."""
+    """Solve thesis Eq 3.8 and 3.9 with the smallest isotropic damping that keeps the joint speeds within limits."""
     scaled, target, _ = problem.tasks[0]
     length = math.hypot(*target.tolist())
     gram = scaled.dot(scaled.T)
@@ -65,7 +66,7 @@ def _is_above(gram: Array, bound: float) -> bool:
 
 
 def _undamped(problem: IKProblem, gram: Array) -> Array:
-    """Solve without damping; no joint can then be too fast, since the norm is at most 1 in scaled joints."""
+    """Solve without damping; no joint is too fast, because the norm of the scaled velocity is at most 1."""
     jacobian, target, _ = problem.tasks[0]
     along = np.empty(6)
     mujoco.mju_cholFactor(gram, 0.0)

@@ -41,7 +41,7 @@ class IKStep:
 
     Attributes:
         velocity: velocity of the joints, shape (n_joints,) [rad/s].
-        missing: target minus result of each task, in the weighted units of the task.
+        missing: target velocity minus achieved velocity of each task, in the weighted units of the task.
         limited: whether each joint velocity is at a bound of the box, shape (n_joints,) bool.
         slack: violation of each row, shape (m,); 0 where the row holds.
     """
@@ -61,16 +61,16 @@ class IKSolver:
               + \sum_j \tfrac{c_j}2 \max(0, b_j - A_j v)^2 / |A_j|^2
 
     where each task has a Jacobian :math:`J_i` and a target :math:`t_i`, :math:`v_p` is the previous velocity, and the
-    rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite price are kept
-    whenever the boxes allow it. If the boxes do not allow it, the sum of the squared violations, in rad/s along each
-    row, is minimised first, and the tasks have second priority. The other methods take one
-    :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one :class:`~imitarm.kinematics.tasks.PostureTask`, and
+    rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite price are hard
+    constraints: they are kept whenever the boxes allow it. If the boxes do not allow it, the sum of the squared
+    violations, in rad/s along each row, is minimised first, and the tasks have second priority. The other methods take
+    one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one :class:`~imitarm.kinematics.tasks.PostureTask`, and
     boxes:
 
     * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9): in joints scaled by their velocity limits
       :math:`v = J^T (J J^T+\lambda^2)^{-1} t`, with :math:`\lambda=0` for :math:`s_{min}\ge d`,
-      :math:`\lambda^2=s_{min}(d-s_{min})` for :math:`d/2\le s_{min}<d` and :math:`\lambda=d/2` below, :math:`d=|t|`.
-      This keeps the norm of the scaled velocity at most 1.
+      :math:`\lambda^2=s_{min}(d-s_{min})` for :math:`d/2\le s_{min}<d` and :math:`\lambda=d/2` for smaller
+      :math:`s_{min}`, where :math:`d=|t|`. This keeps the norm of the scaled velocity at most 1.
     * ``"dls_small_angle"``: the same with half of the smallest singular value subtracted from d, as the thesis prints
       after Eq 3.9; this weakens the damping and is kept for comparison.
     * ``"svd"``, numerical filtering (Maciejewski and Klein 1988):
@@ -102,7 +102,7 @@ class IKSolver:
         )
         if method != "qp" and any(limit.soft for limit in self.limits):
             soft = ", ".join(type(limit).__name__ for limit in self.limits if limit.soft)
-            raise InputError(f"IKSolver: method {method!r} can't keep {soft}; use method='qp', or leave it out")
+            raise InputError(f"IKSolver: method {method!r} can't keep {soft}; use method='qp', or leave this limit out")
         self._solve = METHODS[method]
         self._max_speed = _MAX_SPEED[method]
         self._scaled = method.startswith("dls")
@@ -138,7 +138,7 @@ class IKSolver:
         velocity: ArrayLike | None = None,
         rows: Rows | Sequence[Rows] | None = None,
     ) -> IKStep:
-        """Solve like :meth:`solve`, and also report unmet tasks and limits; same arguments and errors."""
+        """Solve like :meth:`solve`, with the same arguments and errors, and also report unmet tasks and limits."""
         problem = self.problem(q, tasks, velocity=velocity, rows=rows)
         result = self._solve(problem)
         counted = result / self.arm.max_velocity if self._scaled else result
@@ -208,7 +208,7 @@ class IKSolver:
             if wanted is not None:
                 problem.tasks.append(wanted)
         if not problem.tasks:
-            raise InputError("solve_ik: no task has rows; put a TwistTask first")
+            raise InputError("solve_ik: none of the tasks sets a velocity; put a TwistTask first")
 
     def _checked_rows(self, rows: Rows | Sequence[Rows]) -> list[Rows]:
         given: Sequence[Rows] = (rows,) if isinstance(rows, Rows) else rows
@@ -286,7 +286,7 @@ def _solver(arm: ArmModel, dt: float, method: str) -> IKSolver:
 
 
 def quadratic_program(problem: IKProblem) -> Array:
-    """Minimise the weighted error of the tasks inside the box and under the rows."""
+    """Minimise the weighted error of the tasks subject to the box and the rows."""
     jacobian, target, thrift = problem.tasks[0]
     if len(problem.tasks) > 1:
         jacobian, target = _stacked(problem.tasks)
@@ -337,7 +337,7 @@ def _sorted_rows(rows: list[Rows]) -> tuple[Array | None, Array | None, Sequence
 
 
 def _least_cost(box: Box, matrix: Array | None, least: Array | None, hessian: Array, linear: Array) -> Array:
-    """Minimise v^T H v / 2 - f^T v inside the box and under the rows, exactly."""
+    """Minimise v^T H v / 2 - f^T v exactly, subject to the box and the rows."""
     free = _unconstrained(box, matrix, least, hessian, linear)
     if free is not None:
         return free
@@ -364,7 +364,7 @@ def _least_cost(box: Box, matrix: Array | None, least: Array | None, hessian: Ar
 
 
 def _least_violation(box: Box, matrix: Array, least: Array) -> tuple[Array, Array]:
-    """Return a velocity that violates contradictory rows least (sum of squares), and the bounds that it keeps.
+    """Return the velocity with the least squared violation of contradictory rows, and the bounds that it satisfies.
 
     Each row gets a slack variable. daqp's own soft constraints need no slack variables, but at active bounds their
     solutions violate rows that could be kept (observed with version 0.11).
@@ -381,7 +381,7 @@ def _least_violation(box: Box, matrix: Array, least: Array) -> tuple[Array, Arra
 
 
 def _unconstrained(box: Box, matrix: Array | None, least: Array | None, hessian: Array, linear: Array) -> Array | None:
-    """Return the unconstrained minimum if it keeps all limits, as in most steps; this takes half the time."""
+    """Return the unconstrained minimum if it keeps all limits, as it does in most steps; None otherwise."""
     factor, velocity = hessian.copy(), np.empty(len(linear))
     if mujoco.mju_cholFactor(factor, _NULL) < len(linear):
         return None

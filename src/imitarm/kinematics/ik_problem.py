@@ -30,11 +30,10 @@ class Box(NamedTuple):
 class Rows(NamedTuple):
     """Linear inequalities on the joint velocity, ``matrix @ v >= lower``.
 
-    With a finite price, a row a that is violated by s costs ``price * (s / |a|)^2 / 2`` beside the tasks, whose weight
-    is about 1. The cost depends on the joint velocity [rad/s] that is missing along the row, not on the unit of the
-    row.
-    Without a finite price, rows have priority over all tasks: they are violated only if they contradict the boxes
-        or one another.
+    With a finite price, violating a row ``a`` by ``s`` adds ``price * (s / |a|)^2 / 2`` to the cost; the weights of the
+    tasks are about 1. The cost depends on the joint velocity [rad/s] that is missing along the row, not on the unit of
+    the row. Without a finite price, rows have priority over all tasks: they are violated only if they contradict the
+    boxes or one another.
 
     Attributes:
         matrix: coefficients of the inequalities, shape (m, n_joints).
@@ -69,10 +68,10 @@ class IKProblem:
         arm: the arm.
         memory: kinematics of the arm at ``q``.
         q: joint positions, shape (n_joints,) [rad].
-        velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: unknown, accelerations are not
-            limited.
+        velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: unknown, so accelerations are
+            not limited.
         dt: length of the control step [s].
-        box: hard bounds of the joint velocity; before the limits are applied, the arm's velocity limits.
+        box: hard bounds of the joint velocity; initially the arm's velocity limits, which the limits then narrow.
         tasks: rows of the tasks; the tool's rows come first.
         rows: soft inequalities.
         max_speed: largest norm of a twist, for tasks without their own limit [m/s].
@@ -94,5 +93,5 @@ class IKProblem:
 
     @property
     def moving(self) -> bool:
-        """Whether the target of the tool's task is not zero; True before it is known."""
+        """Whether the tool's task has a nonzero target; True as long as the target is unknown."""
         return not self.tasks or bool(self.tasks[0].target.any())

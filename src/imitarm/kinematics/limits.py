@@ -44,14 +44,15 @@ class Limit(ABC):
 class JointLimits(Limit):
     r"""Position, velocity and acceleration limits of the joints, as a box that is never empty.
 
-    With D the distance to the upper position limit and a the acceleration limit, a joint that must still be able to
-    stop in time may move at
+    Let D be the distance to the upper position limit and a the acceleration limit. A joint can stop before the position
+    limit only if its velocity is at most
 
     .. math:: v_b(D) = -a\,dt + \sqrt{a^2 dt^2 + 2 a D},
 
     the solution of :math:`v^2/(2a) + v\,dt = D`. The upper bound is :math:`\min(v_{max},\; v_p + a\,dt,\;
     \max(v_b(D),\, v_p - a\,dt))` where :math:`v_p` is the previous velocity; the lower bound is its mirror image. If
-    :math:`v_p` met this bound one step ago, braking with a meets it now, so the box is never empty.
+    :math:`v_p` satisfied this bound in the previous step, braking with a satisfies it in this step. The box is
+    therefore never empty.
 
     The bound assumes that the joint moves by :math:`v\,dt` in one step. A robot with constant acceleration moves by
     :math:`(v_p + v)\,dt/2`; ``imitarm.robots.limit_velocity`` therefore evaluates this box at :math:`q + v_p\,dt/2`.
@@ -130,11 +131,11 @@ class _VelocityBox:
 
 
 class ElbowSingularityLimit(Limit):
-    """Keeps the elbow 0.15 rad away from its stretched position, on the side where it is.
+    """Keeps the elbow 0.15 rad away from its stretched position, on the side on which it currently is.
 
-    Where the upper arm and the forearm of an SRS arm are in line, the shoulder-wrist distance can't change any
-    faster: the arm is singular. The margin acts like an additional position limit of the elbow joint (see
-    :class:`JointLimits`). An arm that starts inside the margin can only move out of it.
+    An SRS (spherical-rotational-spherical) arm is singular where its upper arm and forearm are in line, because the
+    elbow then can't change the distance between shoulder and wrist. The margin acts like an additional position limit
+    of the elbow joint (see :class:`JointLimits`). An arm that starts inside the margin can only move out of it.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.
@@ -179,11 +180,11 @@ class ElbowSingularityLimit(Limit):
 class WristSingularityLimit(Limit):
     r"""Softly keeps the wrist joint at least 0.1 rad away from its singular positions.
 
-    The wrist is singular where the axes before and after its joint are parallel, at every multiple of pi. If the joint
-    is farther than 0.1 rad from the nearest such multiple, let D be the excess. The joint's velocity away from the
-    multiple must be at least :math:`-v_b(D)` (see :class:`JointLimits`), or 5/s times the missing distance if the joint
-    is closer than 0.1 rad. The price of a violation is low, so that the wrist can rotate through a singular position if
-    necessary.
+    The wrist is singular at every multiple of pi, because the joint axes before and after the wrist joint are parallel
+    there. If the joint is farther than 0.1 rad from the nearest such multiple, let D be the excess. The joint's
+    velocity away from the multiple must be at least :math:`-v_b(D)` (see :class:`JointLimits`), or 5/s times the
+    distance missing to 0.1 rad if the joint is closer than that. The price of a violation is low, so that the wrist can
+    rotate through a singular position if necessary.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.

@@ -1,8 +1,8 @@
 """Positions and rotations: quaternions (w, x, y, z) as arrays, and the typed :class:`Pose`.
 
 All functions take and return arrays with any leading shape and are vectorised over it. They do not check their
-arguments; :class:`Pose` does. Single rotations are computed with plain floats, which is faster than numpy for an array
-of four; a control step needs many of them.
+arguments; :class:`Pose` does. A single rotation is computed with plain floats, because a control step computes many
+rotations and floats are faster than a numpy array of four numbers.
 
 Rotation vectors (axis times angle) are in rad. Twists have shape (6,): linear velocity [m/s] first, then angular
 velocity [rad/s], both in the base frame.
@@ -96,8 +96,8 @@ def quaternion_to_matrix(q: ArrayLike) -> Array:
 def matrix_to_quaternion(matrix: ArrayLike) -> Array:
     """Return unit quaternions wxyz (..., 4), w >= 0, of rotation matrices (..., 3, 3).
 
-    Uses the largest column of the 4x4 matrix ``4 q q^T``, so it is well conditioned at every angle
-    (the usual trace formula loses all digits near 180 degrees).
+    The function uses the largest column of the 4x4 matrix ``4 q q^T``, so it is well conditioned at every angle (the
+    usual trace formula loses all digits near 180 degrees).
     """
     m = np.asarray(matrix, dtype=float)
     if m.ndim == 2:
@@ -184,7 +184,7 @@ def slerp(times: ArrayLike, key_times: ArrayLike, key_quaternions: ArrayLike) ->
 
 
 def mean_quaternion(quaternions: ArrayLike) -> Array:
-    """Return the rotation (4,) wxyz that is nearest to all ``quaternions`` (n, 4), signs ignored.
+    """Return the rotation (4,) wxyz that is nearest to all ``quaternions`` (n, 4), whose signs do not matter.
 
     It is the eigenvector of the largest eigenvalue of ``sum q q^T`` (Markley et al. 2007).
     """
@@ -251,7 +251,7 @@ class Pose:
 
     @classmethod
     def trusted(cls, position: Array, quaternion: Array) -> Pose:
-        """Build without checks, which take too long in control steps; the caller must not use the arrays afterwards.
+        """Build a pose without checks, to save time in control steps; the caller must not use the arrays afterwards.
 
         Args:
             position: shape (3,) [m]; from now on read-only.

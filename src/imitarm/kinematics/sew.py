@@ -1,10 +1,11 @@
 r"""The shoulder-elbow-wrist angle: the position of the elbow on its circle about the line from shoulder to wrist.
 
-The elbow of an arm with seven joints can move while the hand is at rest; one angle describes its position, for a person
-and for a robot. It is measured from a reference direction, and every choice of that direction has a singularity (Elias
-and Wen 2024). The ``"conventional"`` angle, measured from a fixed vector v, is undefined when the wrist is on the line
-through the shoulder along v. The ``"stereographic"`` angle is undefined only on one half of such a line, which can be
-placed where the wrist never is. Here it points behind the base.
+The elbow of an arm with seven joints can move while the hand is at rest. One angle describes the elbow's position, both
+for a person and for a robot. This angle is measured from a reference direction, and for every choice of that direction
+there are wrist positions at which the angle is undefined (Elias and Wen 2024). The ``"conventional"`` angle, measured
+from a fixed vector v, is undefined when the wrist is on the line through the shoulder along v. The ``"stereographic"``
+angle is undefined only when the wrist is on one half of such a line. This half-line can be placed where the wrist never
+is: here it points backwards, behind the base.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ def sew_angle(
     r"""Return the angle of the elbow about the line from shoulder to wrist.
 
     Let :math:`\hat w` be the direction from shoulder to wrist, e the direction from shoulder to elbow, :math:`e_t` the
-    direction behind the base and :math:`e_r` up. Then the stereographic angle is measured from :math:`e_x`:
+    backward direction (-x) and :math:`e_r` the upward direction (z). Then the stereographic angle is measured from
+    :math:`e_x`:
 
     .. math::
         k_r = (\hat w - e_t) \times e_r, \quad k_x = k_r \times (W - S), \quad e_x = k_x / |k_x|, \quad
@@ -138,7 +140,7 @@ def one_angle(
 
 
 def _stereographic(m: Any, e: Vector, w: Vector) -> SewAngle:
-    """Return value and derivatives; for e_t = -x and e_r = z, many products are single terms."""
+    """Return the angle and its derivatives, with the products simplified for e_t = -x and e_r = z."""
     # written out without _dot and _cross, whose calls would take a third of the time
     (e0, e1, e2), (w0, w1, w2) = e, w
     length = m.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
@@ -168,7 +170,7 @@ def _stereographic(m: Any, e: Vector, w: Vector) -> SewAngle:
 
 
 def _conventional(m: Any, e: Vector, w: Vector) -> SewAngle:
-    """Return value and derivatives of the conventional angle, which is measured from a fixed direction."""
+    """Return the conventional angle, which is measured from a fixed direction, and its derivatives."""
     length = m.sqrt(_dot(w, w))
     along = _times(1.0 / length, w)
     to_wrist, to_up = _dot(along, e), _dot(along, UP)

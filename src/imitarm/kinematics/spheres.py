@@ -90,8 +90,8 @@ class SphereCover:
     def speeds(self, data: mujoco.MjData, spheres: NDArray[np.int_], centers: Array, normals: Array) -> Array:
         """Return how fast each joint moves chosen spheres along chosen directions, shape (k, n_joints) [m/rad].
 
-        MuJoCo stores a joint's twist about the centre of mass ``o`` as ``(w, v)``; it moves ``c`` along ``n`` by
-        ``n.(v + w x (c - o)) = n.v + w.((c - o) x n)``.
+        MuJoCo stores the twist ``(w, v)`` of each joint about the centre of mass ``o``. This twist moves a point ``c``
+        along ``n`` at the rate ``n.(v + w x (c - o)) = n.v + w.((c - o) x n)``.
 
         Args:
             data: the kinematics of a posture.
@@ -117,7 +117,8 @@ class SphereCover:
         """Return the gradients of the distances of pairs of spheres, shape (k, n_joints) [m/rad].
 
         A joint that moves both spheres does not change their distance. A joint with axis a through the point o that
-        moves only the outer sphere, with center c, changes the distance by n (a x (c - o)) = a (c x n) - n (a x o).
+        moves only the outer sphere, with center c, changes the distance by n (a x (c - o)) = a (c x n) - n (a x o) per
+        radian, where n is the unit vector from the inner to the outer sphere.
 
         Args:
             data: the kinematics of a posture.
@@ -164,7 +165,7 @@ def _carries(model: mujoco.MjModel, carrier: int, body: int) -> bool:
 
 
 def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:
-    """Cover one geom with equal spheres: every point of the geom is inside one of them.
+    """Cover one geom with equal spheres: every point of the geom is inside at least one sphere.
 
     Round bars (capsule, cylinder, ellipsoid) are covered by a row of spheres, all other shapes (box, bounding box of a
     mesh) by a grid of spheres.
@@ -212,7 +213,7 @@ def _row(axis: int, half_length: float, radius: float) -> tuple[Array, float]:
 
 
 def _cylinder(half_length: float, radius: float) -> tuple[Array, float]:
-    """Cover a cylinder about z: slices, each inside the sphere through its two rims."""
+    """Cover a cylinder about z: cut it into slices, each of which is inside the sphere through its two rims."""
     n = _pieces(half_length, radius)
     centers = np.zeros((n, 3))
     centers[:, 2] = half_length * (2.0 * np.arange(n) + 1.0 - n) / n

@@ -46,9 +46,8 @@ class TwistTask(NamedTuple):
     r"""Move the tool (or the flange) with a twist.
 
     A rotation of 1 rad is weighted like a displacement of ``rotation_length``. A twist whose weighted norm exceeds
-    ``max_speed`` is
-    scaled down: without this, damped least squares stops short of its target, because its damping grows with the error
-        (thesis Eq 3.9).
+    ``max_speed`` is scaled down. Without this, damped least squares would stop short of its target, because its damping
+    grows with the error (thesis Eq 3.9).
 
     Attributes:
         twist: desired velocity in the base frame, linear rows first, shape (6,) [m/s, rad/s].
@@ -106,10 +105,10 @@ class JointVelocityTask(NamedTuple):
 
 
 class PostureTask(NamedTuple):
-    """Drift towards a posture in the freedom that the other tasks leave: :math:`v = k (q_{ref} - q)`.
+    """Drift towards a posture with the joint motion that the other tasks leave free: :math:`v = k (q_{ref} - q)`.
 
     Attributes:
-        q: joint positions to drift to, shape (n_joints,) [rad].
+        q: joint positions of that posture, shape (n_joints,) [rad].
         gain: k [1/s].
         weight: weight of this task [m^2]; the weight of a twist is 1.
     """
@@ -133,16 +132,17 @@ class PostureTask(NamedTuple):
 class ElbowTask(NamedTuple):
     r"""Rotate the elbow to an SEW angle without affecting the task of the tool.
 
-    The elbow moves by the self-motion: the unit vector n along :math:`(I - J^+ J) J_\psi^T`, which does not move the
-    tool (the first task, with Jacobian J and target e). The task adds :math:`\tfrac{w}2\,(n^T v - s)^2` with
+    The elbow moves by the arm's self-motion, a joint motion that does not move the tool. Its unit vector n points along
+    :math:`(I - J^+ J) J_\psi^T`, where J is the Jacobian of the tool's task (the first task) and e the target of that
+    task. The elbow task adds :math:`\tfrac{w}2\,(n^T v - s)^2` with
 
     .. math:: s = c\,\min(1, 10\sin^2\!\beta)\;\frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
 
     where :math:`\psi` is the arm's :func:`~imitarm.kinematics.sew.sew_angle` and :math:`\beta` the angle at its elbow.
     The elbow's speed goes to zero as the arm becomes straight, and near the one direction in which the stereographic
     angle is undefined. From one step to the next, s changes by at most half of the change that the joints'
-    accelerations allow. As long as no limit is active, this does not affect the tool, whatever the weight. At the
-    limits the weight decides.
+    accelerations allow. As long as no limit is active, the task does not affect the tool, whatever its weight. When a
+    limit is active, the weights decide between the tool's task and the elbow's.
 
     Attributes:
         angle: desired SEW angle :math:`\psi_h` [rad].
@@ -235,7 +235,7 @@ def _root(weight: float, task: str) -> float:
 def _scales(
     rotation_length: float | tuple[float, float, float], frame: str, arm: ArmModel, scaled: bool
 ) -> tuple[Array, Array, float, int]:
-    """Return the weights of a twist (6,), the factors of its Jacobian (6, n_joints) and of the effort, and the site."""
+    """Return the weights of a twist (6,), the factors for its Jacobian (6, n_joints) and the effort, and the site."""
     try:
         lengths = np.broadcast_to(np.asarray(rotation_length, dtype=float), 3)
         usable = bool(np.isfinite(lengths).all() and lengths.min() > 0.0)

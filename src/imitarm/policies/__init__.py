@@ -1,4 +1,4 @@
-"""Policies: methods of reproducing a skill around obstacles, one file for each.
+"""Policies: methods that reproduce a skill around obstacles, with one file for each method.
 
 ``POLICIES`` is the registry: to add a policy, write one file and add one line here.
 """

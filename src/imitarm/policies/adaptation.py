@@ -50,7 +50,7 @@ ADAPTERS: Registry[PathAdapter] = Registry(
 
 
 def adapter_named(method: str) -> PathAdapter:
-    """Return a member of ``ADAPTERS``; the default needs no search for other packages.
+    """Return the method of that name in ``ADAPTERS``; for the default, no search of installed packages is needed.
 
     Raises:
         UnknownNameError: when there is no such method.
@@ -79,13 +79,14 @@ class Adaptation:
             obstacles.
         certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m].
         only_on_schedule: whether the guarantee depends on the schedule, because an obstacle moves. The guarantee then
-            holds only while the motion is on time: the tool is at ``trajectory`` at the time of each sample, counted
-            from when the scene was seen. The guarantee ends with the last sample.
+            holds only while the motion is on time, which means that the tool is at each sample of ``trajectory`` at its
+            time, counted from the time of the scene. The guarantee ends with the last sample.
         validity: text that says what the guarantee assumes and what it does not cover.
         deviation: largest displacement of a mean, in standard deviations of the demonstrations (Mahalanobis distance).
         jerk_ratio: largest jerk of the adapted path, divided by the largest jerk of the nominal path.
         jerk_reason: why ``jerk_ratio`` exceeds 10; empty if it does not.
-        feasible: whether ``certified_clearance`` reaches the required clearance, within the stated limits.
+        feasible: whether ``certified_clearance`` reaches the required clearance and the path is within the method's
+            limits on displacement and step length.
         reason: which obstacle blocks the path and why it can't be avoided; empty when feasible.
         method: name of the method.
         compute_time: computing time of the whole adaptation [s].
@@ -168,10 +169,11 @@ def adapt(
 
     ``certified`` moves the affected components by the smallest displacement that keeps the clearance on the whole path,
     or refuses and says why. ``mapf`` and ``literal`` are the thesis's potential fields (see ``potential_components``),
-    which may fail. Start, goal and ``pinned`` times do not move. Specify the tool by exactly one of ``tool_radius``,
-    ``tool_spheres`` and ``arm``.
+    which may fail. The path does not move at its start, at its goal and at the ``pinned`` times. Specify the tool by
+    exactly one of ``tool_radius``, ``tool_spheres`` and ``arm``.
 
-    The motion begins at time 0, when the obstacles have the poses of the scene; then they move with their velocities.
+    The motion begins at time 0. At that time, the obstacles are at the poses given by the scene; from then on, they
+    move with their velocities.
 
     Args:
         skill: a fitted skill, or its decomposed path (``ComponentPath.of_skill``), which can be adapted to many scenes.
@@ -181,8 +183,8 @@ def adapt(
         method: a name in ``ADAPTERS``: ``"certified"``, ``"mapf"``, ``"literal"`` or a registered method.
         tool_radius: the tool as one sphere of this radius about its tip [m]; 0 for a point.
         tool_spheres: the tool as spheres that contain it: rows x y z r in the tool's frame, shape (m, 4) [m]. The
-            spheres rotate with the tool as in the skill.
-        arm: the tool as the spheres of this arm (``ArmModel.tool_spheres``). The links of the arm are not considered.
+            spheres rotate with the tool's learned orientation.
+        arm: arm whose ``tool_spheres`` represent the tool. The links of the arm are not considered.
         clearance: required distance from the tool to every obstacle [m].
         forbidden: directions in which no component may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
         pinned: times [s] at which the path must not move, for example contact points.
@@ -308,7 +310,7 @@ def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
 
 def _validity(scene: Scene, duration: float) -> str:
     moving = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.velocity.any()]
-    covers = "the tool on the planned path; not the links of the arm, not tracking errors"
+    covers = "the tool on the planned path, but not for the links of the arm and not for tracking errors"
     rotating = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.angular_velocity.any()]
     if rotating:
         covers += f"; {' and '.join(rotating)} may rotate in any way about the centre"
@@ -316,7 +318,7 @@ def _validity(scene: Scene, duration: float) -> str:
         return f"while the obstacles stand still, for {covers}"
     return (
         f"only from 0 to {duration:.2f} s, while the motion is on time and {' and '.join(moving)} "
-        f"{'keeps' if len(moving) == 1 else 'keep'} the given velocity, for {covers}; not after arrival"
+        f"{'keeps' if len(moving) == 1 else 'keep'} the given velocity, for {covers}; the guarantee ends at arrival"
     )
 
 
@@ -350,13 +352,16 @@ def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str
             f"between them; try method 'certified'"
         )
     if not problem.allowed.dimension:
-        return f"{name} blocks the path ({left} left, {required}), and every direction is forbidden: allow one"
+        return (
+            f"{name} blocks the path ({left} of clearance, {required}), and every direction is forbidden: allow "
+            f"at least one direction"
+        )
     if detour.out_of_limits:
         far = np.linalg.norm(detour.clearance.positions - path.nominal.positions, axis=1).max()
         return (
-            f"no path around {name} with {required} within the limits: it would lead {far:.2f} m away (at most "
-            f"{MAX_DISPLACEMENT:g} m) or make steps above {MAX_STEP_RATIO:.0f} times the longest nominal one; move the "
-            "obstacle, or ask for less clearance"
+            f"no path around {name} with {required} within the limits: the path would lead {far:.2f} m away from the "
+            f"nominal path (limit {MAX_DISPLACEMENT:g} m) or have steps longer than {MAX_STEP_RATIO:.0f} times the "
+            "longest nominal step; move the obstacle, or reduce the required clearance"
         )
     near = {pair // k for pair in np.flatnonzero(detour.bounds < problem.clearance).tolist()} - {worst // k}
     sample = int(np.argmin(detour.clearance.distance[worst]))
@@ -364,17 +369,17 @@ def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str
     n_forbidden = len(problem.allowed.forbidden)
     return (
         f"no path around {name} with {required}: the best attempt leaves {left}"
-        + (f", and {', '.join(map(scene.name_of, sorted(near)))} too near as well" if near else "")
-        + ("; it stands too close to a point that must not move" if held else "")
-        + (f"; {n_forbidden} forbidden direction(s) were kept" if n_forbidden else "")
-        + ": move an obstacle, allow another direction, or ask for less clearance"
+        + (f", and {', '.join(map(scene.name_of, sorted(near)))} are also too close" if near else "")
+        + ("; the obstacle is too close to a point that must not move" if held else "")
+        + (f"; {n_forbidden} forbidden direction(s) were excluded" if n_forbidden else "")
+        + ": move an obstacle, allow another direction, or reduce the required clearance"
     )
 
 
 def _at_fixed(path: ComponentPath, name: str, sample: int, left: float, required: str) -> str:
-    """Return a message that an obstacle is too near to a point that must not move."""
+    """Return a message which says that an obstacle is too close to a point that must not move."""
     at, end = path.nominal.times[sample], path.nominal.times[-1]
     where = "start" if at < 0.02 * end else "goal" if at > 0.98 * end else f"pinned point at {at:.2f} s"
     lies = f"covers the {where}" if left <= 0.0 else f"leaves {1e3 * left:.0f} mm at the {where} ({required})"
     other = where if where in {"start", "goal"} else "pinned time"
-    return f"{name} {lies}, which must not move: move the obstacle, or choose another {other}"
+    return f"{name} {lies}; this point must not move: move the obstacle, or choose another {other}"

@@ -160,8 +160,8 @@ class ToolAmongObstacles:
     def exits(self, pair: int, points: Array, directions: Array, target: float, tolerance: float) -> Array:
         """Return how far points must move along directions to leave the inflated obstacle.
 
-        Newton's method from outside: the signed distance along a ray is convex, so the lift decreases to the largest
-        root without passing it.
+        Newton's method from outside: the signed distance along a ray is convex, so the computed distance decreases to
+        the largest root without passing it.
 
         Args:
             pair: index of the pair.
@@ -257,10 +257,11 @@ class PathClearance:
     def certified(self, clearance: float) -> tuple[Array, ClosePoints]:
         """Bound the distance on each segment, and refine the bound where it is below a clearance.
 
-        Near a corner of an obstacle, the two tangents cross at least twice as deep as the chord. The distance is
-        therefore measured where they cross. If the distance is too small there, the path really is too close. Otherwise
-        the tangent at that point replaces one of the two tangents: the one from whose side the distance decreases
-        towards the point. So the minimum stays between two tangents that converge to it.
+        Near a corner of an obstacle, the bound from the tangents at the two ends of a segment is much too low. The
+        distance is therefore measured at the point where the tangents cross. If the distance there is below the
+        clearance, the path really is too close. Otherwise the tangent at that point replaces the tangent at one end:
+        the end from which the distance decreases towards the point. The minimum of the distance therefore stays between
+        two tangents that converge to it.
 
         Args:
             clearance: required clearance [m].

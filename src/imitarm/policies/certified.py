@@ -3,19 +3,19 @@
 The algorithm of :func:`find_detour`:
 
 1. **Side.** Take the obstacle with the largest violation. Try directions across the path. Along each direction, the
-   lift of a violated sample is its distance to the exit from the inflated convex obstacle, found by Newton's method
-   from outside, which never overshoots on a convex function. A small quadratic program computes the smallest amplitudes
-   of the components that give this lift. The direction of least cost (displacement relative to the demonstrated
-   variance, plus the remaining violation) is followed first, until nothing is violated; the other directions are kept
-   and tried later if this one fails.
-2. **Least detour** (:mod:`~imitarm.policies.least_detour`): on that side, the smallest displacement that keeps the
+   lift of a violated sample is the distance by which the sample must move to leave the inflated convex obstacle.
+   Newton's method computes the lift from outside; it never overshoots, because the signed distance is convex. A small
+   quadratic program computes the smallest amplitudes of the components that give this lift. The search follows the
+   direction of least cost first, until nothing is violated. The cost is the displacement relative to the demonstrated
+   variance, plus the remaining violation. The other directions are kept and tried later if this direction fails.
+2. **Least detour** (:mod:`~imitarm.policies.least_detour`): the smallest displacement on that side that keeps the
    clearance.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
    samples.
 4. If the search over sides finds no path, a second search treats all samples together
-   (:mod:`~imitarm.policies.roadmap`), first with the learned components, then with more and narrower ones. Where
-   components move only in a plane, the roadmap is built as soon as the next side costs hardly less than the one before;
-   if it shows no route, no further side is tried.
+   (:mod:`~imitarm.policies.roadmap`), first with the learned components, then with more and narrower ones. If
+   components can move only in a plane, the roadmap is built as soon as the next choice of sides is hardly cheaper than
+   the previous choice. If the roadmap then contains no route, no further choice of sides is tried.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class _Node:
 
 
 class _SideSearch:
-    """The state of one best-first search over sides."""
+    """The state of one best-first search over the sides on which the path passes the obstacles."""
 
     def __init__(
         self, path: ComponentPath, nominal: PathClearance, clearance: float, allowed: AllowedDirections
@@ -145,10 +145,10 @@ class _SideSearch:
     def run(self, *, while_cheaper: bool = False) -> Detour | None:
         """Follow the cheapest choice of sides until a path is feasible, starting at the nominal path.
 
-        A second call goes on where the first one stopped.
+        A second call continues where the first call stopped.
 
         Args:
-            while_cheaper: stop as soon as another choice is hardly cheaper than the one before; the answer is None.
+            while_cheaper: stop and return None as soon as the next choice is hardly cheaper than the previous choice.
         """
         while self._heap:
             if while_cheaper and 0 < self._choices < _MAX_CHOICES and self._heap[0].cost > _HARDLY_CHEAPER * self._cost:
@@ -245,7 +245,7 @@ class _SideSearch:
         return list(children), costs.tolist(), bool(nearer.any())
 
     def _costs(self, displacements: Array, here: PathClearance) -> tuple[Array, Array]:
-        """Rate displacements (c, n_components, 3) by their size and the remaining violation.
+        """Return the costs of displacements (c, n_components, 3): their size plus the remaining violation.
 
         Returns:
             Costs (c,), and for each pair the violation summed over every third sample (n_pairs, c) [m].
@@ -263,7 +263,8 @@ class _SideSearch:
     def _violations_near(self, sampled: Array, here: PathClearance) -> Array:
         """Return the violation of each pair, summed over the samples (c, m, 3) of displaced paths, (n_pairs, c) [m].
 
-        A distance changes by at most one metre per metre, so only samples near an obstacle can violate its clearance.
+        A distance changes by at most the displacement of the sample, so only samples near an obstacle can violate its
+        clearance.
         """
         moved = sampled - here.positions[::_THINNED]
         farthest = np.sqrt(np.einsum("csd,csd->cs", moved, moved).max(axis=0))

@@ -59,10 +59,9 @@ class ComponentPath:
         basis: w h, shape (n, n_components); never negative.
         means: centres of the components on the nominal path, shape (n_components, 3) [m].
         covariances: position covariances of the components, with the lower bound (5 mm)^2, (n_components, 3, 3) [m^2].
-            They
-            contain the motion itself too: a component is long along the path.
+            They also include the motion itself, so a component is long in the direction of the path.
         yields: GMR's covariance at the time of each component's centre, with the same lower bound, (n_components, 3, 3)
-            [m^2]. The size of a displacement is measured relative to it.
+            [m^2]. The size of a displacement is measured relative to this covariance.
         centres: index of the sample at the centre of each component, (n_components,).
         precisions: inverses of ``yields``, (n_components, 3, 3) [1/m^2].
         tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
@@ -114,7 +113,7 @@ class ComponentPath:
         return _learned(skill.gmr_, n_samples, (0.0, *pins, duration)).between(skill, start, goal)
 
     def between(self, skill: Skill, start: Pose | None, goal: Pose | None) -> ComponentPath:
-        """Return the path of ``skill``, decomposed with its learned ends, between another start or goal.
+        """Return this decomposed path of ``skill``, moved to another start or goal.
 
         Args:
             skill: the skill whose path this is.
@@ -190,12 +189,10 @@ class ComponentPath:
     def divided(self) -> ComponentPath:
         """Return the same path with more, narrower components.
 
-        For some scenes, the influence of the Gaussians extends too far: near the start or the goal, or in narrow
-            spaces. A
-        divided path has cubic B-splines in time instead of the responsibilities. The B-splines also sum to 1. The first
-        and the last one are left out, because they would move the start and the goal. The knots are closer together
-        near
-        the fixed times.
+        For some scenes, the influence of the Gaussians extends too far, for example near the start or the goal, or in
+        narrow spaces. A divided path has cubic B-splines in time instead of the responsibilities. The B-splines also
+        sum to 1. The first and the last B-spline are left out, because they would move the start and the goal. The
+        knots are closer together near the fixed times.
         """
         times, fixed = self.nominal.times, self.fixed_times
         knots = np.concatenate([[times[0]] * 3, _knots(times, fixed), [times[-1]] * 3])
@@ -270,10 +267,7 @@ def _window(times: Array, fixed_times: Sequence[float], width: float) -> Array:
 
 
 def _knots(times: Array, fixed_times: Sequence[float]) -> Array:
-    """Return knots at samples: about ``_PIECES`` evenly spaced ones, and more at 1, 2, 4, ...
-
-    Samples from each fixed time.
-    """
+    """Return the sample indices of the knots: about ``_PIECES`` evenly spaced ones, and more near each fixed time."""
     last = len(times) - 1
     widest = max(last / _PIECES, 1.0)
     fixed = np.unique(np.searchsorted(times, fixed_times)).tolist()

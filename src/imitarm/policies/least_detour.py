@@ -2,8 +2,9 @@
 
 With one tangent plane for each sample and obstacle, "keep the clearance" is a set of linear inequalities in the
 displacements. Because the planes under-estimate the distance, each solution truly keeps the clearance at the samples
-(an inner convex approximation). Repeatedly minimising ``sum_k Delta_k^T Y_k^-1 Delta_k`` under these inequalities and
-renewing the planes stays in the feasible set, and never increases the cost.
+(an inner convex approximation). The method therefore alternates two steps: it minimises ``sum_k Delta_k^T Y_k^-1
+Delta_k`` under these inequalities, then computes new planes. Each solution stays in the feasible set, and the cost
+never increases.
 """
 
 from __future__ import annotations
@@ -260,10 +261,10 @@ class LeastDetour:
     ) -> Detour | None:
         """Return the least detour that the tangents along a path allow, or the best attempt; None without an attempt.
 
-        Where a segment is too close although its samples are not, the closest point adds a row. Requiring more
-        at the samples instead does not work: with longer steps around the edge, the samples can be farther out
-        while the path still cuts the edge; and next to a fixed time, a small additional distance needs a huge
-        displacement.
+        Where a segment is too close although the samples at its ends are not, its closest point adds an inequality. A
+        larger clearance at the samples would not help for two reasons. With longer steps around an edge, the samples
+        can be farther out while the path still cuts the edge. Next to a fixed time, a small additional distance needs a
+        very large displacement.
 
         Args:
             start: clearance along the path at which the tangents are taken; this path need not be a sum of the
@@ -350,7 +351,8 @@ class LeastDetour:
     ) -> tuple[Array, PathClearance, float] | None:
         """Return the displacement of least cost under the tangents, its clearance and cost; None: no solution.
 
-        At first only samples near an obstacle get a row; if the solution violates another sample, all samples get one.
+        At first, only samples near an obstacle have an inequality. If the solution violates the clearance at another
+        sample, all samples get an inequality.
         """
         answer = None
         for influence in (_INFLUENCE, np.inf):

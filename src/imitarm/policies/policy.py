@@ -60,10 +60,11 @@ class Observation:
 class Policy(ABC):
     """Decides the next command from the current observation.
 
-    To write your own policy, implement the three methods below in one subclass. Registered under the entry point group
-    ``imitarm.policies``, or by ``POLICIES.register(name, policy)``, it appears in ``imitarm reproduce --policy``, in
-    ``imitarm benchmark placements`` and in their reports, which build it with the arguments below. Its state lasts from
-    :meth:`reset` to the end of one reproduction; the same observations give the same commands.
+    To write your own policy, implement the three methods below in one subclass. Register the policy under the entry
+    point group ``imitarm.policies``, or by ``POLICIES.register(name, policy)``. It then appears in ``imitarm reproduce
+    --policy``, in ``imitarm benchmark placements`` and in their reports. These commands construct the policy with the
+    arguments below. Its state lasts from :meth:`reset` to the end of one reproduction; the same observations give the
+    same commands.
 
     Args:
         skill: the skill to reproduce.
@@ -103,8 +104,8 @@ class Policy(ABC):
             return cls(skill, **options)
         except TypeError as error:
             raise InputError(
-                f"{cls.__name__}: can't be built with the arguments {', '.join(options)}: {error}; let its "
-                f"constructor take the arguments of Policy's constructor"
+                f"{cls.__name__}: can't be built with the arguments {', '.join(options)}: {error}; change its "
+                "constructor so that it takes the arguments of Policy's constructor"
             ) from error
 
     @abstractmethod
@@ -133,8 +134,8 @@ class ACFRA(Policy):
         twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
     so the phase ``s`` waits for a robot that lags, for example at its speed limits or when a hand holds it. If ``e_0``
-    is the required clearance, the tool cuts no corner by more than half of it: each point of the straight line back is
-    within ``e_0 / 2`` of the tool or of its target, and both are clear.
+    is the required clearance, the tool does not touch an obstacle when it returns to the path on a straight line: each
+    point of this line is within ``e_0 / 2`` of the tool or of its target.
 
     Among moving obstacles the plan is valid only at the planned times, so the phase follows the clock and does not
     wait. When the tool is farther than ``e_0 / 2`` from its planned position, the plan is no longer valid: the arm
@@ -152,7 +153,7 @@ class ACFRA(Policy):
         forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
         pinned: times at which the path must not move [s].
         gain: K [1/s].
-        patience: e_0 [m]; None: the clearance, at least 5 mm.
+        patience: e_0, the position error at which the phase stops [m]; None: the clearance, at least 5 mm.
         arrival: distance to the end of the path at which the motion counts as arrived [m].
         allowance: margin added to the clearance in planning, if possible, because a robot has tracking errors [m].
 
@@ -197,7 +198,7 @@ class ACFRA(Policy):
         """Adapt the path to the scene, starting at the measured pose of the tool.
 
         Raises:
-            InfeasibleError: when the clearance can't be kept, with the obstacle and the reason.
+            InfeasibleError: when the clearance can't be kept; the message names the obstacle and the reason.
         """
         away = observation.tool_to_base.error_to(self.skill.start_)
         if not self.skill.gmr_.has_orientation_:

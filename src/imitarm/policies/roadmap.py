@@ -179,7 +179,7 @@ class Roadmap:
         return edges.take(slow), cost, violation
 
     def _sweep(self, *, forward: bool) -> tuple[Array, Index]:
-        """Return the lowest cost from the start to each node (or from it to the goal), and the adjacent node."""
+        """Return the lowest cost from the start to each node (or from each node to the goal), and the adjacent node."""
         precisions = np.linalg.inv(self.path.tolerance[self.layers] + 0.005**2 * np.eye(3))
         style = np.einsum("lkd,lkd->lk", self.nodes @ precisions, self.nodes) * (
             self.path.n_components / len(self.layers)
@@ -218,7 +218,7 @@ class Roadmap:
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether there is no route, or an edge of the cheapest one lacks so much clearance that it leads nowhere."""
+        """Whether no route exists, or an edge of the cheapest one lacks so much clearance that the route is useless."""
         if not self._forward[0][-1, 0] < _BLOCKED:
             return True
         edges = self._edges_of(self._through(len(self.layers) - 1, 0))
@@ -233,7 +233,7 @@ class Roadmap:
     def _worst_layer(self, chosen: Index) -> int:
         """Return the layer at which a route costs most.
 
-        When all of its edges are free, the layer with the largest displacement.
+        When all edges of the route are free, this is the layer with the largest displacement.
         """
         costs = self.costs[self._edges_of(chosen)]
         if costs.max() > 1.0:
@@ -282,7 +282,7 @@ def _spread_directions(allowed: AllowedDirections) -> Array:
 def _edges(rays: Array, n_neighbours: int) -> tuple[Index, Index]:
     """Return the start and end node of every edge between two layers.
 
-    From the nominal node to all nodes, and from each ray to its neighbours.
+    The edges lead from the nominal node to all nodes, and from each ray to its neighbours.
     """
     n = 1 + len(rays) * _SLOTS
     ray_of = np.concatenate([[-1], np.repeat(np.arange(len(rays)), _SLOTS)])

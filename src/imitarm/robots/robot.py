@@ -1,4 +1,4 @@
-"""Robot: the interface of every robot. It reports its state and moves at joint velocities within its limits."""
+"""Robot: the interface of every robot. A robot reports its state and moves at joint velocities within its limits."""
 
 from __future__ import annotations
 
@@ -92,10 +92,10 @@ class Robot(ABC):
     def move(self, velocity: ArrayLike, dt: float) -> ArmState:
         """Move for ``dt`` seconds; the joints reach ``velocity`` at the end.
 
-        A velocity beyond the limits is replaced by the nearest one within them (:func:`limit_velocity`), and
-        ``clamped`` names the limits. An invalid argument (wrong shape, NaN) stops the robot, then raises InputError.
-        A joint that is more than 0.1 rad away from its set-point counts as blocked: the robot makes a protective
-        stop, sets ``fault`` and does not move any more.
+        A velocity beyond the limits is replaced by the nearest velocity within the limits (:func:`limit_velocity`), and
+        ``clamped`` names the limits that were exceeded. An invalid argument (wrong shape, NaN) stops the robot, then
+        raises InputError. A joint that is more than 0.1 rad away from its set-point counts as blocked: the robot makes
+        a protective stop, sets ``fault`` and does not move any more.
 
         Args:
             velocity: joint velocities, shape (n_joints,) [rad/s].

@@ -52,15 +52,15 @@ class Supervisor:
     ========== ============================================== ======================================================
     status     what the robot does                            what ends it
     ========== ============================================== ======================================================
-    stopped    has braked and holds; ignores commands         ENABLE with the challenge of this stop
+    stopped    holds its position; ignores commands           ENABLE with the challenge of this stop
     following  moves to the newest commanded positions        no valid command for 0.1 s: slowing; STOP: stopped
-    slowing    brakes and holds                               a valid command: following; none for 0.5 s: stopped
+    slowing    brakes to rest, then holds its position        a valid command: following; none for 0.5 s: stopped
     fault      has made a protective stop                     a restart of the process
     ========== ============================================== ======================================================
 
-    It starts stopped. Every stop draws a new challenge, so a recorded ENABLE has no effect, and after a restart of the
-    client its user must enable the robot again. The client that enables the robot is its owner until the next stop.
-    Any client may stop it.
+    It starts stopped. Every stop generates a new random challenge, so a recorded ENABLE has no effect, and after a
+    restart of the client its user must enable the robot again. The client that enables the robot is its owner until the
+    next stop. Any client may stop it.
 
     A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this
     arm, is within the joints' position and velocity limits, and is at most as far from the set-point as the joints
@@ -71,12 +71,13 @@ class Supervisor:
     .. math:: \dot q = f\,\dot q_c + \mathrm{sign}(e) \min(k |e|, \sqrt{a |e|}), \qquad
               e = q_c + \dot q_c\, s - q
 
-    where k is the gain, a the maximum acceleration, s the time for which the command is extrapolated, and f the
-    fraction of its velocity: 1 for the first 30 ms, then decreasing to 0 at 100 ms. :meth:`Robot.move
-    <imitarm.robots.robot.Robot.move>` limits this velocity again. No sequence of datagrams can therefore move the
-    set-point beyond the limits of position, velocity and acceleration.
+    where k is the gain, a the maximum acceleration, s the time for which the command is extrapolated, and f a factor
+    that depends on the age of the command: it is 1 for the first 30 ms, then decreases to 0 at 100 ms.
+    :meth:`Robot.move <imitarm.robots.robot.Robot.move>` limits this velocity again. No sequence of datagrams can
+    therefore move the set-point beyond the limits of position, velocity and acceleration.
 
-    Time is an argument, and no method waits: :class:`~imitarm.robots.server.RobotServer` adds sockets and real time.
+    The methods take the time as an argument and never wait; :class:`~imitarm.robots.server.RobotServer` adds sockets
+    and real time.
 
     Args:
         robot: robot to move.
@@ -137,7 +138,7 @@ class Supervisor:
         return True
 
     def _enable(self, header: Header, message: JointCommand, now: int) -> str:
-        """Make a client the owner, or return why not."""
+        """Make a client the owner, or return the reason why it can't become the owner."""
         if self.status is not RobotStatus.STOPPED:
             return "not stopped"
         if message.arm != self._arm or len(message.q) != self.robot.arm.n_joints:
@@ -155,7 +156,7 @@ class Supervisor:
         return ""
 
     def _take(self, header: Header, message: JointCommand, now: int) -> str:
-        """Make a command the newest one, or return why not."""
+        """Accept a command as the newest command, or return the reason why it is rejected."""
         if self.status not in (RobotStatus.FOLLOWING, RobotStatus.SLOWING):
             return "stopped"
         if not self.datagram_filter.accept(header, now):  # the filter counts it
@@ -259,10 +260,10 @@ class Supervisor:
 class RobotServer:
     """Receives commands, moves a robot at a fixed rate, and answers each request once per period.
 
-    It sends nothing without a request, and a :class:`~imitarm.robots.server.Supervisor` checks everything it receives.
-    If the machine was too busy and periods were missed, the next step is lengthened by the missed time, up to 20 ms in
-    total, so that the robot keeps up with the commands. The limits still hold, because they are computed from the
-    length of the step. Missed time beyond 20 ms is skipped.
+    The server sends nothing without a request, and a :class:`~imitarm.robots.server.Supervisor` checks every datagram
+    that it receives. If the machine was too busy and periods were missed, the next step is lengthened by the missed
+    time, up to 20 ms in total, so that the robot keeps up with the commands. The limits still hold, because they are
+    computed from the length of the step. Missed time beyond 20 ms is skipped.
 
     Args:
         robot: robot to serve.
@@ -274,8 +275,8 @@ class RobotServer:
             timestep.
         on_event: function called with a text when the robot is enabled, slows or stops.
         clock_ns: function that returns the time [ns].
-        wait: function that waits until a datagram arrives, at most for a number of seconds, and returns whether one
-            has arrived; a simulated clock advances here.
+        wait: function that waits until a datagram arrives, at most for the given number of seconds, and returns whether
+            one has arrived; with a simulated clock, this function advances the clock.
 
     Attributes:
         address: host and port on which it listens.

@@ -1,4 +1,4 @@
-"""SimulatedRobot: an arm with its real inertias and limits in a MuJoCo world, with drives for its joints."""
+"""SimulatedRobot: an arm in a MuJoCo world, with the inertias and limits of the real arm and a drive for each joint."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ _GUIDED_DAMPING = 0.05  # [s/rad] damping of a guided joint per rated torque
 class SimulatedRobot(Robot):
     """An arm in a MuJoCo world, with drives that are limited to their rated torques.
 
-    Both kinds of control follow the set-point ``q_d(t)`` and feed gravity, inertia and friction forward, see
-    :class:`Drives`: ``"position"`` is a stiff servo at each joint, ``"torque"`` is the softer computed-torque control.
+    Both kinds of control follow the set-point ``q_d(t)`` and feed gravity, inertia and friction forward (see
+    :class:`Drives`). ``"position"`` is a stiff servo at each joint, ``"torque"`` is the softer computed-torque control.
     Time advances only within :meth:`move` and :meth:`guide`, and the same commands always give the same motion.
 
     Attributes:
@@ -197,8 +197,8 @@ class SimulatedRobot(Robot):
     def clearance(self) -> float:
         """Return the smallest distance from the arm or its tool to an obstacle [m].
 
-        It is measured between the simulator's geoms, negative when they overlap and inf without obstacles. While two
-        links touch each other, it is at most minus the depth of their contact.
+        The distance is measured between the simulator's geoms. It is negative when geoms overlap, and inf without
+        obstacles. While two links of the arm touch each other, the result is at most minus the depth of their contact.
         """
         return self._gauge.measure(self.data)[0]
 
@@ -281,7 +281,7 @@ class SimulatedRobot(Robot):
 
 
 def _slice(indices: NDArray[np.int32]) -> slice | NDArray[np.int32]:
-    """Return successive indices, as those of most arms are, as a slice: numpy reads it several times as fast."""
+    """Return indices as a slice if they are successive, because numpy reads a slice several times as fast."""
     first, last = int(indices[0]), int(indices[-1])
     return slice(first, last + 1) if np.array_equal(indices, np.arange(first, last + 1)) else indices
 

@@ -31,10 +31,11 @@ class Echo(NamedTuple):
 
     Attributes:
         sequence: sequence number of the command.
-        sent: time from sending to receiving [s]; to another machine, relative to the fastest command.
+        sent: time from sending to receiving [s]; if the server is on another machine, relative to the time of the
+            fastest command.
         applied: time from receiving the command until the drives had a set-point computed from it [s].
-        applied_ns: time at which the drives had that set-point, on the clock of this process [ns]; for another
-            machine, the travel time of the fastest command counts as 0.
+        applied_ns: time at which the drives had that set-point, on the clock of this process [ns]; if the server is on
+            another machine, the travel time of the fastest command is assumed to be 0.
     """
 
     sequence: int
@@ -47,9 +48,9 @@ class UdpRobot(Robot):
     """The client of a :class:`~imitarm.robots.server.RobotServer`.
 
     :meth:`move` limits a velocity as every robot does and sends the resulting set-point; the server checks it again.
-    The client sends commands only while the server reports that it follows this client, in a state that is at most
-    0.1 s old. Otherwise it sends no command and adopts the server's set-point. Therefore the arm never jumps after
-    a restart of the client or the server, or after an interrupted connection.
+    The client sends commands only while the newest state from the server is at most 0.1 s old and says that the robot
+    follows this client. Otherwise the client sends no command and adopts the server's set-point. Therefore the arm
+    never jumps after a restart of the client or the server, or after an interrupted connection.
 
     A stopped robot moves again only after :meth:`enable`, which requires a decision by a person.
 
@@ -300,7 +301,7 @@ class UdpRobot(Robot):
         return came
 
     def _record_echo(self, header: Header, state: JointState) -> None:
-        """Record the times of a command, once."""
+        """Record the times of a command unless they are already recorded."""
         if state.owner != self._encoder.session or state.applied_ns == 0 or state.echo_sent_ns == self._echoed:
             return
         self._echoed = state.echo_sent_ns

@@ -28,7 +28,7 @@ _FAR = 100.0  # [m] farther pairs are not measured
 def arm_world(
     arm: ArmModel, *, floor: float = -0.75, pedestal_radius: float = 0.12, fixtures: Sequence[Obstacle] | None = None
 ) -> mujoco.MjSpec:
-    """Return a world with the arm, its base at the origin, on its fixtures; furniture can be added.
+    """Return a world with the arm on its fixtures, to which furniture can be added; the arm's base is at the origin.
 
     Args:
         arm: the arm with its tool.
@@ -141,18 +141,17 @@ def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
 class ClearanceGauge:
     """Smallest distance from an arm to obstacles, and pairs in contact, from the simulator's geoms.
 
-    Bounding spheres are evaluated first: the distance between centres less both radii is a lower bound of a pair's
-        distance.
-    Pairs are then measured by ``mj_geomDistance``, nearest bound first, until the next bound exceeds the smallest
-    distance found. Most pairs therefore need no exact measurement.
+    Bounding spheres are evaluated first: the distance between centres minus both radii is a lower bound of a pair's
+    distance. Pairs are then measured by ``mj_geomDistance``, nearest bound first, until the next bound exceeds the
+    smallest distance found. Most pairs therefore need no exact measurement.
 
     Args:
         model: the compiled world.
         arm_geoms: ids of the geoms of arm and tool.
         obstacle_geoms: ids of the geoms whose distance is measured.
         fixture_geoms: ids of the geoms on which the arm stands; they count only for contact.
-        links: number of the arm's joints that move each arm geom. Contact between two geoms with different numbers
-            is a self-contact; None: self-contacts are not checked.
+        links: number of the arm's joints that move each arm geom. Contact between two geoms with different values is a
+            self-contact; None: self-contacts are not checked.
     """
 
     def __init__(
@@ -208,7 +207,7 @@ class ClearanceGauge:
     def touching(self, data: mujoco.MjData) -> set[tuple[int, int]]:
         """Return the pairs of geoms currently in contact.
 
-        Arm and obstacle, arm and fixture, arm and arm (lower id first).
+        The pairs are arm and obstacle, arm and fixture, or arm and arm (lower id first).
         """
         if not data.ncon:
             return set()

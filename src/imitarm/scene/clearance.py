@@ -1,4 +1,4 @@
-"""Clearance of an arm: rows of the inverse kinematics that keep it clear of obstacles, and its links of each other."""
+"""Inequalities for the inverse kinematics that keep an arm clear of obstacles, and its links clear of each other."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class ClearanceLimit:
 
     .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - \xi h
 
-    lets this distance shrink at most exponentially, so that it stays positive. h can still become negative, because
-    links move on arcs and control steps are finite. In this case it must grow, with ``retreat_rate`` instead of
-    :math:`\xi`. Every sphere within ``influence`` of an obstacle has a row; none is left out. The spheres contain the
+    lets this distance shrink at most exponentially, so that in theory it stays positive. In practice h can become
+    negative, because links move on arcs and control steps are finite. Then ``retreat_rate`` replaces :math:`\xi`, and h
+    must grow. Every sphere within ``influence`` of an obstacle has a row; none is left out. The spheres contain the
     shapes they cover, so the true distance is never smaller than the distance of the spheres.
 
     Args:
@@ -132,9 +132,9 @@ class SelfClearance:
     .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
 
     and a row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets it shrink no faster than exponentially. If the distance
-    is below the clearance, it must grow, with 25/s instead of :math:`\xi`. Every pair of spheres within 6 cm of
-    the clearance has a row (at most the 64 nearest pairs). In addition, each of the ``n_rows`` nearest pairs of links
-    within 15 cm has a row for its nearest pair of spheres.
+    is below the clearance, the distance must grow; the row then has the rate 25/s instead of :math:`\xi`. Every pair of
+    spheres within 6 cm of the clearance has a row (at most the 64 nearest pairs). In addition, each of the ``n_rows``
+    nearest pairs of links within 15 cm has a row for its nearest pair of spheres.
 
     These pairs are not checked: links that share a joint, links that can't touch within their joint limits
         (:func:`meeting_links`), and spheres that are nearer than the clearance in the arm's home posture. The base is
@@ -288,9 +288,9 @@ class SelfClearance:
 class PeriodicSelfClearance:
     r"""Rows of a :class:`SelfClearance` for a fast control loop: near pairs are searched for only every 30 to 50 ms.
 
-    In between the distances follow from the joints' motion, :math:`d(q) \approx d_0 + \nabla d\,(q - q_0)`. Within 50
-    ms the error of this approximation is less than 8 mm with every joint at 1 rad/s; it grows with the square of the
-    speed.
+    Between two searches, the distances follow from the joints' motion, :math:`d(q) \approx d_0 + \nabla d\,(q - q_0)`.
+    Within 50 ms the error of this approximation is less than 8 mm with every joint at 1 rad/s; it grows with the square
+    of the speed.
 
     Args:
         own: self-clearance whose rows are approximated.

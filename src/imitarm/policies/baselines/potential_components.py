@@ -4,14 +4,14 @@ The same descent is used for two potentials. With ``d`` the distance from an obs
 the outward normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the obstacle:
 
 * ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The last term does not depend on the
-  position, so it drops out of the force: the spread has no effect.
+  position, so it drops out of the force, and the spread has no effect.
 * ``mapf``: a dimensionless form with the effect that the text of the thesis describes,
   ``U = 1/2 eta s d_th^2 (1/rho - 1)^2`` with ``rho = d / d_th`` and a gain ``s = exp((sigma(n)^2 - mean) / max)`` that
   moves components with a large spread more.
 
-Neither checks whether the path *between* two pushed means is clear. Two components on opposite sides of an obstacle are
-pushed apart, so the path between them passes through the obstacle. They are kept for comparison; ``certified`` is the
-default.
+Neither potential checks whether the path *between* two pushed means is clear. Two components on opposite sides of an
+obstacle are pushed apart, so the path between them passes through the obstacle. Both potentials are kept for
+comparison; ``certified`` is the default method.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ FORCES = {"literal": literal_force, "mapf": modified_force}
 def push_components(
     path: ComponentPath, obstacles: Sequence[Obstacle], margin: float, *, method: str, forbidden: Array
 ) -> Array:
-    """Move the means along the potential's force until none is within its influence, or for 200 steps.
+    """Move the means along the potential's force until no mean is within reach of the force, or for 200 steps.
 
     Args:
         path: the nominal path and its components.
@@ -124,7 +124,7 @@ class PotentialField(PathAdapter):
         self.force = force
 
     def detour(self, problem: AvoidanceProblem) -> Detour:
-        """Return the path after the push; it need not keep the clearance."""
+        """Return the path after the push; this path may violate the clearance."""
         tool = problem.nominal.tool
         pushed = push_components(
             problem.path,
