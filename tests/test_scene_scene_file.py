@@ -233,7 +233,7 @@ def test_obstacles_below_a_millimetre_are_in_another_unit(tmp_path, entry):
 )
 def test_a_scene_within_the_base_is_in_another_unit(tmp_path, text):
     message = message_of(tmp_path, HEAD + text)
-    assert "mm of the robot's base; check units: are these metres?" in message
+    assert "mm of the robot's base; check units: are the numbers in metres?" in message
 
 
 BOX = "type: box, name: tin, position: [0, 0, 0], size: [1, 1, 1]"

@@ -160,7 +160,7 @@ class Trajectory:
         """Return a motion with the same times and rotations and other positions, shape (n, 3) [m].
 
         Raises:
-            InputError: when the shape is another one, or a number is not finite.
+            InputError: when ``positions`` has another shape, or a number is not finite.
         """
         moved = copy.copy(self)  # times and rotations have been checked
         name = f"{type(self).__name__} positions"
@@ -306,7 +306,9 @@ def read_demonstration_table(path: str | os.PathLike[str]) -> Table:
         )
     for key, wanted in (("units", _UNITS), ("frame", _FRAME)):
         if table.remarks.get(key, wanted) != wanted:
-            raise FileFormatError(f"{path}: {key} are {table.remarks[key]!r}, must be {wanted!r}; convert the numbers")
+            raise FileFormatError(
+                f"{path}: {key}: found {table.remarks[key]!r}, but {wanted!r} is needed; convert the numbers"
+            )
     samples = table.remarks.get("samples", str(len(table.values)))
     if samples != str(len(table.values)) or not table.ends_in_newline:
         raise FileFormatError(

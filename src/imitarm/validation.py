@@ -2,7 +2,7 @@
 
 Each function returns the value in a form that is safe to compute with, or raises :class:`InputError`. The message names
 the argument, its unit, the expected and the given value. NaN, infinities, text, booleans, complex numbers,
-``None`` and masked entries are never numbers. Arrays of float64 are returned without a copy.
+``None`` and masked entries are not accepted as numbers. Arrays of float64 are returned without a copy.
 
 :func:`finite_vector` takes less than a microsecond for an array of float64, so that it may be used in a control loop.
 """
@@ -34,7 +34,7 @@ def finite_vector(value: Any, n: int, what: str, unit: str = "") -> Array:
 
     Args:
         value: the argument to check.
-        n: required number of numbers.
+        n: required length.
         what: the name of the argument in messages, for example ``"q"``.
         unit: the unit of the numbers in messages, for example ``"rad"``.
 

@@ -73,8 +73,9 @@ class ArmModel(ArmKinematics):
 
     .. math:: M(q) \ddot q + C(q, \dot q) \dot q + g(q) = \tau
 
-    where :math:`M` is the rigid-body inertia. Rotor inertia (``armature``), viscous damping and dry friction of the
-    joints, which a simulated arm also has, are not included; their values are in ``spec()``.
+    Here, :math:`M` is the rigid-body inertia, :math:`C` contains the Coriolis and centrifugal terms, :math:`g` is
+    gravity and :math:`\tau` are the joint torques. Rotor inertia (``armature``), viscous damping and dry friction of
+    the joints, which a simulated arm also has, are not included; their values are in ``spec()``.
 
     All poses are in the base frame, whose origin is the origin of the robot's file. Jacobians have the linear rows
     first. All methods take one posture ``q`` of shape (n_joints,) and raise :class:`InputError` if its shape is wrong

@@ -5,7 +5,7 @@ for a person and for a robot. This angle is measured from a reference direction,
 there are wrist positions at which the angle is undefined (Elias and Wen 2024). The ``"conventional"`` angle, measured
 from a fixed vector v, is undefined when the wrist is on the line through the shoulder along v. The ``"stereographic"``
 angle is undefined only when the wrist is on one half of such a line. This half-line can be placed where the wrist never
-is: here it points backwards, behind the base.
+is; in this module it points backwards, behind the base.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ Array = NDArray[np.float64]
 Vector = tuple[Any, Any, Any]
 
 UP = (0.0, 0.0, 1.0)
-"""With the wrist ahead of the shoulder, the angle is 0 for an elbow straight above and pi for an elbow straight
-below."""
+"""With the wrist ahead of the shoulder, the angle is 0 for an elbow above and pi for an elbow below the line."""
 _LOST = 1e-12  # squared sine below which an angle is only rounding
 
 

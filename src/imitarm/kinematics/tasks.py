@@ -138,7 +138,7 @@ class ElbowTask(NamedTuple):
 
     .. math:: s = c\,\min(1, 10\sin^2\!\beta)\;\frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
 
-    where :math:`\psi` is the arm's :func:`~imitarm.kinematics.sew.sew_angle` and :math:`\beta` the angle at its elbow.
+    Here, :math:`\psi` is the arm's :func:`~imitarm.kinematics.sew.sew_angle` and :math:`\beta` the angle at its elbow.
     The elbow's speed goes to zero as the arm becomes straight, and near the one direction in which the stereographic
     angle is undefined. From one step to the next, s changes by at most half of the change that the joints'
     accelerations allow. As long as no limit is active, the task does not affect the tool, whatever its weight. When a

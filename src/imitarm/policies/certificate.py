@@ -236,7 +236,7 @@ class PathClearance:
         ``f(s) >= max(f0 + a s, f1 - b (L - s))``. The minimum of the right side over s is at an end of the segment or
         at the crossing of the two lines. The tip moves straight between two samples. The centre of a sphere beside the
         tip leaves the straight line by at most ``|offset| (1 - cos(angle / 2))`` while the tool rotates by ``angle``;
-        this is subtracted.
+        the bound is lower by this amount.
 
         Returns:
             Shape (n_pairs, n - 1) [m].
@@ -259,9 +259,9 @@ class PathClearance:
 
         Near a corner of an obstacle, the bound from the tangents at the two ends of a segment is much too low. The
         distance is therefore measured at the point where the tangents cross. If the distance there is below the
-        clearance, the path really is too close. Otherwise the tangent at that point replaces the tangent at one end:
-        the end from which the distance decreases towards the point. The minimum of the distance therefore stays between
-        two tangents that converge to it.
+        clearance, the path really is too close. Otherwise the tangent at that point replaces the tangent at the end
+        from which the distance decreases towards the point. The minimum of the distance therefore stays between two
+        tangents that converge to it.
 
         Args:
             clearance: required clearance [m].

@@ -71,10 +71,10 @@ class Supervisor:
     .. math:: \dot q = f\,\dot q_c + \mathrm{sign}(e) \min(k |e|, \sqrt{a |e|}), \qquad
               e = q_c + \dot q_c\, s - q
 
-    where k is the gain, a the maximum acceleration, s the time for which the command is extrapolated, and f a factor
-    that depends on the age of the command: it is 1 for the first 30 ms, then decreases to 0 at 100 ms.
-    :meth:`Robot.move <imitarm.robots.robot.Robot.move>` limits this velocity again. No sequence of datagrams can
-    therefore move the set-point beyond the limits of position, velocity and acceleration.
+    Here, k is the gain, a the maximum acceleration, and s the time for which the command is extrapolated. The factor f
+    depends on the age of the command; it is 1 for the first 30 ms, then decreases to 0 at 100 ms. :meth:`Robot.move
+    <imitarm.robots.robot.Robot.move>` limits this velocity again. No sequence of datagrams can therefore move the
+    set-point beyond the limits of position, velocity and acceleration.
 
     The methods take the time as an argument and never wait; :class:`~imitarm.robots.server.RobotServer` adds sockets
     and real time.

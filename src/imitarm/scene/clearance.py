@@ -39,14 +39,14 @@ class ClearanceLimit:
 
     Spheres cover the arm and its tool (``ArmModel.collision_spheres``). For the sphere with centre ``c`` and radius
     ``r`` near an obstacle with signed distance ``sd`` and outward normal ``n``, the remaining distance is ``h = sd(c) -
-    r - clearance``. If ``v_o`` is the velocity of the obstacle's nearest point, the row
+    r - clearance``. Let ``v_o`` be the velocity of the obstacle's nearest point. The row for this sphere is
 
     .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - \xi h
 
-    lets this distance shrink at most exponentially, so that in theory it stays positive. In practice h can become
-    negative, because links move on arcs and control steps are finite. Then ``retreat_rate`` replaces :math:`\xi`, and h
-    must grow. Every sphere within ``influence`` of an obstacle has a row; none is left out. The spheres contain the
-    shapes they cover, so the true distance is never smaller than the distance of the spheres.
+    This row lets h shrink at most exponentially, so that in theory h stays positive. In practice h can become negative,
+    because links move on arcs and control steps are finite. Then ``retreat_rate`` replaces :math:`\xi`, and h must
+    grow. Every sphere within ``influence`` of an obstacle has a row; none is left out. The spheres contain the shapes
+    they cover, so the true distance is never smaller than the distance of the spheres.
 
     Args:
         arm: arm with its tool.
@@ -131,10 +131,11 @@ class SelfClearance:
 
     .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
 
-    and a row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets it shrink no faster than exponentially. If the distance
-    is below the clearance, the distance must grow; the row then has the rate 25/s instead of :math:`\xi`. Every pair of
-    spheres within 6 cm of the clearance has a row (at most the 64 nearest pairs). In addition, each of the ``n_rows``
-    nearest pairs of links within 15 cm has a row for its nearest pair of spheres.
+    A row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets the distance shrink no faster than exponentially towards the
+    required clearance :math:`d_{safe}`. If the distance is below the clearance, the distance must grow; the row then
+    has the rate 25/s instead of :math:`\xi`. Every pair of spheres within 6 cm of the clearance has a row (at most the
+    64 nearest pairs). In addition, each of the ``n_rows`` nearest pairs of links within 15 cm has a row for its nearest
+    pair of spheres.
 
     These pairs are not checked: links that share a joint, links that can't touch within their joint limits
         (:func:`meeting_links`), and spheres that are nearer than the clearance in the arm's home posture. The base is
@@ -239,13 +240,13 @@ class SelfClearance:
         return gradients, distances - self.clearance
 
     def lower(self, room: Array) -> Array:
-        """Return the lower bound of each distance's rate (k,) [m/s], from distance minus clearance (k,) [m]."""
+        """Return the lower bound of each distance's rate (k,) [m/s], for given distances minus clearance (k,) [m]."""
         if min(room.tolist(), default=0.0) >= 0.0:  # nearly always
             return -self._gain * room
         return np.where(room < 0.0, -_RETREAT_RATE, -self._gain) * room
 
     def periodic(self, dt: float = 0.01) -> PeriodicSelfClearance:
-        """Return a version of this check for a control loop with period ``dt`` [s], at a fifth of the cost."""
+        """Return a version of this check for a control loop with period ``dt`` [s] that needs a fifth of the time."""
         return PeriodicSelfClearance(self, dt)
 
     def _found(self, q: ArrayLike) -> tuple[Indices, Indices, Array, Array, Array]:
@@ -303,7 +304,7 @@ class PeriodicSelfClearance:
         self.reset()
 
     def reset(self) -> None:
-        """Search again in the next step."""
+        """Make the next step search for near pairs again."""
         self._age = self._latest
         self._found: tuple[Array, Array] | None = None
         self._at: Array = np.zeros(0)

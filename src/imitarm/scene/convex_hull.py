@@ -31,7 +31,8 @@ class Polytope:
 
     Attributes:
         vertices: corners of the hull, shape (v, 3) [m].
-        triangles: rows of ``vertices``, counter-clockwise seen from outside, shape (k, 3).
+        triangles: indices of each triangle's corners in ``vertices``, counter-clockwise seen from outside, shape (k,
+            3).
         normals: outward unit normal of each face, shape (m, 3).
         offsets: distance of each face's plane from the centroid, shape (m,) [m].
         cosines: cosines of the angles between the faces' normals, shape (m, m).
@@ -93,7 +94,7 @@ class Polytope:
         )
 
     def formula(self, q: Array, gradient: bool) -> tuple[Array, Array | None]:
-        """Return distances and normals in the form of all formulas of this module."""
+        """Return distances and normals; arguments and results are those of :class:`~imitarm.scene.obstacle.Family`."""
         distance, rows = self.distance_and_normal(np.ascontiguousarray(q.reshape(3, -1).T))
         return distance.reshape(q.shape[1:]), rows.T.reshape(q.shape) if gradient else None
 
@@ -178,7 +179,7 @@ class ConvexHull(Obstacle):
         if spread[-1] <= _FLAT * spread[0]:
             raise InputError(
                 f"{self._label}: the {len(points)} points lie in one plane; a hull needs points that span a volume "
-                "(a thin Box does for a plate)"
+                "(for a plate, use a thin Box)"
             )
         polytope = Polytope.around(points - center)
         self._set(points=points, _center=center, _quaternion=UPRIGHT.copy(), _polytope=polytope)
@@ -207,7 +208,7 @@ class ConvexHull(Obstacle):
 
     @property
     def triangles(self) -> NDArray[np.intp]:
-        """Surface as rows of ``vertices``, counter-clockwise seen from outside, shape (k, 3)."""
+        """Triangles of the surface as indices into ``vertices``, counter-clockwise seen from outside, shape (k, 3)."""
         return self._polytope.triangles.copy()
 
     def _support(self, directions: Array) -> Array:

@@ -1,6 +1,6 @@
 """Distances to all obstacles of a scene, as packed arrays.
 
-A single obstacle has its own ``Obstacle.signed_distance``. The distance formulas are with the shapes.
+For a single obstacle, use ``Obstacle.signed_distance``. The distance formulas are in the modules of the shapes.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class PackedObstacles:
         quaternions: local_to_base rotations wxyz, shape (n, 4).
         sizes: sizes of the shapes, shape (n, 3) [m]. Sphere: radius; box: full edge lengths; capsule and cylinder:
             radius, length of the axis; cone: radius, height; ellipsoid: semi-axes; convex hull: half extents;
-            half-space: nothing. Unused entries are 0.
+            half-space: not used. Unused entries are 0.
         velocities: velocities of the local frame's origin, shape (n, 3) [m/s].
         angular_velocities: angular velocities about that origin, in the base frame, shape (n, 3) [rad/s].
         covariances: covariances of the positions, shape (n, 3, 3) [m^2]; 0 when unknown.
@@ -133,7 +133,7 @@ class PackedObstacles:
         return moved
 
     def __getattr__(self, name: str) -> Array:
-        """Compute the positions of obstacles that :meth:`after` moved, the only attribute that may be missing."""
+        """Compute ``positions`` after :meth:`after` has moved the obstacles; no other attribute may be missing."""
         ahead: tuple[PackedObstacles, float] | None = self.__dict__.get("_ahead")
         if name != "positions" or ahead is None:
             raise AttributeError(f"PackedObstacles has no attribute {name!r}")
@@ -316,7 +316,7 @@ def _evaluate(
     else:
         t = finite_array(times, (None,), "times", "s")
         if not len(t):
-            raise InputError("times must be at least one")
+            raise InputError("times must contain at least one number")
         if p.ndim < 2 or p.shape[0] not in {1, len(t)}:
             raise InputError(
                 f"points must have shape ({len(t)}, ..., 3) or (1, ..., 3) for {len(t)} times, got {p.shape}"

@@ -23,16 +23,16 @@ from imitarm.validation import finite_array, finite_number
 
 Array = NDArray[np.float64]
 Motion = Callable[[float], "Pose | ArrayLike"]
-"""A function of time [s] that returns the pose of an obstacle, or its position (3,) [m] when it does not rotate. Both
-are those of the obstacle's local frame (:class:`~imitarm.scene.distances.PackedObstacles`): the centre of a shape, the
-mean of a hull's points."""
+"""A function of time [s] that returns the pose of an obstacle, or its position (3,) [m] when it does not rotate.
+The pose is that of the obstacle's local frame (:class:`~imitarm.scene.distances.PackedObstacles`).
+The origin of the local frame is the centre of a shape, or the mean of a hull's points."""
 
 _STEP = 1e-4  # [s] half of the interval over which velocities are differences
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A recorded motion with linear interpolation of positions and shortest rotations; at rest before and after it.
+    """A recorded motion, interpolated between its samples; before and after it, the obstacle is at rest.
 
     Attributes:
         times: strictly increasing, shape (n,) [s].
@@ -50,7 +50,7 @@ class Track:
     def __post_init__(self) -> None:
         times = np.array(finite_array(self.times, (None,), "Track: times", "s"))
         if not len(times) or (np.diff(times) <= 0.0).any():
-            raise InputError("Track: times must be at least one and strictly increase [s]")
+            raise InputError("Track: times must contain at least one number and strictly increase [s]")
         positions = np.array(finite_array(self.positions, (len(times), 3), "Track: positions", "m"))
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "positions", positions)

@@ -81,7 +81,7 @@ def lengths(vectors: Array) -> Array:
 
 
 def below(values: Array, bound: float) -> bool:
-    """Return whether any of ``values`` (...), of which none is nan, is below ``bound``."""
+    """Return whether any of ``values`` (...) is below ``bound``; none of them may be nan."""
     return values.size > 0 and values.item(values.argmin()) < bound
 
 
@@ -180,11 +180,12 @@ class Obstacle(ABC):
         sd(x) =  min |x - s| over the surface points s   when x is outside
         sd(x) = -min |x - s| over the surface points s   when x is inside
 
-    and its gradient, a unit vector: outside it points from the nearest surface point to ``x``, inside from ``x`` to
-    the nearest surface point, on the surface along the outward normal. Because the solids are convex, ``sd`` is convex,
-    and it changes by at most one metre per metre. Where the nearest surface point is not unique (the centre of a
-    sphere, the medial axis of a box), one of them is used; it is always the same for the same input. To keep a distance
-    ``r`` from an obstacle, require ``sd(x) >= r``: no inflated copy is needed.
+    The gradient of this distance is a unit vector. Outside, the gradient points from the nearest surface point to
+    ``x``; inside, it points from ``x`` to the nearest surface point; on the surface, it is the outward normal. Because
+    the solids are convex, ``sd`` is convex, and between two points it changes by at most their distance. Where the
+    nearest surface point is not unique (at the centre of a sphere, on the medial axis of a box), the gradient refers to
+    one of the nearest points, always the same one for the same input. To keep a distance ``r`` from an obstacle,
+    require ``sd(x) >= r``: no inflated copy is needed.
 
     Attributes:
         velocity: velocity of the shape's centre, in the base frame, shape (3,) [m/s].
@@ -229,11 +230,11 @@ class Obstacle(ABC):
 
     @property
     def _label(self) -> str:
-        """The obstacle in an error message."""
+        """Shape and name of the obstacle, for error messages."""
         return f'{type(self).__name__} "{self.name}"' if self.name else type(self).__name__
 
     def _forget(self) -> None:
-        """Drop, in a new copy, the values that were computed for the old pose."""
+        """Clear the cached values of a new copy, which were computed for the old pose."""
         for key in ("_single", "vertices"):
             self.__dict__.pop(key, None)
 
@@ -287,7 +288,7 @@ class Obstacle(ABC):
         return _distance(self._single, finite_points(points), True)
 
     def distances_at(self, points: Array, gradient: bool) -> tuple[Array, Any]:
-        """Do the same for points that are known to be finite; this saves the check, and gradients that nobody needs.
+        """Return distances, and gradients on request, for points known to be finite; this saves the check.
 
         Args:
             points: float64 points in the base frame, shape (..., 3) [m].
@@ -377,7 +378,7 @@ class Obstacle(ABC):
 
     @abstractmethod
     def _move(self, offset: Array, turn: Array | None) -> None:
-        """Move this fresh copy by ``offset`` (3,) [m] and rotate it about its centre by ``turn`` (4,)."""
+        """Move this new copy by ``offset`` (3,) [m] and rotate it about its centre by ``turn`` (4,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -416,4 +417,4 @@ class PosedObstacle(Obstacle):
 
     @abstractmethod
     def _local_support(self, v: Array) -> Array:
-        """Farthest points (3, n), own coordinates, in directions ``v`` (3, n)."""
+        """Farthest points (3, n) in directions ``v`` (3, n), both in the local frame."""

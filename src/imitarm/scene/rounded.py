@@ -37,7 +37,7 @@ _FLOOR = 1e-12  # [fraction of the shortest semi-axis] changes a distance by les
 
 
 def rounds(q: Array, gradient: bool, radius: Array, half: Array | None) -> tuple[Array, Array | None]:
-    """Spheres and capsules: the distance to the nearest point of a segment along z, less the radius.
+    """Spheres and capsules: the distance to the nearest point of a segment along z, minus the radius.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
@@ -176,8 +176,8 @@ def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor:
     The surface point nearest to ``y`` is ``e_j = g_j^2 y_j / (t + g_j^2)`` with semi-axes ``g``, where ``t`` is the
     largest root of ``F(t) = sum_j (g_j y_j / (t + g_j^2))^2 - 1``. With ``s = t + min g^2`` the function
     ``h(s) = 1 / sqrt(F + 1)`` is concave and rises, so Newton's method on ``h = 1`` from the left never steps over the
-    root and needs no bracket. With the unit normal ``n`` at ``e`` the distance is ``n.y - sqrt(sum_j g_j^2 n_j^2)``: an
-    error in ``n`` has a quadratic effect and never makes the distance too large.
+    root and needs no bracket. With the unit normal ``n`` at ``e`` the distance is ``n.y - sqrt(sum_j g_j^2 n_j^2)``. An
+    error in ``n`` has only a quadratic effect on the distance and never makes it too large.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].

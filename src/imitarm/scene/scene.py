@@ -71,9 +71,9 @@ class Scene:
     def at(self, time: float) -> Scene:
         """Return the scene as predicted for another time; only this method predicts the motion of obstacles.
 
-        Each obstacle keeps its velocity and its angular velocity; the goal stays. The result has ``stamp = time``;
-        ``packed.stamps`` keeps the time at which each obstacle was seen. It takes microseconds: only the packed arrays
-        are moved, and the obstacle objects are built when ``obstacles`` is read.
+        Each obstacle keeps its velocity and its angular velocity; the goal does not move. The result has ``stamp =
+        time``; ``packed.stamps`` keeps the time at which each obstacle was seen. The prediction takes microseconds,
+        because only the packed arrays are moved. The obstacle objects are built when ``obstacles`` is read.
 
         Args:
             time: time on the clock of ``stamp`` [s].
@@ -88,7 +88,7 @@ class Scene:
         return Scene.predicted(seen, seen.packed.after(time - seen.stamp), time)
 
     def now(self, time: float) -> Scene:
-        """Return :meth:`at`, or the scene itself if no obstacle moves or the scene was seen at that time.
+        """Return the scene predicted by :meth:`at`, or this scene itself if no obstacle moves or ``time`` is its stamp.
 
         Args:
             time: time on the clock of ``stamp`` [s].

@@ -79,7 +79,8 @@ def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
         path: the file; its folder must exist.
 
     Raises:
-        InputError: when an obstacle's shape is in no registry, two have one name, or the file can't be written.
+        InputError: when an obstacle's shape is not registered, two obstacles have the same name, or the file can't be
+            written.
     """
     instance(scene, Scene, "scene")
     path = file_path(path, "path")
@@ -190,7 +191,7 @@ def _obstacles(content: Mapping[Any, Any], key: str, metres: float) -> tuple[Obs
 
 
 def _check_names(key: str, obstacles: Sequence[Obstacle]) -> None:
-    """Reject two obstacles with one name: motions of obstacles and bodies of fixtures are found by name."""
+    """Reject two obstacles with the same name, because obstacles and fixtures are identified by their names."""
     names = [obstacle.name for obstacle in obstacles]
     for i, name in enumerate(names):
         if name and (first := names.index(name)) < i:
@@ -204,7 +205,7 @@ def _check_distances(goal: Pose | None, obstacles: Iterable[Obstacle], units: st
     if farthest < _NEAREST:
         raise InputError(
             f"units: in {units}, everything lies within {1e3 * farthest:.3g} mm of the robot's base; check units: are "
-            "these metres?"
+            "the numbers in metres?"
         )
 
 

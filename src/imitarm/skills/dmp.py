@@ -49,13 +49,13 @@ class DMPState(NamedTuple):
     """State of a primitive during a motion. ``DMP.begin`` creates it and ``DMP.step`` advances it.
 
     Attributes:
-        motion: [x; T x'] with T the duration, shape (2, 3) [m].
+        motion: [x; T x'], where T is the duration, shape (2, 3) [m].
         fraction: elapsed fraction of the duration on the primitive's own clock; the phase is ``exp(-alpha
             fraction)``.
         target: start, goal and duration of the motion.
         rotation: state of the rotation; None when no rotation was learned.
-        steps: common length of the steps so far, as a fraction of the duration, and their number; None if the
-            lengths differ.
+        steps: length of each step so far (as a fraction of the duration) and number of steps; None if the steps differ
+            in length.
         checked: the ``motion`` array that is known to be finite; None before a check. A step checks only states
             that the caller changed, not the state that the previous step returned.
     """
@@ -101,10 +101,10 @@ class DMP:
 
         f(s) &= \frac{\sum_i w_i \psi_i(s) s}{\sum_i \psi_i(s)}, \quad \psi_i(s) = \exp(-h_i (s - c_i)^2)
 
-    It replaces thesis Eqs 2.8 to 2.12, in which the force is scaled by g - x_0 and fails for an axis that does not
-    move. tau is the duration, so K and D have no unit: ``"critical"`` gains have D = 2 sqrt(K); the ``"thesis"`` gains
-    K = 139.26, D = 28 have a damping ratio of 1.186. Equivalently, the spring follows a moving target ``y(s) = g - (g -
-    x_0) s + f(s)`` that ends at the goal.
+    This form replaces thesis Eqs 2.8 to 2.12, which scale the force by g - x_0 and therefore fail for an axis that does
+    not move. tau is the duration, so K and D have no unit: ``"critical"`` gains have D = 2 sqrt(K); the ``"thesis"``
+    gains K = 139.26, D = 28 have a damping ratio of 1.186. Equivalently, the spring follows a moving target ``y(s) = g
+    - (g - x_0) s + f(s)`` that ends at the goal.
 
     **Fitting** (:func:`~imitarm.skills.dynamical_systems.fit_weights`) is ridge regression on the positions. Measured
     positions are not differentiated, samples may have any times, and the motion reaches the goal at the end of the
@@ -116,8 +116,8 @@ class DMP:
     * ``"progress"``: w + (change of g - x_0) w_p. The change of start and goal is added in proportion to the travelled
       path. The motion therefore rests where the demonstration rests, does not reverse when the distance is halved, and
       needs no special treatment for an axis without motion.
-    * ``"hoffmann"``: w as learned, the published form. The change of start and goal is added as fast as the spring
-      allows.
+    * ``"hoffmann"``: w as learned, as in the published form. The change of start and goal is added as fast as the
+      spring allows.
     * ``"rotodilatation"``: w is rotated and stretched like g - x_0 (Ginesi et al. 2019), so the shape scales.
 
     **Integration.** The integration is exact for a target that is a parabola within each 1/200 of the duration.
@@ -164,10 +164,9 @@ class DMP:
 
         Args:
             trajectory: the motion to reproduce.
-            exact_ends: whether to start and end exactly at the first and the last sample and rotation. Otherwise a
-                noisy first or
-                last sample is smoothed: if it is more than 0.1 mm from the path that fits all samples, the
-                motion starts or ends on that path.
+            exact_ends: whether to start and end exactly at the first and the last sample and rotation. Otherwise, if
+                noise moves the first or the last sample more than 0.1 mm away from the path that fits all samples, the
+                motion starts or ends on that path instead.
 
         Raises:
             InputError: when the trajectory has fewer than 3 samples.
@@ -269,7 +268,7 @@ class DMP:
         Args:
             start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
             goal: likewise.
-            duration: [s]; None: as learned.
+            duration: duration of the motion [s]; None: the learned one.
             start_velocity: start velocity (3,) [m/s]; None: the learned one, scaled with the duration.
             adjustment: how the motion is changed for another start and goal, see the class.
 
@@ -408,7 +407,7 @@ def number_of_steps(duration: float, dt: float, what: str) -> int:
     """Return ``round(duration / dt)``, at least 1.
 
     Raises:
-        InputError: when ``dt`` [s] is not above 0, or gives no step or more than 10 million.
+        InputError: when ``dt`` [s] is not above 0, or the duration has no step or more than 10 million steps.
     """
     steps = duration / finite_number(dt, f"{what}: dt", "s", above=0.0)
     if not 0.5 <= steps <= MOST_STEPS:

@@ -343,9 +343,9 @@ def fit_weights(
 
     The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. If noise
     moves one of these samples more than 0.1 mm away from the path that fits all samples, the end of this path is used
-    instead, because a motion forced through a noisy sample would jerk there. ``exact_ends`` turns this off. The last
-    drive is 0, so that the target is the goal when the duration is over. (The regression hardly determines the last
-    drive; without this condition, it can pull the tool decimetres away from the goal after the end.)
+    instead, because a motion forced through a noisy sample would jerk there. ``exact_ends`` turns this smoothing off.
+    The last drive is 0, so that the target is the goal when the duration is over. (The regression hardly determines the
+    last drive; without this condition, it can pull the tool decimetres away from the goal after the end.)
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).
@@ -389,7 +389,7 @@ def _without_last(R: Array, y: Array, force: Array, regularisation: float, end: 
 
 
 def _beside(R: Array, y: Array, n_basis: int, regularisation: float) -> Array:
-    """Return the offset of the best path from the first and the last sample, rows (start, 0, goal) [m]."""
+    """Return the offsets of the best path from the first and the last sample, as rows (start, 0, goal) [m]."""
     columns = np.concatenate([R[:, :1], R[:, 3:-1]], axis=1)
     solution = _ridge(columns, y, np.append(1.0, phase_basis(n_basis).centers[:-1]), regularisation)
     start, goal = columns[[0, -1]] @ solution - y[[0, -1]]
@@ -429,7 +429,7 @@ def start_rate(fraction: Array, x: Array, part: float = _START) -> Array:
     """Return the velocity at the first sample, in m per duration, shape (3,).
 
     The velocity is the slope of a parabola through the first samples. It is 0 unless it exceeds three standard errors
-    and a tenth of the mean speed: a motion that begins at rest begins exactly at rest.
+    and a tenth of the mean speed, so that a motion which begins at rest begins exactly at rest.
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).

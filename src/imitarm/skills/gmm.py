@@ -35,8 +35,8 @@ def ellipsoid_scale(probability: float, n_dims: int) -> float:
 
     The squared Mahalanobis distance of a Gaussian in ``n_dims`` dimensions has a chi-square distribution with
     ``n_dims`` degrees of freedom. The semi-axes are therefore ``scale * sqrt(eigenvalue)`` with the scale 1.960, 2.448,
-    2.796 for 95 % in 1, 2, 3 dimensions. The factor 1.960 for one dimension contains only 85 % in the plane and 72 % in
-    space.
+    2.796 for 95 % in 1, 2, 3 dimensions. The one-dimensional factor 1.960 would give an ellipse with only 85 % of a
+    Gaussian in the plane, and an ellipsoid with only 72 % in space.
 
     Raises:
         InputError: when ``probability`` is not in [0, 1) or ``n_dims`` is below 1.
@@ -75,7 +75,7 @@ class GaussianMixture:
         min_std: smallest standard deviation of a column [the column's unit] that counts as motion, one number or one
             per column. A constant column is given this standard deviation.
         random_state: seed of the k-means++ starts.
-        tol: stop when the mean log-likelihood per sample changes by less.
+        tol: stop when the mean log-likelihood per sample changes by less than this.
         max_iter: largest number of iterations of one start.
 
     Attributes:

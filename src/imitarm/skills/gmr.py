@@ -47,8 +47,9 @@ class UnalignedWarning(UserWarning):
 class GMR:
     r"""Gaussian mixture regression over time, of positions and rotations.
 
-    A :class:`~imitarm.skills.gmm.GaussianMixture` is fitted to all samples z = [t; x] of all demonstrations, and then
-    conditioned on t (thesis Eq 2.6, where the printed version lacks the responsibilities h_k):
+    A :class:`~imitarm.skills.gmm.GaussianMixture` is fitted to all samples z = [t; x] of all demonstrations. The
+    regression then conditions it on t, as in thesis Eq 2.6, whose printed version lacks the responsibilities
+    :math:`h_k`:
 
     .. math::
         \beta_k = \Sigma_k^{xt} / \Sigma_k^{tt}, \quad
@@ -64,8 +65,8 @@ class GMR:
         relative to a reference rotation; the reference follows the motion if the tool rotates far
     (:class:`~imitarm.skills.rotations.RotationReference`).
 
-    Times are counted from the first sample. Outside the demonstrated time span, the values at its ends are returned,
-    because the linear pieces would drift away.
+    Times are counted from the first sample. Outside the demonstrated time span, the regression returns its value at the
+    nearest end of the span, because extrapolated linear pieces would drift away.
 
     Args:
         n_components: number K of Gaussians, or ``"auto"``: the smallest K that reproduces held-out demonstrations as
@@ -133,7 +134,7 @@ class GMR:
         self.random_state = random_state
 
     def fit(self, demonstrations: Sequence[Demonstration | Trajectory]) -> Self:
-        """Learn from demonstrations, aligned beforehand (``imitarm.demonstrations.align``).
+        """Learn from demonstrations that were aligned before (``imitarm.demonstrations.align``).
 
         Times may start anywhere: the first time of each demonstration is subtracted. Durations that differ by more
             than 1 % are scaled to their median, and the method issues an :class:`UnalignedWarning`.
@@ -346,8 +347,8 @@ class GMR:
     def nominal(self, times: ArrayLike) -> tuple[Array, Array | None]:
         r"""Return the nominal path at ``times`` (n,) [s]: the mean motion, with exact start and goal.
 
-        The mean :math:`\hat x` blends straight pieces, so it misses the mean start and the mean goal of the
-        demonstrations by some millimetres. The nominal path corrects both ends by smooth steps:
+        The mean :math:`\hat x` blends straight pieces and therefore misses the mean start and the mean goal of the
+        demonstrations by some millimetres. The nominal path corrects both ends by the smooth steps :math:`b`:
 
         .. math::
             \bar x(t) = \hat x(t) + b(t / w_1) (x_{start} - \hat x(0)) + b((T - t) / w_K) (x_{goal} - \hat x(T)), \quad
@@ -429,7 +430,7 @@ def samples_of(
     if np.ptp(durations) > _SAME_DURATION * duration:
         warnings.warn(
             f"demonstrations last from {durations.min():.3g} to {durations.max():.3g} s; their times are scaled to "
-            f"{duration:.3g} s. Align them first, or the mean is flattened",
+            f"{duration:.3g} s. Align them first, because the mean of unaligned motions is flattened",
             UnalignedWarning,
             stacklevel=3,
         )

@@ -4,17 +4,17 @@ The logarithm of a weighted Gaussian is linear in the quadratic features ``phi(z
 
     log pi_k N(z; mu_k, Sigma_k) = theta_k . phi(z)
 
-so all log-densities are one matrix product, ``theta @ phi``, and all sufficient statistics are a second matrix product,
-``responsibilities @ phi^T``. There is no loop over components or samples. Written as a symmetric matrix M, the
+Therefore, all log-densities are one matrix product, ``theta @ phi``, and all sufficient statistics are a second matrix
+product, ``responsibilities @ phi^T``. There is no loop over components or samples. Written as a symmetric matrix M, the
 statistics of one component are the second moments of ``[1; z]``. The inverse of M contains all parts of ``theta_k``
 (``P = Sigma^-1``)::
 
     M = [1     mu^T             ]     M^-1 = [1 + mu^T P mu   -mu^T P]     det M = det Sigma
         [mu    Sigma + mu mu^T  ]            [-P mu            P     ]
 
-Fits that differ only in their start or in their samples (restarts, folds of a cross-validation) are further rows of
-the same two products. The samples must be standardised (each column with mean 0 and standard deviation 1), so that the
-sums of squares are well conditioned.
+Fits that differ only in their start or in their samples (restarts, folds of a cross-validation) are computed together,
+as further rows of the same two products. The samples must be standardised (each column with mean 0 and standard
+deviation 1), so that the sums of squares are well conditioned.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def expectation_maximisation(
         responsibilities: initial responsibilities, shape (B, K, n).
         sample_weights: weight of each sample in each fit, shape (B, n); 0 excludes the sample. None: all 1.
         floor: smallest eigenvalue of a covariance, in squared standard deviations of the columns.
-        tol: stop when the mean log-likelihood per sample changes by less, in every fit.
+        tol: stop when, in every fit, the mean log-likelihood per sample changes by less than this.
         max_iter: largest number of iterations.
     """
     fraction = None if sample_weights is None else sample_weights / sample_weights.sum(axis=1, keepdims=True)
@@ -216,7 +216,8 @@ def responsibilities_by_segments(features: Array, column: Array, numbers: Sequen
         numbers: numbers K of segments to compute.
 
     Returns:
-        Responsibilities of 0 or 1, shape (K, n), in the order of time, for each K; equal bins for few samples or gaps.
+        Responsibilities of 0 or 1, shape (K, n), in the order of time, for each K. If there are few samples or gaps in
+        time, the segments are equal bins.
     """
     most = max(numbers)
     n_slots = max(_SLOTS, 4 * most)
@@ -264,7 +265,7 @@ def _cut(slot: NDArray[np.intp], came_from: list[NDArray[np.intp]], n_slots: int
 
 
 def responsibilities_by_bins(column: Array, n_bins: int) -> Array:
-    """Return responsibilities of 0 or 1, shape (K, n), of equally wide (few samples: equally full) bins."""
+    """Return responsibilities of 0 or 1, shape (K, n), of equally wide bins; for few samples, of equally full bins."""
     low, high = column.min(), column.max()
     labels = np.minimum(((column - low) * (n_bins / max(high - low, 1e-300)) + _EDGE).astype(np.intp), n_bins - 1)
     if np.bincount(labels, minlength=n_bins).min() < 2:
@@ -299,16 +300,18 @@ class Candidate:
 def choose(candidates: Sequence[Candidate]) -> int:
     """Return the number of components to use.
 
-    It is the smallest K
+    The function returns the smallest K that meets two conditions:
 
-    * whose held-out error is within 2 % (or 0.1 mm) of the smallest, so it generalises as well as any other K, and
-    * whose bias is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small compared with the
+    * Its held-out error is within 2 % (or 0.1 mm) of the smallest held-out error, so it generalises as well as any
+      other K.
+    * Its bias is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small compared with the
       differences between demonstrations. The held-out error alone hardly shows a bias, because the squared bias is
       added to much larger squared differences.
 
-    If no K meets both conditions, the result is the smallest K that meets the first one and whose bias is at most a
-    tenth above the smallest bias among those. BIC alone selects ever larger K for time series, because neighbouring
-    samples are not independent. BIC decides only when there is one demonstration, because then none can be left out.
+    If no K meets both conditions, only the K that meet the first condition are compared. The result is the smallest of
+    them whose bias is at most 10 % above the smallest bias among them. BIC alone selects ever larger K for time series,
+    because neighbouring samples are not independent. BIC decides only if there is a single demonstration, because a
+    held-out error needs at least two demonstrations.
     """
     ordered = sorted(candidates, key=lambda c: c.n_components)
     if any(np.isnan(c.held_out_rmse_mm) for c in ordered):
@@ -334,9 +337,10 @@ def try_numbers_of_components(
     """Evaluate several numbers of components.
 
     For each number, the fit to all demonstrations and the fits without one demonstration run together, as rows of the
-    same matrix products. Only a subset of the samples is used; a longer path uses more of them. For a pure rotation,
-    errors are computed for a point 100 mm from the axis. The search stops when four numbers in a row did not reduce the
-    held-out error by 0.5 %, and one number meets both conditions of :func:`choose`.
+    same matrix products. Only a subset of the samples is used; the longer the path, the more samples are used. For a
+    pure rotation, errors are computed for a point 100 mm from the axis. The search stops when four numbers of
+    components in a row did not reduce the held-out error by 0.5 %, and one of the numbers meets both conditions of
+    :func:`choose`.
 
     Args:
         tables: samples [t, x, y, z, ...] of each demonstration, over the same span of time.

@@ -49,7 +49,7 @@ class RotationReference:
 
     A rotation ``R`` near the reference ``R_ref(t)`` has the rotation vector ``r = log(R R_ref(t)^T)`` [rad] in the base
     frame. A fixed reference suffices if all rotations are well within 180 degrees of it. A longer rotation needs a
-    moving reference: a cubic spline through a few key quaternions, normalised.
+    moving reference, which is a normalised cubic spline through a few key quaternions.
 
     Attributes:
         times: times of the keys [s], strictly increasing, shape (m,); a single key is a fixed reference.
@@ -82,7 +82,7 @@ class RotationReference:
         return CubicSpline(self.times, self.quaternions)
 
     def at(self, times: ArrayLike) -> Array:
-        """Return the reference (n, 4) wxyz at ``times`` (n,) [s]; outside the keys' time span, the nearest key."""
+        """Return the reference (n, 4) wxyz at ``times`` (n,) [s], or the nearest key outside the keys' time span."""
         t = finite_numbers(times, "RotationReference: times", "s")
         if len(self.times) == 1:
             return np.repeat(self.quaternions, len(t), axis=0)
@@ -179,11 +179,11 @@ class QuaternionDMP:
     .. math::
         r = \log(R R_y(s)^T), \qquad \tau^2 \ddot r = -K r - D \tau \dot r + \tau^2 c
 
-    where c is an external angular acceleration. The logarithm is taken only of ``r``, the rotation from the target,
+    Here, c is an external angular acceleration. The logarithm is taken only of ``r``, the rotation from the target,
     never of the rotation to the goal. Therefore a rotation by 270 degrees, or by three full revolutions, is reproduced
-    as demonstrated. (Forms that use log(q_goal conj(q)) rotate in the opposite direction beyond 180 degrees.) The
-    target is a cubic spline through quaternions with continuous signs, normalised. Another start or goal rotates the
-    target in the base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. The
+    as demonstrated. (Formulations that use log(q_goal conj(q)) rotate in the opposite direction beyond 180 degrees.)
+    The target is a cubic spline through quaternions with continuous signs, normalised. Another start or goal rotates
+    the target in the base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. The
     rotations ``d_start`` and ``d_goal`` are each at most 180 degrees.
 
     Args:
@@ -256,8 +256,8 @@ class QuaternionDMP:
         c = finite_array(coefficients, (None, 4), "QuaternionDMP.from_spline: coefficients").copy()
         if len(c) != len(t) - _DEGREE - 1 or len(c) <= _DEGREE:
             raise InputError(
-                f"QuaternionDMP.from_spline: {len(t)} knots need {len(t) - _DEGREE - 1} coefficients and at least "
-                f"{_DEGREE + 1}, got {len(c)}"
+                f"QuaternionDMP.from_spline: {len(t)} knots need {len(t) - _DEGREE - 1} coefficients, and at least "
+                f"{_DEGREE + 1} are needed; got {len(c)}"
             )
         ends = np.all(t[: _DEGREE + 1] == 0.0) and np.all(t[-_DEGREE - 1 :] == 1.0)
         if not (ends and np.all(np.diff(t) >= 0.0)):
@@ -334,7 +334,7 @@ class QuaternionDMP:
         Args:
             state: state returned by :meth:`begin` or by the last step.
             step: fraction of the duration, above 0.
-            acceleration: T^2 times an angular acceleration (3,) [rad] in the base frame, held during the step; T is
+            acceleration: T^2 times an angular acceleration (3,) [rad] in the base frame, constant during the step; T is
                 the duration.
 
         Raises:
@@ -370,8 +370,8 @@ def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, go
 def rotodilatation(learned: Array, asked: Array, path_length: float) -> Array:
     """Return the product of a factor and the smallest rotation that maps ``learned`` to ``asked``, shape (3, 3).
 
-    After Ginesi, Sansonetto and Fiorini (2019), "DMP++". If the learned motion ends near its start, its direction and
-    length are undefined, and the result is the identity.
+    The method follows Ginesi, Sansonetto and Fiorini (2019), "DMP++". If the learned motion ends near its start, its
+    direction and length are undefined, and the result is the identity.
 
     Args:
         learned: vector from the learned start to the learned goal, shape (3,) [m].

@@ -36,8 +36,8 @@ class Skill:
 
     A :class:`~imitarm.skills.gmr.GMR` learns the mean motion and its covariance, which shows how much the
     demonstrations differ at each time. A :class:`~imitarm.skills.dmp.DMP` is trained on the nominal path: it can change
-    the start, the goal and the duration of the motion. The covariance is the tolerance: the robot must be precise where
-    the person was precise. A skill is independent of obstacles; policies handle them.
+    the start, the goal and the duration of the motion. The covariance is used as a tolerance: the robot must be precise
+    where the person was precise. A skill is independent of obstacles; policies handle them.
 
     The nominal path and the primitive start and end exactly at the means of the demonstrated starts and goals.
 
@@ -118,7 +118,7 @@ class Skill:
         return self
 
     def _primitive(self, gmr: GMR) -> DMP:
-        """Train primitives of increasing size until one follows the nominal path, and keep it (or the largest one)."""
+        """Return the smallest primitive that follows the nominal path after training, or the largest if none does."""
         for dmp in self._primitives:
             nominal = gmr.trajectory(max(_SAMPLES, _SAMPLES_PER_BASIS * dmp.n_basis))
             dmp.fit(nominal, exact_ends=True)
@@ -195,7 +195,7 @@ class Skill:
 
         .. math:: x(t) = \bar x(t) + (1 - p(t)) \delta_{start} + p(t) \delta_{goal}
 
-        where p is the fraction of the path that has been travelled. The rotation changes along a minimum-jerk profile.
+        Here, p is the fraction of the path that has been travelled. The rotation changes along a minimum-jerk profile.
 
         Args:
             times: strictly increasing times from 0 to the learned duration, shape (n,) [s].
@@ -286,7 +286,9 @@ class Skill:
         try:
             gmr, dmp = gmr_of(document.gmr), dmp_of(document.dmp)
             if gmr.has_orientation_ != (dmp.orientation_ is not None):
-                raise InputError("rotation was learned by one of gmr and dmp only")
+                raise InputError(
+                    "only one of gmr and dmp has learned the rotation; both or neither must have learned it"
+                )
             quality = None
             if document.fit is not None:
                 quality = fit_of(document.fit, document.provenance.sources, gmr.n_components_)

@@ -1,10 +1,10 @@
 """The skill file: human-readable JSON. It is checked when it is read, and nothing in it is ever executed.
 
-Layout: ``format``, ``version``, the meaning of the numbers (``units``, ``frames``), their origin (``task``,
-``provenance``), the numbers (``gmr``, ``dmp``, ``fit``), and last a ``checksum``: SHA-256 of everything else in
-canonical form (sorted keys, no spaces), so a change of any digit is detected, while a change of layout is accepted.
-Floats are written with all digits and are read back exactly. The classes below are the schema: they define the content
-that is written and accepted.
+The file contains ``format``, ``version``, the meaning of the numbers (``units``, ``frames``), their origin (``task``,
+``provenance``), the numbers (``gmr``, ``dmp``, ``fit``), and last a ``checksum``. The checksum is the SHA-256 of
+everything else in canonical form (sorted keys, no spaces). It therefore detects a change of any digit, but accepts a
+change of layout. Floats are written with all digits and are read back exactly. The classes below are the schema: they
+define the content that is written and accepted.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class ReferenceFields(msgspec.Struct):
 
 
 class SelectionFields(msgspec.Struct, omit_defaults=True):
-    """The numbers of components that were tried."""
+    """The results for all numbers of components that were tried."""
 
     rows: Table = msgspec.field(name="n_components, bic, aic, bias_rmse_mm")
     held_out_rmse_mm: Row | None = None
@@ -173,7 +173,7 @@ def gmr_of(fields: GmrFields) -> GMR:
         rows = fields.selection.rows
         errors = fields.selection.held_out_rmse_mm or [np.nan] * len(rows)
         if len(errors) != len(rows) or any(len(row) != 4 for row in rows):
-            raise InputError("gmr.selection: expected rows of 4 numbers, each with one error")
+            raise InputError("gmr.selection: must have rows of 4 numbers, and one held-out error for each row")
         selection = [Candidate(int(k), bic, aic, e, bias) for (k, bic, aic, bias), e in zip(rows, errors, strict=True)]
     return GMR.from_mixture(
         fields.weights,
@@ -326,7 +326,7 @@ def read_skill(path: str | os.PathLike[str]) -> SkillDocument:
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{source}: holds a value that is not allowed in a skill file ({error})") from error
     if checksum != expected:
-        raise FileFormatError(f"{source}: the checksum does not fit the content; {_REMEDY}")
+        raise FileFormatError(f"{source}: the checksum does not match the content; {_REMEDY}")
     return as_document(whole, SkillDocument, source, _REMEDY)
 
 
