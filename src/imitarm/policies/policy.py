@@ -134,8 +134,9 @@ class ACFRA(Policy):
         twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
     The phase ``s`` therefore waits for a robot that lags, for example at its speed limits or when a hand holds it. If
-    ``e_0`` is the required clearance, the tool does not touch an obstacle when it returns to the path on a straight
-    line, because each point of this line is within ``e_0 / 2`` of the tool or of its target.
+    ``e_0`` is the required clearance, the straight line back to the path cuts a corner by at most half of the
+    clearance, because each point of the line is within ``e_0 / 2`` of the tool or of its target, and both are clear of
+    obstacles.
 
     Among moving obstacles the plan is valid only at the planned times, so the phase follows the clock and does not
     wait. When the tool is farther than ``e_0 / 2`` from its planned position, the plan is no longer valid: the arm
