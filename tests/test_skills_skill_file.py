@@ -120,7 +120,7 @@ def test_a_digit_changed_by_hand_is_refused(path: Path) -> None:
     text = path.read_text()
     altered = path.with_name("by_hand.json")
     altered.write_text(text.replace('"duration": 2.0', '"duration": 3.0', 1))
-    with pytest.raises(FileFormatError, match="checksum does not fit"):
+    with pytest.raises(FileFormatError, match="checksum does not match"):
         Skill.load(altered)
 
 
