@@ -156,5 +156,6 @@ def success_table(
         "diameter",
         _COLUMNS,
         tuple(rows),
-        "Right answer: solved with the required clearance (less 0.5 mm), or refused where it can't be solved.",
+        "Right answer: the method solved the scene with the required clearance (tolerance 0.5 mm), or it refused a "
+        "scene that can't be solved.",
     )

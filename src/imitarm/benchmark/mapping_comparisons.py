@@ -65,9 +65,10 @@ def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
     ]
     columns = ("measure", f"{OURS} minus", "difference (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
     note = (
-        "↑: a larger value is better; otherwise a smaller one. Intervals: by resampling the persons. "
-        "p: by sign flips of the persons' differences, corrected within each measure. "
-        "Pairs: recordings for which both methods have a value."
+        "↑ marks measures for which a larger value is better. For all other measures, a smaller value is better. "
+        "Intervals are computed by resampling the persons. p is computed by sign flips of the persons' differences, "
+        "and corrected for the number of methods within each measure. Pairs: recordings for which both methods have a "
+        "value."
     )
     return Table(f"Paired comparison: {', '.join(tasks)}", columns, tuple(rows), note)
 
@@ -82,10 +83,19 @@ def better_methods_table(results: Results, tasks: Sequence[str]) -> Table:
             if often or (found.excludes_zero and sign * found.mean > 0.0):
                 cells = _difference(comparison, figure)
                 rows.append((task, _titled(figure), METHODS[name].title, *cells, f"{p:.3f}"))
-    columns = ("recordings", "measure", "better", f"{OURS} minus it (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
+    columns = (
+        "recordings",
+        "measure",
+        "better method",
+        f"{OURS} minus better method (95 %)>",
+        "relative [%]>",
+        "pairs>",
+        "p, Holm>",
+    )
     note = (
-        f"All compared measures whose interval shows that {OURS} is worse (for any p), and all methods that stacked "
-        f"more often. ↑: a larger value is better; otherwise a smaller one."
+        f"The table lists every measure whose interval shows that {OURS} is worse, whatever the value of p, and every "
+        f"method that stacked more often. ↑ marks measures for which a larger value is better. For all other measures, a smaller "
+        "value is better."
     )
     return Table(f"Where another method is better than {OURS}", columns, tuple(rows), note)
 
@@ -157,9 +167,9 @@ def printed_table(results: Results, tasks: Sequence[str]) -> Table:
     columns = ("", *(f"τ{joint + 1} [N m]>" for joint in range(7)), "path>", "time [s]>")
     over = int(np.sum(PRINTED_TORQUES.mean(axis=0) > arm.max_torque))
     note = (
-        f"Means (95 % interval). Ours: torques and path of the replayed recordings ({', '.join(tasks)}), time of the "
-        f"closed-loop trials that succeeded. {over} of the 7 printed means are above the rated torques of the joints, "
-        "so they can't be mean torques of a Sawyer's joints."
+        "Values are means (95 % interval). In the rows of the methods, torques and path are from the replayed "
+        f"recordings ({', '.join(tasks)}), and the time is from the closed-loop trials that succeeded. {over} of the 7 printed "
+        "means are above the rated torques of the joints, so they can't be mean torques of a Sawyer's joints."
     )
     return Table("Table 3.1 of the thesis, and ours", columns, tuple(rows), note)
 
@@ -184,9 +194,10 @@ def claims_table(results: Results, tasks: Sequence[str]) -> Table:
         rows.append((claim, *cells))
     columns = ("the thesis claims", "thesis, corrected", "held?", "modern", "held?")
     note = (
-        "Each difference is the method of the column minus the baseline, in paired trials. yes: for every baseline the "
-        "95 % interval of the difference is on the claimed side and the corrected p is below 0.05; no: for at least "
-        "one baseline the interval is on the other side; not shown: neither. Times are compared where both succeeded."
+        "Each percentage is the difference of the column's method from the baseline, in paired trials. yes: for every "
+        "baseline, the 95 % interval of the difference is on the claimed side, and the corrected p is below 0.05. no: "
+        "for at least one baseline, the interval is on the other side. not shown: neither. Times are compared only for "
+        "trials in which both methods succeeded."
     )
     return Table("Claims of the thesis, and results", columns, tuple(rows), note)
 
@@ -285,7 +296,10 @@ CLAIMS: Sequence[tuple[str, Callable[[Results, str, Sequence[str]], Verdict]]] =
     ("a shorter path than M1, M2, M3, by up to 5 % (Fig 3.7)", _less("path_length")),
     ("shorter time than M1, M2, M3 (Fig 3.8)", _quicker),
     ("M2 has the smallest torque, but takes longest (text beside Fig 3.7)", _two_leads),
-    ("singularities are avoided: farther from them than M3 at the edge of reach", _farther_from_singular),
+    (
+        "singularities are avoided: at the edge of reach, the arm is farther from them than with M3",
+        _farther_from_singular,
+    ),
     (f"mean torques of {min(_MEANS):.0f} to {max(_MEANS):.0f} N m at every joint (Table 3.1)", _rated),
     (f"four cubes stacked in {PRINTED_TIME.mean():.1f} s (Table 3.1)", _like_printed_time),
 )

@@ -72,12 +72,15 @@ TORQUES = (
 LOOP = (Figure("time", "time [s]", digits=0), Figure("path_length", "path [m]", digits=2), TORQUES[0])
 
 _RECORDED = (Figure("recorded", "length [s]"), Figure("beyond_reach", "beyond reach [%]", 100.0))
-_MEANS_NOTE = "Mean over persons (95 % interval)"
+_MEANS_NOTE = "Each value is the mean over persons (95 % interval)."
 _ACCURACY_NOTE = (
-    "root mean squares. Executed: by an arm that keeps its limits, as a real arm does. Engaged: fraction of the time "
-    "in which the robot was led."
+    "Distances are root mean squares. Executed: measured on an arm that keeps its limits, as a real arm does. Engaged: "
+    "fraction of the time in which the person led the robot."
 )
-_CAPTURED_NOTE = "One person's motion, so without an interval: mean (least … greatest over the cameras)"
+_CAPTURED_NOTE = (
+    "All recordings show the motion of one person, so there is no interval: each value is the mean over the cameras "
+    "(smallest … largest)."
+)
 _ONE = -1  # person of the captured arm: it is the same whichever simulated body carries it
 
 
@@ -199,8 +202,8 @@ def accuracy_table(results: Results, task: str) -> Table:
         engaged = interval(results.values(name, [task], "engaged_fraction")).mean
         cells = _cells(results, name, task, ACCURACY)
         rows.append((METHODS[name].title, *cells, f"{100 * engaged:.0f}" if math.isfinite(engaged) else "–"))
-    columns = ("method", *(f"{figure.title}>" for figure in ACCURACY), "led [%]>")
-    note = f"{_CAPTURED_NOTE if task == CAPTURED else _MEANS_NOTE}; {_ACCURACY_NOTE}"
+    columns = ("method", *(f"{figure.title}>" for figure in ACCURACY), "engaged [%]>")
+    note = f"{_CAPTURED_NOTE if task == CAPTURED else _MEANS_NOTE} {_ACCURACY_NOTE}"
     return Table(f"Accuracy, {task}", columns, tuple(rows), note)
 
 
@@ -220,7 +223,7 @@ def _figures(results: Results, tasks: Sequence[str], figures: Sequence[Figure], 
         for name in results.methods
     )
     columns = ("method", *(f"{figure.title}>" for figure in figures))
-    return Table(f"{title}: {', '.join(tasks)}", columns, rows, f"{_MEANS_NOTE}.")
+    return Table(f"{title}: {', '.join(tasks)}", columns, rows, _MEANS_NOTE)
 
 
 def torque_table(results: Results, tasks: Sequence[str], name: str, title: str) -> Table:
@@ -231,7 +234,7 @@ def torque_table(results: Results, tasks: Sequence[str], name: str, title: str) 
         figure = Figure(name, "", digits=2)
         rows.append((METHODS[method].title, *(written(f, figure) for f in found)))
     columns = ("method", *(f"τ{joint + 1}>" for joint in range(7)))
-    return Table(f"{title} [N m]: {', '.join(tasks)}", columns, tuple(rows), f"{_MEANS_NOTE}.")
+    return Table(f"{title} [N m]: {', '.join(tasks)}", columns, tuple(rows), _MEANS_NOTE)
 
 
 def limits_table(results: Results, tasks: Sequence[str]) -> Table:
@@ -252,8 +255,11 @@ def limits_table(results: Results, tasks: Sequence[str]) -> Table:
         rows.append((*row, *(f"{ratio:.2f}" for ratio in ratios), str(own)))
     heads = ("method", "recordings without any>", "position>", "velocity>", "acceleration>")
     columns = (*heads, "worst velocity>", "worst acceleration>", "found by the method>")
-    note = "Frames that exceed a limit; largest value relative to the limit; faults that the method itself found and "
-    "did not fix."
+    note = (
+        "Position, velocity, acceleration: number of frames that exceed the limit. Worst velocity, worst acceleration: "
+        "largest value divided by the limit. Found by the method: number of faults that the method itself found and "
+        "did not fix."
+    )
     return Table(f"Limit violations: {', '.join(tasks)}", columns, tuple(rows), note)
 
 
@@ -275,9 +281,9 @@ def success_table(results: Results) -> Table:
         rows.append((METHODS[name].title, *rate, *cells, why))
     columns = ("method", "stacked>", "95 % [%]>", *(f"{figure.title}>" for figure in LOOP), "failures")
     note = (
-        "The interval of the rate is Wilson's with an effective number of trials, which decreases as the "
-        "differences between persons increase; one more failure never raises its lower end. "
-        "Time, path and torque are means over persons (95 % interval) of the trials that succeeded. "
+        "The interval of the success rate is Wilson's, with an effective number of trials. This number decreases as "
+        "the differences between persons increase. One more failure never raises the lower end of the interval. "
+        "Time, path and torque are means over persons (95 % interval) and include only the trials that succeeded. "
         f"{persons_note(results)}"
     )
     return Table("Four cubes stacked, closed loop", columns, tuple(rows), note)
