@@ -39,7 +39,7 @@ def test_the_captured_arm_is_one_person_and_has_no_interval():
     lag = table.columns.index("lag [ms]>")
     assert [row[lag] for row in table.rows] == ["60 (44 … 75)"] * 2
     assert not any(" to " in cell for row in table.rows for cell in row)
-    assert "One person's" in table.note
+    assert "the motion of one person" in table.note
     ((kind, n, who, *facts),) = recordings_table(Results(results)).rows
     assert (kind, n, who, facts[0]) == (CAPTURED, "2", "1 person, 2 cameras", "43.0 (43.0 … 43.0)")
     titles = [t.title for t in tables(Results(results))]

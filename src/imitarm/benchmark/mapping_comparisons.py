@@ -94,8 +94,8 @@ def better_methods_table(results: Results, tasks: Sequence[str]) -> Table:
     )
     note = (
         f"The table lists every measure whose interval shows that {OURS} is worse, whatever the value of p, and every "
-        f"method that stacked more often. ↑ marks measures for which a larger value is better. For all other measures, a smaller "
-        "value is better."
+        "method that stacked more often. ↑ marks measures for which a larger value is better. For all other measures, "
+        "a smaller value is better."
     )
     return Table(f"Where another method is better than {OURS}", columns, tuple(rows), note)
 
@@ -168,8 +168,8 @@ def printed_table(results: Results, tasks: Sequence[str]) -> Table:
     over = int(np.sum(PRINTED_TORQUES.mean(axis=0) > arm.max_torque))
     note = (
         "Values are means (95 % interval). In the rows of the methods, torques and path are from the replayed "
-        f"recordings ({', '.join(tasks)}), and the time is from the closed-loop trials that succeeded. {over} of the 7 printed "
-        "means are above the rated torques of the joints, so they can't be mean torques of a Sawyer's joints."
+        f"recordings ({', '.join(tasks)}), and the time is from the closed-loop trials that succeeded. {over} of the 7 "
+        "printed means are above the rated torques of the joints, so they can't be mean torques of a Sawyer's joints."
     )
     return Table("Table 3.1 of the thesis, and ours", columns, tuple(rows), note)
 
