@@ -261,7 +261,7 @@ def test_learn_reports_the_distance_to_each_demonstration(shown, tmp_path, capsy
         (row,) = [line for line in lines if d.source in line and "mm" not in line and "│" in line]
         cells = [cell.strip() for cell in row.strip("│").split("│")]
         assert cells == [d.source, *(f"{1e3 * x:.1f}" for x in (d.rms, d.largest, d.start, d.goal))]
-    assert any("distance to their average (bias)" in line for line in lines)
+    assert any("distance to the mean demonstration (bias)" in line for line in lines)
 
 
 def test_learn_does_not_report_a_poor_fit_as_success(tmp_path, capsys):

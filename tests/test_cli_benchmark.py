@@ -77,7 +77,7 @@ def test_a_reports_folder_is_made_before_the_work_or_the_work_is_not_begun(tmp_p
     assert begun == [(1, True, "out")]
     (tmp_path / "file").write_text("")
     assert cli.main([*SMALL, "--report", "file/page.html"]) == 2
-    assert "--report file/page.html: its folder can't be made" in capsys.readouterr().err
+    assert "--report file/page.html: its folder can't be created" in capsys.readouterr().err
     assert len(begun) == 1
 
 

@@ -192,15 +192,18 @@ def test_the_guided_way(inside, monkeypatch, capsys):
     assert touching(monkeypatch, [""] * 5, POINTS) == 0
     np.testing.assert_allclose(Calibration.load("calibration.json").sensor_to_base.position, SENSOR.position, atol=1e-9)
     text = capsys.readouterr().err
-    assert "Point 1 of 5: tool at 50.0 -30.0 20.0 cm, hand on it, Enter" in text and "palm of your right hand" in text
+    assert (
+        "Point 1 of 5: tool at 50.0 -30.0 20.0 cm; put your hand on the tool and press Enter" in text
+        and "palm of your right hand" in text
+    )
 
 
 def test_a_hand_that_moves_or_is_not_seen_is_measured_again(inside, monkeypatch, capsys):
     places = [(POINTS[0], 0.05, Tracking.TRACKED), (POINTS[0], 0.0, Tracking.INFERRED), *POINTS]
     assert touching(monkeypatch, [""] * 7, places) == 0
     text = capsys.readouterr().err
-    assert "the hand moved by 5.0 cm; hold it still. Try again" in text
-    assert "the right hand was seen in 0 of" in text
+    assert "the hand moved by 5.0 cm; hold the hand still. Try again" in text
+    assert "the right hand was seen in only 0 of" in text
 
 
 def test_the_point_that_does_not_fit_is_touched_again(inside, monkeypatch, capsys):
@@ -226,7 +229,7 @@ def test_a_point_may_be_skipped_but_not_too_many(inside, monkeypatch, capsys):
 def test_the_clutch_by_options_and_by_answers(inside, monkeypatch, capsys):
     Calibration(lengths=None).save("calibration.json")
     assert main(["calibrate", "clutch", "--anchor", "shoulder", "--orientation", "fixed"]) == 2
-    assert "needs your arm's lengths; run 'imitarm calibrate limbs" in capsys.readouterr().err
+    assert "needs the lengths of your arm; run 'imitarm calibrate limbs" in capsys.readouterr().err
     assert main(["calibrate", "clutch", "--scale", "0.5", "--orientation", "fixed"]) == 0
     assert (Calibration.load("calibration.json").scale, Calibration.load("calibration.json").orientation) == (
         0.5,

@@ -119,7 +119,7 @@ def test_a_truncated_file_is_named(wave, capsys):
 def test_nobody_there_is_a_failure_and_leaves_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("imitarm.cli.capture.open_source", lambda word, realtime: Listed([None, None]))
     assert main(["capture", "webcam:0", "--out", str(tmp_path / "a.csv")]) == 1
-    assert "nobody was seen, nothing is written" in capsys.readouterr().err
+    assert "nobody was seen, so nothing is written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -170,7 +170,7 @@ def test_skeletons_are_sent_at_the_pace_at_which_they_happened(tmp_path, capsys)
         )
     assert "sent 12 skeletons to 127.0.0.1:" in capsys.readouterr().err
     assert main(["capture", str(path), "--send", f"127.0.0.1:{received.address[1]}"]) == 0
-    assert "nobody listened to" in capsys.readouterr().err
+    assert "no program received them" in capsys.readouterr().err
     assert main(["capture", str(path), "--send", "nowhere"]) == 2
     assert "'nowhere' is not an address" in capsys.readouterr().err
 

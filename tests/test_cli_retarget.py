@@ -98,7 +98,7 @@ def test_all_methods_side_by_side(shown, tmp_path, capsys, monkeypatch):
     shown_table = capsys.readouterr().out
     for name in RETARGETERS:
         assert len(Demonstration.load(tmp_path / f"demo_{name}.csv")) > 100
-    row = next(line for line in shown_table.splitlines() if "simulated: RMS error of the worst joint" in line)
+    row = next(line for line in shown_table.splitlines() if "simulated: RMS position error of the worst joint" in line)
     assert len(row.split("│")) == 2 + 1 + len(RETARGETERS)
     text = page.read_text(encoding="utf-8")
     assert text.count('id="tab-method-') == len(RETARGETERS)

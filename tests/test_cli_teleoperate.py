@@ -75,7 +75,7 @@ def test_a_recording_leads_a_simulated_robot(person, tmp_path, capfd):
         "the source has ended",
         "following",
         "largest use of the limits",
-        "no safe motion in 0 steps",
+        "no safe motion was found in 0 steps",
         "median [ms]",
         "total",
         "wrote",

@@ -26,7 +26,8 @@ GOOD = TargetTracking("modern", 0.01, 0.0, 0.0, 0.03, 1, 0.95, 0)
         (
             {},
             True,
-            "modern: follows its target, 10 mm from it (RMS), farther than 5 cm for 0 % of the time; the person led",
+            "modern: follows its target, 10 mm from it (RMS), farther than 5 cm for 0 % of the time; the "
+            "person controlled the robot for",
         ),
         ({"rms": FAR}, True, "follows"),
         ({"rms": 1.01 * FAR}, False, "does not follow"),
@@ -34,7 +35,7 @@ GOOD = TargetTracking("modern", 0.01, 0.0, 0.0, 0.03, 1, 0.95, 0)
         ({"far_fraction": 1.01 * FAR_FRACTION}, False, "does not follow"),
         ({"far_fraction": 0.001}, True, "for under 1 % of the time"),
         ({"far_fraction": 0.999, "rms": 1.0}, False, "for over 99 % of the time"),
-        ({"engaged_fraction": 0.49}, False, "nobody led for most of the time"),
+        ({"engaged_fraction": 0.49}, False, "nobody controlled the robot for most of the time"),
         ({"rms": np.nan, "far_fraction": np.nan, "farthest": np.nan}, False, "followed nothing"),
         ({"violations": 3}, True, "limits are exceeded in 3 frames"),
     ],
@@ -89,7 +90,7 @@ def test_the_arm_that_shows_something_is_named_first_and_one_that_hangs_never():
     assert "try --side left" in suggestion(BAD, showing(0.4, 0.05), right, fitted=True, pace=1.0)
     assert "--side" not in suggestion(BAD, showing(0.05, 0.4), right, fitted=True, pace=1.0)
     assert suggestion(BAD, showing(0.4, 0.4), right, fitted=True, pace=1.0).endswith(
-        "--side left (if the other arm is meant)"
+        "--side left (if the person demonstrates with the other arm)"
     )
     assert "try --side right" in suggestion(BAD, showing(0.05, 0.4), replace(right, side="left"), fitted=True, pace=1.0)
 

@@ -1,4 +1,4 @@
-"""The ``imitarm`` command: one file a subcommand, each with ``add_arguments(parser)`` and ``run(arguments)``.
+"""The ``imitarm`` command. Each subcommand has its own file with ``add_arguments(parser)`` and ``run(arguments)``.
 
 A module is imported only when its command is used, so ``imitarm --help`` answers at once. To add a command, write a
 file in this folder and add a line to ``COMMANDS``.
@@ -17,7 +17,7 @@ from imitarm.errors import ImitarmError
 
 COMMANDS = {
     "capture": "record a person's motion from a camera or a file, and check it",
-    "calibrate": "measure a person's arm, locate the sensor, choose how the robot follows",
+    "calibrate": "measure a person's arm, locate the sensor, choose how the robot follows the person",
     "retarget": "convert a person's motion to a robot demonstration",
     "teleoperate": "let a person move a robot in real time",
     "serve": "make a simulated robot available to other processes over UDP",
@@ -25,7 +25,7 @@ COMMANDS = {
     "learn": "learn a skill from demonstrations",
     "reproduce": "let a simulated arm reproduce a skill around obstacles",
     "demo": "learn a sweep, reproduce it around obstacles, write a report",
-    "benchmark": "compare the methods with each other and with the thesis",
+    "benchmark": "run a benchmark of the methods, and compare the results with those of the thesis",
     "robots": "list the known arms and tools, or inspect one",
 }
 
@@ -35,18 +35,18 @@ examples:
   imitarm learn recordings/ --task pour --out pour.json --units cm --duration 10
   imitarm robots sawyer
 
-Run 'imitarm COMMAND --help' for the options of a command. Exit status: 0 when done, 1 when it could not be done,
-2 when the input is wrong, 130 when interrupted.
+Run 'imitarm COMMAND --help' for the options of a command.
+The exit status is 0 after success, 1 after a failure, 2 after wrong input and 130 after an interruption.
 """
 
 _INTERRUPTED, _PIPE_CLOSED = 130, 141  # 128 and the number of the signal, as shells count
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status; a failure is one message, never a traceback.
+    """Run the command line and return its exit status; a failure prints one message, never a traceback.
 
     Args:
-        argv: arguments without the program's name; None: the arguments of this process.
+        argv: command-line arguments without the program's name; by default, the arguments of this process.
     """
     # Many small matrices: one thread is quicker than several that wait for each other. NumPy is not loaded yet.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _explained(error: BaseException) -> tuple[str, int]:
-    """Return the message for an error, and the exit status."""
+    """Return the message and the exit status for an error."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", _INTERRUPTED
     if isinstance(error, ImitarmError):
@@ -83,11 +83,14 @@ def _explained(error: BaseException) -> tuple[str, int]:
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """Build the parser; only the command that ``words`` name gets its arguments."""
+    """Build the parser.
+
+    Only the subcommand named in ``words`` gets its arguments, so that the others are not imported.
+    """
     parser = argparse.ArgumentParser(
         prog="imitarm",
-        description="Teach industrial robot arms by showing: learn a motion from demonstrations and reproduce it "
-        "safely around obstacles.",
+        description="Teach industrial robot arms by demonstration: learn a motion, and reproduce it safely around "
+        "obstacles.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -38,7 +38,8 @@ examples:
   imitarm benchmark people recordings person.mp4
   imitarm benchmark refusals --scenes 1000
 
-'mapping' saves each result in the folder --out; after Ctrl-C the same command continues where it stopped.
+'mapping' saves each result in the folder --out.
+If it was interrupted, the same command continues where it stopped.
 """
 
 
@@ -53,7 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--first",
         type=int,
         metavar="N",
-        help=f"number of the first person; default: {TEST}, with --quick 0. Persons below {TEST} are for developing "
+        help=f"number of the first simulated person; default: {TEST}, with --quick 0. Persons below {TEST} are for "
+        f"developing "
         "methods, the others for testing them",
     )
     mapping.add_argument(
@@ -70,9 +72,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument(
         "--sigma", type=float, metavar="MM", help="standard deviation of the camera's error; default: 10 to 20 mm"
     )
-    mapping.add_argument("--no-live", action="store_true", help="use recordings only, without the closed loop")
-    mapping.add_argument("--no-replay", action="store_true", help="use only the closed loop, without recordings")
-    mapping.add_argument("--data", type=Path, metavar="DIR", help="folder of real recordings: adds a captured arm")
+    mapping.add_argument("--no-live", action="store_true", help="use recordings only, without closed-loop trials")
+    mapping.add_argument("--no-replay", action="store_true", help="use closed-loop trials only, without recordings")
+    mapping.add_argument(
+        "--data",
+        type=Path,
+        metavar="DIR",
+        help="folder of real recordings; adds the captured arm (motion capture of a real person)",
+    )
     mapping.add_argument("--out", type=Path, metavar="DIR", help="folder of the results; default: benchmark-mapping")
     mapping.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
     _add_fill(mapping)
@@ -83,35 +90,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument("--jobs", type=int, metavar="N", help="number of processes; default: one for each processor")
     mapping.add_argument("--backend", default=LOCAL, metavar="NAME", help="backend of joblib: loky (local), dask, ray")
     mapping.set_defaults(benchmark=_mapping)
-    other = parsers.add_parser("avoidance", help="measure how often a method keeps its clearance in seeded scenes")
+    other = parsers.add_parser("avoidance", help="measure how often each method keeps its clearance in random scenes")
     other.add_argument(
         "--seeds", type=int, default=200, metavar="N", help="number of scenes in each family; default: 200"
     )
-    other.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000, the test seeds")
+    other.add_argument(
+        "--first", type=int, default=2000, metavar="N", help="first seed; default: 2000, where the test seeds begin"
+    )
     other.add_argument("--methods", nargs="+", choices=ADAPTERS, default=list(ADAPTERS))
     _add_fill(other)
     other.set_defaults(benchmark=_avoidance)
-    third = parsers.add_parser("refusals", help="check accepted paths and refusals in random scenes by an oracle")
+    third = parsers.add_parser(
+        "refusals", help="check in random scenes, with an independent oracle, whether paths and refusals are correct"
+    )
     third.add_argument("--scenes", type=int, default=1000, metavar="N", help="how many; default: 1000")
     third.add_argument("--first", type=int, default=0, metavar="N", help="first seed; default: 0")
     third.add_argument("--skills", type=Path, nargs="+", default=[], metavar="FILE", help="additional skills to adapt")
     _add_fill(third)
     third.set_defaults(benchmark=_refusals)
     placed = parsers.add_parser(
-        "placements", help="compare policies on a simulated arm with seeded obstacles on the path"
+        "placements", help="compare policies on a simulated arm with randomly placed obstacles on the path"
     )
-    placed.add_argument("--skill", type=Path, metavar="FILE", help="default: the packaged sweep, Sawyer and brush")
+    placed.add_argument(
+        "--skill", type=Path, metavar="FILE", help="default: the skill 'sweep' of the package, with Sawyer and brush"
+    )
     placed.add_argument("--policies", nargs="+", choices=POLICIES, default=["acfra"], metavar="NAME")
     placed.add_argument("--seeds", type=int, default=50, metavar="N", help="number of placements; default: 50")
     placed.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
     placed.add_argument("--jobs", type=int, default=1, metavar="N", help="number of processes; default: 1")
-    placed.add_argument("--list", action="store_true", help="also list each placement in which a policy did not arrive")
+    placed.add_argument(
+        "--list", action="store_true", help="also list each placement in which a policy did not reach the goal"
+    )
     add_robot_options(placed)
     _add_fill(placed)
     placed.set_defaults(benchmark=_placements)
-    people = parsers.add_parser("people", help="let recordings of real people drive simulated arms")
+    people = parsers.add_parser("people", help="retarget recordings of real people to simulated arms")
     people.add_argument(
-        "data", type=Path, metavar="DATA", help="folder of real recordings, with kinect_gestures and mocap_arm"
+        "data",
+        type=Path,
+        metavar="DATA",
+        help="folder of real recordings, with the subfolders kinect_gestures and mocap_arm",
     )
     people.add_argument("videos", nargs="*", metavar="VIDEO", help="videos or recordings of a person")
     _add_fill(people)
@@ -128,7 +146,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     Raises:
         InputError: when an option is wrong or a folder can't be used.
-        TaskFailedError: when a worker process was lost.
+        TaskFailedError: when a worker process ended unexpectedly.
     """
     status: int = arguments.benchmark(arguments)
     return status
@@ -142,7 +160,10 @@ def _mapping(arguments: argparse.Namespace) -> int:
     place = _place(arguments, "mapping")
     _check(arguments, folder)
     if not benchmark.data and benchmark.kinds:
-        remark("the captured arm is left out: it needs real recordings, name their folder with --data")
+        remark(
+            "the arm measured by motion capture is left out, because it needs real recordings; name their folder "
+            "with --data"
+        )
     with progress_bar() as bar:
         task = bar.add_task("measuring", total=None)
         done = run_all(
@@ -192,7 +213,7 @@ def _avoidance(arguments: argparse.Namespace) -> int:
 
 
 def _refusals(arguments: argparse.Namespace) -> int:
-    """Run the random scenes and print their table; return 1 when an accepted path violates its clearance."""
+    """Adapt skills to random scenes and print the results; return 1 when an accepted path violates its clearance."""
     if arguments.scenes < 1 or arguments.first < 0:
         raise InputError(
             f"--scenes must be at least 1 and --first at least 0, got {arguments.scenes} and {arguments.first}"
@@ -239,7 +260,7 @@ def _placements(arguments: argparse.Namespace) -> int:
 
 
 def _people(arguments: argparse.Namespace) -> int:
-    """Let recordings of real people drive the arms, and print the tables."""
+    """Retarget recordings of real people to the arms, and print the tables."""
     place = _place(arguments, "people")
     motions = list(real_motions.real_motions(arguments.data, arguments.videos))
     _report(real_motions.tables(motions), place, [code_version()])
@@ -247,7 +268,7 @@ def _people(arguments: argparse.Namespace) -> int:
 
 
 def _place(arguments: argparse.Namespace, benchmark: str) -> Place | None:
-    """Return the document for the tables, which is checked before the run; None if there is no document."""
+    """Return the document to fill with tables, after checking that it can be filled; None if no document is given."""
     return None if arguments.fill is None else Place(arguments.fill, benchmark)
 
 
@@ -280,7 +301,7 @@ def _configured(arguments: argparse.Namespace) -> MappingBenchmark:
 
 
 def _command() -> str:
-    """Return the command without file names of this machine."""
+    """Return the command line without file names that apply only to this machine."""
     words, places = sys.argv[1:], {"--out", "--report", "--fill", "--jobs", "--backend"}
     kept = [
         w
@@ -292,7 +313,7 @@ def _command() -> str:
 
 
 def _not_done(results: Sequence[Result]) -> list[str]:
-    """Return the failures and their reasons; a recording that can't be made is reported once, not for every method."""
+    """Return the failed experiments and their reasons; a recording that can't be made is listed only once."""
     found: dict[tuple[str, int, int, str], list[str]] = {}
     for result in results:
         if result.failure:
@@ -309,7 +330,7 @@ def _given(value: int | None, otherwise: int) -> int:
 
 
 def _check(arguments: argparse.Namespace, folder: Path) -> None:
-    """Check options that would otherwise fail only after the run."""
+    """Check the options now, because a wrong option would otherwise fail only after the long run."""
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {arguments.jobs}")
     if arguments.data is not None and not arguments.data.is_dir():
@@ -329,7 +350,9 @@ def _check(arguments: argparse.Namespace, folder: Path) -> None:
     try:
         page.absolute().parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"--report {page}: its folder can't be made ({error.strerror}); name another one") from error
+        raise InputError(
+            f"--report {page}: its folder can't be created ({error.strerror}); name another one"
+        ) from error
     from imitarm.viewer.page import check_writable  # noqa: PLC0415 (draws: needs an extra)
 
     check_writable(page)

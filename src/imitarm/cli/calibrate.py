@@ -1,4 +1,4 @@
-"""``imitarm calibrate``: measure limbs, locate the sensor, choose scale and orientation, and save them in one file."""
+"""``imitarm calibrate``: measure limbs, locate the sensor, choose scale and orientation, and save all in one file."""
 
 from __future__ import annotations
 
@@ -48,8 +48,10 @@ _ORIENTATIONS: dict[Orientation, str] = {
     "fixed": "the tool does not rotate",
 }
 _ANCHORS: dict[Anchor, str] = {
-    "shoulder": "the robot's arm is stretched when your arm is: whole workspace, less precise",
-    "object": "1 cm of the hand is 1 cm of the tool: for objects that you and the robot both have in front of you",
+    "shoulder": "the robot's arm is stretched when your arm is stretched; uses the robot's whole workspace, but is "
+    "less precise",
+    "object": "the tool moves 1 cm when the hand moves 1 cm; for objects that you and the robot both have in front "
+    "of you",
 }
 _TRIES = 3
 _STILL = 0.015  # [m] largest standard deviation of a hand that is held still, with the camera's noise
@@ -57,8 +59,8 @@ _SEEN = 0.5  # least fraction of frames with the hand
 _LEAST_FRAMES = 5
 _STEPS = (
     "1. Stand 1.5 to 3 m in front of the sensor, facing it, alone in view.",
-    "2. Hold the {side} arm away from the body, the elbow bent, with nothing between arm and sensor.",
-    "3. Move it slowly while it is measured.",
+    "2. Hold the {side} arm away from the body with a bent elbow, and keep the view from sensor to arm free.",
+    "3. Move the arm slowly during the measurement.",
 )
 
 
@@ -71,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=float, default=5.0, metavar="S", help="duration, for a live source; default: 5"
     )
     sensor = kinds.add_parser(
-        "sensor", help="locate the sensor in the robot's base frame, from points that a hand touches"
+        "sensor", help="locate the sensor in the robot's base frame, from points that your hand touches"
     )
     sensor.add_argument(
         "pairs", nargs="?", metavar="PAIRS", help=f"table of points in both frames: {', '.join(_PAIRS)} [m]"
@@ -176,13 +178,13 @@ def _sensor(arguments: argparse.Namespace, before: Calibration) -> Calibration:
 
 
 def _read_pairs(path: str) -> tuple[list[list[float]], list[list[float]]]:
-    """Return the points of a table of pairs, in the sensor's and in the base frame."""
+    """Return the points of a table of pairs: in the sensor's frame and in the robot's base frame."""
     values = _columns(path, _PAIRS)
     return [row[:3] for row in values], [row[3:] for row in values]
 
 
 def _columns(path: str, names: Sequence[str]) -> list[list[float]]:
-    """Return columns of a table, by name if it has column names, otherwise in the given order."""
+    """Return the columns called ``names``; without column names, the table must have exactly these columns."""
     table = read_table(path)
     if table.names is not None:
         lower = [name.lower() for name in table.names]
@@ -198,7 +200,7 @@ def _columns(path: str, names: Sequence[str]) -> list[list[float]]:
 
 
 def _guided(arguments: argparse.Namespace) -> SensorFit:
-    """Let the user touch all points, and then the points with a large residual again."""
+    """Let the user touch all points, then let the user touch points with a large residual again."""
     if arguments.source is None or arguments.points is None:
         raise InputError("sensor: a guided calibration needs both --source and --points")
     points = _columns(arguments.points, ("x", "y", "z"))
@@ -239,11 +241,12 @@ def _clutch(arguments: argparse.Namespace, before: Calibration) -> Calibration:
         raise InputError("clutch: --scale and --anchor both set the scale; give one of them")
     if scale is None:
         if anchor is None:
-            remark("When you engage, the tool stays where it is; from then on it follows your hand.")
+            remark("When you take control, the tool stays where it is. From then on, the tool follows your hand.")
             anchor = choose("How far should the tool move when the hand moves?", _ANCHORS)
         if anchor == "shoulder" and before.lengths is None:
             raise InputError(
-                f"{arguments.out}: a scale for the whole reach needs your arm's lengths; run 'imitarm calibrate limbs "
+                f"{arguments.out}: to match your whole reach to the robot's, the scale needs the lengths of your "
+                f"arm; run 'imitarm calibrate limbs "
                 "SOURCE' first, or give --scale"
             )
         scale = 1.0
@@ -270,14 +273,15 @@ def ask(question: str) -> str:
     """Show a question and return the answer in lower case.
 
     Raises:
-        InputError: when nobody can answer because the input has ended.
+        InputError: when the input has ended, so that nobody can answer.
     """
     remark(question)
     try:
         return input().strip().lower()
     except EOFError as error:
         raise InputError(
-            "input ended before the question was answered; run it in a terminal, or give options"
+            "input ended before the question was answered; run the command in a terminal, or give the answers as "
+            "options"
         ) from error
 
 
@@ -285,7 +289,7 @@ def choose(question: str, choices: Mapping[Word, str]) -> Word:
     """Ask until the answer is one of the choices: its number, or the beginning of its name.
 
     Raises:
-        InputError: when nobody can answer because the input has ended.
+        InputError: when the input has ended, so that nobody can answer.
     """
     names = list(choices)
     for i, name in enumerate(names, start=1):
@@ -306,9 +310,9 @@ def touched_points(
     *,
     only: int | None = None,
 ) -> dict[int, list[float]]:
-    """Ask the user to put a hand on the robot's tool at each point in turn, and measure the hand's position.
+    """Ask the user to put a hand on the robot's tool at one point after the other, and measure the hand's position.
 
-    A hand that moved or was not seen is measured again.
+    If the hand moved or was not seen, the measurement is repeated.
 
     Args:
         source: source that observes the hand, live or replayed in real time.
@@ -318,7 +322,7 @@ def touched_points(
         only: index of the single point to touch, from 0; None: all points.
 
     Returns:
-        Position of the hand in the sensor's frame, shape (3,) [m], by the index of each point that was not skipped.
+        For the index of each point that was not skipped: position of the hand in the sensor's frame, shape (3,) [m].
 
     Raises:
         InputError: when the user gives up, the source has ended, or fewer than four points were measured.
@@ -328,15 +332,19 @@ def touched_points(
         if len(points) < LEAST_PAIRS:
             raise InputError(f"sensor calibration: {len(points)} points, at least {LEAST_PAIRS} are needed; add more")
         remark(
-            f"{len(points)} points. At each point: bring the robot's tool there, put the palm of your {side} hand "
-            f"on its"
+            f"{len(points)} points. At each point: bring the robot's tool there, and put the palm of your {side} "
+            f"hand on the tool's"
         )
-        remark("tip so that the sensor sees the hand, hold still, press Enter. 's' skips a point, 'q' quits.")
+        remark(
+            "tip so that the sensor sees the hand. Then hold still and press Enter. Type s to skip a point, q to quit."
+        )
     seen: dict[int, list[float]] = {}
     for i in wanted:
         place = " ".join(f"{100 * value:.1f}" for value in points[i])
         while True:
-            answer = ask(f"Point {i + 1} of {len(points)}: tool at {place} cm, hand on it, Enter")
+            answer = ask(
+                f"Point {i + 1} of {len(points)}: tool at {place} cm; put your hand on the tool and press Enter"
+            )
             if answer == "q":
                 raise InputError("sensor calibration: stopped by the user; nothing was written")
             if answer == "s":
@@ -346,7 +354,9 @@ def touched_points(
                 seen[i] = hand
                 break
             if source.over:
-                raise InputError(f"sensor calibration: {source.name} ended at point {i + 1}; use a live source")
+                raise InputError(
+                    f"sensor calibration: {source.name} ended before point {i + 1} was measured; use a live source"
+                )
             remark(f"{fault}. Try again:")
     if only is None and len(seen) < LEAST_PAIRS:
         raise InputError(f"sensor calibration: {len(seen)} points were measured, at least {LEAST_PAIRS} are needed")
@@ -354,15 +364,18 @@ def touched_points(
 
 
 def _measured(source: SkeletonSource, side: str, seconds: float) -> tuple[list[float] | None, str]:
-    """Return the position of the hand (3,) [m], or None and the reason."""
+    """Return the position of the hand (3,) [m] and an empty text; if the measurement failed, None and the reason."""
     while source.read(0.0) is not None:  # skeletons from before Enter
         pass
     taken, _ = gather(source, seconds, "measuring", live=True)
     index = JOINT[f"hand_{side}"]
     hands = np.array([s.positions[index] for s in taken if s.tracking[index] == Tracking.TRACKED])
     if len(hands) < max(_LEAST_FRAMES, _SEEN * len(taken)):
-        return None, f"the {side} hand was seen in {len(hands)} of {len(taken)} frames; turn it to the sensor"
+        return (
+            None,
+            f"the {side} hand was seen in only {len(hands)} of {len(taken)} frames; turn the hand towards the sensor",
+        )
     spread = float(np.sqrt(np.var(hands, axis=0).max()))
     if spread > _STILL:
-        return None, f"the hand moved by {100 * spread:.1f} cm; hold it still"
+        return None, f"the hand moved by {100 * spread:.1f} cm; hold the hand still"
     return [float(x) for x in np.median(hands, axis=0)], ""

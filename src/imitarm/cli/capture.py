@@ -29,8 +29,9 @@ examples:
   imitarm capture synthetic:7 --out synthetic.csv
   imitarm capture synthetic:7 --send 127.0.0.1:7400
 
-Each frame is written immediately: a program that is killed leaves FILE.part, which can be read. Ctrl-C ends a live
-source and keeps the recorded frames. Exit status 2 when --check finds an error.
+Each frame is written to FILE.part immediately, so that it can be read even if the program is killed.
+Ctrl-C ends a live source and keeps the recorded frames.
+The exit status is 2 when --check finds an error.
 """
 
 
@@ -40,29 +41,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_side_and_person(parser)
     parser.add_argument("--seconds", type=float, metavar="S", help="duration; default: to the end, or until Ctrl-C")
     parser.add_argument("--check", action="store_true", help="exit with status 2 when an issue is an error")
-    parser.add_argument("--realtime", action="store_true", help="replay a recording at its own speed")
+    parser.add_argument("--realtime", action="store_true", help="replay a recording at its original speed")
     output = parser.add_argument_group("output")
     output.add_argument("--out", type=Path, metavar="FILE", help="record into this file; default: none")
     output.add_argument("--force", action="store_true", help="replace an existing file")
     output.add_argument(
         "--send",
         metavar="HOST:PORT",
-        help="send each skeleton by UDP, at its own speed; 'udp:PORT' receives it",
+        help="send each skeleton by UDP at the original speed; the source 'udp:PORT' receives the skeletons",
     )
-    output.add_argument("--trim", type=float, nargs=2, metavar=("A", "B"), help="keep the part from A to B seconds")
+    output.add_argument(
+        "--trim", type=float, nargs=2, metavar=("A", "B"), help="keep only the part from A to B seconds"
+    )
     output.add_argument(
         "--repair",
         action="store_true",
-        help="fix faults that need no guess: several persons, wrong order, repeated frames, spikes, exchanged sides",
+        help="fix clear faults: several persons, wrong order, repeated frames, spikes, exchanged left and right sides",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Capture, record, check and print; return 2 when --check was given and an issue is an error.
+    """Capture, record and check a person's motion, and print a summary; with --check, return 2 if an issue is an error.
 
     Raises:
         InputError: when an option, the source or the output file is wrong.
-        TaskFailedError: when nobody was seen.
+        TaskFailedError: when the source never showed a person.
     """
     _check_options(arguments)
     going_on = is_live(arguments.source)
@@ -89,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
         taken, _ = gather(source, arguments.seconds, "capturing", live=going_on, total=total, on_skeleton=give)
     if not taken:
         raise TaskFailedError(
-            f"{arguments.source}: nobody was seen, nothing is written; stand 1.5 to 3 m in front of the sensor"
+            f"{arguments.source}: nobody was seen, so nothing is written; stand 1.5 to 3 m in front of the sensor"
         )
     captured = SkeletonRecording(taken, name=source.name) if recorded is None else recorded.with_skeletons(taken)
     recording = _finished(captured, arguments)
@@ -103,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _tell_sent(sender: SkeletonSender, address: str) -> None:
     """Print how many skeletons were sent."""
-    unheard = f"; nobody listened to {sender.failed} more" if sender.failed else ""
+    unheard = f"; {sender.failed} more were sent, but no program received them" if sender.failed else ""
     remark(f"sent {sender.sent} skeletons to {address}{unheard}")
 
 
@@ -117,7 +120,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
 
 
 def _chosen(source: SkeletonSource, person: int | None) -> SkeletonSource:
-    """Return the source, or one person of it; if a recording lacks that person, the error lists the persons in it."""
+    """Return the source, limited to one person if ``person`` is given; a recording must contain that person."""
     if person is None:
         return source
     if isinstance(source, SkeletonRecording):
@@ -126,7 +129,7 @@ def _chosen(source: SkeletonSource, person: int | None) -> SkeletonSource:
 
 
 def _finished(recording: SkeletonRecording, arguments: argparse.Namespace) -> SkeletonRecording:
-    """Return the recording, trimmed and repaired as requested; the output file is rewritten if it changed."""
+    """Return the recording, trimmed and repaired as requested; a changed recording is written to the output file."""
     done = recording
     if arguments.trim is not None:
         done = done.trim(*arguments.trim)

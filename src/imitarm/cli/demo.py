@@ -28,17 +28,19 @@ examples:
   imitarm demo --out demo_7 --seed 7
 
 The package contains eight demonstrations of a sweep, in which a synthetic teacher guides the simulated Sawyer by hand.
-The command checks and aligns them, learns a skill, and reproduces the skill without obstacles and in four scenes with
-obstacles. It writes skill.json, report.html (opens offline in any browser) and results.json to FOLDER. It replaces
-existing files only with --force.
+The command checks and aligns the demonstrations, and learns a skill from them.
+It then reproduces the skill without obstacles and in four scenes with obstacles.
+It writes skill.json, report.html (opens offline in any browser) and results.json to FOLDER.
+It replaces existing files only with --force.
 The exit status is 1 if a scene fails or the arm touches an obstacle.
 """
 
 _SUMMARY = (
     "A Sawyer learns from eight demonstrations to sweep crumbs into a dustpan. It then sweeps tables on which new "
-    "obstacles stand in the way. Only the parts of the learned path near an obstacle are moved, and only as far as the "
-    "required clearance demands. A synthetic teacher gave the demonstrations by guiding the simulated arm by hand. "
-    "Clearance, torques and crumbs are measured in the simulator; they are not taken from the plan."
+    "obstacles stand in the way. Only the parts of the learned path that are near an obstacle are moved, and only "
+    "as far as needed for the required clearance. A synthetic teacher gave the "
+    "demonstrations by guiding the simulated arm by hand. Clearance, torques and the number of swept crumbs are "
+    "measured in the simulator, not taken from the plan."
 )
 
 _CAPTIONS = {
@@ -105,7 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def packaged_demonstrations() -> list[Demonstration]:
-    """Return the demonstrations of the sweep that the package contains."""
+    """Return the packaged demonstrations of the sweep."""
     paths = sorted(DEMONSTRATIONS.glob("*.csv"))
     return [replace(Demonstration.load(path), source=path.name) for path in paths]  # no folder names in the skill file
 

@@ -28,9 +28,10 @@ examples:
   imitarm learn pouring.npy --task pour --out pour.json --units cm --duration 10
   imitarm learn recordings/ --task insert --robot sawyer --components 8
 
-The demonstrations are read, checked (as by 'imitarm lint') and aligned, then the skill is learned and compared with
-them. Nothing is written when a check finds an error (exit status 2), or when the skill does not reproduce the motion
-(exit status 1).
+The demonstrations are read, checked (as by 'imitarm lint') and aligned.
+Then the skill is learned and compared with the demonstrations.
+If a check finds an error, no file is written and the exit status is 2.
+If the skill does not reproduce the motion, no file is written and the exit status is 1.
 """
 
 
@@ -38,7 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add_reading_arguments(parser)
     parser.add_argument("--repair", action="store_true", help="drop rows with invalid numbers or times")
-    parser.add_argument("--allow-errors", action="store_true", help="learn and write the skill despite errors")
+    parser.add_argument(
+        "--allow-errors", action="store_true", help="learn and write the skill even if the checks find errors"
+    )
     learning = parser.add_argument_group("learning")
     learning.add_argument("--task", default="", metavar="NAME", help="name of the task, stored in the skill")
     learning.add_argument("--align", choices=METHODS, default="dtw", help="method of alignment; default: dtw")
@@ -108,9 +111,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _samples_needed(demonstrations: Sequence[Demonstration]) -> int:
-    """Return the number of samples.
+    """Return the number of samples of each aligned demonstration.
 
-    200, and proportionally more, up to 2000, for paths longer than 6 times their extent.
+    It is 200, or more (up to 2000) in proportion to the path length if a path is longer than 6 times its extent.
     """
     most = 1.0
     for one in demonstrations:
@@ -121,7 +124,7 @@ def _samples_needed(demonstrations: Sequence[Demonstration]) -> int:
 
 
 def _show(skill: Skill, alignment: Alignment, quality: FitQuality) -> None:
-    """Print the numbers of components that were tried, the distance to each demonstration, and the skill."""
+    """Print the tried numbers of components, the distance from the skill to each demonstration, and the skill."""
     gmr = skill.gmr_
     if gmr.selection_:
         show_table(
@@ -163,7 +166,10 @@ def _show(skill: Skill, alignment: Alignment, quality: FitQuality) -> None:
             ("orientation", "learned" if turns else "not in the demonstrations"),
             ("start, goal", f"{start} cm, {goal} cm"),
             ("distance to the demonstrations", f"{1e3 * rms:.1f} mm (root mean square)"),
-            ("distance to their average (bias)", f"{1e3 * bias:.1f} mm, {100 * quality.relative_bias:.1f} % of extent"),
+            (
+                "distance to the mean demonstration (bias)",
+                f"{1e3 * bias:.1f} mm, {100 * quality.relative_bias:.1f} % of extent",
+            ),
             *([("bias of the rotation", f"{np.rad2deg(quality.rotation_bias):.2f} degrees")] if turns else []),
             ("tolerance along the motion", f"{spread.min():.1f} to {spread.max():.1f} mm"),
         ],

@@ -13,7 +13,7 @@ examples:
   imitarm lint pouring.npy --units cm --duration 10
   imitarm lint recordings/ --robot sawyer --tool gripper
 
-The exit status is 2 when there is an error among the findings; it is 0 when there are only warnings and notes.
+The exit status is 2 if any finding is an error, and 0 if all findings are warnings or notes.
 """
 
 

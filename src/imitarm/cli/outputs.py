@@ -1,4 +1,4 @@
-"""The output files of a command, which are checked before the work so that nothing is overwritten by accident."""
+"""Check the output files of a command before its work begins, so that no file is overwritten by accident."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from imitarm.errors import InputError
 
 PAGE = "--report"
-"""The option that names a report page; it may replace an older page."""
+"""The option that names a report page; a new report may replace an older one without --force."""
 
 _BEGINS = ("<!doctype html", "<html")  # first characters of an HTML page
 
@@ -24,14 +24,14 @@ def check_outputs(
     """Reject outputs that would overwrite an input, another output or an existing file.
 
     Args:
-        outputs: option and file of each output; None: the output is not written.
-        inputs: option or argument of each input, and its file, or the name of a source that may not be a file.
-        force: whether existing files may be replaced; None: the command has no option ``--force``.
+        outputs: option and file of each output; a file None means that the output is not written.
+        inputs: option or argument of each input, and its file or the name of its source.
+        force: whether existing files may be replaced; None if the command has no option ``--force``.
         new_folders: whether the command creates missing folders.
 
     Raises:
-        InputError: when an output is a folder, its folder is missing, it is the file of an input or of another output,
-            or it exists and may not be replaced. ``--report`` always replaces an HTML page.
+        InputError: when an output is a folder, when its folder is missing, when it is also an input or another output,
+            or when it exists and may not be replaced. An HTML page of ``--report`` may always be replaced.
     """
     taken = [(name, file) for name, word in inputs if word is not None for file in _files(word)]
     for option, path in outputs:
@@ -53,7 +53,7 @@ def check_outputs(
 
 
 def same_place(one: Path, other: Path) -> bool:
-    """Return whether two paths lead to the same file or folder, which need not exist yet."""
+    """Return whether two paths denote the same file or folder, even if it does not exist yet."""
     if one.exists() and other.exists():
         return one.samefile(other)
     return _place(one) == _place(other)

@@ -23,7 +23,10 @@ _WAIT = 0.2  # [s] for one read of a silent source
 
 
 class _SourceArgument(argparse.Action):
-    """Stores the name of a source. The help text lists all sources, which are imported only to show it."""
+    """Stores the name of a source.
+
+    The help text lists all sources; their modules are imported only when it is shown.
+    """
 
     @property
     def help(self) -> str | None:
@@ -60,7 +63,10 @@ def add_side_and_person(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose an arm and a person."""
     parser.add_argument("--side", choices=SIDES, default="right", help="the person's arm; default: right")
     parser.add_argument(
-        "--person", type=int, metavar="N", help="number of the person, if there are several; default: the first seen"
+        "--person",
+        type=int,
+        metavar="N",
+        help="number of the person, if there are several; default: the first one seen",
     )
 
 
@@ -76,14 +82,15 @@ def gather(
     total: float | None = None,
     on_skeleton: Callable[[Skeleton], None] | None = None,
 ) -> tuple[list[Skeleton], bool]:
-    """Read skeletons until the source ends, the time is up, or the user stops; show the progress.
+    """Read skeletons until the source ends, the duration has passed, or the user stops the reading; show the progress.
 
     Args:
         source: source of the skeletons.
-        seconds: duration, by the clock for a live source, otherwise by the skeletons' times; None: to the end.
+        seconds: duration [s], measured by the clock for a live source, otherwise by the skeletons' times; None: to the
+            end.
         what: text of the progress bar, for example ``"capturing"``.
         live: whether the source runs until it is stopped.
-        total: expected duration, if known without ``seconds`` [s].
+        total: expected duration for the progress bar if ``seconds`` is None [s]; None if unknown.
         on_skeleton: function called with each skeleton.
 
     Returns:
@@ -132,15 +139,15 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
         side: side of the arm that the robot follows.
 
     Returns:
-        The skeletons; the changes and issues, one sentence each; and the person's true motion if the source is
-        synthetic.
+        The skeletons; the changes and issues, one sentence each; and, if the source is synthetic, the person's true
+        motion.
 
     Raises:
         InputError: when the source or an option is wrong.
         TaskFailedError: when fewer than two skeletons arrived.
     """
     if is_live(arguments.source) and (arguments.trim is not None or arguments.pace != 1.0):
-        raise InputError("--trim, --pace: a live source can't be cut or slowed; record it by 'imitarm capture' first")
+        raise InputError("--trim, --pace: a live source can't be cut or slowed; record it with 'imitarm capture' first")
     source = open_source(arguments.source)
     truth = source.truth if isinstance(source, SyntheticSource) else None
     notes: list[str] = []
@@ -158,7 +165,7 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
         recording = recording.trim(*arguments.trim)
     if len(recording) < 2:
         raise TaskFailedError(
-            f"{arguments.source}: {len(recording)} frames show a person, at least 2 are needed; stand 1.5 to 3 m "
+            f"{arguments.source}: {len(recording)} frames show a person, but at least 2 are needed; stand 1.5 to 3 m "
             "in front of the sensor"
         )
     notes += [str(issue) for issue in check(recording, side)]
@@ -171,12 +178,12 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
 
 
 def _slow(truth: Truth, begin: float, pace: float) -> Truth:
-    """Return the motion, slowed from the time ``begin`` [s] on."""
+    """Return the true motion, slowed down by the factor ``pace`` from the time ``begin`` [s] on."""
     return lambda time: truth(begin + pace * (time - begin))
 
 
 def _repaired_person(recording: SkeletonRecording, person: int | None) -> tuple[SkeletonRecording, list[str]]:
-    """Return a repaired recording of one person, with the changes and the issues found while reading."""
+    """Return a repaired recording of one person, and sentences about the repairs and the issues found while reading."""
     one = recording if person is None else recording.person(person)
     fixed, notes = repaired(one)
     return fixed, [*(f"repaired: {note}" for note in notes), *(str(issue) for issue in recording.issues)]
@@ -190,7 +197,7 @@ def _duration(source: SkeletonSource) -> float | None:
 
 
 def show_issues(issues: Sequence[RecordingIssue]) -> None:
-    """Print the issues as a table, and the number of each severity."""
+    """Print the issues as a table, and the number of issues of each severity."""
     if issues:
         show_table(
             ["", "place", "code", "issue", "remedy"],

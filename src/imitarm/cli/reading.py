@@ -1,4 +1,4 @@
-"""The shared arguments of commands that read demonstrations, and the function that reads with them."""
+"""The arguments that all commands for reading demonstrations share, and the function that reads files accordingly."""
 
 from __future__ import annotations
 
@@ -23,31 +23,33 @@ _ARGUMENT = re.compile(
 
 
 def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the files, and the options for everything that files may not state themselves."""
+    """Add the argument for files, and options for values that the files do not state, such as units."""
     parser.add_argument(
         "files", nargs="+", metavar="FILE", help=f"demonstrations, or folders of them; formats: {', '.join(READERS)}"
     )
     unsaid = parser.add_argument_group("for values that the files do not state")
-    unsaid.add_argument("--units", choices=LENGTH_UNITS, help="unit of lengths; default: as the file says, else m")
+    unsaid.add_argument("--units", choices=LENGTH_UNITS, help="unit of lengths; default: as the file states, else m")
     unsaid.add_argument(
-        "--time-units", choices=TIME_UNITS, help="unit of time stamps; default: as the file says, else s"
+        "--time-units", choices=TIME_UNITS, help="unit of time stamps; default: as the file states, else s"
     )
     unsaid.add_argument(
-        "--duration", type=float, metavar="S", help="length of each motion in seconds, if it has no time stamps"
+        "--duration", type=float, metavar="S", help="duration of each motion in seconds, for files without time stamps"
     )
-    unsaid.add_argument("--rate", type=float, metavar="HZ", help="samples per second, if it has no time stamps")
+    unsaid.add_argument("--rate", type=float, metavar="HZ", help="samples per second, for files without time stamps")
     unsaid.add_argument(
         "--quaternion-order",
         choices=QUATERNION_ORDERS,
-        help="order of quaternion columns without names; default: as the file says, else wxyz",
+        help="order of quaternion columns without names; default: as the file states, else wxyz",
     )
-    parser.add_argument("--thin", action="store_true", help="drop rows that only repeat the previous value")
-    parser.add_argument("--all", action="store_true", help="list every finding; default: one row for each kind")
+    parser.add_argument("--thin", action="store_true", help="drop rows that only repeat the previous row")
+    parser.add_argument(
+        "--all", action="store_true", help="list every finding; default: one row for each kind of finding"
+    )
     add_robot_options(parser, default=None)  # else recordings of another arm would be compared with Sawyer
 
 
 def as_options(text: str) -> str:
-    """Return a message with arguments of ``read`` written as command-line options: ``units="mm"`` as ``--units mm``."""
+    """Rewrite arguments of ``read`` in a message as command-line options: ``units="mm"`` as ``--units mm``."""
 
     def option(match: re.Match[str]) -> str:
         if match["name"] == "arm":
@@ -61,11 +63,11 @@ def as_options(text: str) -> str:
 def read_and_lint(
     arguments: argparse.Namespace, arm: ArmModel | None, *, task: str = "", repair: bool = False
 ) -> tuple[list[RawDemonstration], list[Finding]]:
-    """Read and check every file; a file that can't be read is a finding too.
+    """Read and check every file; a file that can't be read also becomes a finding.
 
     Args:
         arguments: arguments added by :func:`add_reading_arguments`.
-        arm: arm that was recorded.
+        arm: robot arm with which the demonstrations were recorded.
         task: name of the task.
         repair: whether to drop invalid rows before the checks.
 
@@ -94,7 +96,7 @@ def read_and_lint(
 
 
 def _repaired(raw: RawDemonstration, arm: ArmModel | None) -> RawDemonstration:
-    """Return a copy without invalid rows that still carries the reader's notes."""
+    """Return a copy without invalid rows, but with the notes of the reader."""
     repaired = RawDemonstration.of(raw.demonstration(arm, repair=True))
     return replace(repaired, notes=raw.notes, unread_rotation=raw.unread_rotation)
 
@@ -105,7 +107,7 @@ def show_findings(raw: Sequence[RawDemonstration], findings: Sequence[Finding], 
     Args:
         raw: the demonstrations that were read.
         findings: about them.
-        every: whether to print one row for each finding; otherwise one row for each kind, with a count.
+        every: whether to print one row for each finding; if False, one row for each kind of finding, with their number.
     """
     groups = [[f] for f in findings] if every else _kinds(findings)
     if findings:

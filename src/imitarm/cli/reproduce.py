@@ -31,8 +31,9 @@ examples:
   imitarm reproduce pour.json --robot panda --tool gripper --scene bottles.yaml --report pour.html
   imitarm reproduce pour.json --robot panda --scene bottles.yaml --clearance 30 --goal 40 -30 25
 
-The arm is simulated with its inertias and limits; the clearance is measured by the simulator between its own shapes.
-The exit status is 1 when no path keeps the required clearance, something was touched, or the motion did not finish.
+The arm is simulated with its inertias and limits.
+The simulator measures the clearance between its own shapes of the arm and of the obstacles.
+The exit status is 1 if no path keeps the required clearance, if the arm touched something, or if it did not finish.
 """
 
 FORBIDDEN = {"keep_height": HORIZONTAL_ONLY, "not_down": NOT_DOWN}
@@ -62,15 +63,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     avoid.add_argument(
         "--tool-only",
         action="store_true",
-        help="do not keep the links away from obstacles; only the tool keeps its clearance (for comparison)",
+        help="keep the clearance only for the tool, not for the links of the arm (for comparison)",
     )
     held = avoid.add_mutually_exclusive_group()
     held.add_argument("--keep-height", action="store_true", help="move the path only sideways, as on a table")
     held.add_argument("--not-down", action="store_true", help="never move the path downwards")
     moved = parser.add_argument_group("other start and goal")
     triple = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
-    moved.add_argument("--start", **triple, help="start of the motion [cm]; default: as learned")  # type: ignore[arg-type]
-    moved.add_argument("--goal", **triple, help="goal of the motion [cm]; default: from the scene, else as learned")  # type: ignore[arg-type]
+    moved.add_argument("--start", **triple, help="start position of the tool [cm]; default: as learned")  # type: ignore[arg-type]
+    moved.add_argument(
+        "--goal", **triple, help="goal position of the tool [cm]; default: from the scene file, else as learned"
+    )  # type: ignore[arg-type]
     parser.add_argument(
         "--control", choices=("position", "torque"), default="position", help="control mode of the simulated drives"
     )
@@ -124,7 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
         Demonstration(result.rollout.trajectory, result.rollout.joints, skill.task_, source).save(arguments.out)
         say(f"wrote {arguments.out}")
     elif arguments.out is not None:
-        remark(f"nothing was done, so {arguments.out} was not written")
+        remark(f"the robot did not move, so {arguments.out} was not written")
     if arguments.report is not None:
         say(f"wrote {write_report(report, arguments.report)}")
     show_results(report)
@@ -132,7 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _policy(arguments: argparse.Namespace, skill: Skill, spheres: NDArray[np.float64]) -> Policy:
-    """Return the chosen policy, built with the arguments that every policy takes."""
+    """Return the chosen policy, created with the arguments that all policies share."""
     options: dict[str, Any] = {
         "tool_spheres": spheres,
         "clearance": 1e-3 * arguments.clearance,
@@ -146,14 +149,14 @@ def _policy(arguments: argparse.Namespace, skill: Skill, spheres: NDArray[np.flo
 
 
 def _start(skill: Skill, arm: ArmModel, centimetres: Sequence[float] | None) -> Pose:
-    """Return the start pose of the tool; for a skill without orientation, the rotation is that at the arm's home."""
+    """Return the start pose of the tool; if the skill has no orientation, use the rotation at the home posture."""
     learned = skill.start_
     position = learned.position if centimetres is None else 0.01 * np.array(centimetres)
     return Pose(position, learned.quaternion if skill.gmr_.has_orientation_ else arm.tool_pose(arm.home).quaternion)
 
 
 def _tool(skill: Skill, arm: ArmModel, millimetres: float | None) -> NDArray[np.float64]:
-    """Return spheres that cover the tool, one row x y z r for each [m]."""
+    """Return spheres that cover the tool, one row x y z radius for each sphere [m]."""
     if millimetres is not None:
         return np.array([[0.0, 0.0, 0.0, 1e-3 * millimetres]])
     if skill.gmr_.has_orientation_:

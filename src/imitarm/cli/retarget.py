@@ -49,11 +49,13 @@ examples:
   imitarm learn wave_1.csv wave_2.csv wave_3.csv --task wave --out wave.json
 
 The robot starts at its home posture, or with --fit at a posture from which the whole recorded motion is within reach.
-It waits until the person has been seen for half a second; then its tool follows the hand. The demonstration contains
-only the time in which the person led. The first line of the output says whether the tool followed its target: it did
-not if it was more than {100 * FAR:.0f} cm away (RMS), or that far for more than {100 * FAR_FRACTION:.0f} % of the time.
-The files are then written all the same, with a warning. The exit status is 1 when the person was never seen for long
-enough to lead.
+When the camera has seen the person's arm for half a second, the robot's tool begins to follow the hand.
+The demonstration contains only the time in which the tool followed the person.
+The first line of the output says whether the tool followed its target closely enough.
+The tool did not if its RMS distance to the target exceeds {100 * FAR:.0f} cm.
+It also did not if its distance exceeds {100 * FAR:.0f} cm for more than {100 * FAR_FRACTION:.0f} % of the time.
+If the tool did not follow its target, the files are written, with a warning.
+The exit status is 1 if the arm was never seen for half a second, so that the robot did not move.
 """
 
 PERIOD = 0.01  # [s] control period
@@ -67,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--method", choices=(*RETARGETERS, "all"), default="modern", help="retargeting method; default: modern"
     )
     parser.add_argument(
-        "--drive", action="store_true", help="let the simulated robot execute the motion, and measure it"
+        "--drive", action="store_true", help="let the simulated robot execute the motion, and measure the execution"
     )
     parser.add_argument("--scene", type=Path, metavar="FILE", help="obstacles that the method 'modern' avoids (YAML)")
     person = parser.add_argument_group("the person")
@@ -99,7 +101,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="how the tool rotates: with the hand, about the vertical, or not; default: as calibrated, else upright",
     )
     follow.add_argument(
-        "--fit", action="store_true", help="start where the whole motion is within reach, reducing --scale if necessary"
+        "--fit",
+        action="store_true",
+        help="choose a start from which the whole motion is within reach; reduces --scale if necessary",
     )
     output = parser.add_argument_group("output")
     output.add_argument("--task", default="", metavar="WORDS", help="name of the task, saved in the demonstration")
@@ -110,7 +114,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the demonstration (CSV); with '--method all', one file per method",
     )
     output.add_argument("--force", action="store_true", help="overwrite existing files")
-    output.add_argument("--keep-waiting", action="store_true", help="keep the time before and after the person led")
+    output.add_argument(
+        "--keep-waiting", action="store_true", help="also keep the time before and after the robot followed the person"
+    )
     output.add_argument(
         "--report", type=Path, metavar="FILE", help="write a page with person and robot side by side (HTML)"
     )
@@ -118,7 +124,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Setting:
-    """The same input for all methods: the arm, its start posture, the correspondence and the obstacles."""
+    """The input that all methods share: the arm, its start posture, the correspondence and the obstacles."""
 
     arm: ArmModel
     q: NDArray[np.float64]
@@ -127,12 +133,12 @@ class _Setting:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Retarget a recording, print how good the result is, and write the files.
+    """Retarget a recording, print measures of the result, and write the files.
 
     Raises:
         InputError: when an option, the source or an output path is wrong.
-        TaskFailedError: when the person never led.
-        UnreachableError: when a motion should be fitted (``--fit``) and can't be.
+        TaskFailedError: when the person was never seen for long enough to move the robot.
+        UnreachableError: when ``--fit`` finds no start from which the whole motion is within reach.
     """
     names = list(RETARGETERS) if arguments.method == "all" else [arguments.method]
     files = _output_files(arguments, names)
@@ -168,9 +174,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _output_files(arguments: argparse.Namespace, names: Sequence[str]) -> dict[str, Path]:
-    """Return the demonstration's file for each method.
+    """Return the file of the demonstration for each method.
 
-    It also checks everything that would otherwise cause a failure only after the run.
+    All options are also checked here, because a wrong option would otherwise cause a failure only after the run.
     """
     slowed((), arguments.pace)
     if arguments.seconds is not None and not 0.0 < arguments.seconds < np.inf:
@@ -191,7 +197,7 @@ def _output_files(arguments: argparse.Namespace, names: Sequence[str]) -> dict[s
 
 
 def _correspondence(arguments: argparse.Namespace) -> Correspondence:
-    """Return the correspondence: from the options, else from the calibration, else the default."""
+    """Return the correspondence of person and robot: from the options, else from the calibration, else the default."""
     calibration = Calibration() if arguments.calibration is None else Calibration.load(arguments.calibration)
     found = calibration.correspondence()
     if calibration.orientation is None:  # a camera sees the hand's rotation poorly
@@ -214,7 +220,7 @@ def _setting(
     scene: Scene,
     skeletons: Sequence[Skeleton],
 ) -> _Setting:
-    """Return the input for the methods; with ``--fit`` the start and the scale that the motion needs."""
+    """Return the input for the methods; ``--fit`` chooses start and scale so that the motion is within reach."""
     if not arguments.fit:
         return _Setting(arm, arm.home, correspondence, scene)
     duration = skeletons[-1].time - skeletons[0].time
@@ -263,7 +269,7 @@ def _result(name: str, evaluation: RunEvaluation, execution: Execution | None) -
 
 
 def _demonstration(made: Retargeting, task: str, source: str, whole: bool) -> Demonstration:
-    """Return the time in which the person led as a demonstration that starts at 0 s; with ``whole`` the whole run."""
+    """Return the part in which the robot followed the person as a demonstration; with ``whole``, the whole run."""
     engaged = np.flatnonzero(made.engaged)
     first, last = (0, len(made.times) - 1) if whole else (max(int(engaged[0]) - 1, 0), int(engaged[-1]))
     part = slice(first, max(last, first + 1) + 1)
@@ -286,12 +292,12 @@ def _measures(evaluation: RunEvaluation) -> list[Measure]:
     return [
         Measure("duration", m.duration, "s", 2),
         *(Measure(s, 100.0 * float(np.mean(run.states == s)), "% of the time", 1) for s in EngagementState),
-        Measure("person began to lead", m.engagements, "times", 0),
+        Measure("robot began to follow", m.engagements, "times", 0),
         Measure(TARGET_RMS, 1e3 * m.target_rms, "mm", 1, "less"),
         Measure(TARGET_FAR, 1e2 * tracking.far_fraction, "% of the time", 1, "less"),
         Measure(TARGET_LAG, 1e3 * evaluation.target_lag, "ms", 0, "less"),
         Measure(f"tool to the {hand}, RMS", 1e3 * m.tool_rms, "mm", 1, "less"),
-        Measure("the same after removing the lag", 1e3 * m.tool_rms_without_lag, "mm", 1, "less"),
+        Measure("tool to the hand after removing the lag, RMS", 1e3 * m.tool_rms_without_lag, "mm", 1, "less"),
         Measure(f"lag behind the {hand}", 1e3 * evaluation.hand_lag, "ms", 0),
         Measure("upper arm's direction, RMS error", _DEGREES * m.elbow_direction_rms, "°", 1, "less"),
         Measure("beyond a limit of position", m.position_violations, "frames", 0, "less", fault=True),
@@ -308,7 +314,7 @@ def _measures(evaluation: RunEvaluation) -> list[Measure]:
 
 
 def _torques(evaluation: RunEvaluation) -> PlainTable:
-    """Return the torques of each joint."""
+    """Return a table with the torques of each joint."""
     run, m = evaluation.run, evaluation.metrics
     columns = (m.mean_torque, m.mean_gravity_torque, m.mean_motion_torque, m.rms_torque, run.arm.max_torque)
     rows = [
@@ -319,17 +325,17 @@ def _torques(evaluation: RunEvaluation) -> PlainTable:
         "Torques [N m]",
         ("Joint", "Mean", "Weight", "Motion", "RMS", "Rated"),
         tuple(rows),
-        "Torques are computed by inverse dynamics, without friction. Weight: the part that holds the arm's weight; "
-        "motion: the rest. Means "
-        "are of absolute values, so the two parts need not add up to the whole.",
+        "Torques are computed by inverse dynamics, without friction. Weight: the torque that holds the arm against "
+        "gravity; motion: the rest. The means are taken over absolute values, so the two parts need not add up to "
+        "the whole torque.",
     )
 
 
 def _execution_measures(execution: Execution) -> list[Measure]:
     """Return the measurements on the simulated robot."""
     return [
-        Measure("simulated: RMS error of the worst joint", 1e3 * execution.error_rms, "mrad", 1, "less"),
-        Measure("simulated: largest error of a joint", 1e3 * execution.error_max, "mrad", 0, "less"),
+        Measure("simulated: RMS position error of the worst joint", 1e3 * execution.error_rms, "mrad", 1, "less"),
+        Measure("simulated: largest position error of a joint", 1e3 * execution.error_max, "mrad", 0, "less"),
         Measure("simulated: highest torque", 100.0 * execution.peak_torque_ratio, "% of the rated", 0, "less"),
         Measure("simulated: commands reduced by the robot's limits", execution.limited, "frames", 0, "less"),
     ]
@@ -358,7 +364,7 @@ def suggestion(
     fitted: bool,
     pace: float,
 ) -> str:
-    """Return the options to try if the tool did not follow, the most promising first; empty if it did.
+    """Return which options to try if the tool did not follow its target, the most promising first; else an empty text.
 
     Args:
         tracking: tracking result of the run.
@@ -370,25 +376,28 @@ def suggestion(
     if tracking.followed:
         return ""
     if tracking.near:  # it followed while the person led
-        return "nobody led for most of the time: keep the arm in view, use --trim, or choose the arm with --side"
+        return (
+            "nobody controlled the robot for most of the time: keep the arm in view, use --trim, or choose the "
+            "arm with --side"
+        )
     tries, side = [], SIDES[1 - SIDES.index(correspondence.side)]
     mine, other = _wrist_motion(skeletons, correspondence.side), _wrist_motion(skeletons, side)
     if other > _OTHER_MOVES_MORE * mine:
-        moves = f"this wrist moves by {1e2 * other:.0f} cm, the {correspondence.side} one by {1e2 * mine:.0f} cm"
+        moves = f"this wrist moves by {1e2 * other:.0f} cm, but the {correspondence.side} wrist by {1e2 * mine:.0f} cm"
         tries.append(f"--side {side} ({moves})")
     if correspondence.orientation != "fixed":
         tries.append("--orientation fixed (the tool need not rotate)")
     if not fitted:
-        tries.append("--fit (starts where the whole motion is within reach)")
+        tries.append("--fit (starts the robot where the whole motion is within reach)")
     tries.append(f"--pace {0.5 * pace:.2g} (slower)")
     tries.append(f"--scale {0.5 * correspondence.scale:.2g} (smaller)")
     if mine / _OTHER_MOVES_MORE <= other <= _OTHER_MOVES_MORE * mine:
-        tries.append(f"--side {side} (if the other arm is meant)")
+        tries.append(f"--side {side} (if the person demonstrates with the other arm)")
     return "the tool did not follow its target: try " + ", ".join(tries)
 
 
 def _wrist_motion(skeletons: Sequence[Skeleton], side: str) -> float:
-    """Return the RMS distance of a wrist from its mean position [m]; 0 when it is never seen."""
+    """Return the RMS distance of a wrist from its mean position, relative to the shoulder [m]; 0 if never seen."""
     wrists = np.array([skeleton.arm(side).wrist - skeleton.arm(side).shoulder for skeleton in skeletons])
     seen = wrists[np.isfinite(wrists).all(axis=1)]
     return float(np.sqrt(np.mean(np.sum((seen - seen.mean(axis=0)) ** 2, axis=1)))) if len(seen) else 0.0

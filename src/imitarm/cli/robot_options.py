@@ -17,7 +17,7 @@ def add_robot_options(parser: argparse.ArgumentParser, *, default: str | None = 
 
     Args:
         parser: parser of the command.
-        default: robot to use when none is named; None for a command that does not require a robot.
+        default: robot to use if ``--robot`` is not given; None for a command that does not require a robot.
     """
     group = parser.add_argument_group("the robot arm")
     group.add_argument(
@@ -30,14 +30,14 @@ def add_robot_options(parser: argparse.ArgumentParser, *, default: str | None = 
         "--tool", metavar="NAME", help=f"tool at the flange: {', '.join(sorted(TOOLS))}, or an MJCF file; default: none"
     )
     group.add_argument(
-        "--flange", metavar="NAME", help="body or site of the file that is the flange; default: the end of the arm"
+        "--flange", metavar="NAME", help="body or site in the file that is the flange; default: the end of the arm"
     )
     group.add_argument(
         "--package-path",
         metavar="FOLDER",
         action="append",
         default=[],
-        help="folder to search for the ROS packages and meshes of the file; may be given several times",
+        help="folder to search for ROS packages and meshes that the file names; may be given several times",
     )
     group.add_argument(
         "--discard-meshes", action="store_true", help="ignore all meshes; contact is checked with primitive shapes only"
@@ -45,10 +45,10 @@ def add_robot_options(parser: argparse.ArgumentParser, *, default: str | None = 
 
 
 def load_robot(arguments: argparse.Namespace) -> ArmModel:
-    """Load the arm that the options name, and print the assumptions about it.
+    """Load the arm that the options select, and print the assumptions made about it.
 
     Raises:
-        InputError: if no robot is named but another option needs one, or the robot can't be loaded.
+        InputError: if another option needs a robot but none is named, or the robot can't be loaded.
     """
     arm = load_optional_robot(arguments)
     if arm is None:
@@ -60,12 +60,12 @@ def load_optional_robot(arguments: argparse.Namespace) -> ArmModel | None:
     """Load the arm as :func:`load_robot` does; return None if no robot is named.
 
     Raises:
-        InputError: if no robot is named but another option needs one, or the robot can't be loaded.
+        InputError: if another option needs a robot but none is named, or the robot can't be loaded.
     """
     if arguments.robot is None:
         for option in ("tool", "flange", "package_path", "discard_meshes"):
             if getattr(arguments, option):
-                raise InputError(f"--{option.replace('_', '-')} needs --robot: name the arm that it belongs to")
+                raise InputError(f"--{option.replace('_', '-')} needs --robot: name the arm to which it applies")
         return None
     arm = ArmModel.load(
         arguments.robot,
@@ -80,5 +80,5 @@ def load_optional_robot(arguments: argparse.Namespace) -> ArmModel | None:
 
 
 def robot_files(arguments: argparse.Namespace) -> list[tuple[str, str | None]]:
-    """Return the options that may name a file, with their values, to check that no output overwrites these files."""
+    """Return the options that may name an input file, with their values, so that no output overwrites such a file."""
     return [("--robot", arguments.robot), ("--tool", arguments.tool)]

@@ -61,7 +61,8 @@ def _list(tool: str | None) -> None:
     )
     say(
         f"tools: {', '.join(sorted(TOOLS))}",
-        "any MJCF or URDF file of an arm can be used too; give a name or a path to see its joints and limits",
+        "other arms can be loaded from MJCF or URDF files; give the name or file of an arm to see its joints and "
+        "limits",
     )
 
 

@@ -53,20 +53,20 @@ def run_scene(
     Args:
         name: short, unique name of the scene.
         title: title for tables and the report.
-        robot: robot at its start posture, in its scene.
-        policy: policy before its reset.
+        robot: simulated robot at its start posture, with the obstacles of its scene.
+        policy: policy that has not been reset yet.
         clearance: required clearance [m].
         link_clearance: required clearance of every link [m]; None: only the tool keeps a clearance.
         tool_radius: radius of the tool for drawing [m].
         tool_spheres: spheres of the tool for drawing, instead of ``tool_radius``: rows x, y, z, radius, shape (m,
             4) [m].
-        demonstrations: aligned demonstrations for measuring the deviation.
-        evaluate: success test of the task; returns the rollout with its verdict.
+        demonstrations: aligned demonstrations, from which the deviation of the measured motion is computed.
+        evaluate: success test of the task; it returns the rollout with success and reason.
         caption: one sentence that describes the scene.
         progress: function called with the fraction of the motion that is done, 0 to 1.
 
     Returns:
-        The result. If the policy refuses, it has a reason but no rollout.
+        The result. If the policy refuses to move, the result has a reason but no rollout.
     """
     scene = robot.scene_at_start
     frames = FrameRecorder(robot.model)
@@ -117,7 +117,7 @@ def run_scene(
 
 
 def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
-    """Return further values for the table."""
+    """Return further measured values for the table of results."""
     details: dict[str, object] = {}
     if rollout is not None and "swept_fraction" in rollout.details:
         details["dirt in the pan"] = f"{100 * rollout.details['swept_fraction']:.0f} %"
@@ -129,8 +129,8 @@ def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
 def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | None, phases: Sequence[float]) -> float:
     """Return the root mean square distance [m] of the measured tool to all demonstrations at the same phase.
 
-    This is thesis Eq 4.9 with the square root that is missing in print. The comparison is at the same phase, not at the
-    same time, so that a robot that waits does not count as inaccurate.
+    This is thesis Eq 4.9, with the square root that the printed equation lacks. Positions are compared at the same
+    phase, not at the same time, so that waiting does not count as inaccuracy.
     """
     if rollout is None or not demonstrations or not phases:
         return float("nan")
@@ -161,7 +161,7 @@ def learning_summary(
 
 
 def provenance(**facts: object) -> Mapping[str, object]:
-    """Return the facts needed to repeat a run: command, versions, platform, and the given ``facts``."""
+    """Return the facts that are needed to repeat a run: command, versions, platform, and the given ``facts``."""
     return {
         "command": shlex.join(["imitarm", *sys.argv[1:]]),
         **facts,
@@ -184,7 +184,7 @@ def _certified(scene: SceneResult) -> str:
 
 
 def show_results(report: Report) -> None:
-    """Print a row for each scene, and below the table why a scene failed."""
+    """Print a table with a row for each scene, and below the table the reasons why scenes failed."""
     rows, styles = [], []
     for scene in report.scenes:
         adaptation = scene.adaptation
@@ -206,8 +206,9 @@ def show_results(report: Report) -> None:
     show_table(headings, rows, styles=styles)
     remark(
         "clearance: smallest measured distance between the arm (with tool) and any obstacle [mm]; certified: "
-        "guaranteed lower bound for the tool on the planned path [mm]; RMSE to the demonstrations [mm]; unmoved: "
-        "fraction of the components; adaptation: computing time [ms]"
+        "guaranteed lower bound for the tool on the planned path [mm]; RMSE: root mean square distance to the "
+        "demonstrations [mm]; unmoved: fraction of the Gaussian components that were not moved; "
+        "adaptation: computing time [ms]"
     )
     if any(scene.certificate_void for scene in report.scenes):
         say(f"void: {CERTIFICATE_VOID}")

@@ -1,4 +1,4 @@
-"""Printing of commands: results go to stdout, progress and remarks to stderr."""
+"""Terminal output of commands: results go to stdout, progress and remarks go to stderr."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def show_table(
         columns: headings; a column whose heading ends in ``>`` is right-aligned.
         rows: the cells.
         title: title above the table.
-        styles: one colour for each row; empty: no colours.
+        styles: one colour for each row; if empty, rows have no colours.
     """
     table = Table(title=title or None, title_justify="left", header_style="bold")
     for column in columns:
@@ -61,18 +61,19 @@ def working(what: str) -> Status:
 
 
 def progress_bar() -> Progress:
-    """Show the progress and the remaining time while the ``with`` block runs."""
+    """Show a progress bar and the remaining time while the ``with`` block runs."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     return Progress(*columns, console=_console(sys.stderr), transient=True)
 
 
 @contextmanager
 def watched(what: str, fraction: Callable[[], float]) -> Iterator[None]:
-    """Show the progress of work that does not report it while the ``with`` block runs; the bar appears after 2 s.
+    """Show a progress bar for the work in the ``with`` block; the bar appears 2 s after the start of the work.
 
     Args:
         what: description of the work.
-        fraction: function that returns the finished fraction, 0 to 1; called five times per second from another thread.
+        fraction: function that returns the finished fraction of the work, 0 to 1; another thread calls it five times
+            per second.
     """
     over = threading.Event()
 

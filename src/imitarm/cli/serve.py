@@ -29,9 +29,11 @@ examples:
   imitarm serve --robot panda --scene table.yaml --seconds 600
   imitarm serve --robot sawyer --trace steps.csv
 
-Control the robot with 'imitarm teleoperate SOURCE --to 127.0.0.1:7500'. It is stopped until the user there enables it.
-After 0.1 s without a command it brakes, and after 0.5 s it stays stopped. Anyone who can reach the port can move the
-robot; without --host only this machine can. Ctrl-C brakes the robot and ends the command.
+Control the robot with 'imitarm teleoperate SOURCE --to 127.0.0.1:7500'.
+The robot is stopped until the user of that command enables it.
+After 0.1 s without a command the robot brakes, and after 0.5 s it stays stopped until it is enabled again.
+Anyone who can reach the port can move the robot. Without --host, only this machine can reach the port.
+Ctrl-C brakes the robot and ends the command.
 """
 
 _PORT = 7500
@@ -57,12 +59,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     network.add_argument("--rate", type=float, default=250.0, metavar="HZ", help="control rate; default: 250")
     parser.add_argument("--seconds", type=float, metavar="S", help="duration; default: until Ctrl-C")
-    parser.add_argument("--trace", type=Path, metavar="FILE", help="write each period's status and set-point (CSV)")
+    parser.add_argument(
+        "--trace", type=Path, metavar="FILE", help="write status and set-point of each control period (CSV)"
+    )
     parser.add_argument("--force", action="store_true", help="replace the file of --trace")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve the robot until the time is up or the user stops it.
+    """Serve the robot until the duration has passed or the user stops the command.
 
     Raises:
         InputError: when an option or a file is invalid, or the port is in use.
@@ -108,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _show_progress(trace: Trace | None, update: Callable[[Text], None]) -> Callable[[RobotServer], None]:
-    """Return the function to call after every period: it writes the trace and, from time to time, the status line."""
+    """Return the function to call after every control period: it writes the trace and updates the status line."""
 
     def on_step(server: RobotServer) -> None:
         supervisor = server.supervisor
@@ -146,7 +150,7 @@ def _show_summary(server: RobotServer) -> None:
 class Trace:
     """A file with one line for each control period.
 
-    Each line is written immediately, so that a killed process loses none.
+    Each line is written immediately, so that no line is lost if the process is killed.
 
     Columns: time [s], status (0 stopped, 1 following, 2 slowing, 3 fault), then set-point [rad], its velocity [rad/s]
     and measured position [rad] of each joint.
@@ -174,7 +178,7 @@ class Trace:
         self._file.flush()
 
     def write(self, server: RobotServer) -> None:
-        """Write the period that has just ended."""
+        """Write a line for the control period that has just ended."""
         supervisor = server.supervisor
         robot = supervisor.robot
         state = robot.state()
@@ -189,7 +193,7 @@ class Trace:
 
 @contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM end the ``with`` block as Ctrl-C does, so that the robot is braked."""
+    """Let SIGTERM end the ``with`` block in the same way as Ctrl-C, so that the robot is braked."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

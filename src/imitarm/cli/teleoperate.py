@@ -44,10 +44,11 @@ examples:
   imitarm teleoperate udp:7400 --calibration mine.json --to 127.0.0.1:7500
   imitarm teleoperate wave.csv --side left --robot panda --latency latency.csv
 
-The robot is simulated in this process, or served by 'imitarm serve' (--to). A served robot that is stopped moves only
-after you press Enter here, or with --enable once at the start. The robot follows a person who has been seen for half a
-second. Recorded data is written at once: a process that is killed leaves FILE.part, which can be read.
-Exit status 1 if the robot never followed a person, or could not be controlled any more.
+The robot is simulated in this process, or with --to it is a robot that 'imitarm serve' makes available.
+Such a robot is stopped at first, and moves only after you press Enter here; --enable enables it once at the start.
+The robot begins to follow a person who has been seen for half a second.
+Each recorded sample is written to FILE.part immediately, so that it can be read even if the process is killed.
+The exit status is 1 if the robot never followed a person, or could not be controlled any more.
 """
 
 _INTERRUPTED = "interrupted"
@@ -70,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     person.add_argument(
         "--orientation",
         choices=get_args(Orientation),
-        help="which rotation of the hand the tool follows; default: as calibrated, else upright",
+        help="how the tool rotates with the hand; default: as calibrated, else upright",
     )
     add_robot_options(parser)
     robot = parser.add_argument_group("control")
@@ -83,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output = parser.add_argument_group("output")
     output.add_argument("--record", type=Path, metavar="FILE", help="write the robot's motion as a demonstration (CSV)")
     output.add_argument("--task", default="", metavar="TEXT", help="description of the task, for the demonstration")
-    output.add_argument("--latency", type=Path, metavar="FILE", help="write each skeleton's latencies (CSV)")
+    output.add_argument("--latency", type=Path, metavar="FILE", help="write the latencies of each skeleton (CSV)")
     output.add_argument("--force", action="store_true", help="replace existing files")
 
 
@@ -92,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     Raises:
         InputError: when an option, a file or the source is invalid.
-        TaskFailedError: when no robot answers, it could not be controlled any more, or it never followed a person.
+        TaskFailedError: when no robot answers, the robot can't be controlled any more, or it never followed a person.
     """
     _check_options(arguments)
     correspondence = _correspondence(arguments)
@@ -151,7 +152,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
 
 
 def _correspondence(arguments: argparse.Namespace) -> Correspondence:
-    """Return the calibration with the changes that the options request."""
+    """Return the calibration, changed according to the options."""
     calibration = Calibration() if arguments.calibration is None else Calibration.load(arguments.calibration)
     found = calibration.correspondence()
     if calibration.orientation is None:  # a camera measures the rotation of the hand poorly
@@ -170,12 +171,12 @@ def _connected(arm: ArmModel, address: str) -> UdpRobot:
 
 
 def _enable_prompt(arguments: argparse.Namespace, tell: Callable[[str], None]) -> EnablePrompt | None:
-    """Return the prompt that lets a served robot move; None for a robot in this process, which needs none."""
+    """Return the prompt that enables a served robot; None for a robot in this process, which needs no enabling."""
     return EnablePrompt(tell, enable_first=arguments.enable) if arguments.to else None
 
 
 def _show_progress(prompt: EnablePrompt | None, update: Callable[[Text], None]) -> Callable[[StepInfo], None]:
-    """Return the function to call after every step: it updates the prompt and, from time to time, the status line."""
+    """Return the function to call after every control step: it updates the prompt and the status line."""
     steps = 0
 
     def on_step(step: StepInfo) -> None:
@@ -201,8 +202,11 @@ def _show(arguments: argparse.Namespace, summary: Summary, robot: Robot, stream:
         ("duration", f"{summary.duration:.2f} s, {summary.steps} steps, {summary.overruns} missed"),
         ("skeletons", str(summary.skeletons)),
         ("states", states),
-        ("commands changed by a limit", clamped),
-        ("commands changed for a clearance", f"in {summary.filtered} steps; no safe motion in {summary.unsafe} steps"),
+        ("commands changed to keep a limit", clamped),
+        (
+            "commands changed to keep a clearance",
+            f"in {summary.filtered} steps; no safe motion was found in {summary.unsafe} steps",
+        ),
         ("largest use of the limits", limits),
     ]
     received = [("skeletons", stream.datagram_filter.dropped)] if stream is not None else []
@@ -241,12 +245,12 @@ def _raise_failure(summary: Summary, robot: Robot) -> None:
 class EnablePrompt:
     """Asks the user at the terminal whether a stopped robot may move again, without blocking the control loop.
 
-    It prints why the robot cannot be controlled and waits for Enter. Lines typed before the question are ignored.
-    Without a terminal nobody can answer, and a stopped robot ends the command.
+    The prompt prints why the robot cannot be controlled and waits for Enter. Lines that the user typed before the
+    question are ignored. Without a terminal, nobody can answer, so the command fails when the robot is stopped.
 
     Args:
-        tell: prints a line.
-        enable_first: enable the robot at the start without asking.
+        tell: function that prints a line.
+        enable_first: whether to enable the robot once at the start without asking.
         read: function that blocks until a line is typed and returns it; an empty result means that the input has
             ended. None: standard input.
     """
@@ -263,7 +267,7 @@ class EnablePrompt:
         threading.Thread(target=self._reading, daemon=True).start()
 
     def reset(self) -> None:
-        """Record that the robot can be controlled, so that the next problem counts as new."""
+        """Note that the robot can be controlled, so that the user is asked about the next problem."""
         self._first, self._asked = False, ("", False)
 
     def __call__(self, problem: str, stopped: bool) -> bool:
@@ -271,7 +275,7 @@ class EnablePrompt:
 
         Args:
             problem: why the robot cannot be controlled.
-            stopped: whether the robot is stopped.
+            stopped: whether the robot is stopped and must be enabled.
 
         Raises:
             TaskFailedError: when the robot is stopped and nobody can answer.

@@ -86,7 +86,7 @@ def read_bytes(path: str | Path) -> bytes:
     except OSError as error:
         raise InputError(f"{path}: can't be read ({error.strerror or error}); check the path") from error
     if not content.strip():
-        raise FileFormatError(f"{path}: the file is empty; record or copy the data again")
+        raise FileFormatError(f"{path}: the file is empty; record or copy it again")
     return content
 
 
