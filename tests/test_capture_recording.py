@@ -95,7 +95,8 @@ def test_a_cut_off_file_is_refused_wherever_it_was_cut(saved, tmp_path):
 
 def test_a_file_cut_between_two_rows_knows_how_many_there_were(saved):
     saved.write_text("".join(saved.read_text().splitlines(keepends=True)[:-2]))
-    with pytest.raises(FileFormatError, match=r"wave\.csv, line 19: ends after 10 frames, but the header announces 12.*copy"):
+    message = r"wave\.csv, line 19: ends after 10 frames, but the header announces 12.*copy"
+    with pytest.raises(FileFormatError, match=message):
         read_recording(saved)
 
 

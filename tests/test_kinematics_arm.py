@@ -242,7 +242,7 @@ def test_one_model_serves_many_threads():
 
 def test_an_arm_never_changes():
     arm = ARMS["sawyer"]
-    with pytest.raises(AttributeError, match="can.t be changed"):
+    with pytest.raises(AttributeError, match="can't be changed"):
         arm.name = "other"
     with pytest.raises(ValueError, match="read-only"):
         arm.upper[0] = 5.0
