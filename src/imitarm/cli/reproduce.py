@@ -69,11 +69,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     held.add_argument("--keep-height", action="store_true", help="move the path only sideways, as on a table")
     held.add_argument("--not-down", action="store_true", help="never move the path downwards")
     moved = parser.add_argument_group("other start and goal")
-    triple = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
-    moved.add_argument("--start", **triple, help="start position of the tool [cm]; default: as learned")  # type: ignore[arg-type]
+    triple: Any = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
+    moved.add_argument("--start", **triple, help="start position of the tool [cm]; default: as learned")
     moved.add_argument(
         "--goal", **triple, help="goal position of the tool [cm]; default: from the scene file, else as learned"
-    )  # type: ignore[arg-type]
+    )
     parser.add_argument(
         "--control", choices=("position", "torque"), default="position", help="control mode of the simulated drives"
     )
