@@ -46,7 +46,7 @@ def test_the_verdict_counts_scenes_with_obstacles() -> None:
 def test_names_are_unique_and_not_empty() -> None:
     with pytest.raises(InputError, match="'a' is used twice"):
         Report("x", [make_result("a"), make_result("a")])
-    with pytest.raises(InputError, match="not empty"):
+    with pytest.raises(InputError, match="name is empty"):
         make_result(" ", title="Untitled")
 
 

@@ -38,7 +38,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match=r"call note\(data\)"):
         FrameRecorder(model).recording()
     good = make_recording(seconds=0.2)
-    with pytest.raises(InputError, match="each later"):
+    with pytest.raises(InputError, match="later than the previous one"):
         Recording(good.model, good.times[::-1], good.positions, good.quaternions)
     with pytest.raises(InputError, match="Recording positions"):
         Recording(good.model, good.times, good.positions[:, 1:], good.quaternions)

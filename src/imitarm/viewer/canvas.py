@@ -1,7 +1,7 @@
-"""Matplotlib drawings as inline SVG that adapts to the light or dark colours of the page.
+"""Matplotlib drawings as inline SVG, which adapts to the light or dark colours of the page.
 
-Text and axes have the colour of the text around the drawing (``currentColor``); the data have the colours of
-:mod:`~imitarm.viewer.palette`. The SVG refers to nothing outside the page.
+Text and axes have the colour of the text around the drawing (``currentColor``). Curves and areas have the colours of
+:mod:`~imitarm.viewer.palette`. The SVG does not load anything from outside the page.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ _STYLE: Final[Mapping[str, Any]] = {
 
 
 class Canvas:
-    """A figure while it is drawn, and its SVG text afterwards.
+    """A matplotlib figure to draw on; when the drawing is finished, ``svg`` contains its SVG text.
 
-    Margins are given in inches: an automatic layout would draw every figure twice.
+    Margins are given in inches, because an automatic layout would draw every figure twice.
     """
 
     def __init__(self, figure: Any, size: tuple[float, float]) -> None:
@@ -63,7 +63,7 @@ class Canvas:
         self.svg = ""
 
     def axes(self, left: float, bottom: float, right: float, top: float, **options: Any) -> Any:
-        """Return axes whose edges have these distances [inch] from the lower left corner of the figure."""
+        """Return axes; the arguments are distances of the edges from the lower left corner of the figure [inch]."""
         width, height = self.size
         return self.figure.add_axes(
             (left / width, bottom / height, (right - left) / width, (top - bottom) / height), **options
@@ -79,7 +79,7 @@ def canvas(name: str, description: str, size: tuple[float, float]) -> Iterator[C
     """Yield a figure of ``size`` [inch] to draw on, then convert it to SVG.
 
     Args:
-        name: name, unique in the page, with which all ids in the SVG begin.
+        name: name that is unique in the page; all ids in the SVG begin with it.
         description: description of the figure, for screen readers.
         size: width and height [inch].
     """
@@ -100,7 +100,7 @@ def canvas(name: str, description: str, size: tuple[float, float]) -> Iterator[C
 
 
 def _inline(svg: str, name: str, description: str) -> str:
-    """Convert an SVG file to an element that can share a page with others."""
+    """Convert the text of an SVG file to an ``<svg>`` element that can stand in a page with other SVG elements."""
     prefix = re.sub(r"\W+", "-", name)
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", svg)  # two figures may not share an id
@@ -115,12 +115,12 @@ def _inline(svg: str, name: str, description: str) -> str:
 
 
 def thin(n: int, most: int = POINTS) -> NDArray[np.int64]:
-    """Return at most ``most`` indices that are spread evenly over ``n`` samples and include both ends."""
+    """Return at most ``most`` indices of ``n`` samples, evenly spaced and including the first and the last sample."""
     return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
 
 
 def thin_extremes(values: Array, most: int = POINTS) -> NDArray[np.int64]:
-    """Return indices that include the minimum and the maximum of every short stretch, so that no peak is lost."""
+    """Return indices of samples to draw; every short interval keeps its minimum and maximum, so no peak is lost."""
     if len(values) <= most:
         return np.arange(len(values))
     stretches = np.array_split(np.arange(len(values)), most // 2)

@@ -1,4 +1,4 @@
-"""Figures of a report: time series, displacements of components, choice of their number, small charts of joints.
+"""Charts of a report: time series, displacements of components, choice of the number of components, joint charts.
 
 Every function returns one ``<svg>`` element. Figures of paths are in :mod:`~imitarm.viewer.maps`.
 """
@@ -79,7 +79,7 @@ def torques(
     joint_names: Sequence[str] = (),
     name: str = "torques",
 ) -> str:
-    """Draw the torque of each joint over time, with its rated torque.
+    """Draw the torque of each joint over time, with the rated torque of the joint.
 
     Args:
         times: time stamps, shape (n_steps,) [s].
@@ -151,11 +151,11 @@ def selection(
     """Draw the information criteria and the error on held-out demonstrations for each number of components.
 
     Args:
-        n_components: numbers of components that were evaluated, shape (n,).
-        bic: Bayesian information criterion, lower is better, shape (n,); may be empty.
-        aic: Akaike information criterion, lower is better, shape (n,); may be empty.
+        n_components: the numbers of components that were compared, shape (n,).
+        bic: Bayesian information criterion for each number of components, lower is better, shape (n,); may be empty.
+        aic: Akaike information criterion for each number of components, lower is better, shape (n,); may be empty.
         held_out_error: root mean square distance to held-out demonstrations, shape (n,) [m]; may be empty.
-        chosen: number that was chosen.
+        chosen: number of components that was chosen.
         name: name, unique in the page.
 
     Returns:
@@ -190,7 +190,7 @@ def selection(
 
 @dataclass(frozen=True, eq=False)
 class JointCurve:
-    """The motion of one joint between its limits.
+    """A chart of one joint: a quantity over time, with the limits of the joint.
 
     Attributes:
         title: title above the chart.
@@ -208,7 +208,7 @@ class JointCurve:
 
 
 def small_multiples(name: str, description: str, unit: str, times: Array, curves: Sequence[JointCurve]) -> str:
-    """Draw one small chart for each joint, each between its own limits.
+    """Draw one small chart for each joint, with the limits of the joint.
 
     Args:
         name: name, unique in the page.
@@ -238,7 +238,10 @@ def small_multiples(name: str, description: str, unit: str, times: Array, curves
 
 @dataclass(frozen=True)
 class _Panel:
-    """A small chart on shared axes whose units are inches; separate axes for each joint would take ten times longer."""
+    """A small chart in a figure of many.
+
+    All charts share one pair of axes in inches, because separate axes for each joint would take ten times longer.
+    """
 
     left: float
     bottom: float
@@ -246,7 +249,7 @@ class _Panel:
     height: float
 
     def draw(self, paper: Any, times: Array, curve: JointCurve) -> None:
-        """Draw the motion of a joint between its limits."""
+        """Draw the curve of a joint and the limits of the joint."""
         low, high = min(curve.lower, float(curve.values.min())), max(curve.upper, float(curve.values.max()))
         low, high = low - 0.06 * (high - low), high + 0.06 * (high - low)
         right = self.left + self.width

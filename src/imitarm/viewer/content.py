@@ -1,6 +1,6 @@
-"""The content of a report: results, the numbers derived from them, and these numbers as plain data.
+"""The content of a report: results of runs, numbers derived from the results, and all numbers as plain data.
 
-:mod:`~imitarm.viewer.report` draws a page from them.
+:mod:`~imitarm.viewer.report` draws a page from this content.
 """
 
 from __future__ import annotations
@@ -19,14 +19,16 @@ from imitarm.scene import Scene
 from imitarm.trajectory import Demonstration, Rollout, Trajectory
 from imitarm.viewer.recording import Recording
 
-CERTIFICATE_VOID = "an obstacle moves, so the certificate requires a motion on schedule, which was not completed"
+CERTIFICATE_VOID = (
+    "an obstacle moves, so the certificate holds only for a motion on schedule, but the motion was not completed"
+)
 
 Array = NDArray[np.float64]
 
 
 @runtime_checkable
 class AdaptedPath(Protocol):
-    """The attributes of an adaptation that are drawn; :class:`imitarm.policies.Adaptation` has all of them."""
+    """The attributes that an adaptation needs to be drawn, such as :class:`imitarm.policies.Adaptation`."""
 
     @property
     def nominal(self) -> Trajectory:
@@ -38,7 +40,7 @@ class AdaptedPath(Protocol):
 
     @property
     def means(self) -> Array:
-        """Centres of the components before they moved, shape (n_components, 3) [m]."""
+        """Centres of the components before they were moved, shape (n_components, 3) [m]."""
 
     @property
     def covariances(self) -> Array:
@@ -62,15 +64,15 @@ class AdaptedPath(Protocol):
 
     @property
     def only_on_schedule(self) -> bool:
-        """Whether the bound holds only while the motion is on schedule, because an obstacle moves."""
+        """Whether the certified clearance holds only while the motion is on schedule, because an obstacle moves."""
 
     @property
     def feasible(self) -> bool:
-        """Whether the certified clearance reaches the required one."""
+        """Whether the certified clearance is at least the required clearance."""
 
     @property
     def method(self) -> str:
-        """Name of the method of adaptation."""
+        """Name of the method that adapted the path."""
 
     @property
     def compute_time(self) -> float:
@@ -79,26 +81,26 @@ class AdaptedPath(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SceneResult:
-    """One scene: the planned path and the motion of the robot.
+    """The results in one scene: the planned path and the measured motion of the robot.
 
     Attributes:
         name: short name, unique in the report; used in links.
         title: title as shown to the reader.
         scene: goal and obstacles.
         success: whether the task succeeded.
-        required_clearance: distance to keep from every obstacle [m].
+        required_clearance: distance that the robot must keep from every obstacle [m].
         rollout: the measured motion; None when the robot did not start.
-        adaptation: the planned path; None when nothing was adapted.
+        adaptation: the planned path; None when the path was not adapted.
         rmse: root mean square distance from the measured path to the demonstrations [m]; NaN when unknown.
-        reason: reason why the run ended.
+        reason: explanation of why the run ended.
         tool_radius: radius of the sphere that contained the tool in the plan [m].
-        tool_spheres: spheres that contained the tool, instead of ``tool_radius``: rows of x, y, z, radius in the
-            tool frame, shape (m, 4) [m].
-        recording: poses of all bodies, for the 3-D playback.
+        tool_spheres: spheres that contained the tool in the plan, used instead of ``tool_radius``: rows of x, y, z,
+            radius in the tool frame, shape (m, 4) [m].
+        recording: recorded poses of all bodies, for the 3-D playback.
         torque_limits: rated torques, shape (n_joints,) [N m].
         joint_names: titles of the torque charts.
         caption: one sentence that describes the scene.
-        details: further measurements of the task; each name becomes a column of the table.
+        details: further measured values of the task; each name becomes a column of the table of results.
 
     Raises:
         InputError: when ``name`` is empty.
@@ -123,7 +125,7 @@ class SceneResult:
 
     def __post_init__(self) -> None:
         if not self.name.strip():
-            raise InputError(f"SceneResult {self.title!r}: needs a name that is not empty")
+            raise InputError(f"SceneResult {self.title!r}: the name is empty; give the scene a name")
 
     @property
     def tool(self) -> Array:
@@ -139,7 +141,7 @@ class SceneResult:
 
     @property
     def certificate_void(self) -> bool:
-        """Whether the certificate required a motion on schedule, among moving obstacles, and there was none."""
+        """Whether the certificate is void: an obstacle moves, and the motion was not completed on schedule."""
         return self.adaptation is not None and self.adaptation.only_on_schedule and not self.success
 
     @property
@@ -161,7 +163,7 @@ class SceneResult:
 
 
 class Candidate(Protocol):
-    """The evaluation of a number of components, such as :class:`imitarm.skills.mixture_fitting.Candidate`."""
+    """The evaluation of one number of components, such as :class:`imitarm.skills.mixture_fitting.Candidate`."""
 
     @property
     def n_components(self) -> int:
@@ -177,7 +179,7 @@ class Candidate(Protocol):
 
     @property
     def held_out_rmse_mm(self) -> float:
-        """Error on held-out demonstrations [mm]; NaN when none could be held out."""
+        """Error on demonstrations that were held out of learning [mm]; NaN when none could be held out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,10 +191,10 @@ class LearningSummary:
         means: means of the Gaussian components' positions, shape (n_components, 3) [m].
         covariances: covariances of the Gaussian components' positions, shape (n_components, 3, 3) [m^2].
         predicted: the learned path.
-        candidates: the numbers of components that were evaluated.
+        candidates: evaluations of the numbers of components that were compared.
         findings: findings of ``lint`` about the recordings.
-        alignment: result of ``align``; None when it was not used.
-        details: further facts, by name.
+        alignment: result of ``align``; None when the demonstrations were not aligned.
+        details: further facts about learning, by name.
     """
 
     demonstrations: Sequence[Demonstration]
@@ -212,15 +214,15 @@ class LearningSummary:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """The content of a page about one run.
+    """The content of a report page about one run of a command.
 
     Attributes:
         title: title of the page.
         scenes: results, in the order in which they are shown; names must be unique.
         summary: one or two sentences that introduce the page.
         learning: demonstrations and result of learning.
-        provenance: facts needed to repeat the run (command, seed, platform, versions, ...), by name; values that
-            are mappings become separate tables.
+        provenance: facts by name that are needed to repeat the run, such as command, seed, platform and versions. A
+            value that is a mapping becomes a separate table.
 
     Raises:
         InputError: when two scenes have the same name.
@@ -236,7 +238,7 @@ class Report:
         names = [scene.name for scene in self.scenes]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise InputError(f"Report: the scene name {twice[0]!r} is used twice; give each scene a name of its own")
+            raise InputError(f"Report: the scene name {twice[0]!r} is used twice; give each scene a different name")
 
     @property
     def passed(self) -> bool:
@@ -250,7 +252,7 @@ class Report:
 
     @property
     def verdict(self) -> str:
-        """The result in one line."""
+        """The result of all scenes in one line."""
         if not self.scenes:
             return "no scene was run"
         obstructed = [scene for scene in self.scenes if scene.scene.obstacles]
@@ -329,7 +331,7 @@ def _alignment_data(alignment: Alignment) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` with NumPy values as plain Python values, and NaN and infinity as None."""
+    """Return ``value`` for JSON: NumPy values become plain Python values; NaN and infinity become None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):

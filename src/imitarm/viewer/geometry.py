@@ -1,7 +1,7 @@
-"""Triangle meshes of MuJoCo's geoms, with few triangles, sharp edges and smooth round surfaces.
+"""Convert MuJoCo's geoms to triangle meshes that have few triangles but show sharp edges and smooth round surfaces.
 
-Renderers average the normals of triangles that share a vertex. Faces that meet at a sharp edge therefore get separate
-vertices, and the faces of a round surface share vertices.
+Renderers average the normals of triangles that share a vertex, so shared vertices look smooth. Faces that meet at a
+sharp edge therefore get separate vertices, while the faces of a round surface share vertices.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Mesh:
 
     Attributes:
         vertices: positions of the vertices, shape (n_vertices, 3) [m].
-        faces: vertex indices, counter-clockwise seen from outside, shape (n_faces, 3).
+        faces: vertex indices of each triangle, counter-clockwise seen from outside, shape (n_faces, 3).
     """
 
     vertices: Array
@@ -62,7 +62,7 @@ def box(half_size: ArrayLike) -> Mesh:
 
 
 def _revolved(profile: Array) -> Mesh:
-    """Revolve a profile of (radius, z) rows [m], from the lowest to the highest, around the z axis."""
+    """Revolve a profile around the z axis; its rows (radius, z) [m] go from the lowest to the highest point."""
     angles = np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     rings = np.concatenate(
@@ -84,7 +84,7 @@ def cylinder(radius: float, half_length: float) -> Mesh:
 
 
 def capsule(radius: float, half_length: float) -> Mesh:
-    """Return a cylinder along z of half length ``half_length`` with a hemisphere on each end [m]."""
+    """Return a capsule along z: a cylinder of half length ``half_length`` [m] with a hemisphere on each end."""
     angles = np.linspace(0.0, 0.5 * np.pi, _RINGS + 1)
     cap = np.stack([radius * np.cos(angles), half_length + radius * np.sin(angles)], axis=1)
     cap[-1, 0] = 0.0  # the cosine of a right angle is not quite zero
@@ -107,7 +107,7 @@ _PRIMITIVES: Final[dict[int, Callable[[Array], Mesh]]] = {
 
 
 def _thinned(mesh: Mesh) -> Mesh:
-    """Merge vertices that fall into one cell of a grid, growing the cells until the mesh is small enough."""
+    """Merge all vertices in one cell of a grid; the cells are enlarged until the mesh has few enough triangles."""
     cell = 1e-5 + 1e-3 * float(np.ptp(mesh.vertices, axis=0).max())
     while len(mesh.faces) > _MAX_FACES:
         _, kept, index = np.unique(np.round(mesh.vertices / cell), axis=0, return_index=True, return_inverse=True)
@@ -160,11 +160,14 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
 
 
 def geom_rgba(model: mujoco.MjModel, geom: int) -> Array:
-    """Return red, green, blue and opacity (4,), 0 to 1; as in MuJoCo, a geom's own colour overrides its material's."""
+    """Return the colour of a geom as red, green, blue and opacity (4,), 0 to 1.
+
+    As in MuJoCo, the colour of the geom itself overrides the colour of its material.
+    """
     material, own = int(model.geom_matid[geom]), np.array(model.geom_rgba[geom], dtype=float)
     return own if material < 0 or not np.allclose(own, _NO_COLOUR) else np.array(model.mat_rgba[material], dtype=float)
 
 
 def visible_geoms(model: mujoco.MjModel) -> list[int]:
-    """Return the visible geoms: groups 0 to 2, not fully transparent (group 3 is for collisions)."""
+    """Return the indices of the visible geoms: those in groups 0 to 2 that are not fully transparent."""
     return [g for g in range(model.ngeom) if model.geom_group[g] <= 2 and geom_rgba(model, g)[3] > 0.0]

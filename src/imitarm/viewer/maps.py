@@ -1,4 +1,4 @@
-"""Figures of paths in the base frame: demonstrations, the learned path, and its adaptation around obstacles.
+"""Maps of paths in the base frame: demonstrations, the learned path, and the path adapted around obstacles.
 
 Every public function that draws returns one ``<svg>`` element. Figures over time are in :mod:`~imitarm.viewer.charts`.
 """
@@ -31,8 +31,8 @@ class View:
     """The two axes of the base frame that a figure shows.
 
     Attributes:
-        across: horizontal axis of the figure: 0, 1, 2 for x, y, z.
-        up: vertical axis of the figure.
+        across: coordinate on the horizontal axis of the figure: 0, 1, 2 for x, y, z.
+        up: coordinate on the vertical axis of the figure.
     """
 
     across: int = 0
@@ -40,22 +40,22 @@ class View:
 
     @property
     def depth(self) -> int:
-        """The axis along the line of sight of the figure."""
+        """The coordinate that the figure does not show, along the line of sight."""
         return 3 - self.across - self.up
 
     @property
     def title(self) -> str:
-        """Description of the view, as text."""
+        """Title of the view for the figure, such as "seen from above"."""
         return {2: "seen from above", 1: "seen from the side", 0: "seen from the front"}[self.depth]
 
     @property
     def leftwards(self) -> bool:
-        """Whether ``across`` increases to the left; y does when seen from above with x upwards."""
+        """Whether the horizontal coordinate increases to the left, as y does seen from above with x pointing up."""
         return (self.across, self.up) == (1, 0)
 
     @classmethod
     def best(cls, positions: ArrayLike) -> View:
-        """Return the view in which ``positions`` (n, 3) [m] extend most; from above if that is nearly as good."""
+        """Return the view in which ``positions`` (n, 3) [m] extend furthest; the view from above is preferred."""
         spans = np.ptp(np.asarray(positions, dtype=float), axis=0)
         if spans[2] <= 1.25 * spans[:2].min():
             return cls(0, 1) if spans[0] >= spans[1] else cls(1, 0)
@@ -70,17 +70,17 @@ class View:
 def drawn_map(
     name: str, text: str, view: View, corners: Array, *, legend_rows: int, note: str = "", stretched: bool = False
 ) -> Iterator[tuple[Any, Canvas]]:
-    """Yield axes that show ``corners`` (2, 2) [m] in a figure of suitable height, then convert it to SVG.
+    """Yield axes that show the area between ``corners`` (2, 2) [m]; afterwards, convert the figure to SVG.
 
     Args:
         name: name, unique in the page.
         text: description of the figure, for screen readers.
         view: the axes to show.
-        corners: lower and upper corner of the area that must be visible.
+        corners: lower and upper corner of the area that must be visible, shape (2, 2) [m].
         legend_rows: number of rows of the legend.
         note: text added to the title.
-        stretched: whether a flat map may be stretched vertically instead of drawn at equal scales; the title then
-            says so.
+        stretched: whether a flat map may be stretched vertically; the title then states the factor. If False, both axes
+            have the same scale.
     """
     span = np.maximum(corners[1] - corners[0], 1e-3)
     width = _WIDTH - 0.72
@@ -127,9 +127,10 @@ class Grid:
         return cls(view, *(np.arange(low[i], high[i] + step, step) for i in range(2)))
 
     def distance_to(self, obstacle: Obstacle, depths: Array) -> Array:
-        """Return the distance from each point to an obstacle (rows, columns) [m], the smallest over ``depths``.
+        """Return the distance from each grid point to an obstacle, the smallest over ``depths`` (rows, columns) [m].
 
-        For one depth, the zero line is the cross-section of the obstacle; for several depths, it is the projection.
+        ``depths`` are coordinates along the line of sight. With one depth, the line of distance 0 outlines the
+        cross-section of the obstacle. With many depths, it outlines the projection of the obstacle.
         """
         points = np.empty((len(depths), len(self.up), len(self.across), 3))
         points[..., self.view.across] = self.across
@@ -139,7 +140,7 @@ class Grid:
 
 
 def draw_ellipses(axes: Any, means: ArrayLike, covariances: ArrayLike, view: View, **style: Any) -> None:
-    """Fill the 95 % ellipses of the two shown coordinates of Gaussians."""
+    """Fill the 95 % ellipses of Gaussians, projected onto the two coordinates that the map shows."""
     pick = [view.across, view.up]
     angles = np.linspace(0.0, 2.0 * np.pi, 49)
     circle = _CHI_95 * np.stack([np.cos(angles), np.sin(angles)])
@@ -157,7 +158,7 @@ def demonstrations(
     *,
     name: str = "demonstrations",
 ) -> str:
-    """Draw demonstrations, the Gaussian components learned from them and the path that they predict.
+    """Draw demonstrations, the learned Gaussian components, and the learned path.
 
     Args:
         shown: the demonstrations.
@@ -207,7 +208,7 @@ def _tool_along(path: Trajectory, spheres: ArrayLike | None) -> tuple[Array, Arr
 
 
 def _draw_swept(axes: Any, grid: Grid, centres: Array, radii: Array) -> None:
-    """Fill the area that spheres with ``centres`` (n, m, 2) sweep, and draw its outline."""
+    """Fill the area swept by moving spheres, and draw its outline; ``centres`` has the shape (n, m, 2)."""
     distance = np.full((len(grid.up), len(grid.across)), np.inf)
     for instant in centres:
         for (across, up), radius in zip(instant, radii, strict=True):
@@ -219,7 +220,7 @@ def _draw_swept(axes: Any, grid: Grid, centres: Array, radii: Array) -> None:
 
 
 def _draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance: float, path: Array) -> None:
-    """Fill the obstacles and draw the dashed line outside which the tool must stay."""
+    """Fill the obstacles, and draw dashed lines around them that the tool must not cross."""
     depths = np.linspace(depth.min(), depth.max(), 9) if np.ptp(depth) > 2e-3 else np.array([depth.mean()])
     for obstacle in scene.obstacles:
         distance = grid.distance_to(obstacle, depths)
@@ -235,7 +236,7 @@ def _draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance
 
 
 def _name(axes: Any, grid: Grid, distance: Array, name: str, path: Array) -> None:
-    """Write an obstacle's name beside the area where ``distance`` is negative, away from the path (n, 2) [m]."""
+    """Write an obstacle's name beside the obstacle (``distance`` < 0), on the side away from the path (n, 2) [m]."""
     rows, columns = np.nonzero(distance < 0.0)
     across = float(grid.across[columns].mean())
     beside = path[np.argmin(np.abs(path[:, 0] - across)), 1]
@@ -246,7 +247,7 @@ def _name(axes: Any, grid: Grid, distance: Array, name: str, path: Array) -> Non
 
 
 def _band(path: Array, covariances: Array, view: View) -> Array:
-    """Return the outline (2 n, 2) of a band of two standard deviations on both sides of a path."""
+    """Return the outline (2 n, 2) [m] of the band within two standard deviations on both sides of a path."""
     pick = [view.across, view.up]
     points = view.of(path)
     tangents = np.gradient(points, axis=0)
@@ -272,7 +273,7 @@ def adaptation(
     measured: Trajectory | None = None,
     name: str = "adaptation",
 ) -> str:
-    """Draw a learned path, its adaptation around obstacles, and the displaced components.
+    """Draw a learned path, the path adapted around obstacles, and the displaced components.
 
     Args:
         nominal: the learned path.

@@ -1,8 +1,8 @@
-"""A self-contained HTML page: the data of its templates, its 3-D players, and writing it to a file.
+"""A self-contained HTML page: the data that its templates show, its 3-D players, and the function that writes it.
 
-The templates are in ``templates/``; Jinja escapes every text that they show. The page's content security policy forbids
-every request to the outside, so the browser enforces that the page needs no network. Each 3-D player is an iframe that
-is created when it scrolls into view; the code that all players share is stored once.
+The templates are in ``templates/``; Jinja escapes every text that they show. The content security policy of the page
+forbids every network request, so the browser itself ensures that the page works offline. Each 3-D player is an iframe
+that is created when the reader scrolls to it. The code that all players share is stored once.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MM: Final = 1000.0  # [mm/m], and [ms/s]
 
 @dataclass(frozen=True)
 class Tile:
-    """A number in the header: ``value`` as text, ``unit``, and a ``label`` that names it."""
+    """A number in the header of a page: ``value`` as text, ``unit``, and ``label``, which says what the number is."""
 
     value: str
     unit: str
@@ -35,7 +35,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Header:
-    """The first part of a page.
+    """The header of a page: title, verdict, summary and the most important numbers.
 
     Attributes:
         title: title of the page.
@@ -54,7 +54,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing with its ``title`` and ``caption``; it is left out of the page when ``svg`` is empty."""
+    """A drawing (``svg``) with ``title`` and ``caption``; a drawing with an empty ``svg`` is left out of the page."""
 
     svg: str
     title: str
@@ -76,7 +76,7 @@ class Player:
 
     Attributes:
         title: title for screen readers.
-        own: part of its page that is specific to this player, see :func:`shared_players`.
+        own: the part of the 3-D page that differs from the other players, see :func:`shared_players`.
         keys: its legend.
     """
 
@@ -109,10 +109,10 @@ def render(
 
     Args:
         template: file in ``templates/`` that extends ``page.html``.
-        header: the first part of the page.
-        data: the page's numbers in SI units, ready for JSON; the reader can save them.
-        data_name: file name for saving these numbers.
-        provenance: facts needed to repeat the run, by name; values that are mappings become separate cards.
+        header: header of the page.
+        data: the numbers on the page in SI units, ready for JSON; a button on the page saves them.
+        data_name: name of the file to which the reader saves ``data``.
+        provenance: facts by name that are needed to repeat the run; a value that is a mapping becomes a separate card.
         words: explanations of the technical terms on the page.
         shared: beginning and end of every 3-D player, see :func:`shared_players`; None without players.
         context: further data for the template.
@@ -167,25 +167,26 @@ def number(value: float, digits: int = 1, unit: str = "") -> str:
 
 
 def script_text(value: Any) -> str:
-    """Return ``value`` as JSON that is safe in a script element: it cannot close the element or open a comment."""
+    """Return ``value`` as JSON that is safe in a script element: it can't close the element or open a comment."""
     return json.dumps(value, ensure_ascii=False).replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 def anchor(kind: str, index: int, name: str) -> str:
-    """Return an anchor: unique by its number, readable by its name."""
+    """Return an anchor for links, made of a number, which makes it unique, and a readable name."""
     return f"{kind}-{index + 1}-" + (re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "x")
 
 
 def shared_players(pages: Mapping[str, str]) -> tuple[tuple[str, str] | None, dict[str, str]]:
-    """Split 3-D pages into a shared beginning and end and an individual middle.
+    """Split 3-D pages into a beginning and an end that all pages share, and an individual middle part.
 
-    Most of each page is the player's code. Stored once, it makes a page with five players five times smaller.
+    Most of each 3-D page is the code of the player. Storing this code only once makes a report with five players five
+    times smaller.
 
     Args:
         pages: 3-D pages by name.
 
     Returns:
-        The shared beginning and end, None when there are no pages; and the middle of each page, by name.
+        A pair: the shared beginning and end (None when there are no pages), and the middle part of each page by name.
     """
     if not pages:
         return None, {}
@@ -210,7 +211,7 @@ def _common_start(texts: list[str]) -> str:
 
 
 def check_writable(path: str | Path) -> Path:
-    """Check that a page can be written, before the work of drawing it begins.
+    """Check that a page can be written to a path; call this before the page is drawn.
 
     Returns:
         The absolute path.
@@ -220,7 +221,7 @@ def check_writable(path: str | Path) -> Path:
     """
     target = Path(path).expanduser().absolute()
     if target.is_dir():
-        raise InputError(f"report {target}: is a folder; name a file in it, such as {target / 'report.html'}")
+        raise InputError(f"report {target}: is a folder; name a file in this folder, such as {target / 'report.html'}")
     if not target.parent.is_dir():
         raise InputError(f"report {target}: there is no folder {target.parent}; create it first")
     if not os.access(target.parent, os.W_OK):
@@ -231,8 +232,8 @@ def check_writable(path: str | Path) -> Path:
 def draw_page(draw: Callable[[], str], path: str | Path) -> Path:
     """Write a page as one HTML file that needs no other file.
 
-    The path is checked before anything is drawn. The page is written to a temporary file that is renamed at the end,
-    so an older page stays intact when writing fails.
+    The path is checked before anything is drawn. The page is written to a temporary file, which is renamed at the end.
+    Therefore an older page stays intact when writing fails.
 
     Args:
         draw: function that returns the page.

@@ -49,7 +49,7 @@ _ARM: Final = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")
 
 @dataclass(frozen=True, eq=False)
 class PersonMark:
-    """A person to draw, frame by frame.
+    """The joint positions of a person in each frame, for drawing.
 
     Attributes:
         name: name, unique in the 3-D scene.
@@ -57,7 +57,7 @@ class PersonMark:
             25, 3) [m]; NaN where lost.
         tracking: :class:`~imitarm.capture.skeleton.Tracking` of each joint, shape (n_frames, 25); inferred joints are
             drawn paler, lost joints are not drawn.
-        side: the arm that is drawn in the colour of a demonstration.
+        side: side of the arm that is drawn in the colour of a demonstration.
 
     Raises:
         InputError: when a shape is wrong.
@@ -91,11 +91,11 @@ class PersonMark:
         floor: float = 0.0,
         name: str = "person",
     ) -> PersonMark:
-        """Place a recorded person beside a robot, rotated so that both move in the same directions.
+        """Place a recorded person beside a robot, rotated so that person and robot move in the same directions.
 
         Args:
-            skeletons: at least one skeleton, in the order of their times. After 0.25 s without a skeleton the person is
-                not drawn; after the last skeleton the person does not move.
+            skeletons: at least one skeleton, in the order of their times. The person disappears when no skeleton
+                follows within 0.25 s, and stands still after the last skeleton.
             times: times of the frames to draw, counted from the first skeleton, shape (n_frames,) [s].
             sensor_to_base: pose of the sensor in the base frame; only its rotation is used.
             side: side of the arm that is followed.
@@ -118,7 +118,7 @@ class PersonMark:
 
     @property
     def points_to_see(self) -> Array:
-        """Points for the camera, shape (n, 3) [m]: the median position of each joint, and all positions of the arm."""
+        """Points that the camera must show, shape (n, 3) [m]: the median of each joint, and the path of the arm."""
         shown = np.where((self.tracking > Tracking.LOST)[..., None], self.positions, np.nan)
         seen = ~np.isnan(shown).all(axis=(0, 2))
         arm = shown[:, [JOINT[f"{part}_{self.side}"] for part in _ARM]].reshape(-1, 3)
@@ -126,7 +126,7 @@ class PersonMark:
 
 
 def _shift(joints: Array, place: tuple[float, float], floor: float) -> Array:
-    """Return the displacement (3,) [m] that puts joints (n, 25, 3) at a position on the floor."""
+    """Return the displacement (3,) [m] that makes a person with joints (n, 25, 3) stand on the floor at ``place``."""
     usual = np.array([_median(joints[:, joint]) for joint in range(len(JOINTS))])
     feet = [usual[JOINT[f"{part}_{side}"], 2] for part in ("ankle", "foot") for side in ("left", "right")]
     low = np.nanmin(feet) - _SOLE if np.isfinite(feet).any() else np.nan
@@ -140,18 +140,18 @@ def _shift(joints: Array, place: tuple[float, float], floor: float) -> Array:
 
 
 def _median(points: Array) -> Array:
-    """Return the median of the points (n, 3) that are not NaN; NaN if all of them are."""
+    """Return the median (3,) of points (n, 3), ignoring points that are NaN; NaN if all points are NaN."""
     known = points[np.isfinite(points).all(axis=1)]
     return np.median(known, axis=0) if len(known) else np.full(3, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """A rigid piece of the figure and its pose in each frame.
+    """A rigid piece of the drawn person, and its pose in each frame.
 
     Attributes:
-        name: name, unique in the figure.
-        mesh: mesh in the frame of the piece.
+        name: name that is unique among the pieces of the person.
+        mesh: mesh in the coordinate frame of the piece.
         colour: ``"#rrggbb"``.
         position: positions, shape (n_frames, 3) [m]; NaN where unknown.
         wxyz: quaternions, shape (n_frames, 4).
@@ -167,10 +167,11 @@ class _Piece:
 
 
 def draw_person(server: Any, person: PersonMark) -> list[Mover]:
-    """Draw a person as in the first frame, and return everything that moves, appears or disappears.
+    """Draw a person in the pose of the first frame, and return all pieces that move, appear or disappear.
 
-    Every bone is rigid and has its median length. Batches would need fewer messages, but a browser builds them
-    asynchronously, and they could show a different frame than the robot after a jump in time.
+    Every bone is rigid, with its median length over all frames. The pieces are not sent to viser as one batch. A batch
+    would need fewer messages, but the browser builds it asynchronously, so that after a jump in time the person could
+    show a different frame than the robot.
     """
     movers = []
     for piece in _pieces(person):
@@ -225,7 +226,7 @@ def _pieces(person: PersonMark) -> Iterator[_Piece]:
 
 
 def _bone(length: float, radius: float, begins: float, ends: float) -> Mesh:
-    """Return a bone from the origin along z with a ball at its start and, if its radius is not 0, one at its end."""
+    """Return the mesh of a bone along z: a ball at the origin, a cylinder, and a ball at the end if ``ends`` > 0."""
     half = 0.5 * max(length, 1e-3)
     parts = [cylinder(radius, half).moved([0.0, 0.0, half], np.eye(3)), ellipsoid([begins] * 3)]
     if ends > 0.0:
@@ -234,7 +235,7 @@ def _bone(length: float, radius: float, begins: float, ends: float) -> Mesh:
 
 
 def _upright(up: Array, across: Array) -> Array:
-    """Return rotations (n, 4) with z along ``up`` (n, 3) and x as close to ``across`` (n, 3) as possible."""
+    """Return rotations (n, 4) with the z axis along ``up`` (n, 3) and the x axis as near to ``across`` as possible."""
     rotations = np.tile([1.0, 0.0, 0.0, 0.0], (len(up), 1))
     y = np.cross(up, across)
     known = np.linalg.norm(y, axis=1) > 1e-6  # False for NaN, too
@@ -245,7 +246,7 @@ def _upright(up: Array, across: Array) -> Array:
 
 
 def _rotations_from_z(directions: Array) -> Array:
-    """Return the smallest rotations (..., 4) from z to unit vectors (..., 3)."""
+    """Return the smallest rotations (..., 4) that take the z axis to the unit vectors (..., 3)."""
     x, y, z = np.moveaxis(directions, -1, 0)
     rotations = np.stack([1.0 + z, -y, x, np.zeros_like(x)], axis=-1)
     length = np.linalg.norm(rotations, axis=-1, keepdims=True)
@@ -254,7 +255,7 @@ def _rotations_from_z(directions: Array) -> Array:
 
 
 def _paler(colour: str, white: float) -> list[float]:
-    """Return red, green and blue, 0 to 1, of a colour mixed with a fraction of white."""
+    """Return a colour mixed with a fraction ``white`` of white, as red, green and blue from 0 to 1."""
     return [(1.0 - white) * part / 255.0 + white for part in palette.rgb(colour)]
 
 

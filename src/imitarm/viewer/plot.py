@@ -27,14 +27,14 @@ _DEPTHS: Final = 25  # cross-sections of an obstacle that make its projection
 
 
 def plot(thing: Any) -> Any:
-    """Return a matplotlib figure of one object.
+    """Draw one object, and return the matplotlib figure.
 
     Args:
         thing: object to draw:
 
-            * a :class:`~imitarm.Trajectory`: its path, and x, y and z over time;
+            * a :class:`~imitarm.Trajectory`: the path, and x, y and z over time;
             * a :class:`~imitarm.Demonstration` or a list of them: the paths, and x, y and z over the time since the
-              start of each;
+                start of each demonstration;
             * a :class:`~imitarm.Skill`: the learned path with the 95 % ellipses of the Gaussian components, and x, y
               and z over time with a band of two standard deviations;
             * an :class:`~imitarm.Adaptation`: the learned path, the adapted path and the moved components, and x, y
@@ -43,8 +43,8 @@ def plot(thing: Any) -> Any:
             * a :class:`~imitarm.Scene`: the goal and the obstacles, from above and from the side.
 
     Returns:
-        A :class:`matplotlib.figure.Figure`. Save it with ``figure.savefig("picture.png")``, or open a window with
-        ``matplotlib.pyplot.show()``; a notebook displays it automatically.
+        A :class:`matplotlib.figure.Figure`. Save the figure with ``figure.savefig("picture.png")``, or open a window
+        with ``matplotlib.pyplot.show()``. A notebook displays the figure automatically.
 
     Raises:
         InputError: when the object is of another type, or matplotlib is not installed.
@@ -90,7 +90,7 @@ def _drawing(thing: Any) -> Callable[[Any, Any], None]:
 
 
 def _map(figure: Any, place: Any, view: View, title: str) -> Any:
-    """Add axes that show the base frame from one side, at equal scales."""
+    """Add axes that show the base frame in the directions of ``view``; both axes have the same scale."""
     axes = figure.add_subplot(place, aspect="equal", adjustable="datalim")
     axes.set_xlabel(f"{_AXES[view.across]} [m]")
     axes.set_ylabel(f"{_AXES[view.up]} [m]")
@@ -122,7 +122,7 @@ def _side_by_side(figure: Any, view: View, title: str, labels: Sequence[str]) ->
 
 
 def _draw_path(axes: Any, charts: Sequence[Any], view: View, path: Trajectory, **look: Any) -> None:
-    """Draw one path on a map, and its x, y and z over time."""
+    """Draw one path on a map, and the coordinates x, y and z of the path over time."""
     axes.plot(*view.of(path.positions).T, **look)
     for axis, chart in enumerate(charts):
         chart.plot(path.times, path.positions[:, axis], **look)

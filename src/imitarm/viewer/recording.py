@@ -41,7 +41,9 @@ class Recording:
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         if n < 1 or np.any(np.diff(self.times) <= 0.0):
-            raise InputError("Recording times: needs at least one frame, each later than the one before")
+            raise InputError(
+                "Recording times: needs at least one frame, and each frame must be later than the previous one"
+            )
 
     def __len__(self) -> int:
         return len(self.times)
@@ -72,10 +74,10 @@ class FrameRecorder:
         self._frames: list[tuple[float, Array, Array]] = []
 
     def note(self, data: mujoco.MjData, time: float | None = None) -> None:
-        """Record the current poses when the next frame is due; call it after every step.
+        """Record the current poses if the next frame is due; call this method after every simulated step.
 
         Args:
-            data: the state of the simulation, with its kinematics up to date.
+            data: the state of the simulation, in which the body poses are up to date.
             time: simulated time [s]; None: ``data.time``.
         """
         now = float(data.time if time is None else time)

@@ -40,21 +40,21 @@ _KEYS: Final = (
 _WORDS: Final = {
     "Demonstration": "One recording of a motion demonstrated by a person, here by guiding the arm's tool by hand.",
     "Learned path": "The mean of all demonstrations. The robot follows it when no obstacle is in the way.",
-    "Gaussian component": "One of the parts of which the learned motion consists. It is drawn as an ellipse that "
-    "contains 95 % of what was demonstrated there. Where the ellipse is small, all demonstrations agree, and the task "
-    "needs precision.",
-    "Adaptation (ACFRA)": "Only the components near an obstacle are moved. Everywhere else the robot does exactly what "
-    "was demonstrated.",
-    "Tolerance": "How far a path may be from the learned one and still resemble the demonstrations: two standard "
-    "deviations to each side.",
-    "Clearance": "The smallest distance between any part of the arm or its tool and any obstacle. It is measured in "
-    "the simulator while the arm moves, between the exact shapes; it is not taken from the plan.",
+    "Gaussian component": "The learned motion consists of Gaussian components, which follow one another along the "
+    "path. Each component is drawn as an ellipse that contains 95 % of the demonstrated positions in its part of the "
+    "motion. Where the ellipse is small, all demonstrations agree, and the task needs precision.",
+    "Adaptation (ACFRA)": "Only the components near an obstacle are moved. Everywhere else the robot follows the "
+    "learned path.",
+    "Tolerance": "How far a path may be from the learned path and still resemble the demonstrations: two standard "
+    "deviations of the demonstrations to each side.",
+    "Clearance": "The smallest distance between any part of the arm or its tool and any obstacle. The simulator "
+    "measures it between the exact shapes while the arm moves; it is not taken from the plan.",
     "Certified clearance": "A guaranteed lower bound of the distance between the tool and any obstacle on the whole "
     "planned path.",
-    "RMSE": "Root mean square error: the typical distance between the measured path and the demonstrations. It is "
-    "larger where the path has to go around an obstacle.",
-    "Rated torque": "The torque that the drive of a joint can deliver continuously. A real arm can do a motion that "
-    "stays below it.",
+    "RMSE": "Root mean square error: the typical distance between the measured path and the demonstrations. The "
+    "error is larger where the path has to go around an obstacle.",
+    "Rated torque": "The torque that the drive of a joint can deliver continuously. A real arm can execute a motion "
+    "whose torques stay below their rated values.",
 }
 
 
@@ -62,7 +62,7 @@ def write_report(report: Report, path: str | Path) -> Path:
     """Write a report to one HTML file with :func:`~imitarm.viewer.page.draw_page` and return its absolute path.
 
     Args:
-        report: what the page shows.
+        report: content of the page.
         path: the file to write; its folder must exist.
 
     Raises:
@@ -76,7 +76,7 @@ def report_html(report: Report) -> str:
     """Return the whole page.
 
     Args:
-        report: what the page shows.
+        report: content of the page.
 
     Raises:
         InputError: when the drawing libraries are not installed.
@@ -138,19 +138,19 @@ def _header(report: Report) -> Header:
         Tile(
             number(100 * float(np.mean(unmoved)) if unmoved else math.nan, 0),
             "%",
-            "of the components of the learned motion stay exactly as demonstrated",
+            "of the components of the learned motion were not moved",
         ),
         Tile(
             number(MM * float(np.median(planning)) if planning else math.nan),
             "ms",
-            "to plan the path around the obstacles (median)",
+            "computing time to plan the path around the obstacles (median)",
         ),
     )
     return Header(report.title, report.verdict, report.passed, report.summary, tiles if obstructed else ())
 
 
 def _cells(scene: SceneResult) -> Iterator[str]:
-    """Return the cells of a scene's row in the table of results that follow name, obstacles and outcome."""
+    """Yield the cells of a scene in the table of results, except for the name, the obstacles and the outcome."""
     adaptation = scene.adaptation
     yield number(MM * scene.min_clearance)
     yield number(MM * scene.required_clearance, 0) if scene.scene.obstacles else "–"
@@ -166,12 +166,12 @@ def _cells(scene: SceneResult) -> Iterator[str]:
 
 
 def _sentences(*texts: str) -> str:
-    """Join texts as sentences; empty texts are left out."""
+    """Join texts, each as one sentence; empty texts are left out."""
     return " ".join(f"{text[0].upper()}{text[1:].rstrip('.')}." for text in texts if text)
 
 
 def _playback(scene: SceneResult) -> str:
-    """Return the 3-D page of a scene: its recording with the paths and the components around it."""
+    """Return the 3-D page of a scene, which plays the recording and shows the paths and the Gaussian components."""
     assert scene.recording is not None
     paths, components = [], []
     if scene.adaptation is not None:
@@ -211,8 +211,8 @@ def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:
             yield Figure(
                 svg,
                 "Path around the obstacles",
-                "Path of the tool centre point. The dotted line bounds the area that the tool sweeps; it must stay "
-                "outside the dashed lines. Arrows show how far components were moved.",
+                "Path of the tool centre point. The dotted line bounds the area that the tool sweeps. This area "
+                "must stay outside the dashed lines. Arrows show how far components were moved.",
             )
             lengths = np.linalg.norm(adaptation.displacement, axis=1)
             svg = charts.displacement(lengths, adaptation.moved, name=f"{key}-moved")
@@ -223,7 +223,9 @@ def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:
         times = rollout.trajectory.times - rollout.trajectory.times[0]
         svg = charts.clearance(times, rollout.clearance, scene.required_clearance, name=f"{key}-clearance")
         yield Figure(
-            svg, "Clearance over time", "Measured in the simulator between the arm, with its tool, and any obstacle."
+            svg,
+            "Clearance over time",
+            "Smallest distance between the arm (with its tool) and any obstacle, measured in the simulator.",
         )
         if scene.torque_limits is not None:
             names, limits = scene.joint_names, scene.torque_limits
@@ -231,12 +233,13 @@ def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:
             yield Figure(
                 svg,
                 "Joint torques",
-                "Dashed: the rated torque. Above each chart: the highest torque, as a percentage of the rated torque.",
+                "The dashed lines are the rated torques. The number above each chart is the highest torque, as a "
+                "percentage of the rated torque.",
             )
 
 
 def _scene_facts(scene: SceneResult) -> dict[str, Any]:
-    """Return all numbers of a scene by name."""
+    """Return all numbers and facts of a scene by name, for the table on its tab."""
     values: dict[str, Any] = {
         "Obstacles": "; ".join(o.name or o.kind for o in scene.scene.obstacles) or "none",
         "Smallest measured clearance": number(MM * scene.min_clearance, 2, "mm"),
@@ -265,7 +268,7 @@ def _scene_facts(scene: SceneResult) -> dict[str, Any]:
 
 
 def _tool(scene: SceneResult) -> str:
-    """Describe the model of the tool that the plan used."""
+    """Return a description of the geometry by which the plan modelled the tool."""
     spheres = scene.tool
     reach = float((np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]).max())
     if reach == 0.0:
@@ -291,7 +294,8 @@ def _learning_figures(learning: LearningSummary) -> Iterator[Figure]:
             learning.n_components,
         )
         caption = (
-            "More components always fit the recordings more closely. The number is chosen by the error on "
-            "demonstrations that were held out of learning; BIC and AIC weigh the fit against the number of parameters."
+            "More components always fit the recordings more closely. Therefore the number is chosen by the error on "
+            "demonstrations that were held out of learning. The criteria BIC and AIC balance the fit against the "
+            "number of parameters."
         )
         yield Figure(svg, "Number of components", caption)

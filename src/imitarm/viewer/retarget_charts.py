@@ -1,4 +1,4 @@
-"""Figures of a retargeting over time: states, joints with their limits, the tool and its target, the upper arm.
+"""Charts of a retargeting over time: states, joints and their limits, the tool and its target, the upper arms.
 
 Every public function that draws returns one ``<svg>`` element.
 """
@@ -25,10 +25,10 @@ _DEGREES: Final = 180.0 / np.pi
 
 
 def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> str:
-    """Draw the state of each method over time, one coloured band for each method.
+    """Draw the engagement state of each method over time, as one coloured band for each method.
 
     Args:
-        runs: titles and runs.
+        runs: title and retargeted motion of each method.
         name: name, unique in the page.
 
     Returns:
@@ -63,7 +63,7 @@ def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> 
 
 
 def stretches(states: NDArray[Any]) -> list[tuple[int, int]]:
-    """Return the first and the last index of each stretch of equal states."""
+    """Return the first and the last index of each interval in which the state does not change."""
     ends = np.flatnonzero(states[1:] != states[:-1])
     firsts = np.concatenate([[0], ends + 1])
     return list(zip(firsts.tolist(), [*ends.tolist(), len(states) - 1], strict=True))
@@ -133,14 +133,14 @@ def joints(run: Retargeting, *, name: str = "joints") -> str:
 
 
 def velocities(run: Retargeting, *, name: str = "velocities") -> str:
-    """Draw the velocity of each joint, the difference quotient of its positions, as a percentage of its limit."""
+    """Draw the velocity of each joint (from differences of its positions), as a percentage of the velocity limit."""
     dt = float(run.times[1] - run.times[0])
     percentages = 100.0 * np.diff(run.joints, axis=0) / dt / run.arm.max_velocity
     return _percentages(run, run.times[1:], percentages, "velocity", name)
 
 
 def accelerations(run: Retargeting, *, name: str = "accelerations") -> str:
-    """Draw the acceleration of each joint, from second differences of its positions, as a percentage of its limit."""
+    """Draw the acceleration of each joint (from second differences of its positions), as a percentage of its limit."""
     dt = float(run.times[1] - run.times[0])
     percentages = 100.0 * np.diff(run.joints, 2, axis=0) / dt**2 / run.arm.max_acceleration
     return _percentages(run, run.times[2:], percentages, "acceleration", name)
@@ -157,7 +157,7 @@ def _percentages(run: Retargeting, times: Array, percentages: Array, what: str, 
 
 
 def elbow(run: Retargeting, points: Array, *, name: str = "elbow") -> str:
-    """Draw the directions of the upper arms of person and robot: the angles upwards and to the left.
+    """Draw the directions of the upper arms of person and robot as two angles: upwards, and to the left.
 
     Args:
         run: the retargeted motion.
@@ -196,5 +196,5 @@ def elbow(run: Retargeting, points: Array, *, name: str = "elbow") -> str:
 
 
 def _directions(upper: Array) -> Array:
-    """Return the angles of unit vectors (n, 3) above the horizontal and to the left, (n, 2) [degrees]."""
+    """Return the angles of unit vectors (n, 3) above the horizontal plane and to the left, shape (n, 2) [degrees]."""
     return _DEGREES * np.arcsin(np.clip(upper[:, [2, 1]], -1.0, 1.0))

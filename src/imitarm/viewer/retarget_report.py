@@ -1,4 +1,4 @@
-"""The report of retargeting one recording as one HTML page: person and robot side by side, figures, measures.
+"""The report on the retargeting of one recording: an HTML page with person and robot side by side, figures, measures.
 
 The page is drawn from ``templates/retarget.html``.
 """
@@ -39,34 +39,37 @@ _VIEW: Final = (1.0, -0.42, 0.36)  # direction towards the camera: person and ro
 _FLOOR: Final = -0.75  # [m] height of the floor in the base frame: the robot stands on a pedestal
 _FINGER_TIME: Final = 0.25  # [s] for the fingers to open or close
 _WORDS: Final = {
-    "Retargeting": "The motion of a person's arm, seen by a camera, becomes a motion of a robot arm: the robot's tool "
-    "follows the hand and, where the method supports it, the robot's elbow follows the person's elbow.",
-    "Target": "The position that the method wants the tool to reach: the tool's position when the person began to "
-    "lead, plus the displacement of the hand since then, times the scale.",
-    "Following, coasting, holding, stopped": "Following: the person's arm is seen. Coasting: it has been lost for up "
-    "to 0.1 s, and the motion continues with decaying velocity. Holding: it has been lost for up to 0.3 s, and the "
-    "target stands still. Stopped: it has been lost for longer; following resumes after the arm has been seen for "
-    "0.5 s.",
-    "Frames beyond a limit": "Control periods in which a joint exceeds a limit, computed from the joint positions "
-    "alone: the drives of a real arm would have to execute them.",
-    "Smallest singular value": "How well the arm can move its tool in its worst direction. Near 0 the arm is almost "
-    "stretched or folded, and small motions of the tool need fast joints.",
-    "Torque": "The torque that the motion needs by the inverse dynamics of the arm, without friction. The part due to "
-    "weight holds the arm against gravity.",
+    "Retargeting": "The motion of a person's arm, measured by a camera, is converted to a motion of a robot arm. "
+    "The robot's tool follows the hand. If the method supports it, the robot's elbow follows the person's elbow.",
+    "Target": "The position that the method wants the tool to reach. It is the tool's position at the time when the "
+    "robot began to follow the person, plus the displacement of the hand since that time, multiplied by the scale.",
+    "Following, coasting, holding, stopped": "Following: the camera sees the person's arm, and the tool follows the "
+    "hand. Coasting: the arm has been lost "
+    "for up to 0.1 s, and the motion continues with decaying velocity. Holding: the arm has been lost for up to 0.3 "
+    "s, and the target stands still. Stopped: the arm has been lost for longer than 0.3 s; following resumes after "
+    "the arm has been seen for 0.5 s.",
+    "Frames beyond a limit": "Control periods in which a joint exceeds a limit of position, velocity or "
+    "acceleration. They are computed from the commanded joint positions, which the drives of a real arm would have "
+    "to execute.",
+    "Smallest singular value": "How well the arm can move its tool in the direction in which it is hardest. If the "
+    "value is near 0, the arm is almost stretched or folded, and small motions of the tool need fast motions of the "
+    "joints.",
+    "Torque": "The torque that the motion needs, computed by inverse dynamics without friction. Its weight part "
+    "holds the arm against gravity.",
 }
 
 
 @dataclass(frozen=True)
 class Measure:
-    """One measure of a retargeting.
+    """One measured value of a retargeting, for a table.
 
     Attributes:
         label: label as shown to the reader.
         value: value in ``unit``; NaN when unknown.
         unit: unit as shown to the reader.
         digits: number of decimals.
-        better: whether ``"less"`` or ``"more"`` is better; ``""``: neither.
-        fault: whether any value above 0 is a fault; it is then marked in red.
+        better: ``"less"`` or ``"more"``, whichever is better; ``""`` if neither is.
+        fault: whether any value above 0 is a fault, which is marked in red.
     """
 
     label: str
@@ -79,7 +82,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class PlainTable:
-    """A table of text: ``title``, one heading for each column, rows with one cell for each column, ``caption``."""
+    """A table of text cells with a title, headings and a caption."""
 
     title: str
     heads: tuple[str, ...]
@@ -95,12 +98,12 @@ class MethodResult:
         name: short name, unique in the report.
         title: title of the tab.
         run: the retargeted motion.
-        measures: measures of the run; every method has the same measures in the same order.
+        measures: measures of the run; all methods must have the same measures in the same order.
         tables: further tables for the tab of this method.
         notes: remarks about this run for the reader, one sentence each.
         caption: one sentence that describes the method.
-        clock: time of the person's motion for each sample of the run, counted from the first skeleton, shape (n,)
-            [s]; None: the times of the run.
+        clock: time in the recording of the person that corresponds to each sample of the run, counted from the first
+            skeleton, shape (n,) [s]; None if it equals the time of the run.
     """
 
     name: str
@@ -119,15 +122,15 @@ class RetargetReport:
 
     Attributes:
         title: title of the page.
-        methods: at least one method; the header describes the first method.
+        methods: results of at least one method; the header describes the first result.
         skeletons: skeletons of the person, as the methods received them.
-        correspondence: mapping from the person's motion to the robot's motion.
+        correspondence: settings of the mapping from the person's motion to the robot's motion.
         verdict: the result in one line.
         good: whether the result is good.
         tiles: the most important measures.
         scene: obstacles around the robot.
         summary: one or two sentences that introduce the page.
-        findings: faults and processing steps of the recording, one sentence each.
+        findings: faults of the recording and changes made to it, one sentence each.
         provenance: facts needed to repeat the run, by name.
 
     Raises:
@@ -155,7 +158,7 @@ class RetargetReport:
             raise InputError(f"RetargetReport: method names must be unique, got {names}")
         labels = [[measure.label for measure in method.measures] for method in self.methods]
         if any(own != labels[0] for own in labels):
-            raise InputError("RetargetReport: every method needs the same measures in the same order")
+            raise InputError("RetargetReport: all methods must have the same measures in the same order")
 
 
 def write_retarget_report(report: RetargetReport, path: str | Path) -> Path:
@@ -208,14 +211,14 @@ def retarget_report_html(report: RetargetReport) -> str:
         states=Figure(
             retarget_charts.states([(method.name, method.run) for method in report.methods]),
             "States over time",
-            "The fraction of the time in each state is in the table.",
+            "The table of measures states the fraction of the time in each state.",
         ),
         findings=report.findings,
     )
 
 
 def playback(report: RetargetReport, method: MethodResult, *, dark: bool = False) -> str:
-    """Return the 3-D page in which the person and the robot move side by side on one clock.
+    """Return the 3-D page in which the person and the robot move side by side in synchrony.
 
     Args:
         report: report with the person and the scene.
@@ -249,7 +252,7 @@ def retargeting_frames(run: Retargeting, scene: Scene | None = None, *, rate: fl
 
     Args:
         run: the retargeted motion.
-        scene: obstacles to draw, at their poses at the start.
+        scene: obstacles to draw, at their initial poses.
         rate: frames per second [1/s].
     """
     spec = arm_world(run.arm, floor=_FLOOR)
@@ -270,7 +273,7 @@ def retargeting_frames(run: Retargeting, scene: Scene | None = None, *, rate: fl
 
 
 def _row(measures: tuple[Measure, ...]) -> dict[str, Any]:
-    """Return a row of the table of measures: the best value and faults are marked."""
+    """Return a row of the table of measures, in which the best value and faults are marked."""
     first = measures[0]
     known = [round(m.value, m.digits) for m in measures if math.isfinite(m.value)]
     best = None
@@ -293,31 +296,33 @@ def _figures(run: Retargeting, key: str) -> Iterator[Figure]:
     yield Figure(
         retarget_charts.tool(run, path, name=f"{key}-tool"),
         "Tool and target",
-        "The target begins when the person begins to lead. The distance between tool and target is due to the lag of "
-        "the method and to the limits of the arm.",
+        "The target exists from the time at which the robot begins to follow the person. The lag of the method and "
+        "the limits of the arm cause the distance between tool and target.",
     )
     yield Figure(
         retarget_charts.velocities(run, name=f"{key}-velocities"),
         "Joint velocities",
-        "Computed from the joint positions. Dashed: the limit. Above each chart: the highest velocity, as a percentage "
-        "of the limit.",
+        "Joint velocities are computed from the joint positions. The dashed line is the limit. The number above "
+        "each chart is the highest velocity, as a percentage of the limit.",
     )
     yield Figure(
-        retarget_charts.joints(run, name=f"{key}-joints"), "Joint positions", "Dashed: the limits of each joint."
+        retarget_charts.joints(run, name=f"{key}-joints"),
+        "Joint positions",
+        "The dashed lines are the position limits of each joint.",
     )
     yield Figure(
         retarget_charts.accelerations(run, name=f"{key}-accelerations"),
         "Joint accelerations",
-        "Computed from the joint positions. Dashed: the limit. Above each chart: the highest acceleration, as a "
-        "percentage of the limit.",
+        "Joint accelerations are computed from the joint positions. The dashed line is the limit. The number above "
+        "each chart is the highest acceleration, as a percentage of the limit.",
     )
     if run.arm.landmarks is not None:
         points = np.array([run.arm.sew_points(q) for q in run.joints])
         yield Figure(
             retarget_charts.elbow(run, points, name=f"{key}-elbow"),
             "Direction of the upper arm",
-            "Robot and person start in different postures; compare how the two directions change. 90° is straight up, "
-            "or straight to the left.",
+            "Robot and person start in different postures, so compare how the two directions change, not their "
+            "values. Upwards, 90° is straight up; to the left, 90° is straight to the left.",
         )
 
 

@@ -1,8 +1,8 @@
 """Interactive 3-D playback in a browser, as one HTML page that needs no network.
 
 :func:`playback_html` draws the model of a :class:`~imitarm.viewer.recording.Recording` with paths and Gaussian
-components around it, and moves the bodies as they were recorded. viser draws in the reader's browser; it needs a server
-on this machine only while the page is written.
+components around it, and moves the bodies as they were recorded. The package viser draws the page in the reader's
+browser. It needs a server on this machine only while the page is written.
 """
 
 from __future__ import annotations
@@ -80,9 +80,10 @@ def _add_mesh(server: Any, name: str, part: Part) -> None:
 
 
 def _draw_bodies(server: Any, recording: Recording, parts: Mapping[int, list[Part]]) -> list[Mover]:
-    """Draw every body at its first pose and return those that move.
+    """Draw every body at its first pose, and return the nodes that must move during playback.
 
-    Many equal bodies (crumbs, parts in a box) become one batch; one message for each would make the page large.
+    Many equal bodies, such as crumbs, are sent to viser as one batch, because one message for each body would make the
+    page large.
     """
     positions = np.round(recording.positions / STEP) * STEP
     quaternions = np.round(recording.quaternions / STEP) * STEP
@@ -175,7 +176,7 @@ def _draw_components(server: Any, components: Sequence[ComponentMark]) -> None:
 
 
 def _free_port() -> int:
-    """Return a free port of this machine; raise when none can be opened, because viser would wait forever."""
+    """Return a free port of this machine; raise TaskFailedError if there is none, because viser would wait forever."""
     try:
         with socket.create_server(("127.0.0.1", 0)) as listener:
             return int(listener.getsockname()[1])
@@ -187,7 +188,7 @@ def _free_port() -> int:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence rich, which viser uses to print the address of its server; nobody should open that address."""
+    """Silence rich, with which viser prints the address of its temporary server; the user should not open it."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:
@@ -226,15 +227,15 @@ def playback_html(
     """Draw a recording and return one self-contained HTML page that plays it.
 
     Args:
-        recording: the moving bodies and their model. Geoms of the groups 0 to 2 are drawn.
+        recording: the model and the recorded poses of its bodies. Only geoms in groups 0 to 2 are drawn.
         paths: lines to draw.
         components: Gaussian components to draw as translucent ellipsoids.
-        persons: people to draw, with as many frames as the recording.
-        camera: the first view; None shows the whole model.
+        persons: people to draw; each must have as many frames as the recording.
+        camera: the initial view; None for a view of the whole model.
         dark: dark controls and background.
 
     Returns:
-        The page; it can be saved, opened from disk without a network, or shown in an iframe.
+        The text of the page, which can be saved, opened from disk without a network, or shown in an iframe.
 
     Raises:
         InputError: when viser is not installed, or a person does not have as many frames as the recording.

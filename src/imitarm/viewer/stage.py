@@ -1,4 +1,4 @@
-"""Common parts of 3-D drawings: a model's meshes and floor, a camera, colours under viser's lights, moving nodes."""
+"""Parts that all 3-D drawings need: meshes and floor of a model, a camera, colours for viser's lights, moving nodes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _EXPOSURE: Final = 0.7
 
 @dataclass(frozen=True)
 class Camera:
-    """The first view: ``position`` and ``look_at`` [m] in the world frame, vertical ``field_of_view`` [rad]."""
+    """The initial view: ``position`` and ``look_at`` [m] in the world frame, and vertical ``field_of_view`` [rad]."""
 
     position: tuple[float, float, float]
     look_at: tuple[float, float, float]
@@ -58,7 +58,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """The triangles of one colour of one body, in the frame of the body."""
+    """All triangles of a body that have the same colour, in the frame of the body."""
 
     mesh: Mesh
     rgba: tuple[float, float, float, float]
@@ -81,7 +81,7 @@ def body_parts(model: MjModel) -> dict[int, list[Part]]:
 
 
 def _vertices(recording: Recording, frame: int, bodies: Iterable[int], parts: Mapping[int, list[Part]]) -> Array:
-    """Return vertices (n, 3) [m] of bodies in the world frame; a subset when there are many."""
+    """Return vertices (n, 3) [m] of bodies in the world frame; if a body has many vertices, a subset of them."""
     found = [np.empty((0, 3))]
     for body in bodies:
         vertices = np.concatenate([part.mesh.vertices for part in parts[body]])
@@ -92,7 +92,7 @@ def _vertices(recording: Recording, frame: int, bodies: Iterable[int], parts: Ma
 
 
 def points_to_see(recording: Recording, parts: Mapping[int, list[Part]], paths: Iterable[Array]) -> Array:
-    """Return points (n, 3) [m] for the camera: moving bodies, their parents, the paths and nearby bodies."""
+    """Return points (n, 3) [m] that the camera should show: moving bodies, their parents, paths, nearby bodies."""
     model, still = recording.model, recording.positions[:1]
     turned = np.any(np.abs(recording.quaternions - recording.quaternions[:1]) > 1e-3, axis=(0, 2))
     moves = np.any(np.abs(recording.positions - still) > 1e-3, axis=(0, 2)) | turned
@@ -113,7 +113,7 @@ def points_to_see(recording: Recording, parts: Mapping[int, list[Part]], paths: 
 
 
 def floor_height(recording: Recording, parts: Mapping[int, list[Part]]) -> float:
-    """Return the height of the floor [m]: the lowest plane or vertex, at most 0."""
+    """Return the height of the floor [m]: the height of the lowest plane or vertex, but at most 0."""
     model = recording.model
     planes = [model.geom_pos[g, 2] for g in range(model.ngeom) if model.geom_type[g] == mjtGeom.mjGEOM_PLANE]
     return float(min([*planes, *_vertices(recording, 0, parts, parts)[:, 2], 0.0]))
@@ -124,7 +124,8 @@ class Mover:
 
     Args:
         handle: handle of the node.
-        poses: attributes of the handle in each frame: ``position``, ``wxyz``, ..., or ``visible`` (n_frames,).
+        poses: values of the handle's attributes for all frames, such as ``position``, ``wxyz`` or ``visible``; the
+            first dimension is the frame.
     """
 
     def __init__(self, handle: Any, poses: Mapping[str, NDArray[Any]]) -> None:
@@ -135,21 +136,21 @@ class Mover:
         }
 
     def show(self, frame: int) -> None:
-        """Send the attributes of a frame, from the second on, that differ from the frame before."""
+        """Send the attributes of a frame that differ from the previous frame; the first frame is not sent."""
         for name, values in self._poses.items():
             if self._changed[name][frame - 1]:
                 setattr(self._handle, name, bool(values[frame]) if values.ndim == 1 else values[frame])
 
 
 def node_name(kind: str, *names: object) -> str:
-    """Return the name of a node; slashes in ``names`` are replaced, because viser reads them as levels of its tree."""
+    """Return the name of a node; slashes in ``names`` are replaced, because viser reads them as tree levels."""
     return f"/{kind}/" + " ".join(str(name).replace("/", "|") for name in names)
 
 
 def lit(rgba: Sequence[float], *, linear: bool = False) -> tuple[float, float, float]:
-    """Return the colour that appears like ``rgba`` under viser's lights, which are brighter than MuJoCo's.
+    """Return the colour that looks like ``rgba`` under viser's lights, which are brighter than those of MuJoCo.
 
-    Batches take colours in ``linear`` light, meshes in sRGB.
+    Batches need ``linear`` RGB colours, meshes need sRGB colours.
     """
     srgb = np.asarray(rgba[:3], dtype=float)
     light = _EXPOSURE * np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
