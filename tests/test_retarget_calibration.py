@@ -48,21 +48,21 @@ def test_a_correspondence_holds_all_that_was_measured():
     ("change", "message"),
     [
         ({"format": "other"}, "not a calibration"),
-        ({"version": 2}, "has version 2, this imitarm reads version 1; update imitarm"),
+        ({"version": 2}, "has version 2, but this imitarm reads version 1; update imitarm"),
         ({"version": True}, "has version True"),
         ({"side": "both"}, "unknown side 'both'; known: left, right"),
-        ({"side": 3}, "'side' should be text"),
-        ({"scale": "1"}, "'scale' should hold numbers"),
+        ({"side": 3}, "'side' must be text"),
+        ({"scale": "1"}, "'scale' must contain numbers"),
         ({"scale": 99.0}, "scale must be a finite number"),
-        ({"scale": 10**400}, "'scale' should be a finite number"),
+        ({"scale": 10**400}, "'scale' must be a finite number"),
         ({"orientation": "sideways"}, "unknown orientation 'sideways'"),
-        ({"orientation": 1}, "'orientation' should be text"),
+        ({"orientation": 1}, "'orientation' must be text"),
         ({"scala": 1.0}, "unknown field 'scala'; known: .*scale"),
-        ({"limbs": [1, 2]}, "limbs: should be a group of named fields, is list"),
+        ({"limbs": [1, 2]}, "limbs: must be a group of named fields, but is list"),
         ({"limbs": {"upper_arm": 0.3}}, "limbs: field 'spread' is missing"),
         ({"limbs": {"upper_arm": 30.0, "forearm": 26.0, "spread": [0, 0], "n_frames": 9}}, "is the unit metres"),
         ({"limbs": {"upper_arm": 0.3, "forearm": 0.3, "spread": [0, 0], "n_frames": 1.5}}, "n_frames must be a whole"),
-        ({"sensor_to_base": {"position": [0, 0], "quaternion": [1, 0, 0, 0]}}, "'position' should be 3 finite"),
+        ({"sensor_to_base": {"position": [0, 0], "quaternion": [1, 0, 0, 0]}}, "'position' must be 3 finite"),
         ({"sensor_to_base": {"position": [0, 0, 0], "quaternion": [2, 0, 0, 0]}}, "quaternion"),
         ({"sensor_to_base": {"position": [0, 0, 0], "quaternion": [1, 0, 0, 0], "rms": -1}}, "sensor_rms"),
     ],
@@ -84,7 +84,7 @@ def test_a_file_that_is_no_calibration_is_refused(tmp_path, content):
 
 
 def test_a_missing_file_says_how_to_make_one_and_a_failed_write_loses_nothing(tmp_path):
-    with pytest.raises(InputError, match="make one with 'imitarm calibrate'"):
+    with pytest.raises(InputError, match="create a calibration with 'imitarm calibrate'"):
         Calibration.load(tmp_path / "c.json")
     with pytest.raises(InputError, match="can't be written"):
         WHOLE.save(tmp_path / "no" / "c.json")

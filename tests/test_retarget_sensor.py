@@ -86,14 +86,14 @@ def test_points_on_a_line_are_refused():
 @pytest.mark.parametrize(
     ("sensor", "base", "message"),
     [
-        (seen()[:3], BASE[:3], "3 pairs of points, at least 4"),
+        (seen()[:3], BASE[:3], "3 pairs of points, but at least 4"),
         (seen(), BASE[:5], r"shapes \(6, 3\) and \(5, 3\)"),
         (seen()[:, :2], BASE[:, :2], "shapes"),
         (seen(), np.where(np.arange(18).reshape(6, 3) == 7, np.nan, BASE), "point 3 is not finite; touch it again"),
         (seen(0.1 * BASE), 0.1 * BASE, r"points of the sensor lie within 2\.. cm of their mean; choose points"),
         (seen(), BASE * 100.0, "the robot's points are 100 times as far apart"),
         (seen() * 1000.0, BASE, "the robot's points are 0.001 times as far apart.*give both in metres"),
-        (seen() * [-1, 1, 1], BASE, "mirrored; reverse the sensor's x axis"),
+        (seen() * [-1, 1, 1], BASE, "mirrored: reverse the sensor's x axis"),
         (seen()[[3, 4, 0, 5, 1, 2]], BASE, "not the same points in the same order"),
     ],
 )
@@ -122,7 +122,7 @@ def test_the_one_point_that_was_missed_is_named(i):
 
 def test_points_that_are_all_poor_are_not_accepted():
     fit = fit_sensor_to_base(seen(sigma=0.04, seed=2), BASE)
-    assert not fit.accepted and "20 to" not in fit.notes()[-1] and "2 cm or less is good" in fit.notes()[-1]
+    assert not fit.accepted and "20 to" not in fit.notes()[-1] and "should be at most 2 cm" in fit.notes()[-1]
 
 
 def test_the_condition_grows_as_points_near_a_line():

@@ -99,15 +99,15 @@ class LandmarkConverter:
 
     **Where the person stands.** MediaPipe's positions in metres are relative to the hips. Without a correction, a hand
     at rest would therefore seem to move whenever the hips move. The translation t of the hips is chosen so that the
-    landmarks :math:`X_j, Y_j, Z_j` agree with the image. With image coordinates :math:`u, v` relative to the image's
-    middle, in units of the focal length, and visibility :math:`k`, t minimises
+    landmarks :math:`X_j, Y_j, Z_j` agree with the image. Let :math:`u, v` be image coordinates relative to the image's
+    middle, in units of the focal length, and :math:`k` the visibility. The translation t solves
 
     .. math:: \min_t \sum_j k_j^2 \left( (X_j + t_x - u_j (Z_j + t_z))^2 + (Y_j + t_y - v_j (Z_j + t_z))^2 \right)
 
-    a linear least-squares problem. Across the line of sight, t is accurate to centimetres. Along the line of sight, t
-    is noisy, and its accuracy depends on MediaPipe's scale and on the field of view. The distance along the line of
-    sight is therefore averaged over 0.1 s, and the other two components of t are then fitted again. All joints move by
-    the same t, so positions relative to other joints do not change.
+    This is a linear least-squares problem. Across the line of sight, t is accurate to centimetres. Along the line of
+    sight, t is noisy, and its accuracy depends on MediaPipe's scale and on the field of view. The distance along the
+    line of sight is therefore averaged over 0.1 s, and the other two components of t are then fitted again. All joints
+    move by the same t, so positions relative to other joints do not change.
 
     **Perspective.** MediaPipe's positions in metres assume a camera that looks straight at the person. They are
     therefore rotated by the angle between the camera's axis and the line of sight to the hips.

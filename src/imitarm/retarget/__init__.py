@@ -1,6 +1,6 @@
 """Retargeting: convert the motion of a human arm to the motion of a robot arm.
 
-The built-in methods, and those of other packages, are in :data:`RETARGETERS`.
+:data:`RETARGETERS` lists the built-in methods and the methods of other packages.
 """
 
 from imitarm.registry import Registry
@@ -21,9 +21,11 @@ RETARGETERS: Registry[type[Retargeter]] = Registry(
         "m3": "imitarm.retarget.baselines.incremental_ik:IncrementalIK",
     },
 )
-"""All methods by name. Other packages add methods under the entry-point group ``imitarm.retargeters``; these methods
-then
-appear in ``imitarm retarget``, ``imitarm teleoperate``, ``imitarm benchmark mapping`` and in the reports."""
+"""All methods by name.
+
+Other packages add methods under the entry-point group ``imitarm.retargeters``. These methods then appear in ``imitarm
+retarget``, ``imitarm teleoperate``, ``imitarm benchmark mapping`` and in the reports.
+"""
 
 __all__ = [
     "FACING",

@@ -1,4 +1,4 @@
-"""ArmEstimator: estimates a person's arm from noisy skeletons; all methods use the same estimate."""
+"""ArmEstimator: estimates the motion of a person's arm from noisy skeletons, in the same way for all methods."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _JUMP = 0.12  # [m] that a hand may move within half the outlier filter's window
 
 
 class ArmEstimate(NamedTuple):
-    """A person's arm, smoothed, with the true lengths of its bones, in the robot's base frame.
+    """Smoothed pose and motion of a person's arm with the true bone lengths, in the robot's base frame.
 
     Attributes:
         time: time of the frame, on the source's clock [s].
         shoulder: position, shape (3,) [m].
         elbow: position, shape (3,) [m].
         wrist: position, shape (3,) [m].
-        velocities: velocities of these three points, shape (3, 3) [m/s].
+        velocities: velocities of shoulder, elbow and wrist, shape (3, 3) [m/s].
         hand: rotation of the hand, quaternion wxyz, shape (4,): x along the hand, z out of the back of the hand.
         angular_velocity: angular velocity of the hand, shape (3,) [rad/s].
         confidence: confidences of elbow, wrist and hand rotation, each 0 to 1.
-        closed: whether the hand is closed; None while that is unknown.
+        closed: whether the hand is closed; None while this is unknown.
     """
 
     time: float
@@ -66,15 +66,15 @@ class ArmEstimate(NamedTuple):
 class ArmEstimator:
     """Converts skeletons to an :class:`ArmEstimate`: removes outliers, corrects bone lengths, and smooths.
 
-    All retargeting methods use this estimator, so a comparison of methods does not depend on the filter.
+    All retargeting methods use this estimator, so the filter does not affect a comparison of the methods.
 
     Args:
-        correspondence: provides the side of the arm and the pose of the sensor.
-        smoothing: whether to apply the One-Euro filter and remove jumps due to a change of tracking
-            (:class:`~imitarm.retarget.smoothing.TrackingOffsets`); otherwise the corrected points are returned
-            unfiltered.
-        limbs: correction of bone lengths: ``"fit"``: the smallest change of all three points; ``"direction"``: from the
-            shoulder outwards, as in the thesis.
+        correspondence: correspondence that contains the side of the person's arm and the pose of the sensor.
+        smoothing: whether to apply the One-Euro filter and to remove jumps that occur when the tracking state changes
+            (:class:`~imitarm.retarget.smoothing.TrackingOffsets`); otherwise, the points with corrected bone lengths
+            are returned unfiltered.
+        limbs: how the bone lengths are corrected: ``"fit"``: by the smallest change of all three points;
+            ``"direction"``: from the shoulder outwards, as in the thesis, so that the bones keep their directions.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class ArmEstimator:
             one.reset()
 
     def update(self, skeleton: Skeleton) -> ArmEstimate | None:
-        """Return the estimate from the next skeleton; None when it is not newer or shows no usable arm."""
+        """Return the estimate from the next skeleton; None if the skeleton is not newer or shows no usable arm."""
         if skeleton.time <= self._time:
             return None
         self._time = skeleton.time
@@ -148,10 +148,10 @@ class ArmEstimator:
         return np.array([points[0], *correct_limbs(points[0], points[1], points[2], lengths)])
 
     def _weights(self, confidence: Array) -> Array:
-        """Return the weights of the three points; the elbow's weight decreases with the error of its inferred position.
+        """Return the weights of shoulder, elbow and wrist; an inferred elbow with a large error gets a small weight.
 
-        Otherwise an error of the elbow would move the wrist, because the forearm has a fixed length, and the tool
-        follows the wrist.
+        With a large weight, an error of the elbow would move the wrist, because the forearm has a fixed length. The
+        tool follows the wrist, so the error would also move the tool.
         """
         offset = self._offsets.offset(1)
         if offset == 0.0:
@@ -161,7 +161,7 @@ class ArmEstimator:
         return weights
 
     def _learn(self, skeleton: Skeleton) -> None:
-        """Measure the arm in the first frames that show it."""
+        """Measure the bone lengths of the arm in the first frames that show the arm."""
         self._learning.append(skeleton)
         try:
             self.lengths = measure_limbs(self._learning, self.correspondence.side)
@@ -172,9 +172,9 @@ class ArmEstimator:
             self._learning = []
 
     def _hand_rotation(self, points: Array, confidence: list[float], forearm: Array) -> tuple[Array, float]:
-        """Return the hand's rotation in the base frame and its confidence.
+        """Return the hand's rotation in the base frame, and the confidence of this rotation.
 
-        A hand that is not visible is assumed to rotate with the forearm.
+        If the hand is not visible, it is assumed to rotate with the forearm.
         """
         length = math.sqrt(float(forearm.dot(forearm)))
         fore = forearm / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
@@ -187,7 +187,7 @@ class ArmEstimator:
         return rotation, known
 
     def _grip(self, state: HandState) -> bool | None:
-        """Return whether the hand is closed, once several frames in a row agree."""
+        """Return whether the hand is closed; this changes only when several successive frames agree."""
         self._grips.append(state)
         if len(self._grips) == _GRIP_FRAMES and len(set(self._grips)) == 1 and state in _GRIP:
             self._closed = _GRIP[state]

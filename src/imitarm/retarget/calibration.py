@@ -40,15 +40,16 @@ _WORTH = 0.005  # [m] RMS residual below which no pair is suspect
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Measurements that remain valid until the person changes or the sensor moves; None: not measured.
+    """Measurements of a person and a sensor; a value that was not measured is None.
 
     Attributes:
         side: arm of the person, ``"left"`` or ``"right"``.
-        lengths: lengths of that arm.
+        lengths: bone lengths of this arm.
         sensor_to_base: pose of the sensor in the robot's base frame.
         sensor_rms: RMS residual of the sensor's pose [m].
-        scale: robot motion divided by the person's motion; None: 1.
-        orientation: how the tool rotates with the hand; None: exactly like the hand.
+        scale: motion of the tool divided by the motion of the hand; None: 1.
+        orientation: how the tool rotates with the hand (:class:`~imitarm.retarget.correspondence.Correspondence`);
+            None: exactly like the hand.
 
     Raises:
         InputError: when a value is not usable.
@@ -77,10 +78,10 @@ class Calibration:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the calibration as readable JSON, atomically.
+        """Write the calibration as readable JSON; the file is replaced only when the new one is complete.
 
         Raises:
-            InputError: when it can't be written; an existing file is then unchanged.
+            InputError: when the file can't be written; an existing file is then unchanged.
         """
         write_text(path, json.dumps(self._content(), indent=2, allow_nan=False) + "\n")
 
@@ -117,7 +118,7 @@ class Calibration:
 
         Raises:
             InputError: when there is no such file.
-            FileFormatError: when it is not a calibration, is damaged, or has an unknown version.
+            FileFormatError: when the file is not a calibration, is damaged, or has an unknown version.
         """
         content = _read(Path(path))
         try:
@@ -144,29 +145,32 @@ def _read(path: Path) -> dict[str, Any]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(
-            f"{path}: can't be read ({error.strerror or error}); make one with 'imitarm calibrate'"
+            f"{path}: can't be read ({error.strerror or error}); create a calibration with 'imitarm calibrate'"
         ) from error
     if len(data) > _LARGEST:
-        raise FileFormatError(f"{path}: larger than {_LARGEST // 2**20} MB, so it is not a calibration")
+        raise FileFormatError(f"{path}: larger than {_LARGEST // 2**20} MB, so it is not a calibration; check the path")
     try:
         content = json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not readable as JSON ({error}); it is damaged or not a calibration") from error
+        raise FileFormatError(
+            f"{path}: not readable as JSON ({error}); the file is damaged or not a calibration"
+        ) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise FileFormatError(f"{path}: not a calibration (its 'format' is not {FORMAT!r})")
+        raise FileFormatError(f"{path}: not a calibration, because its 'format' is not {FORMAT!r}; check the path")
     if content.get("version") != VERSION or isinstance(content.get("version"), bool):
         raise FileFormatError(
-            f"{path}: has version {content.get('version')!r:.40}, this imitarm reads version {VERSION}; update imitarm"
+            f"{path}: has version {content.get('version')!r:.40}, but this imitarm reads version {VERSION}; "
+            "update imitarm"
         )
     return content
 
 
 class _Fields:
-    """A group of fields with checked types; an error names the field."""
+    """A group of fields of a document, with checked types; error messages name the field."""
 
     def __init__(self, values: object, place: str) -> None:
         if not isinstance(values, Mapping):
-            raise InputError(f"{place}: should be a group of named fields, is {type(values).__name__}")
+            raise InputError(f"{place}: must be a group of named fields, but is {type(values).__name__}")
         self._values, self._place = values, place
 
     def _get(self, name: str) -> Any:
@@ -183,21 +187,21 @@ class _Fields:
     def text(self, name: str) -> str:
         value = self._get(name)
         if not isinstance(value, str):
-            raise InputError(f"{self._place}: {name!r} should be text, is {value!r:.60}")
+            raise InputError(f"{self._place}: {name!r} must be text, but is {value!r:.60}")
         return value
 
     def numbers(self, name: str, shape: tuple[int, ...]) -> Array:
         value = self._get(name)
         flat = value if isinstance(value, list) else [value]
         if not all(type(number) in {int, float} for number in flat):
-            raise InputError(f"{self._place}: {name!r} should hold numbers, is {value!r:.60}")
+            raise InputError(f"{self._place}: {name!r} must contain numbers, but is {value!r:.60}")
         try:
             array = np.array(value, dtype=float)
         except OverflowError:
             array = np.array(np.inf)
         if array.shape != shape or not np.isfinite(array).all():
             what = f"{shape[0]} finite numbers" if shape else "a finite number"
-            raise InputError(f"{self._place}: {name!r} should be {what}, is {value!r:.60}")
+            raise InputError(f"{self._place}: {name!r} must be {what}, but is {value!r:.60}")
         return array
 
 
@@ -208,7 +212,7 @@ def _limbs(content: Mapping[str, Any]) -> LimbLengths | None:
     fields.refuse_others({"upper_arm", "forearm", "spread", "n_frames"})
     spread, n_frames = fields.numbers("spread", (2,)), fields.numbers("n_frames", ()).item()
     if n_frames < 0 or n_frames != round(n_frames) or (spread < 0.0).any():
-        raise InputError("limbs: n_frames must be a whole number and spread at least 0")
+        raise InputError("limbs: n_frames must be a whole number, and spread must be at least 0")
     return LimbLengths(
         fields.numbers("upper_arm", ()).item(),
         fields.numbers("forearm", ()).item(),
@@ -227,7 +231,7 @@ def _sensor(content: Mapping[str, Any]) -> tuple[Pose | None, float | None]:
 
 
 def robot_reach(arm: ArmModel) -> float:
-    """Return the largest distance of a robot's wrist from its shoulder [m], by a search over the joints.
+    """Return the largest distance between a robot's wrist and its shoulder [m], found by a search over the joints.
 
     Raises:
         InputError: when the arm's file does not define shoulder and wrist.
@@ -252,30 +256,30 @@ def robot_reach(arm: ArmModel) -> float:
 
 
 def suggested_scale(arm: ArmModel, lengths: LimbLengths, anchor: Anchor = "shoulder") -> float:
-    r"""Return a scale for this robot and this person (docs/capture.md).
+    r"""Return a suitable scale for this robot and this person (docs/capture.md).
 
     Args:
         arm: the robot's.
         lengths: the person's.
-        anchor: ``"shoulder"``: the straight arms of person and robot correspond,
-            :math:`\rho = reach_{robot} / reach_{human}`, so that the whole workspace is used; ``"object"``: 1, for work
-            on objects of the same size.
+        anchor: ``"shoulder"``: the ratio of the arms' reaches, :math:`\rho = reach_{robot} / reach_{human}`, so that
+            the person can use the robot's whole workspace; ``"object"``: 1, for tasks in which the robot handles
+            objects of the same size as the person's.
     """
     return 1.0 if anchor == "object" else robot_reach(arm) / lengths.reach
 
 
 @dataclass(frozen=True, eq=False)
 class SensorFit:
-    """The pose of the sensor and its uncertainty.
+    """Result of a sensor calibration: the pose of the sensor and its uncertainty.
 
     Attributes:
         sensor_to_base: pose of the sensor in the robot's base frame.
-        residuals: remaining distance of each pair of points, shape (n,) [m].
-        condition: ratio of the first to the second singular value of the points' cross-covariance H: 1 for points
-            spread equally in all directions, large for points almost on a line.
+        residuals: distance between the two points of each pair after the fit, shape (n,) [m].
+        condition: ratio of the first to the second singular value of the points' cross-covariance H; 1 if the points
+            are spread equally in all directions, large if they lie almost on a line.
         angle_error: standard error of the rotation about its least certain axis [rad].
-        flat: whether the points lie in a plane; a mirrored axis is then not detected.
-        suspect: index of the pair that does not fit the others, from 0; None: all fit.
+        flat: whether the points lie in a plane, so that a mirrored axis can't be detected.
+        suspect: index, from 0, of the pair that does not fit the other pairs; None: all pairs fit.
     """
 
     sensor_to_base: Pose
@@ -294,7 +298,7 @@ class SensorFit:
     def accepted(self) -> bool:
         """Whether the fit is good enough for teleoperation.
 
-        An RMS residual of at most 2 cm and no pair that does not fit.
+        This requires an RMS residual of at most 2 cm, and that every pair fits the others.
         """
         return self.rms <= GOOD and self.suspect is None
 
@@ -313,8 +317,8 @@ class SensorFit:
             )
         elif self.rms > GOOD:
             lines.append(
-                f"the average error is {100 * self.rms:.1f} cm, {100 * GOOD:.0f} cm or less is good; hold the "
-                "hand still and in view while it is measured"
+                f"the average error is {100 * self.rms:.1f} cm, but should be at most {100 * GOOD:.0f} cm; "
+                "hold the hand still and in view during the measurement"
             )
         return lines
 
@@ -326,16 +330,18 @@ def fit_sensor_to_base(sensor: ArrayLike, base: ArrayLike, weights: ArrayLike | 
         H = \sum_i c_i (k_i - \bar k)(b_i - \bar b)^T = U S V^T, \quad
         R = V\,\mathrm{diag}(1, 1, \det V U^T)\,U^T, \quad t = \bar b - R \bar k
 
-    No scale is fitted: both frames are in metres, and a scale would only hide a wrong unit.
+    where H is the weighted cross-covariance of the points k (sensor) and b (base). No scale is fitted, because both
+    frames are in metres and a scale would only hide a wrong unit.
 
     Args:
-        sensor: points measured by the sensor, shape (n, 3) [m].
-        base: the same points in the robot's base frame, shape (n, 3) [m].
-        weights: weights of the pairs, shape (n,); None: equal.
+        sensor: points k in the sensor's frame, as the sensor measured them, shape (n, 3) [m].
+        base: the same points b in the robot's base frame, shape (n, 3) [m].
+        weights: weight c of each pair, shape (n,); None: equal weights.
 
     Raises:
-        InputError: when there are fewer than four pairs, they are not finite, lie on a line or too close together, or
-            no rigid motion maps one set to the other; the message says what to do.
+        InputError: when there are fewer than four pairs of points, when the points are not finite, lie on a line or lie
+            too close together, or when no rigid motion maps one set of points to the other; the message says what to
+            do.
     """
     k, b, c = _checked(sensor, base, weights)
     pose, singular = _kabsch(k, b, c)
@@ -361,7 +367,9 @@ def _checked(sensor: ArrayLike, base: ArrayLike, weights: ArrayLike | None) -> t
     if k.ndim != 2 or k.shape[1:] != (3,) or k.shape != b.shape:
         raise InputError(f"sensor calibration: needs two arrays of shape (n, 3), got shapes {k.shape} and {b.shape}")
     if len(k) < LEAST_PAIRS:
-        raise InputError(f"sensor calibration: {len(k)} pairs of points, at least {LEAST_PAIRS} are needed; touch more")
+        raise InputError(
+            f"sensor calibration: {len(k)} pairs of points, but at least {LEAST_PAIRS} are needed; touch more points"
+        )
     bad = ~np.isfinite(k).all(axis=1) | ~np.isfinite(b).all(axis=1)
     if bad.any():
         raise InputError(f"sensor calibration: point {int(np.argmax(bad)) + 1} is not finite; touch it again")
@@ -373,7 +381,7 @@ def _checked(sensor: ArrayLike, base: ArrayLike, weights: ArrayLike | None) -> t
         if wide < _NEAR:
             raise InputError(
                 f"sensor calibration: the points of {whose} lie within {100 * wide:.1f} cm of their mean; choose "
-                "points that are 20 to 60 cm apart (is the unit metres?)"
+                "points that are 20 to 60 cm apart, and give them in metres"
             )
         if thin < _THIN:
             raise InputError(
@@ -389,7 +397,7 @@ def _spread(points: Array) -> Array:
 
 
 def _kabsch(k: Array, b: Array, c: Array) -> tuple[Pose, Array]:
-    """Return the rigid motion from k to b, and the singular values of H."""
+    """Return the rigid motion that maps points k to points b, and the singular values of H."""
     weight = c / c.sum()
     k_mean, b_mean = weight @ k, weight @ b
     u, singular, vt = np.linalg.svd((k - k_mean).T @ (weight[:, None] * (b - b_mean)))
@@ -413,14 +421,18 @@ def _suspect(k: Array, b: Array, c: Array, rms: float) -> int | None:
 
 
 def _misfit(k: Array, b: Array, c: Array, rms: float) -> str:
-    """Return why no rigid motion maps one set to the other."""
-    text = f"sensor calibration: the average error is {100 * rms:.0f} cm: "
+    """Return the most likely reason why no rigid motion maps one set of points to the other."""
+    text = f"sensor calibration: the average error is {100 * rms:.0f} cm; "
     ratio = float(np.linalg.norm(b - b.mean(axis=0)) / np.linalg.norm(k - k.mean(axis=0)))
     if _rms(k * [-1.0, 1.0, 1.0], b, c) < 0.5 * rms:
-        return text + "one of the frames is mirrored; reverse the sensor's x axis (is its picture mirrored?)"
+        return text + "one of the frames is mirrored: reverse the sensor's x axis (is its image mirrored?)"
     if not 0.67 < ratio < 1.5 and _rms(ratio * k, b, c) < 0.5 * rms:
-        return text + f"the robot's points are {ratio:.3g} times as far apart as the sensor's; give both in metres"
+        return (
+            text + f"the robot's points are {ratio:.3g} times as far apart as the sensor's points: give both in metres"
+        )
     suspect = _suspect(k, b, c, rms)
     if suspect is not None:
-        return text + f"point {suspect + 1} does not fit the others; touch it again, or leave it out"
-    return text + "they are not the same points in the same order; touch them again one by one"
+        return text + f"point {suspect + 1} does not fit the others: touch it again, or leave it out"
+    return (
+        text + "the points of sensor and robot are not the same points in the same order: touch them again one by one"
+    )

@@ -1,4 +1,4 @@
-"""Correspondence: which arm of the person leads, the pose of the sensor, the scale, and how the tool rotates."""
+"""Correspondence: which arm the robot follows, the pose of the sensor, the scale, and how the tool rotates."""
 
 from __future__ import annotations
 
@@ -18,29 +18,31 @@ Array = NDArray[np.float64]
 Orientation = Literal["hand", "upright", "fixed"]
 
 FACING = Pose(np.zeros(3), matrix_to_quaternion(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])))
-"""``sensor_to_base`` for a person who faces the sensor and imagines standing at the robot's place: the person's
-forward is the robot's x, the person's left is its y, up is its z."""
+"""``sensor_to_base`` for a person who faces the sensor and imagines standing in the robot's place: the robot's x
+axis points in the person's forward direction, its y axis to the person's left, and its z axis up.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Correspondence:
     r"""How the person's arm motion is mapped to the robot's tool.
 
-    While the person leads, the tool repeats the displacement of the hand since the person began to lead
+    While the robot follows the person, the tool repeats the displacement of the hand since the robot began to follow
     (docs/retargeting.md):
 
     .. math:: p_d = p_{home} + \rho\, R\,(W - W_0), \qquad R_d = R\,(R_H R_{H,0}^T)\,R^T R_{home}
 
-    where :math:`R` is the rotation from sensor to base, :math:`\rho` the scale, W the wrist and :math:`R_H` the hand's
-    rotation.
+    where :math:`p_d, R_d` is the desired pose of the tool, R the rotation from sensor to base, :math:`\rho` the scale,
+    W the position of the wrist and :math:`R_H` the rotation of the hand, both in the sensor's frame. The values at the
+    time when the robot began to follow are :math:`W_0`, :math:`R_{H,0}`, and :math:`p_{home}, R_{home}` for the tool.
 
     Attributes:
-        side: arm of the person, ``"left"`` or ``"right"``.
-        sensor_to_base: pose of the sensor in the robot's base frame; only its rotation matters for relative motion.
-        lengths: lengths of the person's arm; None: they are measured in the first frames.
-        scale: rho, robot motion divided by the person's motion.
-        orientation: how the tool rotates: ``"hand"`` as the hand does; ``"upright"`` only about the vertical, so that a
-            tool that points down keeps pointing down; ``"fixed"`` not at all.
+        side: side of the person's arm that the robot follows, ``"left"`` or ``"right"``.
+        sensor_to_base: pose of the sensor in the robot's base frame; only its rotation affects the motion of the tool.
+        lengths: bone lengths of the person's arm; None: they are measured in the first frames.
+        scale: :math:`\rho`, displacement of the tool divided by the displacement of the wrist.
+        orientation: how the tool rotates: ``"hand"``: like the hand; ``"upright"``: like the hand, but only about the
+            vertical, so that a tool that points down keeps pointing down; ``"fixed"``: not at all.
 
     Raises:
         InputError: when a value is not usable.
@@ -67,14 +69,14 @@ class Correspondence:
         Args:
             wrist: wrist position in the base frame, shape (3,) [m].
             hand: hand rotation in the base frame, quaternion wxyz, shape (4,).
-            tool_to_base: pose of the tool: its position as measured, its rotation as last commanded.
+            tool_to_base: pose of the tool in the base frame; its position as measured, its rotation as last commanded.
         """
         return Clutch(self, np.array(wrist, dtype=float), np.array(hand, dtype=float), tool_to_base)
 
 
 @dataclass(frozen=True, eq=False)
 class Clutch:
-    """The poses of hand and tool when the person began to lead; see :class:`Correspondence`.
+    """The poses of hand and tool when the robot began to follow the person; see :class:`Correspondence`.
 
     Attributes:
         correspondence: correspondence between the person's arm and the robot's.
@@ -105,9 +107,10 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _about_vertical(hand: Array, before: Array, home: Array) -> Array:
-    """Return ``home`` rotated as the hand has rotated about the base's z since ``before``; quaternions, shape (4,).
+    """Rotate ``home`` by the hand's rotation about the base's z axis since ``before``; quaternions, shape (4,).
 
-    This is the twist of the swing-twist decomposition, in plain floats, because only two of its numbers are not zero.
+    The rotation about z is the twist of the swing-twist decomposition. It is computed with plain floats, because only
+    two components of its quaternion are not zero.
     """
     (a, b, c, d), (e, f, g, h), (w, x, y, z) = hand.tolist(), before.tolist(), home.tolist()
     real, up = a * e + b * f + c * g + d * h, d * e - a * h + c * f - b * g

@@ -1,4 +1,4 @@
-"""Engagement: the state machine that decides when a person leads the robot; all methods use the same one."""
+"""Engagement: the state machine that decides when the robot follows a person; all methods use the same one."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ LONGEST_GAP = 0.1  # [s] between two estimates; a longer gap restarts that count
 
 
 class EngagementState(StrEnum):
-    """State of the engagement. A member equals its value, so ``state == "following"`` works.
+    """State of the engagement; each member equals its value, so ``state == "following"`` works.
 
-    * ``WAITING``: the arm is at rest until a person has been seen for half a second.
-    * ``FOLLOWING``: the person is seen and leads the tool.
-    * ``COASTING``: the person has just been lost; the motion is extrapolated.
-    * ``HOLDING``: the person has been lost for longer; the last target is held.
-    * ``STOPPED``: the person has been lost for too long. The robot brakes, and stays stopped until it is at rest and
-      the person is seen again.
+    * ``WAITING``: the robot is at rest until the camera has seen the person's arm for half a second.
+    * ``FOLLOWING``: the camera sees the person's arm, and the tool follows the hand.
+    * ``COASTING``: the camera has just lost the arm; the motion of the hand is extrapolated.
+    * ``HOLDING``: the arm has been lost for longer; the robot holds its last target.
+    * ``STOPPED``: the arm has been lost for too long, so the robot brakes. When the robot is at rest and the camera
+      sees the arm again, the state becomes ``WAITING``.
     """
 
     WAITING = "waiting"
@@ -38,7 +38,7 @@ class EngagementState(StrEnum):
 
     @property
     def engaged(self) -> bool:
-        """Whether the person leads the tool, including short losses of tracking."""
+        """Whether the robot follows the person, including short losses of tracking."""
         return self in _ENGAGED
 
 
@@ -46,7 +46,7 @@ _ENGAGED = frozenset({EngagementState.FOLLOWING, EngagementState.COASTING, Engag
 
 
 def engaged_samples(states: ArrayLike) -> NDArray[np.bool_]:
-    """Return whether the person leads the tool in each sample of a run, shape (n,).
+    """Return whether the robot follows the person in each sample of a run, shape (n,) bool.
 
     Args:
         states: states of the run, values of :class:`EngagementState`, shape (n,).
@@ -56,14 +56,14 @@ def engaged_samples(states: ArrayLike) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class EngagementRule:
-    """Times of the state machine, all in seconds.
+    """Times at which the engagement changes its state, all in seconds.
 
     Attributes:
-        seen_for: time for which the arm must be visible before the robot follows it.
-        follow_until: longest time since the arm was last seen at which the state is still FOLLOWING (cameras drop
-            frames).
-        coast_until: the same for COASTING.
-        hold_until: the same for HOLDING; inf: the robot never stops.
+        seen_for: time for which the person's arm must be visible before the robot follows it.
+        follow_until: time since the arm was last seen after which FOLLOWING ends; it bridges frames that a camera
+            drops.
+        coast_until: time since the arm was last seen after which COASTING ends.
+        hold_until: time since the arm was last seen after which HOLDING ends; inf: the robot never stops.
     """
 
     seen_for: float = SEEN_FOR
@@ -73,7 +73,7 @@ class EngagementRule:
 
 
 class Engagement:
-    """Decides, one control period at a time, whether a person leads the robot.
+    """Decides, in each control period, whether the robot follows the person.
 
     ::
 
@@ -83,13 +83,15 @@ class Engagement:
 
     Args:
         correspondence: correspondence between the person's arm and the robot's.
-        rule: the times of the transitions.
+        rule: times at which the state changes.
 
     Attributes:
         state: the current state.
-        clutch: the poses of hand and tool when the person began to lead; None while nobody leads.
-        ready: whether the person may begin to lead in this control period; the caller then calls :meth:`engage`.
-        time_since_seen: time since the arm was last seen [s]; inf before it was ever seen.
+        clutch: the poses of hand and tool when the robot began to follow the person; None while the robot follows
+            nobody.
+        ready: whether the robot may begin to follow the person in this control period; the caller then calls
+            :meth:`engage`.
+        time_since_seen: time since the person's arm was last seen [s]; inf if it was never seen.
     """
 
     def __init__(self, correspondence: Correspondence, rule: EngagementRule | None = None) -> None:
@@ -109,11 +111,11 @@ class Engagement:
         """Advance by one control period and return the new state.
 
         Args:
-            estimate: estimate of the person's arm from a new frame; None: there was no frame, or it does not show the
-                arm.
+            estimate: estimate of the person's arm from a new frame; None: there is no new frame, or it does not show
+                the arm.
             period: time since the last call [s].
-            at_rest: whether the robot is at rest: only then can a person begin to lead it. The time for which the
-                person has been seen is counted in any case.
+            at_rest: whether the robot is at rest; only then may it begin to follow a person. The time for which the arm
+                has been visible is counted even while the robot moves.
         """
         self.time_since_seen = self.time_since_seen + period if estimate is None else 0.0
         self.ready = False
@@ -134,7 +136,7 @@ class Engagement:
         return self.state
 
     def engage(self, wrist: ArrayLike, hand: Array, tool_to_base: Pose) -> Clutch:
-        """Let the person lead from now on; call this method when :attr:`ready` is true.
+        """Let the robot follow the person from now on; call this method when :attr:`ready` is true.
 
         Args:
             wrist: position of the person's wrist in the base frame, shape (3,) [m].
@@ -153,7 +155,7 @@ class Engagement:
             self.clutch = replace(self.clutch, home=home)
 
     def _after(self, lost: float) -> EngagementState:
-        """Return the state of an engaged robot ``lost`` seconds after the arm was last seen."""
+        """Return the state of a robot that follows a person, ``lost`` seconds after the person's arm was last seen."""
         rule = self._rule
         if lost <= rule.follow_until:
             return EngagementState.FOLLOWING

@@ -1,14 +1,15 @@
 r"""Fitting: find a start posture and a scale that bring a recorded motion within the robot's reach.
 
-Only a recording can be fitted; a live motion is not known in advance. The tool will be at
+Only a recording can be fitted, because a live motion is not known in advance. The position of the tool will be
 
 .. math:: p(t) = p_0 + \rho\,(W(t) - W_0)
 
-where :math:`W` is the person's wrist along the axes of the base, :math:`W_0` the wrist when the clutch engages,
-:math:`p_0` the tool's start and :math:`\rho` the scale. The middle of the motion is placed near the tool's home
-position, then throughout the workspace. The scale is reduced until the arm reaches the start and the six outermost
-points of the motion, with the tool's orientation at home, away from singularities, with its links apart, and clear of
-the fixtures on which the arm stands.
+where :math:`W` is the position of the person's wrist along the axes of the base, :math:`W_0` its position when the
+clutch engages, :math:`p_0` the start position of the tool, and :math:`\rho` the scale. For each scale, the search
+places the middle of the motion at positions near the tool's home position, and then at positions throughout the
+workspace. The scale is reduced until the arm reaches the start and the six outermost points of the motion. At each of
+these points, the tool must have the same orientation as at home, and the arm must be away from singularities, its links
+must be apart, and it must be clear of the fixtures on which it stands.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ _MOST_CENTRES: Final = 60
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Start posture of the robot, ``q`` (n_joints,) [rad], and the ``scale`` of its motion."""
+    """The start posture of the robot, ``q`` (n_joints,) [rad], and the ``scale`` of its motion."""
 
     q: Array
     scale: float
@@ -68,8 +69,9 @@ def fit_motion(
 
     Args:
         arm: the robot's arm.
-        wrist: positions of the person's wrist along the axes of the base, shape (n, 3) [m]; rows with NaN are skipped.
-        start: position of the wrist when the clutch engages, shape (3,) [m].
+        wrist: positions of the person's wrist along the axes of the robot's base, shape (n, 3) [m]; rows with nan are
+            skipped.
+        start: position of the person's wrist when the clutch engages, shape (3,) [m].
         scale: the largest scale to try.
         fixtures: objects on which the arm stands or works, which it must not touch; None: a floor and a pedestal
             (:func:`~imitarm.scene.standard_fixtures`).
@@ -106,7 +108,7 @@ def fit_motion(
 
 
 class _Search:
-    """Finds postures with the tool oriented as at home, away from singularities and without contact."""
+    """Finds postures with the tool's orientation at home, away from singularities and without contact."""
 
     def __init__(self, arm: ArmModel, fixtures: Sequence[Obstacle]) -> None:
         self.arm, self.links, self.home = arm, SelfClearance(arm, _APART), arm.tool_pose(arm.home)
@@ -122,7 +124,7 @@ class _Search:
         return float(np.linalg.norm(self._tips - self._tips.mean(axis=0), axis=1).max())
 
     def centres(self) -> Iterator[tuple[Array, Array]]:
-        """Yield positions (3,) [m] for the middle of the motion, each with a posture near it, nearest to home first."""
+        """Yield positions (3,) [m] for the motion's middle, nearest to home first, each with a posture close to it."""
         for shift in _NEAR_HOME:
             yield self.home.position + shift, self.arm.home
         if self._far is None:  # the same for all scales

@@ -1,11 +1,12 @@
 r"""Kinematics of the person's arm: seven joint angles, forward and inverse (thesis Eq 3.5; docs/retargeting.md).
 
-The chain is shoulder, upper arm, elbow, forearm, wrist. With all angles zero the arm is straight along the base's x:
+The kinematic chain consists of shoulder, upper arm, elbow, forearm and wrist. When all angles are zero, the arm is
+straight along the x axis of the base, and the joints have the following axes:
 
 .. math:: R = R_z(q_0) R_y(q_1) R_x(q_2)\;|\,L_U\,|\;R_y(q_3) R_x(q_4)\;|\,L_F\,|\;R_y(q_5) R_x(q_6)
 
-These are the axes of Sawyer's joints at zero, in the same order. A person's angles therefore equal a Sawyer's angles,
-apart from the offsets between its links.
+Sawyer's joints have the same axes in the same order when all its joint positions are zero. The joint angles of a person
+and of a Sawyer in the same posture are therefore equal, except for the effect of the offsets between Sawyer's links.
 """
 
 from __future__ import annotations
@@ -20,14 +21,15 @@ from imitarm.retarget.limbs import LimbLengths
 Array = NDArray[np.float64]
 
 AXES = ("z", "y", "x", "y", "x", "y", "x")
-"""Axis of each angle of the chain at zero."""
+"""Rotation axis of each joint angle of the chain when all angles are zero."""
 
 HUMAN_ARM_DH = (
     np.array([0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]),
     np.array([-0.5 * np.pi, 0.5 * np.pi, -0.5 * np.pi, 0.5 * np.pi, -0.5 * np.pi, 0.5 * np.pi, 0.0]),
 )
-"""Offsets of theta, and alpha, of a Denavit-Hartenberg table of the arm [rad], shapes (7,); a is 0, and d is the
-upper arm in the third row and the forearm in the fifth."""
+"""Denavit-Hartenberg table of the arm: offsets of theta, and alpha, shape (7,) each [rad]; a is 0, and d is the length
+of the upper arm in the third row and the forearm in the fifth.
+"""
 
 _TO_HAND = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # from the table's last frame
 _SINGULAR = 0.05  # sine below which an angle keeps its value, because it would only follow noise
@@ -44,12 +46,12 @@ def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike,
         0 & s_\alpha & c_\alpha & d \\ 0 & 0 & 0 & 1 \end{pmatrix}
 
     Args:
-        theta: angle about the previous z axis [rad]; all four arguments broadcast.
+        theta: angle about the previous z axis [rad]; like all four parameters, a number or an array.
         d: distance along the previous z axis [m].
         a: distance along the new x axis [m].
         alpha: angle about the new x axis [rad].
-        as_printed: whether to use the second row as printed in the thesis, with sin instead of cos; the result is
-            not a rotation.
+        as_printed: whether to use the second row of the matrix as printed in the thesis, with sin instead of cos; its
+            rotational part is then no rotation.
 
     Returns:
         shape (..., 4, 4).
@@ -70,16 +72,17 @@ def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike,
 def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: bool = False) -> Array:
     """Return the frames of the Denavit-Hartenberg chain relative to the shoulder (thesis Eq 3.5).
 
-    The thesis prints no table for the arm; :data:`HUMAN_ARM_DH` is a table for this module's chain. Frame 3 is at the
-    elbow, frame 5 at the wrist; frame 7 is the hand frame: x along the hand, z out of its back.
+    The thesis prints no Denavit-Hartenberg table for the arm, so :data:`HUMAN_ARM_DH` is our table for the chain of
+    this module. Frame 3 is at the elbow, and frame 5 at the wrist. Frame 7 is the frame of the hand, with x along the
+    hand and z out of the back of the hand.
 
     Args:
         angles: joint angles, shape (7,) [rad].
         lengths: lengths of this person.
-        as_printed: whether to use the second row as printed in the thesis; the result is not a rotation.
+        as_printed: whether to use the matrices as printed in the thesis; their rotational parts are then no rotations.
 
     Returns:
-        shape (8, 4, 4), beginning with the shoulder's frame.
+        The transforms of frames 0 to 7, shape (8, 4, 4); frame 0 is the shoulder's frame.
     """
     offset, alpha = HUMAN_ARM_DH
     along = np.array([0.0, 0.0, lengths.upper_arm, 0.0, lengths.forearm, 0.0, 0.0])
@@ -93,7 +96,7 @@ def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: boo
 
 
 def human_arm_pose(angles: ArrayLike, lengths: LimbLengths) -> tuple[Array, Array, Array]:
-    """Return elbow (3,), wrist (3,) [m] and the hand's rotation (3, 3) relative to the shoulder, for angles (7,)."""
+    """Return elbow (3,), wrist (3,) [m] and hand rotation (3, 3) relative to the shoulder, for angles (7,) [rad]."""
     elbow, wrist, hand, _ = _chain(np.asarray(angles, dtype=float), lengths)
     return elbow, wrist, hand
 
@@ -106,7 +109,7 @@ def human_arm_jacobian(angles: ArrayLike, lengths: LimbLengths) -> Array:
 
 
 def _chain(angles: Array, lengths: LimbLengths) -> tuple[Array, Array, Array, Array]:
-    """Return elbow, wrist, hand rotation, and the axis of each angle in the shoulder's frame, shape (7, 3)."""
+    """Return elbow, wrist, hand rotation and the joint axes, shape (7, 3), all in the shoulder's frame."""
     rotation, axes = np.eye(3), np.empty((7, 3))
     at, elbow = np.zeros(3), np.zeros(3)
     for i, (name, angle) in enumerate(zip(AXES, angles, strict=True)):
@@ -129,11 +132,11 @@ def _rotation_about(axis: str, angle: float) -> Array:
 
 
 def human_arm_angles(upper: ArrayLike, forearm: ArrayLike, hand: ArrayLike, previous: ArrayLike | None = None) -> Array:
-    """Return the seven angles of an arm in closed form.
+    """Return the seven joint angles of a person's arm in closed form, shape (7,) [rad].
 
-    An angle that is undefined keeps its previous value: the first when the upper arm is along z, the third when the arm
-    is straight, the fifth when the hand is in line with the forearm. Of the two solutions for the wrist, the function
-    returns the one closer to the previous angles.
+    An angle that is undefined keeps its previous value. The first angle is undefined when the upper arm is along z, the
+    third when the arm is straight, and the fifth when the hand is in line with the forearm. The wrist has two
+    solutions; the function returns the solution closer to the previous angles.
 
     Args:
         upper: unit vector from shoulder to elbow, shape (3,).
@@ -162,7 +165,7 @@ def human_arm_angles(upper: ArrayLike, forearm: ArrayLike, hand: ArrayLike, prev
 
 
 def _wrist_angles(rotation: Array, held: Array) -> Array:
-    """Return angles (a, b, c) with Rx(a) Ry(b) Rx(c) = rotation, the solution closest to ``held``."""
+    """Return the angles (a, b, c) with Rx(a) Ry(b) Rx(c) = rotation that are closest to ``held``."""
     sine = math.hypot(rotation[1, 0], rotation[2, 0])
     if sine < _SINGULAR:  # only the sum of the two angles about the forearm is defined
         rest = _rotation_about("x", -held[0]) @ rotation
@@ -186,11 +189,11 @@ def _wrapped(angles: Array) -> Array:
 
 
 def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
-    r"""Return the hand's rotation from three of its points, or None when they do not determine it.
+    r"""Return the hand's rotation from wrist, tip and thumb; None when these points do not determine it.
 
-    Shoulder, elbow and wrist alone do not show how the forearm is rotated or the wrist bent. With the unit vectors
-    :math:`x = \overline{tip - W}` and :math:`n = \overline{x \times (thumb - W)}` the rotation is
-    :math:`[x,\; n \times x,\; n]`.
+    Shoulder, elbow and wrist alone do not show how the forearm is rotated or how the wrist is bent. With the wrist W
+    and the unit vectors :math:`x = \overline{tip - W}` and :math:`n = \overline{x \times (thumb - W)}`, the rotation
+    matrix is :math:`[x,\; n \times x,\; n]`.
 
     Args:
         wrist: wrist position, shape (3,) [m].
@@ -198,7 +201,8 @@ def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
         thumb: its tip.
 
     Returns:
-        shape (3, 3); None when hand and thumb are within 12 degrees of one line, or a point is not plausible.
+        Rotation matrix, shape (3, 3); None when the angle between hand and thumb is less than 12 degrees, or a point is
+        not plausible.
     """
     # plain floats: for nine numbers three times as fast as NumPy
     x0, x1, x2 = (tip - wrist).tolist()
@@ -216,12 +220,12 @@ def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
 
 
 def carried(rotation: Array | None, before: Array | None, after: Array) -> Array:
-    """Return the hand's rotation after a rotation of the forearm, when the hand itself is not visible.
+    """Return the rotation of a hand that is not visible, after a rotation of the forearm.
 
     Args:
-        rotation: previous rotation of the hand, shape (3, 3); None if unknown: then its x is along the forearm and
-            its z is horizontal.
-        before: unit vector along the forearm at that time, shape (3,).
+        rotation: previous rotation of the hand, shape (3, 3); None: unknown, so the function assumes that the hand's x
+            is along the forearm and its z is horizontal.
+        before: unit vector along the forearm when the hand had this rotation, shape (3,).
         after: unit vector along the forearm now, shape (3,).
 
     Returns:

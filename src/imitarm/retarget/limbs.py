@@ -30,9 +30,9 @@ class LimbLengths:
     """Lengths of a person's upper arm and forearm.
 
     Attributes:
-        upper_arm: shoulder to elbow [m].
-        forearm: elbow to wrist [m].
-        spread: standard deviation of single measurements about the median, for the two lengths [m].
+        upper_arm: distance from shoulder to elbow [m].
+        forearm: distance from elbow to wrist [m].
+        spread: standard deviations of the single measurements of the two lengths about their medians [m].
         n_frames: number of frames used for the measurement; 0 when the lengths were given.
 
     Raises:
@@ -70,12 +70,12 @@ class LimbLengths:
 
     @property
     def reach(self) -> float:
-        """Distance from shoulder to wrist of the straight arm [m]."""
+        """Distance from shoulder to wrist when the arm is straight [m]."""
         return self.upper_arm + self.forearm
 
 
 def measure_limbs(skeletons: Iterable[Skeleton], side: str = "right") -> LimbLengths:
-    """Measure the bone lengths of an arm: the medians over frames in which it is tracked and slow (docs/capture.md).
+    """Measure the bone lengths of an arm as medians over frames in which it is tracked and slow (docs/capture.md).
 
     Args:
         skeletons: skeletons in order of time; two seconds are enough.
@@ -95,8 +95,8 @@ def measure_limbs(skeletons: Iterable[Skeleton], side: str = "right") -> LimbLen
     used = slow if len(slow) >= _LEAST_FRAMES else whole
     if len(used) < _LEAST_FRAMES:
         raise InputError(
-            f"limb lengths: the {side} arm is fully tracked in {len(used)} of {len(arms)} frames, {_LEAST_FRAMES} are "
-            "needed; face the sensor with the arm away from the body"
+            f"limb lengths: the {side} arm is fully tracked in {len(used)} of {len(arms)} frames, but {_LEAST_FRAMES} "
+            "are needed; face the sensor with the arm away from the body"
         )
     points = np.array([arm.points[:3] for arm in used])
     lengths = np.linalg.norm(np.diff(points, axis=1), axis=2)
@@ -122,8 +122,8 @@ def correct_limbs(
         elbow: measured elbow position, same shape.
         wrist: measured wrist position, same shape.
         lengths: lengths of this person.
-        as_printed: whether to use the signs printed in the thesis and attach the forearm to the measured elbow; the
-            elbow is then on the wrong side of the shoulder.
+        as_printed: whether to use the equations as printed in the thesis: their signs place the elbow on the wrong side
+            of the shoulder, and the forearm begins at the measured elbow instead of the corrected elbow.
 
     Returns:
         elbow and wrist, shapes (..., 3) [m].
@@ -139,13 +139,14 @@ def correct_limbs(
 def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds: int = 3) -> Array:
     r"""Move shoulder, elbow and wrist as little as possible so that the bones have their true lengths.
 
-    This is the most likely arm when every point is measured with an error and weighted by its confidence c:
+    The result is the most likely arm if every point is measured with an error; each point is weighted by its confidence
+    c:
 
     .. math:: \min \sum_j c_j |x_j - \tilde x_j|^2 \quad\text{s.t.}\quad |E - S| = L_U,\; |W - E| = L_F
 
-    It is solved by a few Gauss-Newton steps, each with a 2 x 2 system for the multipliers. :func:`correct_limbs` is the
-    special case in which the shoulder is exact and only the directions of the bones count: it transfers the errors
-        of shoulder and elbow to the wrist.
+    A few Gauss-Newton steps solve this problem, each with a 2 x 2 system of equations for the Lagrange multipliers.
+    :func:`correct_limbs` is the special case in which the shoulder is assumed to be exact and only the directions of
+    the bones are used; it transfers the errors of shoulder and elbow to the wrist.
 
     Args:
         points: shoulder, elbow, wrist, shape (3, 3) [m].
@@ -185,11 +186,11 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
 
 
 def _unit(x: float, y: float, z: float, length: float) -> tuple[float, float, float]:
-    """Return a unit vector; zero for a vector of hardly any length."""
+    """Return the unit vector in the direction of a vector; zero if the vector is almost zero."""
     return (x / length, y / length, z / length) if length > _POINT else (0.0, 0.0, 0.0)
 
 
 def _direction(vectors: Array) -> Array:
-    """Return unit vectors; zero for vectors of hardly any length."""
+    """Return the unit vectors in the directions of vectors; zero for vectors that are almost zero."""
     length = np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True))
     return np.where(length > _POINT, vectors / np.maximum(length, _POINT), 0.0)

@@ -1,4 +1,4 @@
-"""ModernRetargeter: the recommended method; keeps all limits, follows the elbow, bridges short tracking losses."""
+"""ModernRetargeter: the recommended method; it keeps all limits, follows the elbow and bridges tracking losses."""
 
 from __future__ import annotations
 
@@ -44,48 +44,47 @@ _STILL = 1e-3  # [rad/s] a slower joint is at rest
 
 
 class ModernRetargeter(Retargeter):
-    r"""Follow the person's hand with the tool and the person's elbow with the robot's elbow, within every limit.
+    r"""The tool follows the person's hand, and the robot's elbow follows the person's elbow, within all limits.
 
-    One step does the following (see docs/retargeting.md):
+    Each control step consists of four parts (see docs/retargeting.md):
 
     1. extrapolate the estimate of the person's arm (:class:`~imitarm.retarget.arm_estimator.ArmEstimator`) from its
        last frame at a decaying velocity: after s seconds the wrist is at :math:`W + v\,\tau(1 - e^{-s/\tau})`, with
        :math:`\tau` = 50 ms;
     2. compute the tool's target and the twist towards it, :math:`K \log(T_d T^{-1})`, plus a fraction of the hand's
        velocity (feed-forward);
-    3. solve a quadratic programme for the joint velocities. Its tasks are the twist and the elbow's SEW angle; its
-       limits are the joint limits of position, velocity and acceleration, bounds that keep elbow and wrist away from
-       their
-       singularities, and the distances of the links to each other and to the scene. While nobody leads, the arm rests;
-    4. limit the jerk (:class:`JerkLimiter`) and check all limits again. If something blocks the arm, the arm does
-       not push harder, and the target stays near the blocked tool.
+    3. solve a quadratic programme for the joint velocities. Its tasks are the twist of the tool and the elbow's SEW
+       angle (shoulder-elbow-wrist). Its limits are the joint limits of position, velocity and acceleration, bounds that
+       keep elbow and wrist away from their singularities, and the distances of the links to each other and to the
+       scene. While the robot follows nobody, it is at rest;
+    4. limit the jerk of the joints (:class:`JerkLimiter`) and check all limits again. If something blocks the arm, the
+       arm does not push harder, and the target stays near the blocked tool.
 
-    The robot's elbow angle changes by as much as the person's has changed since the person began to lead:
-    :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of this task decreases when the camera sees the person's
-    elbow poorly and when either arm is nearly straight.
+    The desired elbow angle of the robot changes by as much as the person's elbow angle since the robot began to follow:
+    :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of the elbow task decreases when the camera sees the
+    person's elbow poorly, and when the person's or the robot's arm is nearly straight.
 
-    When the person is lost, the arm coasts for 0.1 s, holds its target until 0.3 s, then stops. Once the person has
-    been seen again for half a second, the motion restarts from the current poses of hand and tool, so that nothing
-    jumps.
+    When the camera loses the person, the robot continues along the extrapolated motion for 0.1 s, then holds its
+    target, and stops 0.3 s after the loss. Once the person has been seen again for half a second, the motion restarts
+    from the current poses of hand and tool, so that nothing jumps.
 
     Args:
         arm: the robot's arm with its tool.
         correspondence: correspondence between the person's arm and the robot's.
         dt: control period [s].
         scene: obstacles to avoid.
-        gain: K [1/s].
+        gain: gain K of the twist towards the target [1/s].
         lead: fraction of the hand's velocity that is fed forward, 0 to 1.
-        rotation_length: length [m] with the same weight as one radian of the tool's rotation, about the base's x, y
-            and z; it matters when the joints can't achieve both position and rotation. None: 0.1 when the tool rotates
-            with the hand,
-            because a camera measures this rotation poorly; 0.3 when the tool keeps its rotation; when the tool stays
-            upright, 0.2 about x and y (tilt) and 0.05 about z.
-        elbow: weight of the elbow's motion relative to the tool's [m^2]; 0 leaves the elbow free.
-        clearance: required distance from the scene [m].
-        own_clearance: required distance between links [m]; None: not checked.
+        rotation_length: position error [m] that counts as much as a rotation error of one radian about the base's x, y
+            and z axes; used when the joints can't achieve both position and rotation. None: 0.1 m when the tool rotates
+            with the hand, because a camera measures this rotation poorly; 0.3 m when the tool keeps its rotation; when
+            the tool stays upright, 0.2 m about x and y (tilt) and 0.05 m about z.
+        elbow: weight of the elbow task relative to the tool's task [m^2]; 0: the elbow is free.
+        clearance: required distance between the arm and the obstacles [m].
+        own_clearance: required distance between the arm's own links [m]; None: not checked.
         max_speed: largest norm of the twist [m/s], with 1 rad counted as ``rotation_length``.
-        max_lead: largest lead of a joint's command over its measured position [rad]; a robot with a longer delay
-            needs a larger value.
+        max_lead: largest distance by which the command of a joint may be ahead of the measured position [rad]; a robot
+            with a longer delay needs a larger value.
 
     Raises:
         InputError: when a number is out of range.
@@ -154,7 +153,7 @@ class ModernRetargeter(Retargeter):
         return super()._see(skeleton)
 
     def _hand(self) -> tuple[Array, Array]:
-        """Return wrist and hand, extrapolated from the last frame at a velocity that decays."""
+        """Return wrist and hand, extrapolated from the last frame with a decaying velocity."""
         estimate, age = self._estimate, self._engagement.time_since_seen
         assert estimate is not None
         wrist, hand = estimate.wrist, estimate.hand
@@ -166,7 +165,7 @@ class ModernRetargeter(Retargeter):
         return wrist, hand
 
     def _at_rest(self) -> bool:
-        """Return whether the arm is at rest; an imperceptibly slow remaining motion is set to zero."""
+        """Return whether the arm is at rest; a remaining motion that is imperceptibly slow is set to zero."""
         if max(np.abs(self._velocity).max(), np.abs(self._limiter.velocity).max()) > _STILL:
             return False
         if self._velocity.any() or self._limiter.velocity.any():
@@ -187,7 +186,7 @@ class ModernRetargeter(Retargeter):
         return self._limiter.follow(self._q, self._velocity, measured)
 
     def _elbow_task(self, estimate: ArmEstimate) -> ElbowTask | None:
-        """Return the desired angle of the robot's elbow; None when the elbow is free or an angle is undefined."""
+        """Return the task for the robot's elbow angle; None when the elbow is free or an angle is undefined."""
         if self._elbow == 0.0:
             return None
         person = one_angle(estimate.shoulder.tolist(), estimate.elbow.tolist(), estimate.wrist.tolist())
@@ -203,7 +202,7 @@ class ModernRetargeter(Retargeter):
         return ElbowTask(angle, self._elbow, confidence, _SWING_GAIN, _SWING_RATE)
 
     def _reach(self, target: Pose, ahead: Array, elbow: ElbowTask | None, measured: Array) -> None:
-        """Move the reference towards the target, but not further against an obstruction."""
+        """Move the joint reference towards the target, but not further against an object that blocks the arm."""
         error = self.arm.tool_pose(self._q).error_to(target)
         x, y, z, u, v, w = error.tolist()
         weighted = math.hypot(x, y, z, ROTATION_LENGTH * u, ROTATION_LENGTH * v, ROTATION_LENGTH * w)
@@ -222,10 +221,10 @@ class ModernRetargeter(Retargeter):
         self._drive(twist, elbow)
 
     def _slip(self, target: Pose, measured: Array) -> None:
-        """Move the clutch's origin while the hand moves the target away from a tool that is blocked and at rest.
+        """Shift the clutch's origin, so that the target does not move away from a tool that is blocked and at rest.
 
-        Otherwise the tool would jump to the target, and against any object on its path, as soon as it is free. A robot
-        that merely responds late keeps moving, so it is not mistaken for a blocked robot.
+        Otherwise, the tool would jump to the target as soon as it is free, and could hit an object on its path. A robot
+        that only responds with a delay keeps moving, so it is not mistaken for a blocked robot.
         """
         at = self.arm.tool_pose(measured).position
         moved, offset = at - self._held_at, target.position - at
@@ -236,7 +235,7 @@ class ModernRetargeter(Retargeter):
             self._engagement.shift((_SLIP / length - 1.0) * offset)
 
     def _yielding(self, twist: Array, measured: Array, fraction: float) -> Array:
-        """Return the twist after reducing its component in the direction in which the tool is blocked."""
+        """Return the twist with a smaller component in the direction in which the tool is blocked."""
         back = self.arm.tool_pose(measured).error_to(self.arm.tool_pose(self._limiter.q)) * _METRES
         square = float(back.dot(back))
         along = float(back.dot(twist * _METRES))
@@ -245,7 +244,7 @@ class ModernRetargeter(Retargeter):
         return twist - fraction * (along / square) * back / _METRES
 
     def _drive(self, twist: Array, elbow: ElbowTask | None, *, engaged: bool = True) -> None:
-        """Move the reference by one step of inverse kinematics; without a leading person, the arm rests."""
+        """Move the reference by one step of inverse kinematics; the arm rests if ``engaged`` is false."""
         obstacles = self._obstacles.rows(self._q, self.scene)
         own = None if self._own is None else self._own.rows(self._q, may_search=not self._seeing)
         rows = ([] if obstacles is None else [obstacles]) + ([] if own is None else [own])
@@ -262,30 +261,34 @@ class ModernRetargeter(Retargeter):
 class JerkLimiter:
     r"""Follows a reference of the joints with limited position, velocity, acceleration and jerk.
 
-    A critically damped follower with feed-forward, :math:`a_d = \omega^2 (q_r - q) + 2\omega (v_r - v)`. Its
-    acceleration is clipped to :math:`|a| \le a_{max}` and to :math:`|a - a_p| \le j\,dt`, where :math:`a_p` is the
-    previous acceleration. The resulting velocity :math:`v + a\,dt` is then clipped so that the joint can still stop
-    before its limit. With D the distance to the limit, and a position that changes by the mean of two successive
-    velocities, the highest such velocity is
+    The limiter is a critically damped follower with feed-forward, whose acceleration is :math:`a_d = \omega^2 (q_r - q)
+    + 2\omega (v_r - v)` for a reference with position :math:`q_r` and velocity :math:`v_r`. The acceleration is clipped
+    to :math:`|a| \le a_{max}` and to :math:`|a - a_p| \le j\,dt`, where :math:`a_p` is the previous acceleration and j
+    the jerk limit. The resulting velocity :math:`v + a\,dt` is then clipped so that the joint can still stop before its
+    limit. Let D be the distance to the limit and a the largest acceleration, and let each step move the joint by the
+    mean of two successive velocities. The highest velocity from which the joint can still stop is then
 
     .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a D'}, \qquad D' = D - \tfrac12 v\,dt,
 
-    and :math:`2 D'/dt` where D' is negative.
+    or :math:`2 D'/dt` if D' is negative.
 
-    A joint that has met this bound once can meet it in all later steps by braking with a_max. Near a limit the last
-    clipping may exceed the jerk limit; position, velocity and acceleration are always kept.
+    A joint that satisfies this bound once can satisfy it in all later steps by braking with a_max. Near a position
+    limit, clipping to this velocity may exceed the jerk limit, but the limits of position, velocity and acceleration
+    are always kept.
 
-    A blocked arm falls behind its commands, and its drives push harder as the error grows. Therefore, a command that
-    leads the measured joint by more than half of ``max_lead`` brakes: ``max_lead`` acts as an additional position
-    limit. The command may exceed it by the braking distance.
+    A blocked arm falls behind its commands, and its drives push harder as the error grows. Therefore, a joint command
+    brakes when it is ahead of the measured position by more than half of ``max_lead``, as if ``max_lead`` were an
+    additional position limit. The command may exceed this limit by the braking distance.
 
     Args:
-        arm: whose limits.
+        arm: arm model that provides the joint limits.
         dt: control period [s].
-        frequency: omega [rad/s]; must be well below 1/dt.
-        rise_time: time to full acceleration [s]: j = a_max / rise_time.
-        max_lead: largest lead of a command over the measured position [rad]; half of it must exceed the distance that
-            the joints move at full speed within the robot's delay, otherwise this limit slows the joints down.
+        frequency: natural frequency omega of the follower [rad/s]; must be well below 1/dt.
+        rise_time: shortest time in which the acceleration rises from 0 to a_max [s]; the jerk limit is j = a_max /
+            rise_time.
+        max_lead: largest distance by which a command may be ahead of the measured position [rad]. Half of this value
+            must exceed the distance that a joint moves at full speed within the robot's delay; otherwise, the limit
+            slows the joints down.
 
     Raises:
         InputError: when a number is out of range.
@@ -333,12 +336,13 @@ class JerkLimiter:
         return np.array(self._acceleration)
 
     def follow(self, q: Array, velocity: Array, measured: Array | None = None) -> Array:
-        """Advance by one period towards a reference and return the joint positions reached, (n_joints,) [rad].
+        """Move towards a reference for one period; return the joint positions reached, shape (n_joints,) [rad].
 
         Args:
             q: joint positions of the reference, shape (n_joints,) [rad].
             velocity: velocity of the reference, shape (n_joints,) [rad/s].
-            measured: measured joint positions, shape (n_joints,) [rad]; None: as commanded.
+            measured: measured joint positions, shape (n_joints,) [rad]; None: the joints are where they were commanded
+                to be.
         """
         # plain floats without min and max: for so few numbers twice as fast as NumPy
         dt, half, stiffness, damping = self._dt, 0.5 * self._dt, self._stiffness, self._damping

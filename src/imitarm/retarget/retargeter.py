@@ -33,11 +33,12 @@ class RetargetStep:
 
     Attributes:
         time: time since :meth:`Retargeter.start` [s].
-        q: joint positions to reach by the end of the step, shape (n_joints,) [rad].
+        q: joint positions that the robot must reach by the end of the step, shape (n_joints,) [rad].
         velocity: joint velocities at the end of the step, shape (n_joints,) [rad/s].
         closed: whether the gripper should be closed; None: leave it as it is.
         state: state of the engagement.
-        target: desired pose of the tool in the base frame, before limits are applied; None while nobody leads.
+        target: desired pose of the tool in the base frame, before limits are applied; None while the robot follows
+            nobody.
         elbow: unit vector from the person's shoulder to the elbow in the base frame, shape (3,); None when unknown.
     """
 
@@ -51,15 +52,15 @@ class RetargetStep:
 
 
 class Goal(NamedTuple):
-    """The input of a method in one control step while the person leads.
+    """The input of a method in one control step while the robot follows the person.
 
     Attributes:
         target: current desired pose of the tool in the base frame.
         estimate: estimate of the person's arm, from the last frame that shows it.
-        fresh: whether that frame arrived in this step.
-        age: time since that frame arrived [s].
+        fresh: whether the frame of the estimate arrived in this step.
+        age: time since the frame of the estimate arrived [s].
         state: FOLLOWING, COASTING or HOLDING.
-        clutch: the poses of hand and tool when the person began to lead.
+        clutch: the poses of hand and tool when the robot began to follow the person.
     """
 
     target: Pose
@@ -73,17 +74,19 @@ class Goal(NamedTuple):
 class Retargeter(ABC):
     """Converts a person's arm motion, given as skeletons, to joint positions of a robot arm.
 
-    :meth:`start` puts the robot at rest at a posture. :meth:`step` is then called once per control period ``dt`` with
-    the skeleton that arrived since the last call, or None: cameras give 30 frames per second and a robot takes 100
-    commands per second, so most calls get None. Every step has the same parts for all methods:
+    :meth:`start` defines the posture in which the robot begins at rest. :meth:`step` is then called once per control
+    period ``dt`` with the skeleton that arrived since the last call, or None. Cameras deliver 30 frames per second, but
+    a robot takes 100 commands per second, so most calls get None. For all methods, a control step has the same four
+    parts:
 
     1. ``_see`` computes an estimate of the person's arm from a new skeleton;
-    2. the :class:`~imitarm.retarget.engagement.Engagement` decides whether the person leads;
-    3. if so, ``_hand`` and ``_target`` compute the desired pose of the tool;
+    2. the :class:`~imitarm.retarget.engagement.Engagement` decides whether the robot follows the person;
+    3. if the robot follows the person, ``_hand`` and ``_target`` compute the desired pose of the tool;
     4. ``_advance`` returns the joint positions of the next period: **this is the method**.
 
-    A method is a subclass that implements ``_advance``. It may also override the other functions with a leading
-    underscore, which have defaults. It sets ``name``, and ``title`` and ``caption`` for tables and reports::
+    A method is a subclass that implements ``_advance``. It may also override the other functions whose names begin with
+    an underscore, which have default implementations. It sets its ``name``, and its ``title`` and ``caption`` for
+    tables and reports::
 
         class Damped(Retargeter):
             name, title = "damped", "Damped least squares"
@@ -100,7 +103,7 @@ class Retargeter(ABC):
         name: name of the method, as in :data:`imitarm.retarget.RETARGETERS`; default: the class's name.
         title: title of the method in tables and reports; default: ``name``.
         caption: one sentence about the method for reports.
-        rule: times after which the robot follows, coasts, holds and stops.
+        rule: times at which the engagement changes its state.
         arm: the robot's arm with its tool.
         n_joints: number of joints of the arm.
         correspondence: correspondence between the person's arm and the robot's.
@@ -168,7 +171,7 @@ class Retargeter(ABC):
         self._rest_at(posture)
 
     def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
-        """Advance by one control period; see the class.
+        """Process one control period; the class describes its parts.
 
         The first call starts at ``arm.home`` unless :meth:`start` was called.
 
@@ -228,7 +231,7 @@ class Retargeter(ABC):
 
     @property
     def notes(self) -> dict[str, float]:
-        """Counts and other figures of the method, by name; empty by default."""
+        """Counts and other figures that the method reports, by name; empty by default."""
         return {}
 
     # --- the method
@@ -240,7 +243,8 @@ class Retargeter(ABC):
         The last commanded positions are ``self.latest.q``.
 
         Args:
-            goal: pose to reach, with its context; None while nobody leads: then the robot must stop and stay at rest.
+            goal: desired pose of the tool, with the data that it is computed from; None while the robot follows nobody
+                and must therefore stop and stay at rest.
             measured: measured joint positions, shape (n_joints,) [rad].
         """
 
@@ -250,18 +254,18 @@ class Retargeter(ABC):
         """Reset the method's state; :meth:`start` calls this before ``_rest_at``."""
 
     def _rest_at(self, q: Array) -> None:  # noqa: B027 (optional)
-        """Record that the robot is at rest at ``q``, shape (n_joints,) [rad]: at the start, or after it was moved."""
+        """Store that the robot is at rest at ``q`` (n_joints,) [rad], at the start or after it was moved by hand."""
 
     def _new_estimator(self) -> ArmEstimator:
         """Return the estimator of the person's arm."""
         return ArmEstimator(self.correspondence)
 
     def _see(self, skeleton: Skeleton | None) -> ArmEstimate | None:
-        """Return the estimate of the person's arm from a new skeleton; None if there is none or it shows no arm."""
+        """Return the estimate of the person's arm from a new skeleton; None without a skeleton that shows the arm."""
         return None if skeleton is None else self._estimator.update(skeleton)
 
     def _hand(self) -> tuple[Array, Array]:
-        """Return the current target wrist (3,) [m] and hand quaternion (4,) wxyz in the base frame."""
+        """Return the current wrist (3,) [m] and hand quaternion (4,) wxyz to follow, in the base frame."""
         assert self._estimate is not None
         return self._estimate.wrist, self._estimate.hand
 
@@ -270,7 +274,7 @@ class Retargeter(ABC):
         return clutch.target(wrist, hand)
 
     def _at_rest(self) -> bool:
-        """Return whether the robot is at rest; only then can a person begin to lead it."""
+        """Return whether the robot is at rest; only then may it begin to follow a person."""
         return True
 
     def _velocity_at(self, before: Array, after: Array) -> Array:
@@ -283,7 +287,7 @@ class Retargeter(ABC):
     # --- the same for all
 
     def _start_where_pushed(self, measured: Array) -> None:
-        """Rest at the measured posture if the arm was moved by hand while nobody led it."""
+        """Rest at the measured posture if the arm was moved by hand while it followed nobody."""
         if float(np.abs(measured - self.latest.q).max()) > PUSHED:
             q = np.clip(measured, self.arm.lower, self.arm.upper)
             self.latest = RetargetStep(self.latest.time, q, np.zeros(self.arm.n_joints), state=self.latest.state)
@@ -299,7 +303,7 @@ class Retargeter(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Retargeting:
-    """The robot motion that a method computed from a recording, sampled at the control period.
+    """The robot motion that a method has computed from a recording, sampled at the control period.
 
     Attributes:
         method: name of the method.
@@ -307,15 +311,16 @@ class Retargeting:
         times: time stamps, shape (n,) [s], from 0.
         joints: joint positions, shape (n, n_joints) [rad].
         velocities: commanded joint velocities, shape (n, n_joints) [rad/s].
-        targets: target positions (n, 3) [m] and quaternions wxyz (n, 4) of the tool; nan while nobody led.
-        elbows: unit vectors from the person's shoulder to the elbow in the base frame, (n, 3); nan where unknown.
+        targets: target positions (n, 3) [m] and quaternions wxyz (n, 4) of the tool; nan while the robot follows
+            nobody.
+        elbows: unit vectors from the person's shoulder to the elbow in the base frame, shape (n, 3); nan where unknown.
         closed: whether the gripper should be closed, shape (n,) bool.
         states: states of the engagement, shape (n,), values of :class:`~imitarm.retarget.engagement.EngagementState`.
-        notes: counts and figures of the method, by name.
+        notes: counts and other figures that the method reports, by name.
         title: title of the method for tables and reports; empty: ``method``.
         caption: one sentence about the method for reports.
-        shown_times: time since the first skeleton at which the person showed each sample, shape (n,) [s]; earlier than
-            ``times`` for methods that slow the motion down. None: ``times``.
+        shown_times: time at which the person showed each sample, counted from the first skeleton, shape (n,) [s];
+            earlier than ``times`` for methods that slow the motion down. None: ``times``.
     """
 
     method: str
@@ -367,7 +372,7 @@ class Retargeting:
 
     @property
     def engaged(self) -> NDArray[np.bool_]:
-        """Whether the person led the robot at each sample, shape (n,)."""
+        """Whether the robot followed the person at each sample, shape (n,) bool."""
         return engaged_samples(self.states)
 
     def demonstration(self, task: str = "", source: str = "") -> Demonstration:
@@ -377,10 +382,11 @@ class Retargeting:
 
 
 def in_order(skeletons: Iterable[Skeleton]) -> list[Skeleton]:
-    """Return a recording as a list.
+    """Return the skeletons of a recording as a list, after checking them.
 
     Raises:
-        InputError: when there are fewer than two skeletons, one is not a skeleton, or times do not increase.
+        InputError: when there are fewer than two skeletons, when an item is not a skeleton, or when times do not
+            increase.
     """
     if not isinstance(skeletons, Iterable):
         raise InputError(f"retarget: needs a sequence of skeletons, got {type(skeletons).__name__}")
@@ -390,14 +396,14 @@ def in_order(skeletons: Iterable[Skeleton]) -> list[Skeleton]:
     for i, (before, after) in enumerate(pairwise(frames)):
         if after.time <= before.time:
             raise InputError(
-                f"retarget: skeleton {i + 1} has time {after.time:g} s, which is not later than the one before; "
-                "sort the recording, or keep one person of it"
+                f"retarget: skeleton {i + 1} has time {after.time:g} s, which is not later than the skeleton before; "
+                "sort the recording by time, or keep only one person"
             )
     return frames
 
 
 def ticks(frames: Sequence[Skeleton], dt: float) -> Iterable[Skeleton | None]:
-    """Yield for each control period of a recording the newest skeleton of that period, or None.
+    """For each control period of a recording, yield the newest skeleton of the period, or None.
 
     Args:
         frames: frames in order of time, at least one.

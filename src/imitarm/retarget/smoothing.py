@@ -1,4 +1,4 @@
-"""Live filters for camera data: One-Euro smoothing, outlier detection, and offsets due to changes of tracking."""
+"""Live filters for camera data: One-Euro smoothing, outlier detection, and compensation of jumps in tracking."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FLICKER = 0.12  # [s] a joint that returns to its previous tracking within this
 
 
 def smoothing_weight(cutoff: Any, period: float) -> Any:
-    r"""Return :math:`\alpha = 1 / (1 + 1/(2\pi f T))`: the weight of a new value in a low-pass filter.
+    r"""Return the weight of a new value in a low-pass filter, :math:`\alpha = 1 / (1 + 1/(2\pi f T))`.
 
     Args:
         cutoff: cut-off frequency f [Hz], a number or an array.
@@ -36,14 +36,15 @@ def smoothing_weight(cutoff: Any, period: float) -> Any:
 class OneEuro:
     r"""The One-Euro filter for vectors (Casiez, Roussel and Vogel, CHI 2012).
 
-    A low-pass filter whose cut-off frequency rises with the speed of the motion:
+    This low-pass filter raises its cut-off frequency with the speed of the motion:
 
     .. math:: \hat x \leftarrow \hat x + \alpha(f_c)\,(x - \hat x), \qquad f_c = f_{min} + \beta\,|\hat{\dot x}|
 
-    The speed is the norm of the whole velocity vector, so the filter acts equally in all directions. It is computed
-    from the difference of two successive measured values. The usual difference to the previous smoothed value contains
-    the filter's own lag and is too large during steady motion, which matters when the velocity is used for prediction.
-    The weight of a value is multiplied by its confidence c.
+    The speed is the norm of the whole velocity vector, so the filter acts equally in all directions. The velocity is
+    computed from the difference of two successive measured values. The original filter uses the difference between a
+    measured value and the previous smoothed value. This difference contains the lag of the filter and is too large
+    during steady motion, which would distort a prediction from the velocity. The weight :math:`\alpha` of a value is
+    multiplied by the value's confidence.
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].
@@ -82,7 +83,7 @@ class OneEuro:
         several = x.ndim == 2
         measured: list[list[float]] = x.tolist() if several else [x.tolist()]
         if period <= GAP and x.shape != self._shape:
-            raise InputError(f"OneEuro: the first vectors had shape {self._shape}, these have {x.shape}")
+            raise InputError(f"OneEuro: the first vectors had shape {self._shape}, but these have shape {x.shape}")
         self._time, self._shape = time, x.shape
         if period > GAP:
             self._begin(measured)
@@ -115,10 +116,10 @@ class OneEuro:
 
 
 class OneEuroRotation(OneEuro):
-    """The One-Euro filter for rotations (quaternions wxyz); steps and speed are rotation vectors in the base frame.
+    """The One-Euro filter for rotations (quaternions wxyz); it filters rotation vectors in the base frame.
 
-    Its ``filter`` takes a unit quaternion, shape (4,), and returns the smoothed one; ``velocity`` has shape (3,)
-    [rad/s].
+    The method ``filter`` takes a unit quaternion, shape (4,), and returns the smoothed quaternion. The attribute
+    ``velocity`` is the angular velocity, shape (3,) [rad/s].
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].
@@ -144,7 +145,7 @@ class OneEuroRotation(OneEuro):
 
 
 def _rotation_between(before: list[float], after: list[float]) -> tuple[float, float, float]:
-    """Return log(after before^-1), a rotation vector [rad], of two unit quaternions."""
+    """Return the rotation vector log(after before^-1) [rad] between two unit quaternions."""
     (w, i, j, k), (a, b, c, d) = before, after
     real = a * w + b * i + c * j + d * k
     u, v, z = b * w - a * i - c * k + d * j, c * w - a * j - d * i + b * k, d * w - a * k - b * j + c * i
@@ -155,7 +156,7 @@ def _rotation_between(before: list[float], after: list[float]) -> tuple[float, f
 
 
 def _rotated(quaternion: list[float], x: float, y: float, z: float) -> list[float]:
-    """Return a unit quaternion rotated by exp(x, y, z) [rad], normalised."""
+    """Rotate a unit quaternion by the rotation vector (x, y, z) [rad], and normalise the result."""
     w, i, j, k = quaternion
     half = 0.5 * math.sqrt(x * x + y * y + z * z)
     factor = 0.5 * math.sin(half) / half if half > _SMALL else 0.5
@@ -173,13 +174,14 @@ def _rotated(quaternion: list[float], x: float, y: float, z: float) -> list[floa
 class Hampel:
     r"""Detects outliers: values too far from the median of a sliding window (Hampel identifier).
 
-    A value is an outlier if :math:`|x - \mathrm{med}| > \max(4 \cdot 1.4826\,\mathrm{MAD},\; r)`. A real jump is
-    accepted after half the window, once most values agree with it.
+    A value x is an outlier if :math:`|x - \mathrm{med}| > \max(4 \cdot 1.4826\,\mathrm{MAD},\; r)`, where med is the
+    median of the window and MAD the median absolute deviation from it. A real jump is accepted after half the window,
+    when most values agree with it.
 
     Args:
         window: duration [s].
-        least: r, distance within which no value is an outlier [m]; it should exceed the distance that a fast hand
-            moves within half the window.
+        least: distance r from the median within which no value is an outlier [m]; it should exceed the distance that a
+            fast hand moves within half the window.
     """
 
     def __init__(self, window: float = 0.3, least: float = 0.02) -> None:
@@ -193,7 +195,7 @@ class Hampel:
         self._values.clear()
 
     def accept(self, time: float, x: Array) -> bool:
-        """Add a value (d,) to the window and return whether it is consistent with the previous values."""
+        """Add a value (d,) to the window, and return whether it is consistent with the previous values."""
         times, values, value = self._times, self._values, x.tolist()
         while times and (time - times[0] > self.window or time <= times[0]):
             times.popleft()
@@ -212,25 +214,27 @@ class Hampel:
 
 
 class TrackingOffsets:
-    r"""Compensates for jumps due to a change of tracking.
+    r"""Compensates for the jumps that occur when a joint changes between tracked and inferred.
 
-    A camera infers the position of a hidden joint, with an error that is several times larger and different from the
-    previous error. The step from the last tracked to the first inferred position is mostly due to this difference, as
-    is the step back. Therefore, when a joint becomes inferred, its offset o is set so that the motion continues,
+    When a joint is hidden, a camera infers its position, with an error that is several times larger than before and
+    differs from the previous error. The jump from the last tracked to the first inferred position is mostly due to this
+    change of the error, and so is the jump back. Therefore, when a joint becomes inferred, an offset o from the
+    measured position :math:`\tilde x` is chosen so that the motion continues,
 
     .. math:: o = x_p + v\,\Delta t - \tilde x, \qquad x = \tilde x + o
 
-    where :math:`x_p` is the previous position and v its velocity. While the joint is inferred, the offset is constant:
-    the joint's motion is used, but not its absolute position. When the joint is tracked again, a new offset is set in
-    the same way; while the joint is tracked, the offset decays with time and with the distance that the joint moves,
+    where x is the compensated position, :math:`x_p` the previous compensated position, v the velocity and :math:`\Delta
+    t` the time step. While the joint is inferred, the offset is constant, so the motion of the measured position is
+    used, but not the absolute position. When the joint is tracked again, a new offset is chosen in the same way. While
+    the joint is tracked, the offset decays with time and with the distance :math:`|\Delta x|` that the joint moves,
 
     .. math:: o \leftarrow o\,\exp(-\Delta t / T - |\Delta x| / L).
 
-    A person who watches the robot does not notice the decay, but would notice a robot that jumps away and back.
+    A person who watches the robot does not notice this decay, but would notice if the robot jumped away and back.
 
-    A joint that flickers between tracked and inferred keeps one offset for each of the two, for up to 0.12 s. Otherwise
-    the measured position would never have an effect, and the estimate would drift away. An offset is at most 0.2 m
-    long.
+    If a joint flickers between tracked and inferred, the filter keeps one offset for each of these two states, for up
+    to 0.12 s. With a new offset at every change, the measured position would never have an effect, and the estimate
+    would drift away. The length of an offset is at most 0.2 m.
 
     Args:
         time: T [s].
@@ -258,7 +262,7 @@ class TrackingOffsets:
         self._kept: dict[tuple[int, float], tuple[float, list[float]]] = {}
 
     def offset(self, joint: int) -> float:
-        """Return the length of a joint's offset from its measured position [m]."""
+        """Return the length of the offset between the compensated and the measured position of a joint [m]."""
         return 0.0 if self._offsets is None else math.hypot(*self._offsets[joint])
 
     def compensate(self, points: Array, confidence: list[float], velocity: Array, period: float) -> Array:
@@ -266,9 +270,9 @@ class TrackingOffsets:
 
         Args:
             points: measured positions, shape (k, 3) [m].
-            confidence: confidence of each point, k numbers; 1 when it is tracked.
+            confidence: confidence of each point, k numbers; 1 if the point is tracked.
             velocity: velocity of each point, from the previous estimate, shape (k, 3) [m/s].
-            period: since the previous call [s].
+            period: time since the previous call [s].
         """
         before, self._confidence = self._confidence, confidence
         last, self._measured = self._measured, points.tolist()
@@ -295,7 +299,7 @@ class TrackingOffsets:
     def _changed(self, joint: int, confidence: float, continued: list[float]) -> list[float]:
         """Return the offset of a joint whose tracking has changed.
 
-        The recent offset for this tracking state, or a new one.
+        This is the recent offset for the new tracking state if there is one, or else a new offset.
         """
         when, offset = self._kept.get((joint, confidence), (-math.inf, continued))
         if self._clock - when > _FLICKER:

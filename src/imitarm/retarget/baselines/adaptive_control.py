@@ -36,17 +36,17 @@ _GRIP = 0.2  # [s] in which the closure follows a closing hand
 
 
 class JointPlant:
-    """The arm in a simulation of a joint controller, in MuJoCo with gravity and without contacts.
+    """A MuJoCo simulation of the robot arm that a joint controller drives, with gravity and without contacts.
 
-    It includes rotor inertia, viscous damping and dry friction of the joints, which ``ArmModel`` leaves out. A
-    controller that uses an ``ArmModel`` therefore does not know these effects.
+    The simulation includes rotor inertia, viscous damping and dry friction of the joints. ``ArmModel`` does not include
+    these effects, so a controller that uses an ``ArmModel`` does not know them.
 
     Args:
         arm: whose dynamics.
-        dt: time for which a torque is applied [s].
+        dt: control period, during which the torque is constant [s].
 
     Attributes:
-        substeps: number of simulation steps in ``dt``.
+        substeps: number of simulation steps per control period.
 
     Raises:
         InputError: when ``dt`` is out of range.
@@ -100,11 +100,11 @@ class JointPlant:
 
 @dataclass(frozen=True, eq=False)
 class Torques:
-    """Torques of one period.
+    """Joint torques of one control period.
 
     Attributes:
-        wanted: torques computed by the law, before the limits, shape (n_joints,) [N m].
-        applied: torques limited to the rated torques, shape (n_joints,) [N m].
+        wanted: torques that the control law computes, before any limit, shape (n_joints,) [N m].
+        applied: the same torques, limited to the rated torques of the joints, shape (n_joints,) [N m].
     """
 
     wanted: Array
@@ -114,43 +114,44 @@ class Torques:
 class AdaptiveLaw:
     r"""A discrete-time adaptive joint controller (baseline M2).
 
-    With :math:`e = q - q_r`, :math:`\dot e = (e - e_{k-1})/T`, :math:`\varepsilon = \dot e + \kappa e`,
-    :math:`\dot q_e = \dot q_r - \kappa e` and :math:`\ddot q_e` by differences, the torque is
+    Let q be the joint positions, :math:`q_r` the reference, :math:`e = q - q_r` the error and T the control period.
+    With :math:`\dot e = (e - e_{k-1})/T`, :math:`\varepsilon = \dot e + \kappa e`, :math:`\dot q_e = \dot q_r - \kappa
+    e`, and :math:`\ddot q_e` from the differences of :math:`\dot q_e`, the torque is
 
     .. math::
         u = M(q)\,\ddot q_e + C(q, \dot q)\,\dot q_e + G(q) - \Gamma\varepsilon - F - K e - D \dot e
 
-    and feed-forward F, stiffness K and damping D adapt, joint by joint,
+    The feed-forward torque F, the stiffness K and the damping D of each joint adapt according to
 
     .. math::
         F \leftarrow F + Q_F(\varepsilon - \gamma F), \quad
         K \leftarrow [K + Q_K(\varepsilon e - \gamma K)]_{K_{min}}^{K_{max}(h)}, \quad
         D \leftarrow [D + Q_D(\varepsilon\dot e - \gamma D)]_0^{D_{max}}
 
-    where the forgetting factor is :math:`\gamma = a/(1 + b|\varepsilon|^2)`. A closed hand (h = 1) raises the
-    stiffness: :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. M, C and G are those of the rigid arm, from
-    ``ArmModel``; F, K and D compensate for effects that the model leaves out (rotor inertia, friction). C is the matrix
-    of Christoffel symbols, for which :math:`C(q, a)\,b = \tfrac12\,(h(a+b) - h(a) - h(b))` with :math:`h(v) = C(q,
-    v)\,v`.
+    where the forgetting factor is :math:`\gamma = a/(1 + b|\varepsilon|^2)`. The closure h of the person's hand (0
+    open, 1 closed) raises the largest stiffness: :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. The inertia matrix
+    M, the Coriolis matrix C and the gravity torque G are those of the rigid arm in ``ArmModel``. The adapted values F,
+    K and D compensate for effects that this model does not include, which are rotor inertia and friction. C consists of
+    Christoffel symbols, so that :math:`C(q, a)\,b = \tfrac12\,(c(a+b) - c(a) - c(b))` with :math:`c(v) = C(q, v)\,v`.
 
-    The law follows Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet, in discrete form; we chose the gains. For
-    small errors :math:`\gamma = a` and :math:`Q_K \gamma = 1`: the stiffness falls back to :math:`K_{min}` within one
-    period. We set :math:`K_{min} = K_{max}(h)/2`, which the sources do not specify, so that the hand still has an
-    effect.
+    The control law is a discrete form of the laws of Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet; we
+    chose the gains. For small errors, :math:`\gamma = a` and :math:`Q_K \gamma = 1`, so the stiffness returns to
+    :math:`K_{min}` within one period. The papers do not specify :math:`K_{min}`. We set :math:`K_{min} = K_{max}(h)/2`,
+    so that the closure of the hand has an effect even for small errors.
 
     Args:
-        arm: provides M, C, G and the rated torques.
+        arm: arm model that provides M, C, G and the rated torques.
         period: T [s].
 
     Raises:
-        InputError: when the arm does not have seven joints, for which the gains are given.
+        InputError: when the arm does not have seven joints; the gains are defined for seven joints only.
     """
 
     def __init__(self, arm: ArmModel, period: float) -> None:
         if arm.n_joints != len(START_STIFFNESS):
             raise InputError(
-                f"AdaptiveLaw: {arm.name} has {arm.n_joints} joints, but the gains are for {len(START_STIFFNESS)}; "
-                "use modern, thesis or m3"
+                f"AdaptiveLaw: {arm.name} has {arm.n_joints} joints, but the gains are for {len(START_STIFFNESS)} "
+                "joints; use the method modern, thesis or m3"
             )
         self.arm, self.period = arm, period
         self._gamma = np.array(SLIDING_GAIN)
@@ -167,7 +168,7 @@ class AdaptiveLaw:
         self._before: Array | None = None  # reference one period ago
 
     def torques(self, q: ArrayLike, velocity: ArrayLike, reference: ArrayLike, closure: float) -> Torques:
-        """Return the torques of one period, and update the adapted values.
+        """Return the torques of one control period, and update the adapted values.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
@@ -220,29 +221,30 @@ class AdaptiveLaw:
 class AdaptiveControl(BaselineRetargeter):
     r"""Baseline M2: our interpretation of "discrete-time adaptive control" in the thesis.
 
-    The thesis refers to Liang et al. 2016, of which only the abstract was available to us. It describes an arm
-    configuration computed from Kinect vectors, a stiffness index from the hand's gesture, and a biomimetic controller
-    in discrete time on a simulated Baxter. The equations are the discrete form of the human-like controllers of Yang et
-    al. 2011 and Li and Burdet 2016.
+    The thesis refers to Liang et al. 2016, but we had access only to the abstract of this paper. The abstract describes
+    an arm configuration computed from Kinect vectors, a stiffness index computed from the hand's gesture, and a
+    biomimetic controller in discrete time on a simulated Baxter. We therefore use a discrete form of the human-like
+    controllers of Yang et al. 2011 and Li and Burdet 2016.
 
-    The person's joint angles, held between frames, pass a first-order low-pass filter at 3 Hz, :math:`q_r \leftarrow
-    q_r + (1 - e^{-2\pi f T})(q_h - q_r)`. An :class:`AdaptiveLaw` computes torques within the rated limits, which drive
-    the simulated arm (:class:`JointPlant`). The position that the arm reaches is the command. The method tracks
-    joints: the tool is not where the hand is.
+    The person's joint angles :math:`q_h` are constant between frames. A first-order low-pass filter with cut-off
+    frequency f = 3 Hz turns them into the reference, :math:`q_r \leftarrow q_r + (1 - e^{-2\pi f T})(q_h - q_r)`. An
+    :class:`AdaptiveLaw` computes torques within the rated limits, and these torques drive the simulated arm
+    (:class:`JointPlant`). The joint positions that the simulated arm reaches are the command to the robot. The method
+    tracks joint angles, so the tool and the hand are at different positions.
 
-    Only the torque limits the joint velocity. ``notes`` has ``"saturated"``, the number of joints and steps at the
-    rated torque; ``"peak_torque"``, the largest torque before limiting, relative to the rated torque; and
-    ``"rms_torque"`` [N m] over all joints and steps.
+    Only the torque limits bound the joint velocity. ``notes`` contains ``"saturated"``, how often a joint reached its
+    rated torque, counted over all joints and control steps; ``"peak_torque"``, the largest torque before limiting, as a
+    multiple of the rated torque; and ``"rms_torque"``, the root mean square torque over all joints and steps [N m].
 
     Args:
         arm: the robot's arm with its tool.
         correspondence: correspondence between the person's arm and the robot's.
         dt: control period T [s].
         scene: ignored.
-        velocity_scaling: whether to scale every step of the reference and of the command so that no joint exceeds
-            its limit.
-        relative: whether to map the change of the person's joint angles since the person began to lead; otherwise
-            the angles themselves are mapped and approached at limited speed. See
+        velocity_scaling: whether to scale every step of the reference and of the command so that no joint exceeds its
+            velocity limit.
+        relative: whether to map the change of the person's joint angles since the robot began to follow the person;
+            otherwise the angles themselves are mapped and approached at limited speed. See
             :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
 
     Attributes:
@@ -305,7 +307,7 @@ class AdaptiveControl(BaselineRetargeter):
         return self._driven_on() if self._driven else self.latest.q
 
     def _driven_on(self) -> Array:
-        """Advance the reference, the controller and the arm by one period; return the position reached."""
+        """Advance the reference, controller and simulated arm by one period; return the joint positions reached."""
         step = self._filter_weight * (self._held_goal - self._reference)
         if self.velocity_scaling:
             step = step / max(float((np.abs(step) / (self.dt * self.arm.max_velocity)).max()), 1.0)
@@ -322,7 +324,7 @@ class AdaptiveControl(BaselineRetargeter):
 
     @property
     def notes(self) -> dict[str, float]:
-        """Counts and RMS torque so far; see this class and its base class."""
+        """Counts and RMS torque since :meth:`start`; this class and its base class describe them."""
         rms = math.sqrt(self._squares / self._periods) if self._periods else 0.0
         return {
             **super().notes,

@@ -1,4 +1,4 @@
-"""BaselineRetargeter: the common part of the baselines M1 to M3, which thus differ only in the method."""
+"""BaselineRetargeter: the common part of the baselines M1 to M3, so that they differ only in the mapping itself."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _ROUNDING = 1.0 + 1e-9
 
 
 class BaselineRetargeter(Retargeter):
-    """A baseline method with the same input processing as every other method.
+    """A baseline method; it processes its input in the same way as all other methods.
 
     The estimate of the person's arm, the engagement, the clutch and the scale are those of
-    :class:`~imitarm.retarget.retargeter.Retargeter`. Where the published methods say nothing, all baselines do the
-    same: while the person is lost the robot holds its position; no joint ever leaves its range. Velocity limits
-    may be exceeded where the method itself does not keep them; ``notes`` counts how often.
+    :class:`~imitarm.retarget.retargeter.Retargeter`. All baselines agree on two points that the published methods do
+    not specify: the robot holds its position while the person is lost, and no joint leaves its range. A method that
+    does not limit velocities itself may exceed the velocity limits; ``notes`` counts how often.
 
     A baseline implements ``_wanted``.
 
@@ -43,7 +43,7 @@ class BaselineRetargeter(Retargeter):
         velocity_scaling: whether to scale every step as a whole so that no joint exceeds its velocity limit.
 
     Attributes:
-        counts: the counts of ``notes`` since :meth:`start`, by name.
+        counts: counts since :meth:`start`, by the names that ``notes`` lists.
     """
 
     def __init__(
@@ -65,15 +65,16 @@ class BaselineRetargeter(Retargeter):
         """Return the desired joint positions at the end of this period, shape (n_joints,) [rad], before any limit."""
 
     def _holding(self) -> Array:
-        """Return the desired joint positions while the person is lost: the current ones."""
+        """Return the desired joint positions while the person is lost, which are the last commanded positions."""
         return self.latest.q
 
     @property
     def notes(self) -> dict[str, float]:
-        """Counts so far, by name.
+        """Counts since :meth:`start`, by name.
 
-        ``"velocity_excess"``: joints and steps that were, or without scaling would have been, too fast;
-        ``"position_clips"``: joints and steps that were clipped at a position limit.
+        ``"velocity_excess"`` counts joint steps faster than the joint's velocity limit, before any scaling.
+        ``"position_clips"`` counts joint steps that were clipped at a position limit. A joint step is the motion of one
+        joint in one control period.
         """
         return {name: float(self.counts[name]) for name in ("velocity_excess", "position_clips", *self.counts)}
 
@@ -97,11 +98,11 @@ class BaselineRetargeter(Retargeter):
 
     @property
     def _steps_per_frame(self) -> int:
-        """Control steps until the next frame is expected, rounded up, so that the robot does not pause."""
+        """Number of control steps until the next frame is expected; rounded up, so that the robot does not pause."""
         return max(math.ceil(self._period / self.dt - 1e-6), 1)
 
     def _limited(self, wanted: Array) -> Array:
-        """Return the joint positions reached: within their ranges, and with velocity scaling if requested."""
+        """Return the desired joint positions after velocity scaling (if requested), clipped to the joint ranges."""
         before = self.latest.q
         step = wanted - before
         fractions = np.abs(step) / (self.dt * self.arm.max_velocity)

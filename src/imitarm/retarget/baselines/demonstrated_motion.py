@@ -1,4 +1,4 @@
-"""DemonstratedMotion: a person's arm and the robot's joints during one engagement, and where the arm can't follow."""
+"""DemonstratedMotion: the motion of a person's arm and of the robot's joints, and where it is infeasible."""
 
 from __future__ import annotations
 
@@ -30,17 +30,16 @@ _WITHIN = 1e-6  # [rad] tolerance of a position limit
 
 @dataclass(frozen=True, eq=False)
 class DemonstratedMotion:
-    """The motion of one engagement, sampled at the control period.
+    """The motion during one engagement (while the robot follows the person), sampled at the control period.
 
     Attributes:
-        shown_times: times at which the person showed each sample [s], on the recording's clock, shape (n,); evenly
-            spaced until
-            the motion is slowed down.
-        points: shoulder, elbow and wrist in the base frame, after the corrections so far, shape (n, 3, 3) [m].
+        shown_times: time at which the person made the motion of each sample, on the recording's clock, shape (n,) [s];
+            evenly spaced until the motion is slowed down.
+        points: shoulder, elbow and wrist in the base frame, after all corrections made so far, shape (n, 3, 3) [m].
         hands: rotations of the hand, quaternions wxyz, shape (n, 4).
-        shown: the same points before all corrections, shape (n, 3, 3) [m].
-        closed: whether the hand was closed; None where unknown.
-        joints: joint positions of the robot, shape (n, n_joints) [rad]; zero columns before they are mapped.
+        shown: shoulder, elbow and wrist as the person showed them, before all corrections, shape (n, 3, 3) [m].
+        closed: for each sample, whether the hand was closed; None where this is unknown.
+        joints: joint positions of the robot, shape (n, n_joints) [rad]; shape (n, 0) before the mapping.
     """
 
     shown_times: Array
@@ -52,7 +51,7 @@ class DemonstratedMotion:
 
     @classmethod
     def through(cls, estimates: Sequence[ArmEstimate], dt: float) -> DemonstratedMotion:
-        """Interpolate the estimates of one engagement, at least two, at every ``dt`` [s], without overshoot."""
+        """Interpolate the estimates of one engagement (at least two) without overshoot, with a step of ``dt`` [s]."""
         times = np.array([e.time for e in estimates])
         shown_times = times[0] + dt * np.arange(int((times[-1] - times[0]) / dt + 1e-9) + 1)
         keys = np.array([(e.shoulder, e.elbow, e.wrist) for e in estimates])
@@ -66,7 +65,7 @@ class DemonstratedMotion:
         return len(self.shown_times)
 
     def estimate(self, i: int) -> ArmEstimate:
-        """Return sample ``i`` as an estimate, the input of live methods."""
+        """Return sample ``i`` as an estimate of the person's arm, which is the input of live methods."""
         s, e, w = self.points[i]
         rest = np.zeros(3)
         return ArmEstimate(
@@ -78,9 +77,9 @@ class DemonstratedMotion:
         return map(self.estimate, range(len(self)))
 
     def at(self, where: Array) -> DemonstratedMotion:
-        """Return the motion at fractional sample numbers, shape (m,).
+        """Return the motion interpolated at fractional sample numbers, shape (m,).
 
-        The motion is slower where the numbers are closer together.
+        The closer together these numbers are, the slower is the motion.
         """
         n = np.arange(len(self))
         near = tuple(self.closed[int(i)] for i in np.clip(where.astype(int), 0, len(self) - 1))
@@ -102,7 +101,7 @@ class DemonstratedMotion:
 def engagements(
     frames: Iterable[Skeleton], correspondence: Correspondence, rule: EngagementRule
 ) -> Iterator[tuple[ArmEstimate, ...]]:
-    """Yield the estimates, at least two, of each engagement in a recording; all methods share the engagement rule.
+    """Yield the list of estimates, at least two, of each engagement in a recording.
 
     Args:
         frames: frames in order of time.
@@ -132,7 +131,7 @@ def engagements(
 
 
 class Constraint(Protocol):
-    """A condition on the tool, such as a teacher annotates."""
+    """A condition on the pose of the tool, as a teacher would annotate it."""
 
     def __call__(self, positions: Array, rotations: Array, /) -> Mask:
         """Return whether the condition holds, shape (n,), for positions (n, 3) [m] and rotations (n, 3, 3)."""
@@ -149,7 +148,7 @@ def above(height: float) -> Constraint:
 
 
 def upright(angle: float) -> Constraint:
-    """Return the constraint that the tool points straight down to within ``angle`` [rad]."""
+    """Return the constraint that the tool points straight down, with a tolerance of ``angle`` [rad]."""
 
     def holds(_: Array, rotations: Array) -> Mask:
         return np.asarray(-rotations[:, 2, 2] > np.cos(angle))
@@ -160,8 +159,8 @@ def upright(angle: float) -> Constraint:
 class FeasibilityCheck:
     """Finds the infeasible samples of a joint motion (baseline M1).
 
-    A sample is infeasible where a joint exceeds a limit of position or velocity, where the arm is singular
-    (:math:`s_{min} < 0.03`) or stretched (:func:`stretch` above 79/80), or where a constraint does not hold.
+    A sample is infeasible if a joint exceeds a position or velocity limit, if the arm is singular (smallest singular
+    value :math:`s_{min} < 0.03`) or stretched (:func:`stretch` above 79/80), or if a constraint does not hold.
 
     Args:
         arm: the robot's arm with its tool.
@@ -175,24 +174,26 @@ class FeasibilityCheck:
     def __init__(self, arm: ArmModel, dt: float, constraints: Mapping[str, Constraint] | None = None) -> None:
         self.arm, self.dt = arm, dt
         if constraints is not None and not isinstance(constraints, Mapping):
-            raise InputError(f"FeasibilityCheck: constraints must be conditions by name, got {constraints!r}")
+            raise InputError(
+                f"FeasibilityCheck: constraints must be a dictionary of conditions by name, got {constraints!r}"
+            )
         self.constraints = dict(constraints or {})
         taken = sorted({"limits", "speed", "singular", "stretched"} & set(self.constraints))
         if taken:
             raise InputError(
-                f"FeasibilityCheck: a constraint can't be named {taken[0]!r}, because this name is built in; rename it"
+                f"FeasibilityCheck: constraint {taken[0]!r} has the name of a built-in condition; rename it"
             )
 
     def reasons(self, joints: Array) -> dict[str, Mask]:
-        """Return the samples that violate each condition, shape (n,) bool, for joints (n, n_joints) [rad]."""
+        """Return, for each condition, which samples of joints (n, n_joints) [rad] violate it, shape (n,) bool."""
         return {"speed": self.too_fast(joints), **self.postures(joints)}
 
     def anywhere(self, joints: Array) -> Mask:
-        """Return the samples that violate any condition, shape (n,), for joints (n, n_joints) [rad]."""
+        """Return which samples of joints (n, n_joints) [rad] violate any condition, shape (n,) bool."""
         return np.asarray(np.any(list(self.reasons(joints).values()), axis=0))
 
     def too_fast(self, joints: Array) -> Mask:
-        """Return the samples on both sides of a step that is too fast for a joint, shape (n,)."""
+        """Return the samples before and after each step that exceeds a velocity limit, shape (n,) bool."""
         found = np.zeros(len(joints), dtype=bool)
         over = (self.speeds(joints) > 1.0 + 1e-9).any(axis=1)
         found[1:] |= over
@@ -200,11 +201,11 @@ class FeasibilityCheck:
         return found
 
     def speeds(self, joints: Array) -> Array:
-        """Return speeds relative to the velocity limits, shape (n - 1, n_joints)."""
+        """Return the joint speeds divided by the velocity limits, shape (n - 1, n_joints)."""
         return np.asarray(np.abs(np.diff(joints, axis=0)) / (self.dt * self.arm.max_velocity))
 
     def postures(self, joints: Array) -> dict[str, Mask]:
-        """Return the samples that violate each condition on single postures, shape (n,) bool."""
+        """Return, for each condition on a single posture, which samples violate it, shape (n,) bool."""
         jacobians = np.array([self.arm.tool_jacobian(q) for q in joints]).reshape(-1, 6, self.arm.n_joints)
         found: dict[str, Mask] = {
             "limits": self.outside(joints),
@@ -229,26 +230,27 @@ class FeasibilityCheck:
         return any(found.any() for found in self.postures(joints).values())
 
     def outside(self, joints: Array) -> Mask:
-        """Return the samples at which a joint is outside its range, shape (n,)."""
+        """Return the samples at which a joint is outside its range, shape (n,) bool."""
         beyond = (joints < self.arm.lower - _WITHIN) | (joints > self.arm.upper + _WITHIN)
         return np.asarray(beyond.any(axis=1))
 
 
 def stretch(joints: Array) -> Array:
-    r"""Return the stretch of the arm: shoulder-wrist distance divided by reach, (n,), for joints (n, n_joints).
+    r"""Return the stretch of a person's arm, shape (n,), for joint positions of the robot (n, n_joints) [rad].
 
-    The stretch is measured on the person's arm, to which the joints belong: upper arm and forearm along the joint axes
-    and equally long (Sawyer's are 0.412 and 0.411 m), so it is :math:`|\cos(q_3/2)|`. The robot's own distance from
-    shoulder to wrist is largest with a bent elbow, because of the offsets between its links.
+    The stretch is the distance from shoulder to wrist divided by the length of the straight arm. It is computed for a
+    person's arm at these joint angles, with upper arm and forearm of equal length (Sawyer's lengths are 0.412 and 0.411
+    m), so it is :math:`|\cos(q_3/2)|`. The robot's own distance from shoulder to wrist is largest with a bent elbow,
+    because of the offsets between its links.
     """
     return np.asarray(np.abs(np.cos(0.5 * joints[:, ELBOW])))
 
 
 def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
-    """Return the runs of True, extended by 0.2 s on both sides and merged where they touch, as (first, end).
+    """Return the segments in which the mask is True, as (first, end), extended by 0.2 s on both sides and merged.
 
     Args:
-        found: mask of the samples to group, shape (n,) bool.
+        found: mask of the samples to group into segments, shape (n,) bool.
         dt: sampling period [s].
     """
     wide = round(DILATION / dt)
@@ -258,7 +260,7 @@ def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
 
 
 def blend(found: Mask, first: int, past: int, dt: float) -> Array:
-    """Return the weight of a change in a segment: 1 where needed, decaying to 0 within 0.2 s, shape (past - first,)."""
+    """Return the weight of a correction in a segment, (past - first,): 1 where needed, falling to 0 within 0.2 s."""
     at = np.arange(first, past)
     needed = at[found[first:past]]
     away = np.abs(at[:, None] - needed).min(axis=1) * dt

@@ -1,9 +1,9 @@
-"""DemonstrationModification: baseline M1, the person's joint angles, corrected where the arm can't follow.
+"""DemonstrationModification: baseline M1, maps a person's joint angles and corrects infeasible segments.
 
 Four corrections replace the teacher's advice: slow the motion down, move the wrist closer, rotate the elbow, or repair
-key frames. Each changes one segment of a :class:`~imitarm.retarget.baselines.demonstrated_motion.DemonstratedMotion` by
-a weight that is 1 where the change is needed and decays to 0 at the segment's ends, so that the motion stays
-continuous.
+key frames. Each correction changes one segment of a
+:class:`~imitarm.retarget.baselines.demonstrated_motion.DemonstratedMotion`. The correction has full weight where it is
+needed, and its weight falls to 0 at the ends of the segment, so that the motion stays continuous.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ COUNTED = (
     "shown_time",
     "corrected_time",
 )
-"""Names of counts that are summed over the engagements of a recording."""
+"""Names of the counts that are summed over all engagements of a recording."""
 
 _STRIDE = 10  # every tenth sample is checked first
 _SLOWEST = 10.0  # largest factor of slowing down
@@ -71,29 +71,35 @@ _SLOWEST = 10.0  # largest factor of slowing down
 class DemonstrationModification(BaselineRetargeter):
     """Baseline M1: our interpretation of "demonstration modification" in the thesis.
 
-    It combines Argall's advice operators, which derive corrected data from an execution and a teacher's advice on a
-    segment of it, and Mueller et al. 2018, who annotate constraints and replace key frames that violate them. The paper
-    cited by the thesis is about policies of a mobile robot; we designed the possible corrections for an arm and the
-    program that replaces the teacher.
+    The method combines two published ideas. Argall's advice operators correct a segment of an execution according to a
+    teacher's advice. Mueller et al. 2018 annotate constraints and replace key frames that violate them. The paper that
+    the thesis cites is about policies of a mobile robot. We therefore designed corrections for an arm, and a program
+    that replaces the teacher.
 
-    The method is offline. :meth:`run` processes the whole recording:
+    The method is offline. :meth:`run` processes the whole recording in four steps:
 
-    1. the person's joint angles are computed in closed form and mapped to the robot's
+    1. the person's joint angles are computed in closed form and mapped to the robot's joints
        (:class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`);
     2. :class:`~imitarm.retarget.baselines.demonstrated_motion.FeasibilityCheck` finds the infeasible segments;
-    3. each of them, extended by 0.2 s on both sides, is changed by the first correction that makes it feasible: slower,
-       wrist closer, elbow rotated; otherwise its key frames are repaired
+    3. each infeasible segment, extended by 0.2 s on both sides, is changed by the first correction that makes it
+       feasible (slower, wrist closer, or elbow rotated); if no correction does, its key frames are repaired
        (:class:`SegmentCorrector`);
     4. steps 2 and 3 are repeated up to five times; samples that remain infeasible are counted and clipped to the
        joint ranges.
 
-    :meth:`step` is only the mapping of step 1, clipped to the joint ranges, for live use.
+    For live use, :meth:`step` performs only the mapping of step 1, and clips the result to the joint ranges.
 
-    ``notes`` of a run has ``"rounds"``; ``"segments"`` corrected in all rounds, of which ``"slowed"``, ``"pulled_in"``,
-    ``"elbow_rotated"`` and ``"repaired"``; ``"missed_keys"``, key frames without a feasible sample;
-    ``"infeasible_before"`` and ``"infeasible_after"``, samples; ``"failures"``, segments that remain;
-    ``"execution_time"`` and, without slowing and approach, ``"shown_time"`` of the motion [s]; ``"teaching_time"`` [s],
-    the length of each segment plus 5 s, per round.
+    After a run, ``notes`` contains:
+
+    * ``"rounds"``: number of rounds of corrections;
+    * ``"segments"``: number of corrected segments in all rounds; ``"slowed"``, ``"pulled_in"``, ``"elbow_rotated"`` and
+      ``"repaired"`` count them by the correction that was used;
+    * ``"missed_keys"``: number of key frames for which no feasible posture was found;
+    * ``"infeasible_before"`` and ``"infeasible_after"``: number of infeasible samples before and after the corrections;
+    * ``"failures"``: number of segments that remain infeasible;
+    * ``"execution_time"``: duration of the robot's motion [s]; ``"shown_time"``: duration of the person's motion [s];
+    * ``"teaching_time"``: assumed working time of a teacher [s]; in each round, this is the duration of each segment
+      plus ``annotation_time``.
 
     Args:
         arm: the robot's arm with its tool.
@@ -104,9 +110,10 @@ class DemonstrationModification(BaselineRetargeter):
         relative: whether to map the change of the person's joint angles since the person began to lead; otherwise
             the angles themselves are mapped and approached at limited speed. See
             :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
-        constraints: additional conditions, by name, for example ``{"table": above(0.02)}``.
-        annotation_time: time that a teacher needs for each segment, in addition to the time for watching it [s].
-        seed: seed of the samples that repair key frames.
+        constraints: additional conditions that the tool must satisfy, by name, for example ``{"table": above(0.02)}``.
+        annotation_time: assumed time that a teacher needs to annotate a segment, in addition to the time for watching
+            it [s].
+        seed: seed of the random postures that are tried when key frames are repaired.
 
     Attributes:
         check: feasibility check that finds the infeasible samples.
@@ -161,11 +168,11 @@ class DemonstrationModification(BaselineRetargeter):
         return np.asarray(q + step)
 
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
-        """Retarget a whole recording and correct it; ``notes`` lists the changes.
+        """Retarget a whole recording and correct the motion; ``notes`` counts the changes.
 
-        If the motion is slowed down, the result is longer than the recording; ``shown_times`` holds the time at which
-        the person showed each sample. The targets are slowed down like the motion; the other corrections do not change
-        them.
+        If the motion is slowed down, the result is longer than the recording; ``shown_times`` contains the time at
+        which the person showed each sample. The targets are slowed down together with the motion. The other corrections
+        do not change the targets.
 
         Args:
             skeletons: skeletons in order of time.
@@ -200,7 +207,7 @@ class DemonstrationModification(BaselineRetargeter):
         return Retargeting.of(self, steps, {**self.notes, **self._notes_of(correctors, performed)}, self._shown_times)
 
     def _notes_of(self, correctors: Sequence[SegmentCorrector], performed: int) -> dict[str, float]:
-        """Return the counts of a run, over all engagements."""
+        """Return the counts of a run, summed over all engagements."""
         counts = {name: sum(corrector.counts[name] for corrector in correctors) for name in COUNTED}
         watched = counts.pop("corrected_time")
         return {
@@ -211,7 +218,7 @@ class DemonstrationModification(BaselineRetargeter):
         }
 
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
-        """Complete the shown times: the last steps correspond to ``shown``; before them, the robot waits."""
+        """Complete the shown times: ``shown`` belongs to the last steps; in the steps before these, the robot waits."""
         rest = len(steps) - len(self._shown_times) - len(shown)
         begin = float(self._shown_times[-1]) if len(self._shown_times) else -self.dt
         waited = begin + self.dt * np.arange(1, rest + 1)
@@ -219,13 +226,13 @@ class DemonstrationModification(BaselineRetargeter):
         self._shown_times = np.concatenate([self._shown_times, np.minimum(waited, ahead), shown])
 
     def _rest(self, steps: list[RetargetStep], duration: float, state: EngagementState) -> None:
-        """Rest for some time, at the end or between two engagements."""
+        """Append steps in which the robot is at rest for ``duration`` [s]."""
         q = self.latest.q
         for _ in range(round(duration / self.dt)):
             self._append(steps, RetargetStep(0.0, q, q, None, state), q)
 
     def _perform(self, steps: list[RetargetStep], motion: DemonstratedMotion, clutch: Clutch) -> None:
-        """Move to the start of the motion at limited speed, then along it."""
+        """Append the steps that move the robot to the motion's start at limited speed, and then along the motion."""
         approach = Approach(self.arm, self.dt)
         start = np.clip(motion.joints[0], self.arm.lower, self.arm.upper)
         at = self.latest.q
@@ -241,7 +248,7 @@ class DemonstrationModification(BaselineRetargeter):
             self._append(steps, done, q)
 
     def _append(self, steps: list[RetargetStep], step: RetargetStep, wanted: Array) -> None:
-        """Append a step towards joint positions (n_joints,) [rad], as far as the limits allow."""
+        """Append a step towards the joint positions ``wanted`` (n_joints,) [rad], as far as the limits allow."""
         before, q = self.latest, self._limited(wanted)
         velocity = (q - before.q) / self.dt
         self.latest = replace(step, time=before.time + self.dt, q=q, velocity=velocity)
@@ -251,7 +258,7 @@ class DemonstrationModification(BaselineRetargeter):
 def slowed(
     motion: DemonstratedMotion, first: int, past: int, weight: Array, factor: float
 ) -> tuple[DemonstratedMotion, int]:
-    r"""Slow a segment down by the factor :math:`1 + w\,(s - 1)`.
+    r"""Slow a segment of a motion down: each sample takes :math:`1 + w\,(s - 1)` times as long.
 
     Args:
         motion: motion with joint positions.
@@ -261,7 +268,7 @@ def slowed(
         factor: s, at least 1.
 
     Returns:
-        The motion, and the sample at which the segment now ends.
+        The motion, and the index of the sample at which the segment now ends.
     """
     stretch = np.ones(len(motion))
     stretch[first:past] += weight * (factor - 1.0)
@@ -272,10 +279,11 @@ def slowed(
 
 
 def pull(points: Array, joints: Array) -> Array:
-    r"""Return the factor :math:`\kappa` of the distance shoulder to wrist that limits the stretch to 78/80, shape (n,).
+    r"""Return the factor :math:`\kappa` by which to shorten the distance from shoulder to wrist, shape (n,).
 
-    Where the robot's elbow angle equals the person's, this is :math:`\kappa = 0.78/(\rho |W - S|)`; where it differs
-    (relative mapping), the person's elbow must bend by the angle that the robot's elbow lacks.
+    With this factor, the stretch is at most 78/80. If the elbow angles of robot and person are equal, :math:`\kappa =
+    \frac{78}{80} L / |W - S|`, where L is the length of the straight arm. If they differ (relative mapping), the
+    person's elbow is bent further by the angle by which the robot's elbow must still bend.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
@@ -291,11 +299,11 @@ def pull(points: Array, joints: Array) -> Array:
 
 
 def pulled_in(points: Array, kappa: Array) -> Array:
-    r"""Move the wrist towards the shoulder, :math:`W' = S + \kappa (W - S)`; the elbow bends in its plane.
+    r"""Move the wrist towards the shoulder, :math:`W' = S + \kappa (W - S)`; the elbow stays in the plane of the arm.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
-        kappa: factors, at most 1, shape (n,).
+        kappa: factor :math:`\kappa` of each sample, at most 1, shape (n,).
 
     Returns:
         shape (n, 3, 3) [m]; the bones keep their lengths.
@@ -320,7 +328,7 @@ def elbow_rotated(points: Array, angle: Array) -> Array:
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
-        angle: shape (n,) [rad].
+        angle: angle of rotation of each sample, shape (n,) [rad].
 
     Returns:
         shape (n, 3, 3) [m]; the bones keep their lengths.
@@ -334,7 +342,7 @@ def elbow_rotated(points: Array, angle: Array) -> Array:
 
 
 def with_points(motion: DemonstratedMotion, first: int, past: int, points: Array) -> DemonstratedMotion:
-    """Return the motion with other points (past - first, 3, 3) [m] in a segment; its joints must be mapped again."""
+    """Return the motion with new points (past - first, 3, 3) [m] in a segment; the joints must then be mapped again."""
     changed = motion.points.copy()
     changed[first:past] = points
     return replace(motion, points=changed)
@@ -343,22 +351,23 @@ def with_points(motion: DemonstratedMotion, first: int, past: int, points: Array
 def repaired(
     joints: Array, first: int, past: int, check: FeasibilityCheck, rng: np.random.Generator
 ) -> tuple[Array, int]:
-    r"""Repair a segment at key frames (after Mueller et al. 2018) and interpolate them by a cubic spline.
+    r"""Repair the key frames of a segment (after Mueller et al. 2018), and interpolate between them by a cubic spline.
 
-    For each of five key frames a normal distribution :math:`N(\mu_k, \Sigma_k)` is fitted to the joints around it, and
-    up to 500 samples are drawn until one is feasible; a key frame that is feasible already is kept. When no sample is
-    feasible, :math:`\mu_k` is clipped to the joint ranges.
+    A segment has five key frames. A key frame that is already feasible is kept. For every other key frame, a normal
+    distribution :math:`N(\mu_k, \Sigma_k)` is fitted to the joint positions around it, and up to 500 random postures
+    are drawn from this distribution until one is feasible. If none is feasible, the key frame becomes :math:`\mu_k`,
+    clipped to the joint ranges.
 
     Args:
         joints: joint positions of the whole motion, shape (n, n_joints) [rad].
         first: first sample of the segment.
         past: index of the sample after the segment.
         check: the feasibility check.
-        rng: random generator for the samples.
+        rng: random generator for the postures that are drawn.
 
     Returns:
-        joints, shape (n, n_joints) [rad], unchanged outside the segment; number of key frames without a feasible
-        sample.
+        Joint positions, shape (n, n_joints) [rad], unchanged outside the segment; and the number of key frames for
+        which no feasible posture was found.
     """
     n, dt = len(joints), check.dt
     last = past - 1
@@ -406,14 +415,14 @@ class SegmentCorrector:
     """Corrects the motion of one engagement in rounds (baseline M1).
 
     Args:
-        mapping: mapping of the person's joints, started at the robot's current posture.
+        mapping: mapping from the person's joints to the robot's joints, started at the robot's current posture.
         clutch: clutch of this engagement.
         check: the feasibility check.
-        rng: random generator for the samples of a repair.
+        rng: random generator for the postures that a repair draws.
 
     Attributes:
-        rounds: number of rounds so far.
-        counts: counts by the names in :data:`COUNTED`; times in s.
+        rounds: number of rounds of corrections so far.
+        counts: counts and times [s], by the names in :data:`COUNTED`.
     """
 
     def __init__(
@@ -424,11 +433,11 @@ class SegmentCorrector:
         self.counts: dict[str, float] = dict.fromkeys(COUNTED, 0.0)
 
     def corrected(self, motion: DemonstratedMotion, rounds: int) -> DemonstratedMotion:
-        """Return the motion with the robot's joints, corrected as far as possible.
+        """Map the motion to the robot's joints, correct it as far as possible, and return it.
 
         Args:
             motion: without joints.
-            rounds: largest number of rounds.
+            rounds: largest number of rounds of corrections.
         """
         dt = self._check.dt
         motion = motion.with_joints(np.array([self._mapping.joints(e, self._clutch) for e in motion.estimates()]))
@@ -447,7 +456,7 @@ class SegmentCorrector:
         return motion
 
     def _corrected(self, motion: DemonstratedMotion, first: int, past: int, weight: Array) -> DemonstratedMotion:
-        """Return the motion with one segment changed by the first correction that makes it feasible, else repaired."""
+        """Return the motion with one segment made feasible by the first correction that can, or else repaired."""
         for name, changed, end in self._proposals(motion, first, past, weight):
             if self._check.clear(changed.joints[max(first - 1, 0) : end + 1]):
                 self.counts[name] += 1
@@ -460,7 +469,7 @@ class SegmentCorrector:
     def _proposals(
         self, motion: DemonstratedMotion, first: int, past: int, weight: Array
     ) -> Iterator[tuple[str, DemonstratedMotion, int]]:
-        """Yield the possible corrections in order: name, changed motion, new end of the segment."""
+        """Yield the possible corrections in order; each has a name, the changed motion, and the segment's new end."""
         window = motion.joints[first:past]
         factor = float(self._check.speeds(window).max(initial=0.0)) / SLOWED_TO
         if SLOWED_TO * factor > 1.0 and factor <= _SLOWEST:
@@ -476,7 +485,7 @@ class SegmentCorrector:
     def _mapped(
         self, name: str, motion: DemonstratedMotion, first: int, past: int
     ) -> Iterator[tuple[str, DemonstratedMotion, int]]:
-        """Yield a motion with the joints of a segment mapped again, if every tenth sample is feasible."""
+        """Map the joints of a segment again, and yield the motion if every tenth sample of the segment is feasible."""
         before = motion.joints[max(first - 1, 0)]
         self._mapping.resume(before)
         for i in range(first, past, _STRIDE):

@@ -1,4 +1,4 @@
-"""HandCurve: a smooth curve of a hand's position and rotation, fitted live and evaluated with a fixed delay."""
+"""HandCurve: a smooth curve of a hand's pose, fitted during capture and evaluated with a fixed delay."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _RESTART = 0.25  # [s] a source whose clock jumps by more has restarted
 
 @dataclass(frozen=True, eq=False)
 class RotationCurve:
-    r"""Rotations along a curve: :math:`R(t) = R_0 \exp(c(t))` where c is a :class:`NURBS` of rotation vectors.
+    r"""A smooth curve of rotations, :math:`R(t) = R_0 \exp(c(t))`, where c is a :class:`NURBS` of rotation vectors.
 
-    Roll, pitch and yaw wrap around and have singularities; rotation vectors relative to a mean rotation have neither
-    problem below 360 degrees.
+    Roll, pitch and yaw wrap around and have singularities. Rotation vectors relative to a mean rotation have neither
+    problem for angles below 360 degrees.
 
     Attributes:
-        reference: :math:`R_0`, quaternion wxyz, shape (4,).
+        reference: reference rotation :math:`R_0`, quaternion wxyz, shape (4,).
         vectors: curve c of the rotation vectors [rad] over time [s].
     """
 
@@ -45,7 +45,7 @@ class RotationCurve:
     vectors: NURBS
 
     def evaluate(self, t: ArrayLike) -> Array:
-        """Return the quaternions wxyz at times (k,), shape (k, 4); for a single time, shape (4,)."""
+        """Return the rotations at times (k,) as quaternions wxyz, shape (k, 4); for a single time, shape (4,)."""
         return quaternion_multiply(self.reference, quaternion_exp(self.vectors.evaluate(t)))
 
 
@@ -60,16 +60,16 @@ def fit_rotations(
     sigma: float | None = None,
     robust: bool = True,
 ) -> RotationCurve:
-    """Fit a curve to rotations: :func:`fit_nurbs` of their rotation vectors relative to the mean rotation.
+    """Fit a curve to rotations; :func:`fit_nurbs` fits their rotation vectors relative to the mean rotation.
 
     Args:
         times: strictly increasing, shape (k,) [s].
         quaternions: unit quaternions wxyz, shape (k, 4); signs do not matter.
         confidence: confidences from 0 to 1, shape (k,); None: all 1.
-        degree: see :func:`fit_nurbs`, like all other arguments.
+        degree: degree of the curve, as in :func:`fit_nurbs`.
         n_control: number of control points.
-        smoothing: a number, ``"gcv"`` or ``"morozov"``.
-        sigma: standard deviation of a rotation vector on each axis [rad].
+        smoothing: a number, ``"gcv"`` or ``"morozov"``, as in :func:`fit_nurbs`.
+        sigma: standard deviation of the measured rotation vectors on each axis [rad].
         robust: whether to reduce the weight of outliers.
 
     Raises:
@@ -94,7 +94,7 @@ def fit_rotations(
 
 
 def _continuous(vectors: Array) -> Array:
-    """Return rotation vectors (k, 3) without jumps by 2 pi where the angle passes pi."""
+    """Return rotation vectors (k, 3) in which the angle does not jump by 2 pi when it passes pi."""
     length = np.sqrt(np.sum(vectors * vectors, axis=1))
     if not length.max() > 0.5 * math.pi:  # no two of them differ by 180 degrees
         return vectors
@@ -137,10 +137,10 @@ class HandCurve:
 
     @classmethod
     def through(cls, samples: Sequence[HandSample], smoothing: Smoothing = "gcv", *, robust: bool = True) -> HandCurve:
-        """Fit both curves to at least four samples.
+        """Fit a curve of positions and a curve of rotations to at least four samples.
 
         Raises:
-            InputError: when there are fewer samples, or times do not increase.
+            InputError: when there are fewer than four samples, or times do not increase.
         """
         if len(samples) <= _DEGREE:
             raise InputError(f"HandCurve: needs at least {_DEGREE + 1} frames that show the arm, got {len(samples)}")
@@ -166,24 +166,24 @@ class HandCurve:
         return cls(wrist, hand)
 
     def at(self, time: float) -> tuple[Array, Array]:
-        """Return wrist (3,) and hand (4,) at a time; beyond the ends they are constant."""
+        """Return wrist (3,) [m] and hand quaternion (4,) at a time; beyond the ends of the curve, both are constant."""
         return self.wrist.evaluate(time), self.hand.evaluate(time)
 
 
 class DelayedCurve:
     """Smooths a hand's motion during capture.
 
-    Fits a curve to the last 0.6 s and evaluates it ``lag`` seconds in the past.
+    The filter fits a curve to the last 0.6 s (``window``) and evaluates this curve ``lag`` seconds in the past.
 
-    The end of a fitted curve changes with every new frame, while a slightly earlier point is supported by frames on
-    both sides. This is the reason for the lag. Frames arrive irregularly, so time is counted in control steps and
-    only corrected by the frames.
+    The lag is needed because the end of a fitted curve changes with every new frame, whereas a slightly earlier point
+    is supported by frames before and after it. Frames arrive irregularly. The filter therefore advances its time in
+    control steps, and uses the frames' time stamps only to correct it.
 
     Args:
-        window: duration to which the curve is fitted [s].
-        lag: delay of the evaluation [s].
+        window: length of the time window to which the curve is fitted [s].
+        lag: time by which the evaluated point lies in the past [s].
         smooth: whether to fit a curve; False returns the newest frame unchanged.
-        whole: a curve of the complete motion; if given, it is evaluated without lag.
+        whole: curve of the complete motion, to be evaluated without lag; None: a curve is fitted live.
     """
 
     def __init__(
@@ -214,7 +214,7 @@ class DelayedCurve:
         self._clock += dt
 
     def now(self) -> tuple[Array, Array] | None:
-        """Return the current target of wrist (3,) [m] and hand (4,); None before the first frame."""
+        """Return the current smoothed wrist (3,) [m] and hand quaternion (4,); None before the first frame."""
         if not self._samples:
             return None
         curve = self._curve if self._whole is None else self._whole

@@ -1,4 +1,4 @@
-"""IncrementalIK: baseline M3, resolved-rate control with error feedback; singularities are not handled."""
+"""IncrementalIK: baseline M3, resolved-rate control with error feedback and no treatment of singularities."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ _RCOND = 1e-6  # ignores only singular values that are numerically zero
 class IncrementalIK(BaselineRetargeter):
     r"""Baseline M3: our interpretation of "incremental inverse kinematics" in the thesis.
 
-    The thesis cites Ijspeert et al. 2002, the paper on movement primitives, whose abstract does not mention incremental
-    inverse kinematics. This is therefore not a published method, but an interpretation of the name. Once per frame it
-    computes
+    For this method, the thesis cites Ijspeert et al. 2002, a paper on movement primitives. The abstract of that paper
+    does not mention incremental inverse kinematics. M3 is therefore not a published method, but our interpretation of
+    the name. Once per frame, M3 computes the joint displacement
 
     .. math:: \Delta q = J^+ \left(\Delta x_d + K\,e\right), \qquad e = \log(T_d\,T(q)^{-1}),
 
-    where :math:`\Delta x_d` is the displacement of the target since the last frame and e the error relative to the last
-    target. The step is spread evenly over the control steps of one frame. The pseudo-inverse is undamped: it inverts
-    even the smallest singular value, so the step grows without bound near the edge of the workspace. Each joint is
-    limited to its own velocity, which changes the direction of the tool's motion, and then to its range. ``notes``
-    counts how often: ``"caps"`` joints and steps, ``"capped_steps"`` steps.
+    where :math:`\Delta x_d` is the displacement of the target since the last frame, and e the error relative to the
+    target of the last frame. The displacement is spread evenly over the control steps of one frame. The pseudo-inverse
+    is not damped: it inverts even the smallest singular value, so the displacement grows without bound near the edge of
+    the workspace. Each joint is then limited to its velocity limit, which changes the direction of the tool's motion,
+    and to its range. In ``notes``, ``"capped_steps"`` counts the control steps in which a velocity limit was active,
+    and ``"caps"`` counts the limited joints in all of these steps.
 
     The movement primitives of the cited paper are left out. They belong to the learned skill and can be used with every
-    method; including them would compare primitives instead of mappings.
+    method. If they were included, a comparison would evaluate the primitives instead of the mappings.
 
     Args:
         arm: the robot's arm with its tool.
         correspondence: correspondence between the person's arm and the robot's.
         dt: control period [s].
         scene: ignored.
-        velocity_scaling: whether to scale every step as a whole so that no joint exceeds its limit, instead of
-            limiting each
-            joint.
+        velocity_scaling: whether to scale every step as a whole so that no joint exceeds its limit, instead of limiting
+            each joint.
         gain: gain K, the fraction of the error that is corrected per frame.
 
     Raises:
@@ -100,7 +100,7 @@ class IncrementalIK(BaselineRetargeter):
         return np.clip(step, -most, most)
 
     def _count(self, step: Array) -> None:
-        """Count the joints that a step would move faster than their velocity limits."""
+        """Count the joints that a step would move faster than their velocity limits allow."""
         over = int(np.count_nonzero(np.abs(step) > self.dt * self.arm.max_velocity * (1.0 + 1e-9)))
         self.counts["caps"] += over
         self.counts["capped_steps"] += over > 0

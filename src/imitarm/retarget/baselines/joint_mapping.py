@@ -1,4 +1,4 @@
-"""JointMapping: map a person's joint angles to the robot's, for methods that map joints instead of the tool."""
+"""JointMapping: maps a person's joint angles to the robot's joints, as the baselines M1 and M2 do."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from imitarm.validation import flag
 Array = NDArray[np.float64]
 
 _STRETCHED = ((0.0,) * 7, (0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0))
-"""Postures in which an arm may be stretched forward: Sawyer's zero posture; the Panda's, which points up at zero;
-its mirror image."""
+"""Postures to try, in one of which a robot arm is stretched forward: zero (Sawyer), the second joint at a right angle
+(the Panda, which points up at zero), and the second joint at the opposite angle.
+"""
 _ALIGNED = 0.999  # smallest cosine between a joint's axis and the person's
 _ANY = LimbLengths(0.3, 0.26)  # where only rotations matter
 _AHEAD = np.array([1.0, 0.0, 0.0])
@@ -27,30 +28,32 @@ _AHEAD = np.array([1.0, 0.0, 0.0])
 class JointMapping:
     r"""Maps the seven angles of a person's arm to seven robot joints with the same order of axes.
 
-    When the arm is stretched forward, a person's joints rotate about z, y, x, y, x, y, x
-    (:mod:`imitarm.retarget.human_arm`). Sawyer's joints have the same axes at zero. The Panda's have them when its
-    second joint is at a right angle, some with the opposite direction. With that posture :math:`q^*` and the directions
-    :math:`\sigma_i = \pm 1` the mapping is
+    When a person's arm is stretched forward, its joints rotate about z, y, x, y, x, y, x
+    (:mod:`imitarm.retarget.human_arm`). Sawyer's joints have the same axes when all joint positions are zero. The
+    Panda's joints have these axes, some in the opposite direction, when its second joint is at a right angle. With this
+    posture :math:`q^*`, the directions :math:`\sigma_i = \pm 1` and the person's angles :math:`\theta_i`, the mapping
+    is
 
     .. math:: q_i = q^*_i + \sigma_i\,\theta_i \quad\text{(absolute)}, \qquad
               q_i = q_{i,0} + \sigma_i\,(\theta_i - \theta_{i,0}) \quad\text{(relative)},
 
-    the latter relative to the joint positions of person and robot when the person began to lead. This holds for
-    shoulder and elbow, i = 1 to
-    4. The last three joints follow in closed form from the desired rotation of the tool: the hand's rotation when
-       the mapping is absolute and the correspondence follows the whole hand, otherwise the rotation of the clutch's
-       target. Link
-    lengths are not used, so the tool is not where the hand is; this is inherent in a mapping of joints.
+    where :math:`q_{i,0}` and :math:`\theta_{i,0}` are the joint positions of robot and person when the robot began to
+    follow the person. These equations determine the joints of shoulder and elbow (the first four). The last three
+    joints are computed in closed form from the desired rotation of the tool. In the absolute mapping, this is the
+    hand's rotation, if the orientation of the correspondence is ``"hand"``; in all other cases, it is the rotation of
+    the clutch's target. The mapping does not use link lengths, so the tool and the hand are at different positions.
+    Every mapping of joints has this property.
 
-    Angles are continuous from frame to frame, without jumps by 360 degrees; an undefined angle keeps its value.
+    The angles are continuous from frame to frame, without jumps by 360 degrees. An angle that is undefined keeps its
+    value.
 
     Args:
         arm: the robot's arm.
-        relative: see above.
+        relative: whether to use the relative mapping; otherwise, the absolute mapping is used.
 
     Attributes:
-        zero: the posture in which the arm is stretched forward, shape (7,) [rad].
-        sense: direction of each joint relative to the person's, 1 or -1, shape (7,).
+        zero: the posture :math:`q^*`, in which the arm is stretched forward, shape (7,) [rad].
+        sense: the directions :math:`\sigma`: 1 if a joint rotates like the person's joint, -1 if opposite, shape (7,).
 
     Raises:
         InputError: when the arm does not have the joint axes of a person's arm.
@@ -70,18 +73,18 @@ class JointMapping:
         self._origin: tuple[Array, Array] | None = None  # robot's joints and person's angles when engaged
 
     def resume(self, q: Array) -> None:
-        """Continue from joints ``q``, shape (7,) [rad], with the same origin; used to map a part of a motion again."""
+        """Continue at joint positions ``q`` (7,) [rad] with the same reference, to map a part of a motion again."""
         self._q = np.array(q, dtype=float)
         if self._origin is not None:
             q0, theta0 = self._from
             self._person = theta0 + self.sense * (self._q - q0)
 
     def joints(self, estimate: ArmEstimate, clutch: Clutch) -> Array:
-        """Return the joints for one frame of the person's arm, before any limit, shape (7,) [rad].
+        """Return the robot's joint positions for one frame of the person's arm, before any limit, shape (7,) [rad].
 
         Args:
             estimate: estimate of the person's arm.
-            clutch: the poses of hand and tool when the person began to lead.
+            clutch: the poses of hand and tool when the robot began to follow the person.
         """
         hand = quaternion_to_matrix(estimate.hand)
         theta = self.angles(estimate.elbow - estimate.shoulder, estimate.wrist - estimate.elbow, hand)
@@ -91,13 +94,13 @@ class JointMapping:
 
     @property
     def _from(self) -> tuple[Array, Array]:
-        """The last joints of the robot and the person's angles that correspond to them."""
+        """The last joint positions of the robot, and the person's angles that correspond to them."""
         if self.relative and self._origin is not None:
             return self._origin
         return self.zero, np.zeros(7)
 
     def angles(self, upper: Array, forearm: Array, hand: Array) -> Array:
-        """Return the person's angles, continuous with the previous angles, shape (7,) [rad].
+        """Return the angles of the person's arm, continuous with the previous angles, shape (7,) [rad].
 
         Args:
             upper: vector from shoulder to elbow, shape (3,), of any length.
@@ -112,12 +115,12 @@ class JointMapping:
         return theta
 
     def onto_robot(self, theta: Array, hand: Array) -> Array:
-        """Return the robot's joints for a person's angles, shape (7,) [rad].
+        """Return the robot's joint positions for the angles of a person's arm, shape (7,) [rad].
 
         Args:
             theta: the person's angles, shape (7,) [rad].
-            hand: desired rotation of the robot's hand: the tool's rotation times the inverse of its rotation in the
-                stretched arm, shape (3, 3).
+            hand: desired rotation of the robot's hand, shape (3, 3): the desired rotation of the tool, times the
+                inverse of the tool's rotation in the posture :attr:`zero`.
         """
         begins = self._origin is None
         if self._origin is None:
@@ -138,7 +141,7 @@ class JointMapping:
 
 
 class Approach:
-    """Moves to a distant first goal at limited speed, then follows the mapping.
+    """Moves to the first goal at limited speed, even if it is far away, and then follows the mapping.
 
     Args:
         arm: arm that provides the velocity limits.
@@ -153,7 +156,7 @@ class Approach:
     def towards(self, q: Array, goal: Array) -> Array:
         """Return the position one period after ``q``.
 
-        A step towards ``goal``, or ``goal`` itself once it has been reached.
+        The result is a step towards ``goal``, or ``goal`` itself once it has been reached.
         """
         if self.active:
             reached = q + np.clip(goal - q, -self._most, self._most)
@@ -163,12 +166,12 @@ class Approach:
 
 
 def continued(angles: Array, before: Array) -> Array:
-    """Return angles plus multiples of 360 degrees, each closest to the previous angle, shape (n,) [rad]."""
+    """Add multiples of 360 degrees so that each angle is as close as possible to the previous one, (n,) [rad]."""
     return np.asarray(before + (angles - before + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def _whole_turn_inside(angles: Array, lower: Array, upper: Array) -> Array:
-    """Shift angles beyond their limits by 360 degrees if this brings them inside, shape (n,) [rad]."""
+    """Shift each angle beyond its limits by 360 degrees if the shifted angle is within them, shape (n,) [rad]."""
     turned = angles - 2.0 * np.pi * np.sign(angles)
     helps = ((angles < lower) | (angles > upper)) & (turned >= lower) & (turned <= upper)
     return np.where(helps, turned, angles)

@@ -1,4 +1,4 @@
-"""NURBS: rational spline curves (thesis Eq 3.6 and 3.7), and their weighted, smooth, robust fit to noisy samples."""
+"""NURBS: rational spline curves (thesis Eq 3.6 and 3.7), and a weighted, smooth and robust fit to noisy samples."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Indices = NDArray[np.intp]
 Smoothing = float | str
 
 SMOOTHINGS = ("gcv", "morozov")
-"""Names of the rules that choose the smoothing."""
+"""Names of the rules that choose the smoothing weight mu."""
 
 _MU = (-6.0, 6.0)  # decades to search
 _HUBER, _PASSES = 2.5, 3  # an outlier is farther than 2.5 sigma; number of reweightings
@@ -28,18 +28,19 @@ _RATIONAL_PASSES = 3
 
 
 def basis_functions(knots: Array, degree: int, u: ArrayLike) -> tuple[Indices, Array]:
-    r"""Return the non-zero basis functions (thesis Eq 3.7, corrected).
+    r"""Return the values of the non-zero B-spline basis functions (thesis Eq 3.7, corrected).
 
     .. math::
         N_{i,0}(u) = \begin{cases} 1 & u_i \le u < u_{i+1} \\ 0 & \text{else} \end{cases} \qquad
         N_{i,p}(u) = \frac{u - u_i}{u_{i+p} - u_i} N_{i,p-1}(u)
         + \frac{u_{i+p+1} - u}{u_{i+p+1} - u_{i+1}} N_{i+1,p-1}(u)
 
-    where 0/0 = 0, and the last span is closed at the right, so that the last function is 1 at the end. At every ``u``
-    only p + 1 of them are non-zero; the recursion runs over these, where no divisor is zero.
+    where 0/0 = 0. The last knot span includes its right end, so that the last function is 1 at the end of the curve. At
+    every ``u``, only p + 1 functions are non-zero. The recursion computes only these functions, and for them no divisor
+    is zero.
 
     Args:
-        knots: non-decreasing, the first and the last repeated degree + 1 times, shape (m,).
+        knots: knots, non-decreasing, the first and the last repeated degree + 1 times, shape (m,).
         degree: p.
         u: parameters, shape (k,); clipped to the range of the knots.
 
@@ -69,8 +70,9 @@ class NURBS:
 
     .. math:: C(u) = \frac{\sum_i N_{i,p}(u)\, w_i P_i}{\sum_i N_{i,p}(u)\, w_i}
 
-    The functions are those of :func:`basis_functions` over the knots :math:`\{a, \dots, a, u_{p+1}, \dots, u_{m-p-1},
-    b, \dots, b\}`, a and b repeated p + 1 times. For a curve fitted to a motion the parameter is the time [s].
+    :math:`N_{i,p}` are the functions of :func:`basis_functions` with the knots :math:`\{a, \dots, a, u_{p+1}, \dots,
+    u_{m-p-1}, b, \dots, b\}`, in which a and b are repeated p + 1 times. For a curve that is fitted to a motion, the
+    parameter u is the time [s].
 
     Attributes:
         knots: shape (n + degree + 1,).
@@ -79,8 +81,8 @@ class NURBS:
         degree: p, at least 1.
 
     Raises:
-        InputError: when shapes do not match, knots decrease, are not repeated at both ends or are repeated too often
-            inside, or a weight is not positive.
+        InputError: when shapes do not match, a weight is not positive, or the knots decrease, are not repeated at both
+            ends, or are repeated too often in between.
     """
 
     knots: Array
@@ -93,8 +95,8 @@ class NURBS:
         p, n = self.degree, len(points)
         if p < 1 or points.ndim != 2 or n < p + 1 or weights.shape != (n,) or knots.shape != (n + p + 1,):
             raise InputError(
-                f"NURBS: degree {p} with control points {points.shape} needs at least {p + 1} of them, weights ({n},) "
-                f"and knots ({n + p + 1},); got {weights.shape} and {knots.shape}"
+                f"NURBS: degree {p} needs n >= {p + 1} control points (n, d), n weights and n + {p + 1} knots; "
+                f"got control points {points.shape}, weights {weights.shape} and knots {knots.shape}"
             )
         if not (np.isfinite(knots).all() and np.isfinite(points).all()):
             raise InputError("NURBS: knots and control points must be finite numbers")
@@ -102,7 +104,7 @@ class NURBS:
             raise InputError(f"NURBS: knots must not decrease; the first and the last must be repeated {p + 1} times")
         if not (knots[p + 1 :] > knots[: -p - 1]).all():
             raise InputError(
-                f"NURBS: a knot inside the curve is repeated more than {p} times: it would be discontinuous"
+                f"NURBS: a knot inside the curve is repeated more than {p} times, so the curve would be discontinuous"
             )
         if not (np.isfinite(weights) & (weights > 0.0)).all():
             raise InputError("NURBS: weights must be positive")
@@ -112,7 +114,7 @@ class NURBS:
 
     @property
     def domain(self) -> tuple[float, float]:
-        """The smallest and the largest parameter."""
+        """The smallest and the largest parameter of the curve."""
         return float(self.knots[0]), float(self.knots[-1])
 
     def evaluate(self, u: ArrayLike) -> Array:
@@ -128,13 +130,14 @@ class NURBS:
         return np.asarray(points.reshape(*at.shape, points.shape[1]))
 
     def derivative(self, u: ArrayLike, order: int = 1) -> Array:
-        r"""Return a derivative with respect to the parameter at ``u`` (k,), shape (k, d).
+        r"""Return a derivative of the curve with respect to its parameter at ``u`` (k,), shape (k, d).
 
-        With :math:`A = \sum N_i w_i P_i` and :math:`W = \sum N_i w_i`: :math:`C^{(r)} = \frac1W \bigl(A^{(r)} -
-        \sum_{j=1}^r \binom rj W^{(j)} C^{(r-j)}\bigr)`.
+        With :math:`A = \sum N_i w_i P_i` and :math:`W = \sum N_i w_i`, the derivative of order r is :math:`C^{(r)} =
+        \frac1W \bigl(A^{(r)} - \sum_{j=1}^r \binom rj W^{(j)} C^{(r-j)}\bigr)`.
 
         Args:
-            u: parameters; a single number gives shape (d,). Beyond the ends, the derivative at the end is returned.
+            u: parameters; a single number gives shape (d,). Beyond the ends of the curve, the derivative at the end is
+                returned.
             order: 0 (the point itself) to ``degree``.
 
         Raises:
@@ -165,7 +168,7 @@ class NURBS:
 
 
 def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
-    """Return knots that follow the density of the data, so that every span contains data (Piegl and Tiller, Eq 9.69).
+    """Return knots spaced like the data, so that every knot span contains data (Piegl and Tiller, Eq 9.69).
 
     Args:
         u: parameters of the data, increasing, shape (k,), k at least ``n_control``.
@@ -199,7 +202,7 @@ class _Problem:
         self.bend = _bend_band(rows, order)
 
     def normal(self, confidence: Array) -> tuple[Array, Array]:
-        """Return the lower band of R^T C R, shape (degree + 1, n), and R^T C Q, shape (n, d)."""
+        """Return the lower band of R^T C R, shape (degree + 1, n), and R^T C Q, shape (n, d), with confidences C."""
         c, n, order, dim = confidence[:, None], self.n_control, self.order, self.dim
         band = np.bincount(self._cells, (c * self._products).ravel(), order * n)
         right = np.bincount(self._places, (c * self._moments).ravel(), n * dim)
@@ -210,7 +213,7 @@ class _Problem:
         return np.asarray((self.values[:, None, :] @ control[self.reached])[:, 0] - self.points)
 
     def with_weights(self, weights: Array) -> _Problem:
-        """Return these samples for a rational curve with weights (n,)."""
+        """Return the same samples for a rational curve with weights (n,)."""
         weighted = self.values * weights[self.reached]
         return _Problem(self.first, weighted / weighted.sum(axis=1, keepdims=True), self.points, self.rows)
 
@@ -227,32 +230,34 @@ def fit_nurbs(
     robust: bool = True,
     rational: bool = False,
 ) -> NURBS:
-    r"""Fit a curve to a motion, each sample weighted by its confidence (docs/thesis_map.md).
+    r"""Fit a curve to a motion, with each sample weighted by its confidence (docs/thesis_map.md).
 
     .. math:: \min_P \sum_k c_k \Bigl|\sum_i R_{ik} P_i - Q_k\Bigr|^2 + \mu \sum_j |(D P)_j|^2,
         \qquad R_{ik} = \frac{N_i(t_k)\, w_i}{\sum_j N_j(t_k)\, w_j}
 
-    where D are the second differences of :func:`bends`. The parameter is the time, not the chord length, because the
-    speed is part of the motion. The normal equations are banded with width p, so the time grows linearly with the
-    number of samples; ``"gcv"`` takes longer because it needs the inverse.
+    where D is the matrix of second differences from :func:`bends`. The parameter is the time, not the chord length,
+    because the speed is part of the motion. The normal equations have a band matrix of width p, so the computing time
+    grows linearly with the number of samples. The rule ``"gcv"`` takes longer because it needs the inverse of the
+    matrix.
 
     Args:
-        times: strictly increasing, shape (k,) [s].
-        points: sample points Q, shape (k, d); any value, including nan, where the confidence is 0.
-        confidence: c, 0 to 1, shape (k,); None: all 1.
+        times: times of the samples, strictly increasing, shape (k,) [s].
+        points: sample points Q, shape (k, d); a point whose confidence is 0 is ignored and may be nan.
+        confidence: confidence c of each sample, 0 to 1, shape (k,); None: all 1.
         degree: p.
-        n_control: number of control points; None: k/4 + p.
-        smoothing: the number :math:`\mu`; ``"gcv"`` chooses it by generalised cross validation, which assumes
-            independent errors; ``"morozov"`` chooses it so that the residual equals ``sigma``.
-        sigma: standard deviation of a sample on each axis, in the points' unit; None: from the residuals.
-        robust: whether to reduce the weight of samples farther than 2.5 sigma from the curve (Huber), in three passes.
-        rational: whether to fit the weights w too, between 0.2 and 5, with mean 1; otherwise all are 1. This is
-            needed only for exact
-            arcs.
+        n_control: number of control points; None: k/4 + p, for k samples and degree p.
+        smoothing: the weight :math:`\mu`, or a rule that chooses it: ``"gcv"``: generalised cross-validation, which
+            assumes independent errors; ``"morozov"``: the weight with which the residual equals ``sigma``.
+        sigma: standard deviation of the samples' errors on each axis, in the unit of the points; None: it is estimated
+            from the residuals.
+        robust: whether to reduce the weight of samples that are farther than 2.5 sigma from the curve (Huber weights),
+            in three passes.
+        rational: whether to fit the weights w too, which are then between 0.2 and 5 with mean 1; otherwise, all weights
+            are 1. This is needed only for exact arcs.
 
     Raises:
-        InputError: when shapes do not match, times do not increase, fewer than p + 1 samples have confidence, or an
-            option is invalid.
+        InputError: when shapes do not match, times do not increase, fewer than p + 1 samples have a confidence above 0,
+            or an option is invalid.
     """
     t, q, c = _checked(times, points, confidence, degree)
     _check_options(smoothing, sigma)
@@ -260,7 +265,8 @@ def fit_nurbs(
     n = min(math.ceil(len(t) / 4) + degree, len(used_times)) if n_control is None else n_control
     if not degree + 1 <= n <= len(used_times):
         raise InputError(
-            f"fit_nurbs: n_control must be {degree + 1} to {len(used_times)} (samples that count), got {n}"
+            f"fit_nurbs: n_control must be {degree + 1} to {len(used_times)}, the number of samples "
+            f"with confidence above 0, got {n}"
         )
     knots = averaged_knots(used_times, n, degree)
     knots[: degree + 1], knots[-degree - 1 :] = t[0], t[-1]
@@ -295,7 +301,9 @@ def _checked(
     if degree < 2:
         raise InputError(f"fit_nurbs: degree must be at least 2, or the speed is discontinuous; got {degree!r}")
     if not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
-        raise InputError("fit_nurbs: times must be finite and strictly increasing; sort them, remove repeated frames")
+        raise InputError(
+            "fit_nurbs: times must be finite and strictly increasing; sort them and remove repeated frames"
+        )
     if not ((c >= 0.0) & (c <= 1.0)).all():
         raise InputError("fit_nurbs: confidence must be between 0 and 1")
     if int((c > 0.0).sum()) < degree + 1:
@@ -320,14 +328,16 @@ def _check_options(smoothing: Smoothing, sigma: float | None) -> None:
 
 
 def bends(knots: Array, degree: int) -> Array:
-    r"""Return the second differences D of the control points, shape (n - 2, 3): row j acts on points j, j+1, j+2.
+    r"""Return the second differences D of the control points, shape (n - 2, 3); row j acts on points j, j+1, j+2.
 
-    Each control point belongs to the mean of p knots, :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`, which are denser
-    near
-    the ends. There, plain differences :math:`P_{j+1} - 2 P_j + P_{j-1}` would not vanish for a straight uniform motion
-    and would slow it down. For this reason they are divided differences, :math:`h (\frac{P_{j+1} - P_j}{g_{j+1} - g_j}
-    - \frac{P_j
-    - P_{j-1}}{g_j - g_{j-1}})` with h the mean distance; for uniform knots they equal the plain differences.
+    Each control point corresponds to a parameter, the mean of p knots :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`.
+    These parameters are denser near the ends. There, plain differences :math:`P_{j+1} - 2 P_j + P_{j-1}` would not
+    vanish for a straight uniform motion and would slow it down. The second differences are therefore divided
+    differences,
+
+    .. math:: h \left( \frac{P_{j+1} - P_j}{g_{j+1} - g_j} - \frac{P_j - P_{j-1}}{g_j - g_{j-1}} \right)
+
+    where h is the mean distance of successive :math:`g_j`. For uniform knots, they equal the plain differences.
     """
     means = np.convolve(knots[1:-1], np.full(degree, 1.0 / degree), "valid")
     apart = np.diff(means)
@@ -336,7 +346,7 @@ def bends(knots: Array, degree: int) -> Array:
 
 
 def _bend_band(rows: Array, order: int) -> Array:
-    """Return the lower band of D^T D, shape (order, n)."""
+    """Return the lower band of the matrix D^T D, shape (order, n)."""
     n = len(rows) + 2
     band = np.zeros((order, n))
     for shift in range(3):
@@ -382,7 +392,7 @@ def _strength(problem: _Problem, confidence: Array, smoothing: Smoothing, sigma:
 
 
 def _cross_validated(problem: _Problem, confidence: Array) -> float:
-    r"""Return the mu with the lowest :math:`k\,RSS / (k - \mathrm{tr} H)^2`, where H is the smoothing matrix."""
+    r"""Return the mu with the lowest :math:`k\,RSS / (k - \mathrm{tr} H)^2`; RSS: residual sum, H: smoothing matrix."""
     count = float((confidence > 0.0).sum())
     eye = np.eye(problem.n_control)
 
@@ -400,7 +410,7 @@ def _cross_validated(problem: _Problem, confidence: Array) -> float:
 
 
 def _least(score: Callable[[float], float]) -> float:
-    """Return ``10**d`` with the lowest ``score(d)``; whole numbers d are tried first, then values near the best."""
+    """Return ``10**d`` with the lowest ``score(d)``; whole numbers d are tried first, then values near the best one."""
     decades = np.arange(_MU[0], _MU[1] + 0.5)
     best = float(decades[int(np.argmin([score(float(d)) for d in decades]))])
     finer = minimize_scalar(score, bounds=(best - 1.0, best + 1.0), method="bounded", options={"xatol": 0.1})
@@ -408,10 +418,11 @@ def _least(score: Callable[[float], float]) -> float:
 
 
 def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
-    r"""Return weights w (n,), mean 1, by least squares, reweighted by the last denominator.
+    r"""Return the weights w (n,), with mean 1, from a least-squares problem weighted by the previous denominators W.
 
-    :math:`\sum_k \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is quadratic in
-    X and in w. X is eliminated; among equally good weights w, the function returns those closest to 1.
+    The cost :math:`\sum_k \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is
+    quadratic in X and w. X is eliminated. If several weights w are equally good, the function returns those closest to
+    1.
     """
     n = problem.n_control
     basis = np.zeros((len(problem.first), n))

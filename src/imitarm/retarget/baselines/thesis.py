@@ -1,4 +1,4 @@
-"""ThesisRetargeter: the method of the thesis's Chapter 3, corrected, or with selected misprints."""
+"""ThesisRetargeter: the method of Chapter 3 of the thesis, corrected, or with selected misprints of the thesis."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ _ARRIVED = 1e-5  # [m, rad] error at which no further increment is needed
 Curve = Literal["live", "global"]
 
 PRINTED = {
-    "limbs": "Eq 3.1 to 3.4: the elbow is behind the shoulder, the forearm is attached to the measured elbow",
-    "dh": "Eq 3.5: the second row has sin instead of cos, so forward kinematics gives no rotation",
-    "error": "the error is actual minus desired: the angles diverge from the target",
-    "rpy": "differences of roll, pitch and yaw are used with a geometric Jacobian",
-    "step": "one increment per frame",
-    "order": "P_R = P_HA R_HR: the hand moves the tool along the sensor's axes instead of the base's",
-    "damping": "Eq 3.9 uses the whole remaining error: the farther the target, the slower the arm",
-    "small_angle": "the small angle after Eq 3.9: less damping than the velocity limit needs",
+    "limbs": "Eq 3.1 to 3.4 place the elbow behind the shoulder and attach the forearm to the measured elbow",
+    "dh": "Eq 3.5 has sin instead of cos in the second row, so forward kinematics gives no rotation",
+    "error": "The error has the wrong sign (actual minus desired), so the angles diverge from the target",
+    "rpy": "Differences of roll, pitch and yaw are used with a geometric Jacobian, which needs a rotation vector",
+    "step": "Only one increment of the joint angles is computed per frame",
+    "order": "P_R = P_HA R_HR moves the tool along the axes of the sensor instead of the axes of the base",
+    "damping": "Eq 3.9 uses the whole remaining error, so the arm is slower when the target is farther away",
+    "small_angle": "The small-angle term after Eq 3.9 gives less damping than the velocity limit needs",
 }
 """The misprints that can be reproduced, by the names that ``as_printed`` accepts."""
 
@@ -59,22 +59,23 @@ _UNSEEN = 0.2  # weight of a hand rotation that was not seen but moved with the 
 class HumanArmTracker:
     r"""Tracks a person's arm in joint angles (thesis 3.1.1 and 3.1.2).
 
-    Starting from the angles :math:`\tau` of the previous frame, one to three times
+    In each frame, the tracker starts from the angles :math:`\tau` of the previous frame and repeats the following
+    update one to three times:
 
     .. math:: \tau \leftarrow \tau + J^+ \varepsilon, \qquad
         \varepsilon = \begin{pmatrix} p_d - p(\tau) \\ \log(R_d R(\tau)^T) \end{pmatrix}
 
-    where :math:`p_d, R_d` are the corrected wrist and hand and J is the Jacobian of the person's arm; :math:`J^+`
-    leaves out directions in which a straight arm can't move. The first frame, and the first frame after a gap, are
-    solved in closed form.
+    where :math:`p_d, R_d` are the corrected wrist position and hand rotation, and J is the Jacobian of the person's
+    arm. The pseudo-inverse :math:`J^+` ignores directions in which a straight arm can't move. In the first frame, and
+    in the first frame after a gap, the angles are computed in closed form.
 
     Attributes:
-        angles: tau, shape (7,) [rad]; None before the first frame.
+        angles: joint angles tau of the person's arm, shape (7,) [rad]; None before the first frame.
 
     Args:
         iterations: per frame.
-        faults: misprints from :data:`PRINTED` to reproduce; ``"limbs"``, ``"dh"``, ``"error"``, ``"rpy"`` and
-            ``"step"`` concern this class.
+        faults: misprints from :data:`PRINTED` to reproduce; only ``"limbs"``, ``"dh"``, ``"error"``, ``"rpy"`` and
+            ``"step"`` affect this class.
     """
 
     def __init__(self, iterations: int = 3, faults: Collection[str] = ()) -> None:
@@ -88,11 +89,11 @@ class HumanArmTracker:
         self._time = -math.inf
 
     def follow(self, estimate: ArmEstimate, lengths: LimbLengths) -> tuple[Array, Array]:
-        """Process a frame; return the tracked arm's wrist (3,) [m] and hand quaternion (4,) in the base frame.
+        """Process a frame; return wrist (3,) [m] and hand quaternion (4,) of the tracked arm in the base frame.
 
         Args:
             estimate: estimate of the arm, with true bone lengths.
-            lengths: these lengths.
+            lengths: bone lengths of the arm.
         """
         elbow, wrist = estimate.elbow, estimate.wrist
         if "limbs" in self._faults:
@@ -120,7 +121,7 @@ class HumanArmTracker:
         self.angles = (self.angles + increment + math.pi) % (2.0 * math.pi) - math.pi
 
     def _pose(self, lengths: LimbLengths) -> tuple[Array, Array]:
-        """Return wrist and hand relative to the shoulder, by forward kinematics."""
+        """Return wrist and hand rotation relative to the shoulder, by forward kinematics of the tracked angles."""
         assert self.angles is not None
         if "dh" in self._faults:
             frames = human_arm_frames(self.angles, lengths, as_printed=True)
@@ -140,8 +141,8 @@ class HumanArmTracker:
 def roll_pitch_yaw(rotation: Array) -> Array:
     """Return roll, pitch and yaw of a rotation Rz(yaw) Ry(pitch) Rx(roll), shape (3,) [rad].
 
-    The thesis uses their differences as the error of orientation: they wrap at 180 degrees, are singular at a pitch of
-        90 degrees, and are not a rotation vector.
+    The thesis uses differences of these angles as the orientation error. Such differences are not a rotation vector,
+    wrap at 180 degrees, and are singular at a pitch of 90 degrees.
     """
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
     return np.array(
@@ -159,7 +160,7 @@ def _unit(vector: Array) -> Array:
 
 
 def _nearest_rotation(matrix: Array) -> Array:
-    """Return the rotation closest to the product of the printed matrices."""
+    """Return the rotation closest to the product of the matrices that the thesis prints, which is not a rotation."""
     left, values, right = np.linalg.svd(matrix)
     if values[1] < 1e-9:  # almost no direction is left
         return carried(None, None, left[:, 0])
@@ -168,21 +169,21 @@ def _nearest_rotation(matrix: Array) -> Array:
 
 
 class ThesisRetargeter(Retargeter):
-    r"""Retarget as in Chapter 3 of the thesis, corrected as in docs/thesis_map.md.
+    r"""The method of Chapter 3 of the thesis, corrected as in docs/thesis_map.md.
 
     For each skeleton
 
     1. the bones get their true lengths (Eq 3.1 to 3.4);
     2. the person's joint angles are tracked by increments :math:`\tau \leftarrow \tau + J^+ \varepsilon`
-       (:class:`HumanArmTracker`), and Denavit-Hartenberg forward kinematics (Eq 3.5) gives the hand relative to the
-       shoulder, then in the robot's base frame;
+       (:class:`HumanArmTracker`); Denavit-Hartenberg forward kinematics (Eq 3.5) then gives the pose of the hand
+       relative to the shoulder, which is transformed to the robot's base frame;
     3. a NURBS is fitted to the last 0.6 s and evaluated 70 ms in the past (Eq 3.6 and 3.7,
        :class:`~imitarm.retarget.baselines.hand_curve.DelayedCurve`).
 
-    At each control step the tool moves towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
-    3.9). The length of every step is limited, because otherwise the damping stops the arm. Joint positions and
-    velocities stay within their limits. Accelerations, the elbow, obstacles and tracking losses are not handled,
-    because the thesis does not handle them: when the person is lost, the target stays, and it jumps when the person
+    In each control step, the tool moves towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
+    3.9). The length of every step is limited, because the damping would otherwise stop the arm. Joint positions and
+    velocities stay within their limits. Like the thesis, the method does not handle accelerations, the elbow, obstacles
+    and tracking losses. When the person is lost, the target therefore stays where it is, and jumps when the person
     returns.
 
     Args:
@@ -190,14 +191,16 @@ class ThesisRetargeter(Retargeter):
         correspondence: correspondence between the person's arm and the robot's.
         dt: control period [s].
         scene: ignored.
-        small_angle: ``"thesis"`` includes the term printed after Eq 3.9.
-        as_printed: names of misprints from :data:`PRINTED` to reproduce; True: all of them. Limits are kept
-            nevertheless.
-        smoothing: ``"live"``; ``"global"``: :meth:`run` fits one curve to the whole recording, without lag
-            (:meth:`step` is live); None: no curve.
+        small_angle: None: damping as in Eq 3.9; ``"thesis"``: damping with the small-angle term that the thesis prints
+            after Eq 3.9.
+        as_printed: names of the misprints in :data:`PRINTED` to reproduce; True: all misprints. The arm stays within
+            its limits in any case.
+        smoothing: ``"live"``: a curve is fitted to the last 0.6 s; ``"global"``: :meth:`run` fits one curve to the
+            whole recording, without lag, but :meth:`step` uses a live curve; None: no curve.
         lag: lag of the live curve [s].
-        iterations: increments per frame.
-        gain: gain K of the twist :math:`K \log(T_d T^{-1})` [1/s]: the inverse of the frame period.
+        iterations: number of increments of the person's joint angles per frame.
+        gain: gain K of the tool's twist :math:`K \log(T_d T^{-1})` [1/s]; the default is the inverse of the frame
+            period.
         max_speed: largest norm of the twist [m/s], with 1 rad counted as 0.3 m.
 
     Raises:
@@ -255,8 +258,8 @@ class ThesisRetargeter(Retargeter):
             q: start posture, shape (n_joints,) [rad]; None: ``arm.home``.
 
         Raises:
-            InputError: when there are fewer than two skeletons, times do not increase, or, with one curve for all,
-                fewer than four show the arm.
+            InputError: when there are fewer than two skeletons, when times do not increase, or when ``smoothing`` is
+                ``"global"`` and fewer than four skeletons show the arm.
         """
         frames = in_order(skeletons)
         if self._smoothing == "global":
@@ -276,7 +279,7 @@ class ThesisRetargeter(Retargeter):
         return estimate
 
     def _sample(self, estimate: ArmEstimate) -> HandSample:
-        """Return the pose of the hand of the tracked arm."""
+        """Return the pose of the hand, computed from the tracked joint angles."""
         lengths = self._estimator.lengths
         assert lengths is not None  # else there would be no estimate
         wrist, hand = self._tracker.follow(estimate, lengths)
@@ -284,7 +287,7 @@ class ThesisRetargeter(Retargeter):
         return HandSample(estimate.time, wrist, hand, (known, max(rotated, _UNSEEN)))
 
     def _hand(self) -> tuple[Array, Array]:
-        """Return wrist and hand on the smoothed curve, where the clutch engages, so that the tool does not jump."""
+        """Return wrist and hand on the smoothed curve; the clutch engages at these, so that the tool does not jump."""
         hand = self._curve.now()
         assert hand is not None
         return hand
