@@ -100,7 +100,7 @@ def read_arm(
         package_path: folders to search for meshes and ROS packages.
 
     Raises:
-        UnknownNameError: when the name is neither a packaged one nor a file.
+        UnknownNameError: when the name is neither a packaged name nor a file.
         FileFormatError: when the file can't be read as a robot.
         InputError: when it has no joint, or the requested flange or tool can't be used.
     """

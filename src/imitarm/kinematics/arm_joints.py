@@ -65,9 +65,10 @@ class _Limb:
 def arm_end(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjsBody, list[str]]:
     """Return the last body of the only arm in ``spec``, and notes on the bodies that were left out.
 
-    The arm ends before the jaws or fingers of a hand. These are joints with such names, parallel joints coupled to each
-    other (mimic joints), a short slide at the end, or several short chains that branch off at the end of a longer
-    chain. A short branch next to a much longer chain (such as a head or a wheel) is left out.
+    The arm ends before the jaws or fingers of a hand. These are recognised as joints with names such as jaw or finger,
+    parallel joints coupled to each other (mimic joints), a short slide at the end, or several short chains that branch
+    off at the end of a longer chain. A short branch next to a much longer chain (such as a head or a wheel) is left
+    out.
 
     Raises:
         InputError: when no joint moves a body, or when several chains could be the arm; the message lists them.
@@ -98,7 +99,7 @@ def arm_end(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjsBody, list[str]]
 
 
 def _limbs(body: mujoco.MjsBody, before: tuple[str, ...], hand: frozenset[str], notes: list[str]) -> list[_Limb]:
-    """Return the chains that could be an arm and that pass through ``body``; ``before`` are the joints below it."""
+    """Return the chains through ``body`` that could be an arm; ``before`` are the joints between base and ``body``."""
     own = [joint.name for joint in body.joints]
     if hand.intersection(own):
         return []
@@ -126,7 +127,7 @@ def _limbs(body: mujoco.MjsBody, before: tuple[str, ...], hand: frozenset[str], 
 
 
 def _last_fixed(body: mujoco.MjsBody) -> mujoco.MjsBody:
-    """Follow fixed links from the last moving link while the next is the only one, or one is named tool0 or flange."""
+    """Return the last of the fixed links that follow ``body``; at a branch, follow the link named tool0 or flange."""
     while True:
         fixed = [child for child in body.bodies if not list(child.joints)]
         named = [child for child in fixed if _END_LINK.search(child.name)]

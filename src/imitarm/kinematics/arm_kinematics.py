@@ -137,7 +137,7 @@ class ArmMemory:
         return positions
 
     def landmark_jacobians(self) -> Array:
-        """Return the Jacobians of the landmarks, one below the other, (3 m, n), as a view that is overwritten."""
+        """Return the stacked Jacobians of the landmarks, (3 m, n), as a view that the next call overwrites."""
         for site, rows in self._landmarks:
             mujoco.mj_jacSite(self._model, self.data, rows, None, site)
         return self._stacked[:, self._joints] if self._views is None else self._views[1]
@@ -318,10 +318,10 @@ def find_posture(
 ) -> Array:
     r"""Find joint positions within the limits that bring the tool to ``pose``.
 
-    The method is Levenberg-Marquardt: steps :math:`J^T(JJ^T+\mu)^{-1}e` of the joints that are not at a limit, with
-    damping :math:`\mu` proportional to the squared error :math:`|e|^2` (Sugihara, IEEE T-RO 27(5), 2011), and a drift
-    towards the starting posture in the null space. The search starts from ``q0``, then from ``home``, then from random
-    postures.
+    The method is Levenberg-Marquardt (Sugihara, IEEE T-RO 27(5), 2011). Each step moves the joints that are not at a
+    limit by :math:`J^T(JJ^T+\mu)^{-1}e`, where the damping :math:`\mu` is proportional to the squared error
+    :math:`|e|^2`. In the null space, the joints drift towards the starting posture. The search starts from ``q0``, then
+    from ``home``, then from random postures.
 
     Args:
         arm: the arm.

@@ -26,9 +26,9 @@ def find_meshes(spec: mujoco.MjSpec, path: Path, root: XmlElement, package_path:
     """Replace the file name of every mesh in ``spec`` by the path at which it was found.
 
     Each file is searched for under the path as written (in the file's ``meshdir``), relative to the robot's file, and
-    in the folders of ``package_path``. For ``package://NAME/...`` the package is a folder of that name, or one whose
-    ``package.xml`` has that name: above or beside the robot's file, in ``package_path``, and in the folders of the
-    environment variables ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
+    in the folders of ``package_path``. In ``package://NAME/...``, NAME is a ROS package, which is a folder of that name
+    or a folder whose ``package.xml`` has that name. Packages are searched for above and beside the robot's file, in
+    ``package_path``, and in the folders of the environment variables ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
 
     Raises:
         FileFormatError: when a mesh is not found or has a format that can't be read; the message names the mesh,

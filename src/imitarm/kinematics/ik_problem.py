@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class Box(NamedTuple):
-    """Bounds of each joint velocity, ``lower <= v <= upper``; always kept.
+    """Bounds of each joint velocity, ``lower <= v <= upper``, which the solver always keeps.
 
     Attributes:
         lower: lower bounds, shape (n_joints,) [rad/s].

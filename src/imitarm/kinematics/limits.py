@@ -182,9 +182,9 @@ class WristSingularityLimit(Limit):
 
     The wrist is singular at every multiple of pi, because the joint axes before and after the wrist joint are parallel
     there. If the joint is farther than 0.1 rad from the nearest such multiple, let D be the excess. The joint's
-    velocity away from the multiple must be at least :math:`-v_b(D)` (see :class:`JointLimits`), or 5/s times the
-    distance missing to 0.1 rad if the joint is closer than that. The price of a violation is low, so that the wrist can
-    rotate through a singular position if necessary.
+    velocity away from the multiple must then be at least :math:`-v_b(D)` (see :class:`JointLimits`). If the joint is
+    closer than 0.1 rad, this velocity must be at least 5/s times the distance that is missing to 0.1 rad. The price of
+    a violation is low, so that the wrist can rotate through a singular position if necessary.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.

@@ -148,7 +148,7 @@ def rotate(q: ArrayLike, vectors: ArrayLike) -> Array:
 
 
 def continuous_signs(quaternions: ArrayLike) -> Array:
-    """Flip signs along the first axis so that neighbours never jump from ``q`` to ``-q``.
+    """Flip the signs of quaternions so that successive ones never jump from ``q`` to ``-q``.
 
     Args:
         quaternions: unit quaternions wxyz in time order, shape (n, 4).
@@ -194,7 +194,7 @@ def mean_quaternion(quaternions: ArrayLike) -> Array:
 
 
 def checked_unit_quaternions(quaternions: ArrayLike, what: str) -> Array:
-    """Return ``quaternions`` (..., 4) scaled to length one; raise an error if a length is not one.
+    """Return ``quaternions`` (..., 4) scaled to length one; raise an error if a length is off by over 1e-3.
 
     Args:
         quaternions: quaternions wxyz, shape (..., 4).
@@ -314,7 +314,7 @@ class Pose:
         return np.asarray(given @ self.rotation.T + self.position)
 
     def error_to(self, target: Pose) -> Array:
-        r"""Return the displacement that moves this pose to ``target``, in the common frame, shape (6,).
+        r"""Return the translation and rotation from this pose to ``target``, in the frame of both poses, shape (6,).
 
         The linear part is :math:`p_{target} - p` [m], the angular part :math:`\log(R_{target} R^T)` [rad] (Lynch and
         Park, Modern Robotics, 2017, section 3.2.3).

@@ -201,8 +201,8 @@ class ElbowTask(NamedTuple):
 def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] | None:
     r"""Return the joint motion that does not move the tool and changes a given quantity most.
 
-    With J the tool's Jacobian and g the gradient of the quantity, the motion is along :math:`(I - J^+ J)\,g`; a motion
-    e of the tool changes the quantity by :math:`g^T J^+ e`.
+    Let J be the tool's Jacobian and g the gradient of the quantity. The returned motion is along :math:`(I - J^+
+    J)\,g`. A motion e of the tool changes the quantity by :math:`g^T J^+ e`.
 
     Args:
         jacobian: Jacobian of the tool, shape (m, n_joints).

@@ -76,7 +76,7 @@ class Intrinsics:
         return np.stack([self.fx * x / ahead + self.cx, self.fy * y / ahead + self.cy], axis=-1)
 
     def rays(self) -> Array:
-        """Return the viewing direction of each pixel, shape (height, width, 3): the point of its ray with ``z = 1``."""
+        """Return the point with ``z = 1`` on the ray of each pixel, in the camera's frame, shape (height, width, 3)."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)
 

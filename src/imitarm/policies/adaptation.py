@@ -79,8 +79,8 @@ class Adaptation:
             obstacles.
         certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m].
         only_on_schedule: whether the guarantee depends on the schedule, because an obstacle moves. The guarantee then
-            holds only while the motion is on time, which means that the tool is at each sample of ``trajectory`` at its
-            time, counted from the time of the scene. The guarantee ends with the last sample.
+            holds only while the motion is on time, which means that the tool reaches each sample of ``trajectory`` at
+            the sample's time, counted from the scene's ``stamp``. The guarantee ends with the last sample.
         validity: text that says what the guarantee assumes and what it does not cover.
         deviation: largest displacement of a mean, in standard deviations of the demonstrations (Mahalanobis distance).
         jerk_ratio: largest jerk of the adapted path, divided by the largest jerk of the nominal path.
@@ -117,7 +117,7 @@ class Adaptation:
 
     @property
     def unmoved_fraction(self) -> float:
-        """Fraction of the components that stayed where they were learned."""
+        """Fraction of the components that were not moved."""
         return float(1.0 - np.mean(self.moved))
 
     @property
@@ -177,8 +177,8 @@ def adapt(
 
     Args:
         skill: a fitted skill, or its decomposed path (``ComponentPath.of_skill``), which can be adapted to many scenes.
-            A decomposed path has its own ends, pinned times and samples: ``pinned``, ``start`` and ``n_samples`` must
-            be left out, and it must end at the goal of the scene, if there is one.
+            A decomposed path has its own ends, pinned times and samples, so leave out ``pinned``, ``start`` and
+            ``n_samples``. If the scene has a goal, the decomposed path must end there.
         scene: goal (None: the learned one) and obstacles.
         method: a name in ``ADAPTERS``: ``"certified"``, ``"mapf"``, ``"literal"`` or a registered method.
         tool_radius: the tool as one sphere of this radius about its tip [m]; 0 for a point.
@@ -295,7 +295,7 @@ def _unit_rows(directions: ArrayLike) -> Array:
 def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
     """Return the detour that the method finds.
 
-    It does not search when no obstacle blocks the path or when an obstacle covers a fixed point.
+    No search is made when no obstacle blocks the path or when an obstacle covers a fixed point.
     """
     path, clearance, lowest = problem.path, problem.clearance, problem.nominal.lowest
     still = np.zeros((path.n_components, 3))
@@ -329,8 +329,9 @@ def _jerk_reason(scene: Scene, detour: Detour, ratio: float, clearance: float) -
     pair = int(np.argmin(detour.clearance.distance.min(axis=1))) if tool.n_pairs else 0
     name = scene.name_of(pair // tool.n_spheres) if tool.n_pairs else "an obstacle"
     return (
-        f"no smoother path was found that keeps {1e3 * clearance:.0f} mm from {name}: its jerk is {ratio:.0f} times "
-        f"that of the nominal path (limit {MAX_JERK_RATIO:.0f}); execute it more slowly, or move the obstacle"
+        f"no smoother path was found that keeps {1e3 * clearance:.0f} mm from {name}: the jerk of the best path is "
+        f"{ratio:.0f} times that of the nominal path (limit {MAX_JERK_RATIO:.0f}); execute it more slowly, or move the "
+        "obstacle"
     )
 
 
@@ -348,8 +349,8 @@ def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str
     left = f"{1e3 * float(detour.bounds[worst]) + 0.0:.1f} mm"
     if not adapter.refuses:
         return (
-            f"the path passes {name} at {left} ({required}): method {method!r} pushes components and ignores the path "
-            f"between them; try method 'certified'"
+            f"the path passes {name} at a distance of {left} ({required}): method {method!r} pushes components and "
+            "ignores the path between them; try method 'certified'"
         )
     if not problem.allowed.dimension:
         return (
@@ -368,7 +369,7 @@ def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str
     held = path.basis[sample].sum() < 0.5
     n_forbidden = len(problem.allowed.forbidden)
     return (
-        f"no path around {name} with {required}: the best attempt leaves {left}"
+        f"no path around {name} with {required}: the best attempt has a clearance of {left}"
         + (f", and {', '.join(map(scene.name_of, sorted(near)))} are also too close" if near else "")
         + ("; the obstacle is too close to a point that must not move" if held else "")
         + (f"; {n_forbidden} forbidden direction(s) were excluded" if n_forbidden else "")
@@ -380,6 +381,7 @@ def _at_fixed(path: ComponentPath, name: str, sample: int, left: float, required
     """Return a message which says that an obstacle is too close to a point that must not move."""
     at, end = path.nominal.times[sample], path.nominal.times[-1]
     where = "start" if at < 0.02 * end else "goal" if at > 0.98 * end else f"pinned point at {at:.2f} s"
-    lies = f"covers the {where}" if left <= 0.0 else f"leaves {1e3 * left:.0f} mm at the {where} ({required})"
+    gap = f"leaves {1e3 * left:.0f} mm of clearance at the {where} ({required})"
+    lies = f"covers the {where}" if left <= 0.0 else gap
     other = where if where in {"start", "goal"} else "pinned time"
     return f"{name} {lies}; this point must not move: move the obstacle, or choose another {other}"

@@ -160,8 +160,8 @@ class ToolAmongObstacles:
     def exits(self, pair: int, points: Array, directions: Array, target: float, tolerance: float) -> Array:
         """Return how far points must move along directions to leave the inflated obstacle.
 
-        Newton's method from outside: the signed distance along a ray is convex, so the computed distance decreases to
-        the largest root without passing it.
+        Newton's method starts from outside. Because the signed distance along a ray is convex, the computed distance
+        decreases to the largest root without passing it.
 
         Args:
             pair: index of the pair.

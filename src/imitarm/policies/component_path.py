@@ -261,7 +261,7 @@ def _sample_times(n_samples: int, fixed_times: tuple[float, ...]) -> Array:
 
 
 def _window(times: Array, fixed_times: Sequence[float], width: float) -> Array:
-    """Return w (n,): 0 at each fixed time, 1 more than ``width`` (fraction of the duration) away from all of them."""
+    """Return w (n,): 0 at each fixed time, and 1 if every fixed time is at least ``width`` durations away."""
     distance = np.min(np.abs(times[:, None] - np.asarray(fixed_times)[None, :]), axis=1)
     return quintic_step(distance / (width * (times[-1] - times[0])))
 

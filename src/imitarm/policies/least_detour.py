@@ -158,8 +158,9 @@ class Detour:
         displacement: displacement of each component's mean, shape (n_components, 3) [m].
         clearance: distances along the displaced path.
         bounds: guaranteed lower bound of the clearance of each pair over the whole path, shape (n_pairs,) [m].
-        feasible: whether every bound reaches the required clearance and the path is within the stated limits.
-        out_of_limits: whether the path's displacement or its steps exceed the stated limits.
+        feasible: whether every bound reaches the required clearance and the path is within ``MAX_DISPLACEMENT`` and
+            ``MAX_STEP_RATIO``.
+        out_of_limits: whether the path exceeds ``MAX_DISPLACEMENT`` or ``MAX_STEP_RATIO``.
         close: points that are too close although the samples before and after them are not.
     """
 
@@ -234,7 +235,7 @@ class LeastDetour:
         self.movable = path.lever > (1e-3 if exact else NEGLIGIBLE_LEVER)
 
     def _beyond_limits(self, positions: Array) -> _Cuts:
-        """Return half-spaces that contain every path within the stated limits and exclude this path."""
+        """Return half-spaces that contain every path within the limits on displacement and steps, but not this path."""
         nominal, basis = self.path.nominal.positions, self.path.basis
         away, step = positions - nominal, np.diff(positions, axis=0)
         far, long = np.linalg.norm(away, axis=1), np.linalg.norm(step, axis=1)
@@ -246,7 +247,7 @@ class LeastDetour:
         return _Cuts(np.concatenate([basis[j], basis[k + 1] - basis[k]]), direction, bound)
 
     def evaluate(self, displacement: Array, clearance: PathClearance) -> Detour:
-        """Return the certificate of a displaced path, and whether the path is within the stated limits."""
+        """Return the certificate of a displaced path, and whether its displacement and steps are within the limits."""
         bounds, close = clearance.certified(self.clearance)
         away = clearance.positions - self.path.nominal.positions
         out = bool(np.sqrt(np.einsum("nd,nd->n", away, away).max()) > MAX_DISPLACEMENT) or (

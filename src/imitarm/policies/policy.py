@@ -281,7 +281,7 @@ class ACFRA(Policy):
             return Command(twist, progress=progress, status=Status.WAITING, reason=reason)
         displaced = float(np.interp(self._phase, self.adaptation.trajectory.times, self._displaced))
         if displaced > _DISPLACED:
-            reason = f"the path is moved by {1e3 * displaced:.0f} mm here"
+            reason = f"the path is displaced by {1e3 * displaced:.0f} mm here because of an obstacle"
             return Command(twist, progress=progress, status=Status.AVOIDING, reason=reason)
         return Command(twist, progress=progress)
 

@@ -22,12 +22,12 @@ _CHANGED = 1e-9  # relative change of a velocity above which a limit counts as h
 def limit_velocity(
     limits: JointLimits, q: ArrayLike, previous: ArrayLike, velocity: ArrayLike, dt: float
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return the velocity nearest to the requested one that the joints can reach and from which they can brake in time.
+    """Return the velocity nearest to the requested one that the joints can reach and can still brake from in time.
 
     First, all joints are slowed by one factor until none exceeds its maximum velocity, so that the tool keeps its
     direction. Then each joint is clipped to the box of :class:`~imitarm.kinematics.limits.JointLimits`, evaluated at
-    ``q + previous * dt / 2`` and not at ``q``: the box assumes that the set-point moves by ``velocity * dt``, but with
-    constant acceleration a robot moves by ``(previous + velocity) / 2 * dt``.
+    ``q + previous * dt / 2`` and not at ``q``, because the box assumes that the set-point moves by ``velocity * dt``,
+    but with constant acceleration a robot moves by ``(previous + velocity) / 2 * dt``.
 
     Args:
         limits: limits of the arm.

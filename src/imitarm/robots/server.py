@@ -1,4 +1,4 @@
-"""RobotServer: serves a robot to clients over UDP; its Supervisor checks every datagram and stops the robot in time."""
+"""RobotServer: serves a robot to clients over UDP; its Supervisor stops the robot if valid commands fail to arrive."""
 
 from __future__ import annotations
 
@@ -49,18 +49,19 @@ def fingerprint(arm: ArmModel) -> int:
 class Supervisor:
     r"""Lets one remote client move a robot while it sends valid commands, and checks every command.
 
-    ========== ============================================== ======================================================
-    status     what the robot does                            what ends it
-    ========== ============================================== ======================================================
-    stopped    holds its position; ignores commands           ENABLE with the challenge of this stop
-    following  moves to the newest commanded positions        no valid command for 0.1 s: slowing; STOP: stopped
-    slowing    brakes to rest, then holds its position        a valid command: following; none for 0.5 s: stopped
-    fault      has made a protective stop                     a restart of the process
-    ========== ============================================== ======================================================
+    The supervisor always has one of four statuses:
 
-    It starts stopped. Every stop generates a new random challenge, so a recorded ENABLE has no effect, and after a
-    restart of the client its user must enable the robot again. The client that enables the robot is its owner until the
-    next stop. Any client may stop it.
+    * ``stopped``: the robot holds its position, and commands are ignored. An ENABLE with the challenge of this stop
+      changes the status to ``following``.
+    * ``following``: the robot moves to the newest commanded positions. If no valid command arrives for 0.1 s, the
+      status becomes ``slowing``. STOP changes it to ``stopped``.
+    * ``slowing``: the robot brakes to rest and holds its position. A valid command changes the status to
+      ``following``. If none arrives for 0.5 s, it becomes ``stopped``.
+    * ``fault``: the robot has made a protective stop. Only a restart of the process ends this status.
+
+    The first status is ``stopped``. Every stop generates a new random challenge, so a recorded ENABLE has no effect,
+    and after a restart of the client its user must enable the robot again. The client that enables the robot is its
+    owner until the next stop. Any client may stop the robot.
 
     A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this
     arm, is within the joints' position and velocity limits, and is at most as far from the set-point as the joints
@@ -86,7 +87,7 @@ class Supervisor:
 
     Attributes:
         robot: the robot.
-        status: see the table.
+        status: see the list of statuses above.
         reason: why the robot is stopped or faulty.
         challenge: number that ENABLE must currently contain; 0 if the robot is not stopped.
         datagram_filter: checks the owner's commands.
@@ -95,7 +96,9 @@ class Supervisor:
 
     def __init__(self, robot: Robot, dt: float, *, on_event: Callable[[str], None] | None = None) -> None:
         if robot.arm.n_joints > MAX_JOINTS:
-            raise DatagramError("range", f"{robot.arm.n_joints} joints are more than {MAX_JOINTS}")
+            raise DatagramError(
+                "range", f"the arm has {robot.arm.n_joints} joints, but a datagram can hold at most {MAX_JOINTS}"
+            )
         self.robot, self.dt = robot, dt
         self._arm = fingerprint(robot.arm)
         self._on_event = on_event

@@ -71,8 +71,8 @@ class SimulatedRobot(Robot):
             arm: the arm with its tool.
             scene: its obstacles and fixtures become solid bodies; None: no obstacles. Its ``stamp`` is the start time
                 of the world. Without fixtures and ``world``, a floor and a pedestal are added.
-            motion: motions of some obstacles, by name or index: functions of the time on the scene's clock, or a
-                recorded :class:`~imitarm.scene.motion.Track`. Other obstacles keep their velocities.
+            motion: motions of some obstacles, by name or index. Each motion is a function of the time on the scene's
+                clock, or a recorded :class:`~imitarm.scene.motion.Track`. Other obstacles keep their velocities.
             world: world with the arm, built by :func:`~imitarm.robots.world.arm_world` and possibly extended by
                 furniture; it is copied. None: the world is built from the scene.
             control: ``"position"`` or ``"torque"``.
@@ -319,8 +319,8 @@ class Drives:
     """One drive for each joint; every method makes one physics step.
 
     ``M`` is the inertia matrix with the rotors, ``h`` the torques of gravity and Coriolis forces, and ``f`` the joints'
-    viscous and dry friction at ``v_d``. ``q_d``, ``v_d`` and ``a_d`` are the set-point. The rated torques are never
-    exceeded.
+    viscous and dry friction at ``v_d``. ``q_d``, ``v_d`` and ``a_d`` are position, velocity and acceleration of the
+    set-point. The rated torques are never exceeded.
 
     Args:
         model: the compiled world, with the drives that :func:`add_drives` has added.

@@ -120,7 +120,8 @@ class UdpRobot(Robot):
             )
         if self._other_arm:
             raise InputError(
-                f"{address[0]}:{address[1]}: the robot there is not {self.arm.name}; choose the model of the arm there"
+                f"{address[0]}:{address[1]}: the robot there is not {self.arm.name}; choose the model of the arm that "
+                "the server controls"
             )
         self._begin(self.reported.set_point)
 

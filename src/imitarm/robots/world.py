@@ -80,7 +80,7 @@ def fixture_names(fixtures: Sequence[Obstacle]) -> list[str]:
 
 
 def add_obstacles(spec: mujoco.MjSpec, scene: Scene) -> None:
-    """Add every obstacle of ``scene`` as a solid body that can be moved but not pushed away.
+    """Add every obstacle of ``scene`` as a solid body that follows given motions and that contacts can't push.
 
     Args:
         spec: world; changed in place.

@@ -63,7 +63,7 @@ class Polytope:
 
     @classmethod
     def around(cls, points: Array) -> Polytope:
-        """Build from centred points (n, 3) that span space."""
+        """Build from centred points (n, 3) that span a volume."""
         from scipy.spatial import ConvexHull as Qhull  # noqa: PLC0415  slow to import, and few scenes need it
 
         hull = Qhull(points)
@@ -190,7 +190,7 @@ class ConvexHull(Obstacle):
             raise InputError(f"{self._label}: points must be at least 4 to span a volume, got {len(points)}")
         if np.abs(points).max() > MAX_COORDINATE or np.ptp(points, axis=0).max() > MAX_SIZE:
             raise InputError(
-                f"{self._label}: points reach from {points.min(axis=0).tolist()} to {points.max(axis=0).tolist()}, "
+                f"{self._label}: the points reach from {points.min(axis=0).tolist()} to {points.max(axis=0).tolist()}, "
                 f"beyond {MAX_SIZE:g} m in size or {MAX_COORDINATE:g} m in place; give them in metres"
             )
         points.setflags(write=False)

@@ -358,12 +358,12 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
 
 
 def _every(parameters: Parameters) -> list[Array | None]:
-    """Return the parameters of all members with a last axis for the points."""
+    """Return the parameters of all members of a family, with an additional last axis for the points."""
     return [None if p is None else p[..., None] for p in parameters]
 
 
 def _take(parameters: Parameters, members: Indices) -> list[Array | None]:
-    """Return the parameters of one member for each point."""
+    """Return, for each point, the parameters of one member of a family."""
     return [None if p is None else p.take(members, axis=-1) for p in parameters]
 
 

@@ -175,9 +175,9 @@ def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor:
 
     The surface point nearest to ``y`` is ``e_j = g_j^2 y_j / (t + g_j^2)`` with semi-axes ``g``, where ``t`` is the
     largest root of ``F(t) = sum_j (g_j y_j / (t + g_j^2))^2 - 1``. With ``s = t + min g^2`` the function
-    ``h(s) = 1 / sqrt(F + 1)`` is concave and rises, so Newton's method on ``h = 1`` from the left never steps over the
-    root and needs no bracket. With the unit normal ``n`` at ``e`` the distance is ``n.y - sqrt(sum_j g_j^2 n_j^2)``. An
-    error in ``n`` has only a quadratic effect on the distance and never makes it too large.
+    ``h(s) = 1 / sqrt(F + 1)`` is concave and increasing, so Newton's method on ``h = 1`` from the left never steps over
+    the root and needs no bracket. With the unit normal ``n`` at ``e`` the distance is ``n.y - sqrt(sum_j g_j^2
+    n_j^2)``. An error in ``n`` has only a quadratic effect on the distance and never makes it too large.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].

@@ -53,8 +53,8 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
 
     Raises:
         InputError: when there is no such file or it can't be read.
-        FileFormatError: when it is not a scene file or an entry is wrong; the message names the file, the entry and the
-            key, and lists the known keys or values.
+        FileFormatError: when the file is not a scene file or an entry is wrong; the message names the file, the entry
+            and the key, and lists the known keys or values.
     """
     path = file_path(path, "path")
     try:
@@ -326,7 +326,7 @@ def _required(entry: Mapping[Any, Any], key: str, where: str) -> Any:
 
 
 def _scaled(value: object, where: str, metres: float, depth: int = 2) -> Any:
-    """Return a number, a list of numbers or a list of such lists times ``metres``."""
+    """Return a number, a list of numbers or a list of such lists, with each number multiplied by ``metres``."""
     if isinstance(value, list) and depth:
         return [_scaled(item, f"{where}[{i}]", metres, depth - 1) for i, item in enumerate(value)]
     if isinstance(value, str) and _ODD_NUMBER.match(value) and not (_INTEGER.match(value) or _REAL.match(value)):

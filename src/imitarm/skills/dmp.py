@@ -103,15 +103,15 @@ class DMP:
 
     This form replaces thesis Eqs 2.8 to 2.12, which scale the force by g - x_0 and therefore fail for an axis that does
     not move. tau is the duration, so K and D have no unit: ``"critical"`` gains have D = 2 sqrt(K); the ``"thesis"``
-    gains K = 139.26, D = 28 have a damping ratio of 1.186. Equivalently, the spring follows a moving target ``y(s) = g
-    - (g - x_0) s + f(s)`` that ends at the goal.
+    gains K = 139.26, D = 28 have a damping ratio of 1.186. Equivalently, the spring follows a moving target that ends
+    at the goal: ``y(s) = g + f(s) + (x_0 - g) s``.
 
     **Fitting** (:func:`~imitarm.skills.dynamical_systems.fit_weights`) is ridge regression on the positions. Measured
     positions are not differentiated, samples may have any times, and the motion reaches the goal at the end of the
     duration.
 
-    **Another start or goal.** With ``p`` the fraction of the path that has been travelled (a primitive from 0 to 1 with
-    weights w_p), ``adjustment`` selects the weights:
+    **Another start or goal.** Let ``p`` be the fraction of the path that has been travelled, which is a primitive from
+    0 to 1 with weights w_p. The argument ``adjustment`` then selects the weights:
 
     * ``"progress"``: w + (change of g - x_0) w_p. The change of start and goal is added in proportion to the travelled
       path. The motion therefore rests where the demonstration rests, does not reverse when the distance is halved, and

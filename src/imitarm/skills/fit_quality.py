@@ -23,7 +23,7 @@ _REPEATS = 0.1  # of the difference between unrelated positions: a motion repeat
 
 
 class PoorFitWarning(UserWarning):
-    """A skill does not reproduce the motion of its demonstrations, see ``Skill.fit_quality_``."""
+    """Warns that a skill does not reproduce the motion of its demonstrations; see ``Skill.fit_quality_``."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class DemonstrationDistance:
 class FitQuality:
     """How well a skill fits its demonstrations.
 
-    The bias is the distance between the skill and the average of the demonstrations at the same times, root mean
-    square. Differences between demonstrations do not count as bias; they are the skill's tolerance. A skill with a bias
-    above 5 % of the motion's extent is not :attr:`faithful`.
+    The bias is the root mean square distance between the skill and the average of the demonstrations at the same times.
+    Differences between demonstrations do not count as bias; they are the skill's tolerance. A skill with a bias above 5
+    % of the motion's extent is not :attr:`faithful`.
 
     Attributes:
         distances: distances of the nominal path to each demonstration.

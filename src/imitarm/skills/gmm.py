@@ -62,8 +62,8 @@ class GaussianMixture:
 
     * Columns are standardised internally, so the result does not depend on the units.
     * ``init="time"`` starts from the best division of column 0 into K segments
-      (:func:`~imitarm.skills.mixture_fitting.responsibilities_by_segments`). It is deterministic and meant for samples
-      [t; x].
+      (:func:`~imitarm.skills.mixture_fitting.responsibilities_by_segments`). This start is deterministic and is meant
+      for samples [t; x].
     * A constant column (such as z in a planar task) does not influence the other columns. It is listed
       in ``degenerate_axes_`` and reported by a :class:`DegenerateAxisWarning`.
 
@@ -132,7 +132,10 @@ class GaussianMixture:
         """
         X = _table(X, "GaussianMixture.fit")
         if self.min_std.ndim and len(self.min_std) != X.shape[1]:
-            raise InputError(f"GaussianMixture.fit: {len(self.min_std)} min_std for {X.shape[1]} columns")
+            raise InputError(
+                f"GaussianMixture.fit: min_std has {len(self.min_std)} numbers, but X has "
+                f"{X.shape[1]} columns; give one number or one per column"
+            )
         if len(X) < max(2, self.n_components):
             raise InputError(
                 f"GaussianMixture.fit: {len(X)} samples are too few for {self.n_components} components; "

@@ -48,7 +48,7 @@ class GMR:
     r"""Gaussian mixture regression over time, of positions and rotations.
 
     A :class:`~imitarm.skills.gmm.GaussianMixture` is fitted to all samples z = [t; x] of all demonstrations. The
-    regression then conditions it on t, as in thesis Eq 2.6, whose printed version lacks the responsibilities
+    regression then conditions this mixture on t, as in thesis Eq 2.6, whose printed version lacks the responsibilities
     :math:`h_k`:
 
     .. math::

@@ -85,8 +85,9 @@ def packing(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
     """Return the maps between a symmetric (size, size) matrix and its packed upper triangle.
 
     Returns:
-        The indices of the packed numbers in the flat matrix, the (size, size) indices of each entry in the packed
-        numbers, and the factors of the packed numbers in ``-[1; z]^T M^-1 [1; z] / 2``.
+        Three arrays. The first gives the index of each packed number in the flat matrix. The second, of shape (size,
+        size), gives the index of each matrix entry among the packed numbers. The third gives the factor of each packed
+        number in ``-[1; z]^T M^-1 [1; z] / 2``.
     """
     i, j = np.triu_indices(size)
     unpack = np.empty((size, size), dtype=np.intp)
