@@ -125,7 +125,7 @@ def test_the_command_says_how_it_goes(skill_and_path):
         seen.append(policy.step(Observation(k * DT, STILL, Pose(position, [1, 0, 0, 0]), scene), DT))
         position = position + (DT * seen[-1].twist[:3] if k < 200 else 0.0)
     assert seen[0].status is Status.NOMINAL and not seen[0].reason
-    assert any(command.status is Status.AVOIDING and "moved by" in command.reason for command in seen)
+    assert any(command.status is Status.AVOIDING and "displaced by" in command.reason for command in seen)
     assert seen[-1].status is Status.WAITING and "behind its path" in seen[-1].reason
     progress = [command.progress for command in seen]
     assert progress == sorted(progress) and 0.0 <= progress[0] < progress[-1] < 1.0
