@@ -296,7 +296,10 @@ BAD = [
     (lambda: ConvexHull([*TETRAHEDRON, [0, np.nan, 0]]), "points must be finite [m], but points[4, 1]"),
     (lambda: ConvexHull([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), "the 4 points lie in one plane"),
     (lambda: ConvexHull([[1, 2, 3]] * 5), "the 5 points lie in one plane"),
-    (lambda: ConvexHull(np.multiply(TETRAHEDRON, 200)), "beyond 10 m in size or 100 m in place; give them in metres"),
+    (
+        lambda: ConvexHull(np.multiply(TETRAHEDRON, 200)),
+        "must span at most 10 m and lie within 100 m of the base; give them in metres",
+    ),
 ]
 
 

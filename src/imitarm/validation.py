@@ -71,7 +71,7 @@ def finite_points(points: Any) -> Array:
     """Return finite points as an array of shape (..., 3).
 
     Raises:
-        InputError: when they are not numbers, the last axis has not length 3, or a number is not finite.
+        InputError: when they are not numbers, the last axis does not have length 3, or a number is not finite.
     """
     if type(points) is np.ndarray and points.dtype is _FLOAT64 and points.shape[-1:] == (3,):
         flat = points.ravel()
@@ -83,7 +83,7 @@ def finite_points(points: Any) -> Array:
 def real_array(value: Any, shape: tuple[int | EllipsisType | None, ...], what: str, unit: str = "") -> Array:
     """Return ``value`` as an array of numbers of the given shape, float64; NaN and infinities are allowed.
 
-    It is meant for measurements in which NaN marks a missing sample. The arguments are the same as in
+    Use this function for measurements in which NaN marks a missing sample. The arguments are the same as in
     :func:`finite_array`.
 
     Raises:
@@ -195,7 +195,7 @@ def choice(value: Any, names: Iterable[str], what: str) -> str:
     """Return ``value`` when it is one of ``names``.
 
     Raises:
-        UnknownNameError: when it is not one of them; the message lists the names.
+        UnknownNameError: when ``value`` is not one of ``names``; the message lists the names.
     """
     known = tuple(names)
     if not isinstance(value, str) or value not in known:

@@ -79,11 +79,11 @@ def reproduce(
 
     Returns:
         The measured motion from rest to rest. ``success`` means that the motion finished in time, touched nothing, and
-        kept the clearance that the filter requires. ``details`` holds the commanded ``"twists"`` (n, 6); ``"clamped"``,
-        how often each limit changed a command; ``"filtered"``, the number of steps in which the filter changed a
-        command to keep a clearance; ``"unsafe"``, the number of steps in which no safe motion existed; ``"statuses"``,
-        the number of steps with each status of the policy; and the entries of the robot's
-        :meth:`~imitarm.robots.robot.Robot.report`.
+        kept the clearance that the filter requires. ``details`` holds the commanded ``"twists"`` (n, 6) and several
+        counts. ``"clamped"`` says how often each limit changed a command. ``"filtered"`` is the number of steps in
+        which the filter changed a command to keep a clearance, and ``"unsafe"`` the number of steps without a safe
+        motion. ``"statuses"`` is the number of steps with each status of the policy. The entries of the robot's
+        :meth:`~imitarm.robots.robot.Robot.report` are added.
 
     Raises:
         InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not return a Command.
@@ -95,7 +95,9 @@ def reproduce(
         raise InputError(f"reproduce: needs 0 < dt <= timeout [s], got dt {dt!r} and timeout {timeout!r}")
     keeper = SafetyFilter(robot.arm, dt=dt) if safety is None else safety
     if keeper.dt != dt:
-        raise InputError(f"reproduce: the safety filter was made for dt {keeper.dt:g} s, not {dt:g} s")
+        raise InputError(
+            f"reproduce: the safety filter was made for dt {keeper.dt:g} s, not {dt:g} s; make it with the same dt"
+        )
     log = _Log(robot)
     if log.clearances[0] <= 0.0:
         raise InfeasibleError(f"the arm starts in contact ({_nearest(robot)}): move the obstacle, or start elsewhere")

@@ -274,7 +274,7 @@ class ArmModel(ArmKinematics):
         """Check that every moving link has a mass and an inertia, which torques and simulation need.
 
         Raises:
-            InputError: if a link lacks one of them; the message names these links and their lines in the file.
+            InputError: if a link lacks its mass or inertia; the message names these links and their lines in the file.
         """
         if self._mass_faults:
             raise InputError(

@@ -183,8 +183,8 @@ class ArmKinematics:
     def at(self, q: ArrayLike) -> ArmMemory:
         """Return this thread's working memory with the kinematics at ``q``.
 
-        Use it in loops that need several results for one posture. It is recomputed only for a new posture, and is valid
-        until a method is called with another posture.
+        Use it in loops that need several results for one posture. The kinematics are recomputed only for a new posture,
+        and are valid until a method is called with another posture.
         """
         # The usual case is decided here: it is on the path of every control step.
         usual = type(q) is np.ndarray and q.dtype is _FLOAT64 and q.shape == self._shape

@@ -70,7 +70,7 @@ class IKSolver:
     * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9): in joints scaled by their velocity limits
       :math:`v = J^T (J J^T+\lambda^2)^{-1} t`, with :math:`\lambda=0` for :math:`s_{min}\ge d`,
       :math:`\lambda^2=s_{min}(d-s_{min})` for :math:`d/2\le s_{min}<d` and :math:`\lambda=d/2` for smaller
-      :math:`s_{min}`, where :math:`d=|t|`. This keeps the norm of the scaled velocity at most 1.
+      :math:`s_{min}`, where :math:`d=|t|`. This damping keeps the norm of the scaled velocity at most 1.
     * ``"dls_small_angle"``: the same with half of the smallest singular value subtracted from d, as the thesis prints
       after Eq 3.9; this weakens the damping and is kept for comparison.
     * ``"svd"``, numerical filtering (Maciejewski and Klein 1988):

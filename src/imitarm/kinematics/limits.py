@@ -1,7 +1,7 @@
 """Limits of the joint velocity in one control step, as small objects that can be combined.
 
-In each control step, a :class:`Limit` returns a :class:`Box` (hard, always kept) or :class:`Rows` (soft: linear
-inequalities that may be violated if they contradict a box, or at a given price).
+In each control step, a :class:`Limit` returns a :class:`Box` or :class:`Rows`. A box is hard, so it is always kept.
+Rows are soft linear inequalities, which may be violated if they contradict a box, or at a given price.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Positions and rotations: quaternions (w, x, y, z) as arrays, and the typed :class:`Pose`.
 
-All functions take and return arrays with any leading shape and are vectorised over it. They do not check their
+All functions take and return arrays with any leading shape and are vectorised over it. The functions do not check their
 arguments; :class:`Pose` does. A single rotation is computed with plain floats, because a control step computes many
 rotations and floats are faster than a numpy array of four numbers.
 
@@ -186,7 +186,7 @@ def slerp(times: ArrayLike, key_times: ArrayLike, key_quaternions: ArrayLike) ->
 def mean_quaternion(quaternions: ArrayLike) -> Array:
     """Return the rotation (4,) wxyz that is nearest to all ``quaternions`` (n, 4), whose signs do not matter.
 
-    It is the eigenvector of the largest eigenvalue of ``sum q q^T`` (Markley et al. 2007).
+    This rotation is the eigenvector of the largest eigenvalue of ``sum q q^T`` (Markley et al. 2007).
     """
     q = np.asarray(quaternions, dtype=float).reshape(-1, 4)
     mean = np.linalg.eigh(q.T @ q)[1][:, -1]

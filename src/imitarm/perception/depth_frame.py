@@ -68,8 +68,8 @@ class Intrinsics:
             points: points in the camera's frame, shape (..., 3) [m].
 
         Returns:
-            u and v, shape (..., 2) [pixel]; nan for points that are not in front of the camera. They may be outside the
-            image.
+            u and v, shape (..., 2) [pixel]; nan for points that are not in front of the camera. Projected points may be
+            outside the image.
         """
         x, y, z = np.moveaxis(finite_array(points, (..., 3), "points", "m"), -1, 0)
         ahead = np.where(z > 0.0, z, np.nan)

@@ -167,10 +167,10 @@ def adapt(
 ) -> Adaptation:
     """Adapt the whole path of a skill to the obstacles of a scene.
 
-    ``certified`` moves the affected components by the smallest displacement that keeps the clearance on the whole path,
-    or refuses and says why. ``mapf`` and ``literal`` are the thesis's potential fields (see ``potential_components``),
-    which may fail. The path does not move at its start, at its goal and at the ``pinned`` times. Specify the tool by
-    exactly one of ``tool_radius``, ``tool_spheres`` and ``arm``.
+    The method ``certified`` moves the affected components by the smallest displacement that keeps the clearance on the
+    whole path, or refuses and says why. The methods ``mapf`` and ``literal`` are the thesis's potential fields (see
+    ``potential_components``), which may fail. The path does not move at its start, at its goal and at the ``pinned``
+    times. Specify the tool by exactly one of ``tool_radius``, ``tool_spheres`` and ``arm``.
 
     The motion begins at time 0. At that time, the obstacles are at the poses given by the scene; from then on, they
     move with their velocities.

@@ -70,9 +70,9 @@ class ToolAmongObstacles:
         obstacles: convex obstacles; a rotating obstacle is replaced by a sphere that contains it.
         spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
         radii: radii of the spheres, shape (n_spheres,) [m].
-        offsets: for each obstacle and sample, the vectors from the tip to the centres of the spheres, minus the
-            displacement of the obstacle since time 0, in the base frame, shape (n_spheres, n, 3) [m]; None when all of
-            them are zero.
+        offsets: for each obstacle, an array of shape (n_spheres, n, 3) [m]. It contains, for each sample, the vectors
+            from the tip to the centres of the spheres, minus the obstacle's displacement since time 0, in the base
+            frame. None when all of them are zero.
         bows: largest distance of a centre from the straight line between two samples while the tool rotates, shape
             (n_spheres, n - 1) [m].
     """
@@ -90,7 +90,7 @@ class ToolAmongObstacles:
         Args:
             nominal: times and rotations of the tool, n samples.
             spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
-            obstacles: obstacles at time 0; those with a velocity move from there. A rotating obstacle is replaced
+            obstacles: obstacles at time 0; obstacles with a velocity move from there. A rotating obstacle is replaced
                 by a sphere about its centre that contains it.
 
         Raises:
@@ -259,9 +259,9 @@ class PathClearance:
 
         Near a corner of an obstacle, the bound from the tangents at the two ends of a segment is much too low. The
         distance is therefore measured at the point where the tangents cross. If the distance there is below the
-        clearance, the path really is too close. Otherwise the tangent at that point replaces the tangent at the end
-        from which the distance decreases towards the point. The minimum of the distance therefore stays between two
-        tangents that converge to it.
+        clearance, the path really is too close to the obstacle. Otherwise the tangent at that point replaces the
+        tangent at the end from which the distance decreases towards the point. The minimum of the distance therefore
+        stays between two tangents that converge to it.
 
         Args:
             clearance: required clearance [m].

@@ -49,8 +49,8 @@ class ComponentPath:
 
         x(t) = x0(t) + w(t) sum_k h_k(t) Delta_k  =  x0(t) + basis(t) @ Delta
 
-    The window ``w`` is a quintic step. It is 0 at every fixed time (start, goal, contact points) and 1 elsewhere.
-    Components with ``Delta_k = 0`` have no effect.
+    The window ``w`` is a quintic step. The window is 0 at every fixed time (start, goal, contact points) and 1
+    elsewhere. Components with ``Delta_k = 0`` have no effect.
 
     Attributes:
         nominal: the path without obstacles, n samples.
@@ -59,7 +59,7 @@ class ComponentPath:
         basis: w h, shape (n, n_components); never negative.
         means: centres of the components on the nominal path, shape (n_components, 3) [m].
         covariances: position covariances of the components, with the lower bound (5 mm)^2, (n_components, 3, 3) [m^2].
-            They also include the motion itself, so a component is long in the direction of the path.
+            The covariances also include the motion itself, so a component is long in the direction of the path.
         yields: GMR's covariance at the time of each component's centre, with the same lower bound, (n_components, 3, 3)
             [m^2]. The size of a displacement is measured relative to this covariance.
         centres: index of the sample at the centre of each component, (n_components,).

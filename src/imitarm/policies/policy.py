@@ -61,10 +61,10 @@ class Policy(ABC):
     """Decides the next command from the current observation.
 
     To write your own policy, implement the three methods below in one subclass. Register the policy under the entry
-    point group ``imitarm.policies``, or by ``POLICIES.register(name, policy)``. It then appears in ``imitarm reproduce
-    --policy``, in ``imitarm benchmark placements`` and in their reports. These commands construct the policy with the
-    arguments below. Its state lasts from :meth:`reset` to the end of one reproduction; the same observations give the
-    same commands.
+    point group ``imitarm.policies``, or by ``POLICIES.register(name, policy)``. The policy then appears in ``imitarm
+    reproduce --policy``, in ``imitarm benchmark placements`` and in their reports. These commands construct the policy
+    with the arguments below. The state of a policy lasts from :meth:`reset` to the end of one reproduction; the same
+    observations give the same commands.
 
     Args:
         skill: the skill to reproduce.
@@ -128,15 +128,16 @@ class Policy(ABC):
 class ACFRA(Policy):
     r"""Adapt the whole path once, then follow it (thesis Chapter 4).
 
-    The constructor decomposes the learned path. ``reset`` adapts it to the observed scene, and raises an error when the
-    clearance can't be kept. ``step`` follows the adapted path with its own velocity plus feedback::
+    The constructor decomposes the learned path. The method ``reset`` adapts this path to the observed scene, and raises
+    an error when the clearance can't be kept. The method ``step`` follows the adapted path with the path's velocity
+    plus feedback::
 
         twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
     The phase ``s`` therefore waits for a robot that lags, for example at its speed limits or when a hand holds it. If
     ``e_0`` is the required clearance, the straight line back to the path cuts a corner by at most half of the
-    clearance, because each point of the line is within ``e_0 / 2`` of the tool or of its target, and both are clear of
-    obstacles.
+    clearance, because each point of the line is within ``e_0 / 2`` of the tool or of its target. Both of these are
+    clear of obstacles.
 
     Among moving obstacles the plan is valid only at the planned times, so the phase follows the clock and does not
     wait. When the tool is farther than ``e_0 / 2`` from its planned position, the plan is no longer valid: the arm

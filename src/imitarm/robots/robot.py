@@ -26,8 +26,8 @@ def limit_velocity(
 
     First, all joints are slowed by one factor until none exceeds its maximum velocity, so that the tool keeps its
     direction. Then each joint is clipped to the box of :class:`~imitarm.kinematics.limits.JointLimits`, evaluated at
-    ``q + previous * dt / 2`` and not at ``q``, because the box assumes that the set-point moves by ``velocity * dt``,
-    but with constant acceleration a robot moves by ``(previous + velocity) / 2 * dt``.
+    ``q + previous * dt / 2`` and not at ``q``. The reason is that the box assumes that the set-point moves by
+    ``velocity * dt``, whereas with constant acceleration it moves by ``(previous + velocity) / 2 * dt``.
 
     Args:
         limits: limits of the arm.

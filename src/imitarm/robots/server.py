@@ -63,9 +63,9 @@ class Supervisor:
     and after a restart of the client its user must enable the robot again. The client that enables the robot is its
     owner until the next stop. Any client may stop the robot.
 
-    A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this
-    arm, is within the joints' position and velocity limits, and is at most as far from the set-point as the joints
-    move in 0.15 s at full speed.
+    A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this arm,
+    and is within the joints' position and velocity limits. It must also be at most as far from the set-point as the
+    joints can move in 0.15 s at full speed.
 
     The set-point q moves towards the commanded position :math:`q_c`, which has the velocity :math:`\dot q_c`, at
 

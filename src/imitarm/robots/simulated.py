@@ -42,8 +42,9 @@ class SimulatedRobot(Robot):
     """An arm in a MuJoCo world, with drives that are limited to their rated torques.
 
     Both kinds of control follow the set-point ``q_d(t)`` and feed gravity, inertia and friction forward (see
-    :class:`Drives`). ``"position"`` is a stiff servo at each joint, ``"torque"`` is the softer computed-torque control.
-    Time advances only within :meth:`move` and :meth:`guide`, and the same commands always give the same motion.
+    :class:`Drives`). The kind ``"position"`` is a stiff servo at each joint; ``"torque"`` is the softer computed-torque
+    control. Time advances only within :meth:`move` and :meth:`guide`, and the same commands always give the same
+    motion.
 
     Attributes:
         model: the compiled world.
@@ -69,8 +70,8 @@ class SimulatedRobot(Robot):
 
         Args:
             arm: the arm with its tool.
-            scene: its obstacles and fixtures become solid bodies; None: no obstacles. Its ``stamp`` is the start time
-                of the world. Without fixtures and ``world``, a floor and a pedestal are added.
+            scene: its obstacles and fixtures become solid bodies; None: no obstacles. The scene's ``stamp`` is the
+                start time of the world. Without fixtures and ``world``, a floor and a pedestal are added.
             motion: motions of some obstacles, by name or index. Each motion is a function of the time on the scene's
                 clock, or a recorded :class:`~imitarm.scene.motion.Track`. Other obstacles keep their velocities.
             world: world with the arm, built by :func:`~imitarm.robots.world.arm_world` and possibly extended by
@@ -197,8 +198,9 @@ class SimulatedRobot(Robot):
     def clearance(self) -> float:
         """Return the smallest distance from the arm or its tool to an obstacle [m].
 
-        The distance is measured between the simulator's geoms. It is negative when geoms overlap, and inf without
-        obstacles. While two links of the arm touch each other, the result is at most minus the depth of their contact.
+        The distance is measured between the simulator's geoms. The distance is negative when geoms overlap, and inf
+        without obstacles. While two links of the arm touch each other, the result is at most minus the depth of their
+        contact.
         """
         return self._gauge.measure(self.data)[0]
 

@@ -44,9 +44,9 @@ class ClearanceLimit:
     .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - \xi h
 
     This row lets h shrink at most exponentially, so that in theory h stays positive. In practice h can become negative,
-    because links move on arcs and control steps are finite. Then ``retreat_rate`` replaces :math:`\xi`, and h must
-    grow. Every sphere within ``influence`` of an obstacle has a row; none is left out. The spheres contain the shapes
-    they cover, so the true distance is never smaller than the distance of the spheres.
+    because links move on arcs and control steps are finite. While h is negative, ``retreat_rate`` replaces :math:`\xi`,
+    and h must grow. Every sphere within ``influence`` of an obstacle has a row; none is left out. The spheres contain
+    the shapes they cover, so the true distance is never smaller than the distance of the spheres.
 
     Args:
         arm: arm with its tool.
@@ -331,14 +331,15 @@ def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
 
     Link 0 is the base; link k is moved by k joints. Neighbouring links are always reported as not meeting. For links
     with two or three joints between them, the distance of their exact shapes is measured in 512 postures that fill the
-    ranges of these joints evenly (a Sobol sequence); links that never touch are reported as not meeting. Links with
-    more joints between them are always reported as meeting.
+    ranges of these joints evenly (a Sobol sequence). Links that touch in none of these postures are reported as not
+    meeting. Links with more joints between them are always reported as meeting.
 
     Args:
         arm: the arm with its tool.
 
     Returns:
-        shape (n_joints + 1, n_joints + 1); entry [outer, inner] for outer > inner, False elsewhere; read-only.
+        A read-only array of shape (n_joints + 1, n_joints + 1). The answer for two links is at [outer, inner] with
+        outer > inner; all other entries are False.
     """
     model = arm.spec().compile()
     content = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)

@@ -191,7 +191,8 @@ class ConvexHull(Obstacle):
         if np.abs(points).max() > MAX_COORDINATE or np.ptp(points, axis=0).max() > MAX_SIZE:
             raise InputError(
                 f"{self._label}: the points reach from {points.min(axis=0).tolist()} to {points.max(axis=0).tolist()}, "
-                f"beyond {MAX_SIZE:g} m in size or {MAX_COORDINATE:g} m in place; give them in metres"
+                f"but must span at most {MAX_SIZE:g} m and lie within {MAX_COORDINATE:g} m of the base; give them in "
+                "metres"
             )
         points.setflags(write=False)
         return points

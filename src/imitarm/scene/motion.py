@@ -71,7 +71,7 @@ class MovingScene:
     """A scene in which some obstacles follow functions of time; the others keep their velocity.
 
     Attributes:
-        scene: all obstacles at ``scene.stamp``; those without a motion start from there.
+        scene: all obstacles at ``scene.stamp``; obstacles without a motion start from there.
         motions: the motion of some obstacles, by index or by name.
 
     Raises:

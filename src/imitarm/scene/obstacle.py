@@ -97,7 +97,7 @@ def rotation_from_z(axis: Array) -> Array:
 
 
 class Solid(NamedTuple):
-    """The geometry of one obstacle, as the distances need it.
+    """The geometry of one obstacle, in the form that the distance formulas need.
 
     Attributes:
         kind: one of :data:`~imitarm.scene.distances.KINDS`.
@@ -117,9 +117,9 @@ class Solid(NamedTuple):
 class Family(NamedTuple):
     """Shapes that share a distance formula.
 
-    The formula works in the obstacle's local frame, for any number of obstacles and points. It takes points ``q``
-    (3, ...), a flag for normals, and the parameters of its shapes, which broadcast against ``q``. It returns signed
-    distances (...) [m] and outward unit normals (3, ...), or None. It may overwrite ``q``.
+    The formula works in the obstacle's local frame, for any number of obstacles and points. The formula takes points
+    ``q`` (3, ...), a flag for normals, and the parameters of its shapes, which broadcast against ``q``. The formula
+    returns signed distances (...) [m] and outward unit normals (3, ...), or None. It may overwrite ``q``.
 
     Attributes:
         kinds: names of the shapes.
@@ -182,10 +182,10 @@ class Obstacle(ABC):
 
     The gradient of this distance is a unit vector. Outside, the gradient points from the nearest surface point to
     ``x``; inside, it points from ``x`` to the nearest surface point; on the surface, it is the outward normal. Because
-    the solids are convex, ``sd`` is convex, and between two points it changes by at most their distance. Where the
-    nearest surface point is not unique (at the centre of a sphere, on the medial axis of a box), the gradient refers to
-    one of the nearest points, always the same one for the same input. To keep a distance ``r`` from an obstacle,
-    require ``sd(x) >= r``: no inflated copy is needed.
+    the solids are convex, ``sd`` is convex, and between two points it changes by at most their distance. The nearest
+    surface point may not be unique, for example at the centre of a sphere. The gradient then refers to one of the
+    nearest points, which is always the same for the same input. To keep a distance ``r`` from an obstacle, require
+    ``sd(x) >= r``: no inflated copy is needed.
 
     Attributes:
         velocity: velocity of the shape's centre, in the base frame, shape (3,) [m/s].
@@ -258,7 +258,7 @@ class Obstacle(ABC):
             Shape (...) [m].
 
         Raises:
-            InputError: when the last axis has not length 3 or a number is not finite.
+            InputError: when the last axis does not have length 3 or a number is not finite.
         """
         return _distance(self._single, finite_points(points), False)[0]
 
@@ -269,7 +269,7 @@ class Obstacle(ABC):
             points: points in the base frame, shape (..., 3) [m].
 
         Raises:
-            InputError: when the last axis has not length 3 or a number is not finite.
+            InputError: when the last axis does not have length 3 or a number is not finite.
         """
         return self.distance_and_gradient(points)[1]
 
@@ -283,7 +283,7 @@ class Obstacle(ABC):
             Distances (...) [m] and unit outward normals (..., 3).
 
         Raises:
-            InputError: when the last axis has not length 3 or a number is not finite.
+            InputError: when the last axis does not have length 3 or a number is not finite.
         """
         return _distance(self._single, finite_points(points), True)
 
@@ -309,7 +309,7 @@ class Obstacle(ABC):
             Points of the surface in the base frame, shape (..., 3) [m].
 
         Raises:
-            InputError: when the last axis has not length 3 or a number is not finite.
+            InputError: when the last axis does not have length 3 or a number is not finite.
         """
         v = finite_points(directions)
         return self._support(v.reshape(-1, 3)).reshape(v.shape)
@@ -327,7 +327,8 @@ class Obstacle(ABC):
     def after(self, dt: float) -> Self:
         """Return the obstacle ``dt`` seconds later.
 
-        Its centre has moved by ``velocity * dt``, and it has rotated about its centre by ``angular_velocity * dt``.
+        The obstacle's centre has moved by ``velocity * dt``, and the obstacle has rotated about its centre by
+        ``angular_velocity * dt``.
 
         Args:
             dt: time ahead [s]; a negative value gives an earlier pose.

@@ -100,7 +100,7 @@ class Sphere(Obstacle):
             Shape (...) [m].
 
         Raises:
-            InputError: when the last axis has not length 3 or a number is not finite.
+            InputError: when the last axis does not have length 3 or a number is not finite.
         """
         if type(points) is np.ndarray and points.dtype is _FLOAT64 and points.shape[1:] == (3,) and len(points) > 1:
             offsets: Array = np.subtract(points.T, self._single.center, order="C")

@@ -30,12 +30,13 @@ class Scene:
         obstacles: any iterable of obstacles; stored as a tuple.
         stamp: time for which the poses of the obstacles are valid [s]. For a scene from a sensor, this is the time
             of the measurement; :meth:`at` predicts from it.
-        fixtures: objects on which the arm stands or works, such as floor, pedestal and table. They are part of a
-            simulated world and cause contacts, but planners keep no distance from them, because a tool must reach its
+        fixtures: objects on which the arm stands or works, such as floor, pedestal and table. Fixtures are part of a
+            simulated world and cause contacts. Planners keep no distance from fixtures, because a tool must reach its
             table.
 
     Raises:
-        InputError: when ``goal`` is not a pose, an obstacle is not an obstacle, or ``stamp`` is not a finite number.
+        InputError: when ``goal`` is not a pose, an entry of ``obstacles`` is not an obstacle, or ``stamp`` is not a
+            finite number.
     """
 
     goal: Pose | None = None
@@ -146,7 +147,7 @@ class Scene:
             Shape (n_obstacles, ...) [m], negative inside.
 
         Raises:
-            InputError: when the last axis of ``points`` has not length 3 or a number is not finite.
+            InputError: when the last axis of ``points`` does not have length 3 or a number is not finite.
         """
         if len(self.packed) == 1 and "_seen" not in self.__dict__:  # takes half of the time
             return self.obstacles[0].signed_distance(points)[None]
@@ -159,7 +160,7 @@ class Scene:
             points: points in the base frame, shape (..., 3) [m].
 
         Raises:
-            InputError: when the last axis of ``points`` has not length 3 or a number is not finite.
+            InputError: when the last axis of ``points`` does not have length 3 or a number is not finite.
         """
         if len(self.packed) == 1 and "_seen" not in self.__dict__:
             distance, gradient = self.obstacles[0].distance_and_gradient(points)
@@ -176,7 +177,7 @@ class Scene:
             Shape (...) [m], negative inside an obstacle.
 
         Raises:
-            InputError: when the last axis of ``points`` has not length 3 or a number is not finite.
+            InputError: when the last axis of ``points`` does not have length 3 or a number is not finite.
         """
         return np.asarray(self.distances(points).min(axis=0, initial=np.inf))
 
@@ -190,7 +191,7 @@ class Scene:
             Indices into ``obstacles``, shape (...).
 
         Raises:
-            InputError: when the last axis of ``points`` has not length 3 or a number is not finite.
+            InputError: when the last axis of ``points`` does not have length 3 or a number is not finite.
         """
         if not len(self.packed):
             return np.full(finite_points(points).shape[:-1], -1, dtype=np.intp)

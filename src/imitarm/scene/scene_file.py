@@ -1,7 +1,7 @@
 """Scene files: a goal and obstacles in hand-written YAML (docs/scene.md).
 
 The keys of each shape are its fields, so a shape added to ``OBSTACLES`` can be read and written without further code.
-Only plain YAML is read: numbers, text, lists and mappings; nothing in a file is executed.
+The reader accepts only plain YAML (numbers, text, lists and mappings) and never executes anything in a file.
 """
 
 from __future__ import annotations

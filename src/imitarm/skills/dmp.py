@@ -102,9 +102,9 @@ class DMP:
         f(s) &= \frac{\sum_i w_i \psi_i(s) s}{\sum_i \psi_i(s)}, \quad \psi_i(s) = \exp(-h_i (s - c_i)^2)
 
     This form replaces thesis Eqs 2.8 to 2.12, which scale the force by g - x_0 and therefore fail for an axis that does
-    not move. tau is the duration, so K and D have no unit: ``"critical"`` gains have D = 2 sqrt(K); the ``"thesis"``
-    gains K = 139.26, D = 28 have a damping ratio of 1.186. Equivalently, the spring follows the moving target ``y(s) =
-    g + f(s) + (x_0 - g) s``, which ends at the goal.
+    not move. Because tau is the duration, K and D have no unit. The ``"critical"`` gains have D = 2 sqrt(K). The
+    ``"thesis"`` gains K = 139.26, D = 28 have a damping ratio of 1.186. Equivalently, the spring follows the moving
+    target ``y(s) = g + f(s) + (x_0 - g) s``, which ends at the goal.
 
     **Fitting** (:func:`~imitarm.skills.dynamical_systems.fit_weights`) is ridge regression on the positions. Measured
     positions are not differentiated, samples may have any times, and the motion reaches the goal at the end of the

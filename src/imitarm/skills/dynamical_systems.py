@@ -195,8 +195,8 @@ def targets_by_step(step: Propagator, target: Array) -> Array:
 def roll_out(step: Propagator, start: Array, target: Array) -> Array:
     """Return the states after all steps, computed at once.
 
-    The recursion ``z_k = E z_(k-1) + q_k`` is summed by doubling: after j passes each state holds the sum of its last
-    2^j terms, so n steps take log2(n) passes over whole arrays instead of a loop.
+    The recursion ``z_k = E z_(k-1) + q_k`` is summed by doubling. After j passes, each state holds the sum of its last
+    2^j terms, so n steps take log2(n) passes over whole arrays.
 
     Args:
         step: one of n equal steps.
@@ -343,9 +343,10 @@ def fit_weights(
 
     The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. If noise
     moves one of these samples more than 0.1 mm away from the path that fits all samples, the end of this path is used
-    instead, because a motion forced through a noisy sample would jerk there. ``exact_ends`` turns this smoothing off.
-    The last drive is 0, so that the target is the goal when the duration is over. (The regression hardly determines the
-    last drive; without this condition, it can pull the tool decimetres away from the goal after the end.)
+    instead, because a motion forced through a noisy sample would jerk there. The argument ``exact_ends`` turns this
+    smoothing off. The last drive is 0, so that the target is the goal when the duration is over. (The regression hardly
+    determines the last drive; without this condition, it can pull the tool decimetres away from the goal after the
+    end.)
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).
@@ -428,8 +429,8 @@ def _progress(rate: Array) -> tuple[Array, float]:
 def start_rate(fraction: Array, x: Array, part: float = _START) -> Array:
     """Return the velocity at the first sample, in m per duration, shape (3,).
 
-    The velocity is the slope of a parabola through the first samples. It is 0 unless it exceeds three standard errors
-    and a tenth of the mean speed, so that a motion which begins at rest begins exactly at rest.
+    The velocity is the slope of a parabola through the first samples. The returned velocity is 0 unless it exceeds
+    three standard errors and a tenth of the mean speed, so that a motion which begins at rest begins exactly at rest.
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).

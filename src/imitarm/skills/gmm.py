@@ -64,8 +64,8 @@ class GaussianMixture:
     * ``init="time"`` starts from the best division of column 0 into K segments
       (:func:`~imitarm.skills.mixture_fitting.responsibilities_by_segments`). This start is deterministic and is meant
       for samples [t; x].
-    * A constant column (such as z in a planar task) does not influence the other columns. It is listed
-      in ``degenerate_axes_`` and reported by a :class:`DegenerateAxisWarning`.
+    * A constant column (such as z in a planar task) does not influence the other columns. Such a column is listed in
+      ``degenerate_axes_`` and reported by a :class:`DegenerateAxisWarning`.
 
     Args:
         n_components: number K of Gaussians.

@@ -62,8 +62,8 @@ class GMR:
         \hat\Sigma(t) = \sum_k h_k \left( S_k + (m_k - \hat x)(m_k - \hat x)^T \right)
 
     When the demonstrations have quaternions, x has six columns: the position [m] and a rotation vector [rad]
-        relative to a reference rotation; the reference follows the motion if the tool rotates far
-    (:class:`~imitarm.skills.rotations.RotationReference`).
+        relative to a reference rotation (:class:`~imitarm.skills.rotations.RotationReference`). The reference follows
+        the motion if the tool rotates far.
 
     Times are counted from the first sample. Outside the demonstrated time span, the regression returns its value at the
     nearest end of the span, because extrapolated linear pieces would drift away.

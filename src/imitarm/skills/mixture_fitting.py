@@ -207,9 +207,9 @@ def responsibilities_by_segments(features: Array, column: Array, numbers: Sequen
 
     The range of ``column`` is divided into equal slots. A segment with n of the N samples and covariance Sigma
     costs ``n (log det Sigma / 2 - log(n / N))``, the negative log-likelihood under a separate Gaussian, plus a small
-    amount for its squared length, so that lengths are equal where the data allow it. Dynamic programming over the slots
-    finds the cheapest division for every K up to the largest. The result is deterministic, and EM converges in fewer
-    iterations from it than from equal bins.
+    amount for its squared length. This amount makes the lengths equal where the data allow it. Dynamic programming over
+    the slots finds the cheapest division for every K up to the largest. The result is deterministic, and EM converges
+    in fewer iterations from it than from equal bins.
 
     Args:
         features: :func:`quadratic_features` of the standardised samples, shape (F, n).
@@ -284,9 +284,8 @@ class Candidate:
         n_components: the number K.
         bic: Bayes' information criterion; lower is better.
         aic: Akaike's information criterion; lower is better.
-        held_out_rmse_mm: distance between a demonstration and the mean learned from all other demonstrations, root
-            mean square
-            over the samples and over all choices of that demonstration [mm]; NaN with one demonstration.
+        held_out_rmse_mm: root mean square distance between each demonstration and the mean learned from all other
+            demonstrations [mm]; NaN with one demonstration.
         bias_rmse_mm: distance between the learned mean and the average of the demonstrations at the same times, root
             mean square [mm].
     """
@@ -340,7 +339,7 @@ def try_numbers_of_components(
     For each number, the fit to all demonstrations and the fits without one demonstration run together, as rows of the
     same matrix products. Only a subset of the samples is used; the longer the path, the more samples are used. For a
     pure rotation, errors are computed for a point 100 mm from the axis. The search stops when four numbers of
-    components in a row did not reduce the held-out error by 0.5 %, and one of the numbers meets both conditions of
+    components in a row do not reduce the held-out error by 0.5 %, and one of the numbers meets both conditions of
     :func:`choose`.
 
     Args:

@@ -32,7 +32,7 @@ class RhythmicDMPState(NamedTuple):
         motion: [x; P x'], shape (2, D): position [m], and the rotation vector [rad] where rotation was learned.
         periods: number of periods since the start, phi / (2 pi).
         center: g, shape (D,).
-        amplitude: r, a factor on the learned motion.
+        amplitude: r, the factor by which the learned motion is multiplied.
         period: P [s].
     """
 
@@ -172,7 +172,7 @@ class RhythmicDMP:
             start: position of the tool at rest, from which the motion approaches the learned cycle. None: the motion
                 begins on the learned cycle.
             center: another centre of the positions (3,) [m]; None: the learned one.
-            amplitude: factor on the learned motion.
+            amplitude: factor by which the learned motion is multiplied.
             period: period of the motion [s]; None: the learned one.
 
         Raises:

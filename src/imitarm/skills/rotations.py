@@ -71,7 +71,9 @@ class RotationReference:
             quaternions = given.copy()  # normalising again would change the last bit
         quaternions = continuous_signs(quaternions)
         if len(times) < 1 or np.any(np.diff(times) <= 0.0):
-            raise InputError("RotationReference: times must be at least one number, each later than the one before [s]")
+            raise InputError(
+                "RotationReference: times must contain at least one number, each later than the one before [s]"
+            )
         times.setflags(write=False)
         quaternions.setflags(write=False)
         object.__setattr__(self, "times", times)
@@ -105,7 +107,8 @@ class RotationReference:
     def among(cls, demonstrations: Sequence[tuple[Array, Array]]) -> RotationReference:
         """Return the simplest reference that is within 120 degrees of all demonstrated rotations.
 
-        This is the mean rotation if possible, otherwise a spline through the mean rotations at 5, 9, 17 or 33 times.
+        The reference is the mean rotation if possible, otherwise a spline through the mean rotations at 5, 9, 17 or 33
+        times.
 
         Args:
             demonstrations: times (n,) [s] on a common clock, and quaternions (n, 4) wxyz, of each demonstration.
@@ -157,7 +160,7 @@ class RotationState(NamedTuple):
     Attributes:
         quaternion: wxyz, shape (4,).
         offset: [r; T r'] with T the duration and r the rotation vector from the target to the rotation, in the base
-            frame, shape (2, 3) [rad]. It differs from 0 only because of a coupling.
+            frame, shape (2, 3) [rad]. The offset differs from 0 only because of a coupling.
         fraction: elapsed fraction of the duration.
         start_change: rotation vector (3,) [rad] from the learned start to the new start, in the base frame.
         goal_change: rotation vector (3,) [rad] from the learned goal to the new goal, in the base frame.

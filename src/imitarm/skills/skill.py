@@ -189,7 +189,7 @@ class Skill:
     ) -> Trajectory:
         r"""Return the nominal path, which policies reproduce, at ``times`` [s] of the learned duration.
 
-        It starts and ends exactly at ``start`` and ``goal``, for any number of samples. The learned path is
+        The path starts and ends exactly at ``start`` and ``goal``, for any number of samples. The learned path is
         :meth:`~imitarm.skills.gmr.GMR.nominal`. Another start or goal changes the path in the same way as the
         primitive's adjustment ``"progress"``:
 

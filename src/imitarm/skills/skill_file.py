@@ -1,10 +1,10 @@
-"""The skill file: human-readable JSON. It is checked when it is read, and nothing in it is ever executed.
+"""The skill file: human-readable JSON. A skill file is checked when it is read, and nothing in it is ever executed.
 
 The file contains ``format``, ``version``, the meaning of the numbers (``units``, ``frames``), their origin (``task``,
 ``provenance``), the numbers (``gmr``, ``dmp``, ``fit``), and last a ``checksum``. The checksum is the SHA-256 of
-everything else in canonical form (sorted keys, no spaces). It therefore detects a change of any digit, but accepts a
-change of layout. Floats are written with all digits and are read back exactly. The classes below are the schema: they
-define the content that is written and accepted.
+everything else in canonical form (sorted keys, no spaces). The checksum therefore detects a change of any digit, but
+accepts a change of layout. Floats are written with all digits and are read back exactly. The classes below are the
+schema, which defines the content that is written and accepted.
 """
 
 from __future__ import annotations
