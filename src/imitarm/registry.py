@@ -38,7 +38,7 @@ class Registry(Mapping[str, Item], Generic[Item]):
         """Return a member.
 
         Raises:
-            UnknownNameError: when there is no such member; the message lists all names.
+            UnknownNameError: when no member has that name; the message lists all names.
             InputError: when a package that adds the member can't be imported.
         """
         if not isinstance(name, str):

@@ -71,7 +71,7 @@ def finite_points(points: Any) -> Array:
     """Return finite points as an array of shape (..., 3).
 
     Raises:
-        InputError: when they are not numbers, the last axis does not have length 3, or a number is not finite.
+        InputError: when the points are not numbers, the last axis does not have length 3, or a number is not finite.
     """
     if type(points) is np.ndarray and points.dtype is _FLOAT64 and points.shape[-1:] == (3,):
         flat = points.ravel()
@@ -221,7 +221,7 @@ def function(value: Any, what: str) -> Callable[..., Any]:
     """Return ``value`` if it is callable.
 
     Raises:
-        InputError: when it is not callable.
+        InputError: when ``value`` is not callable.
     """
     if not callable(value):
         raise InputError(f"{what} must be a function, got {_shown(value)}")
@@ -233,7 +233,7 @@ def file_path(value: Any, what: str) -> Path:
     """Return ``value`` as a path.
 
     Raises:
-        InputError: when it is neither text nor a path, or contains a null character.
+        InputError: when ``value`` is neither text nor a path, or contains a null character.
     """
     name = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(name, str) or "\0" in name:

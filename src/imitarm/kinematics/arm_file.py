@@ -102,7 +102,7 @@ def read_arm(
     Raises:
         UnknownNameError: when the name is neither a packaged name nor a file.
         FileFormatError: when the file can't be read as a robot.
-        InputError: when it has no joint, or the requested flange or tool can't be used.
+        InputError: when the file has no joint, or the requested flange or tool can't be used.
     """
     path, folders = _located(source, ARMS, "robot"), [Path(folder) for folder in package_path]
     for folder in folders:

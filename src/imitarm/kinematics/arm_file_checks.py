@@ -49,7 +49,7 @@ def _check_kind(path: Path, root: XmlElement) -> None:
     """Reject files that are not MJCF or URDF; the message names their type.
 
     Raises:
-        FileFormatError: when the file is a xacro file, a part of an MJCF file or something else.
+        FileFormatError: when the file is a xacro file, a part of an MJCF file, or neither MJCF nor URDF.
         InputError: when the base of the arm is not fixed.
     """
     for element in root.walk():
@@ -81,7 +81,7 @@ def _check_numbers(path: Path, root: XmlElement) -> None:
     """Reject attributes that are NaN or infinite, and limits that are not numbers.
 
     Raises:
-        FileFormatError: when there is one; the message names the joint, link or body that it belongs to, and the line.
+        FileFormatError: when an attribute is faulty; the message names its joint, link or body, and the line.
     """
     pending = [(root, "")]
     while pending:

@@ -214,7 +214,7 @@ def check_joints(spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], path: Path,
     """Reject joints that an arm can't have: joints other than hinges and slides, and coupled joints.
 
     Raises:
-        InputError: when there is such a joint; the message names it and its line.
+        InputError: when the arm has such a joint; the message names the joint and its line.
     """
     names = [joint.name for joint in joints]
     for joint in joints:

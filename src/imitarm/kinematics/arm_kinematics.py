@@ -255,7 +255,7 @@ class ArmKinematics:
             shape (3, n_joints) [m/rad].
 
         Raises:
-            UnknownNameError: if there is no such body.
+            UnknownNameError: if the arm has no body of that name.
         """
         position = finite_vector(point, 3, "point", "m")
         index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_BODY, text(body, "body"))

@@ -66,7 +66,7 @@ def _is_above(gram: Array, bound: float) -> bool:
 
 
 def _undamped(problem: IKProblem, gram: Array) -> Array:
-    """Solve without damping; no joint is too fast, because the norm of the scaled velocity is at most 1."""
+    """Solve without damping; no joint exceeds its limit, because the norm of the scaled velocity is at most 1."""
     jacobian, target, _ = problem.tasks[0]
     along = np.empty(6)
     mujoco.mju_cholFactor(gram, 0.0)

@@ -84,7 +84,7 @@ def sew_angle(
 def sew_derivatives(
     shoulder: ArrayLike, elbow: ArrayLike, wrist: ArrayLike, *, convention: str = "stereographic"
 ) -> SewAngle:
-    """Return the angle of :func:`sew_angle` and its derivatives by the three points; the arguments are the same."""
+    """Return the angle of :func:`sew_angle`, with the same arguments, and its derivatives by the three positions."""
     formula = _formula(convention)
     points = [np.asarray(point, dtype=float) for point in (shoulder, elbow, wrist)]
     if any(point.shape[-1:] != (3,) for point in points):

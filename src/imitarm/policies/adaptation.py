@@ -53,7 +53,7 @@ def adapter_named(method: str) -> PathAdapter:
     """Return the method of that name in ``ADAPTERS``; for the default, no search of installed packages is needed.
 
     Raises:
-        UnknownNameError: when there is no such method.
+        UnknownNameError: when no method has that name.
         InputError: when the name is not text.
     """
     return CERTIFIED if text(method, "method") == "certified" else ADAPTERS[method]
@@ -195,7 +195,7 @@ def adapt(
         The adaptation; check ``feasible`` before executing it.
 
     Raises:
-        UnknownNameError: when there is no such method.
+        UnknownNameError: when no method has that name.
         InputError: when not exactly one of the three tool arguments is given, or an argument is not valid.
     """
     began = time.perf_counter()

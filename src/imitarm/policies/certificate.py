@@ -70,9 +70,9 @@ class ToolAmongObstacles:
         obstacles: convex obstacles; a rotating obstacle is replaced by a sphere that contains it.
         spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
         radii: radii of the spheres, shape (n_spheres,) [m].
-        offsets: for each obstacle, an array of shape (n_spheres, n, 3) [m]. It contains, for each sample, the vectors
-            from the tip to the centres of the spheres, minus the obstacle's displacement since time 0, in the base
-            frame. None when all of them are zero.
+        offsets: for each obstacle, an array of shape (n_spheres, n, 3) [m]. The array contains, for each sample, the
+            vectors from the tip to the centres of the spheres, minus the obstacle's displacement since time 0, in the
+            base frame. None when all of them are zero.
         bows: largest distance of a centre from the straight line between two samples while the tool rotates, shape
             (n_spheres, n - 1) [m].
     """

@@ -100,7 +100,8 @@ class ComponentPath:
                 each of them.
 
         Raises:
-            InputError: when there are fewer than 10 or more than 100 000 samples, or a pinned time is outside.
+            InputError: when there are fewer than 10 or more than 100 000 samples, or a pinned time is outside the
+                motion.
         """
         n_samples = whole_number(n_samples, "n_samples", at_least=10, at_most=100_000)
         duration = skill.duration_

@@ -54,9 +54,9 @@ class Supervisor:
     * ``stopped``: the robot holds its position, and commands are ignored. An ENABLE with the challenge of this stop
       changes the status to ``following``.
     * ``following``: the robot moves to the newest commanded positions. If no valid command arrives for 0.1 s, the
-      status becomes ``slowing``. STOP changes it to ``stopped``.
+      status becomes ``slowing``. A STOP changes the status to ``stopped``.
     * ``slowing``: the robot brakes to rest and holds its position. A valid command changes the status to
-      ``following``. If none arrives for 0.5 s, it becomes ``stopped``.
+      ``following``. If no valid command arrives for 0.5 s, the status becomes ``stopped``.
     * ``fault``: the robot has made a protective stop. Only a restart of the process ends this status.
 
     The first status is ``stopped``. Every stop generates a new random challenge, so a recorded ENABLE has no effect,

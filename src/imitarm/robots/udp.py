@@ -69,7 +69,7 @@ class UdpRobot(Robot):
         datagram_filter: checks the received states.
 
     Raises:
-        InputError: when there is no such host, or it serves another arm.
+        InputError: when the host does not exist, or its server controls another arm.
         TaskFailedError: when no server answers.
     """
 

@@ -142,8 +142,8 @@ class ClearanceGauge:
     """Smallest distance from an arm to obstacles, and pairs in contact, from the simulator's geoms.
 
     Bounding spheres are evaluated first: the distance between centres minus both radii is a lower bound of a pair's
-    distance. Pairs are then measured by ``mj_geomDistance``, nearest bound first, until the next bound exceeds the
-    smallest distance found. Most pairs therefore need no exact measurement.
+    distance. Pairs are then measured by ``mj_geomDistance`` in the order of their bounds, until the next bound exceeds
+    the smallest measured distance. Most pairs therefore need no exact measurement.
 
     Args:
         model: the compiled world.

@@ -75,7 +75,8 @@ class MovingScene:
         motions: the motion of some obstacles, by index or by name.
 
     Raises:
-        InputError: when there is no such obstacle, or a motion does not return a pose or a position.
+        InputError: when an obstacle with a motion is not in the scene, or a motion does not return a pose or a
+            position.
     """
 
     scene: Scene

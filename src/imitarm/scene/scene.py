@@ -203,7 +203,7 @@ class Scene:
         Unnamed obstacles are counted by shape, from 1, in the order of ``obstacles``.
 
         Raises:
-            InputError: when there is no such obstacle.
+            InputError: when the scene has no obstacle with this index.
         """
         i = whole_number(index, "name_of: index")
         if not 0 <= i < len(self.obstacles):

@@ -173,8 +173,8 @@ def _period(times: Array, positions: Array) -> float | None:
     """Return the period [s] of a motion, ignoring a constant drift; None when it repeats less than three times.
 
     For each lag, the mean squared difference between the motion and the motion one lag later is compared with the value
-    for independent positions. The period is the first local minimum below 10 % of that value, provided that the
-    difference exceeded 50 % of that value at a shorter lag.
+    for independent positions. The period is the first local minimum below 10 % of the value for independent positions,
+    provided that the difference exceeded 50 % of this value at a shorter lag.
     """
     n = len(times)
     drift = np.linspace(0.0, 1.0, n)[:, None] * (positions[-1] - positions[0])

@@ -88,7 +88,7 @@ class GMR:
         covariances_: covariances of [t; x], shape (K, 1 + D, 1 + D).
         reference_: the reference of the rotation vectors; None without rotations.
         ends_: mean start and mean goal of the demonstrations, as x (position, rotation vector), shape (2, D).
-        degenerate_axes_: constant columns of x: 0 to 2 for x, y, z, 3 to 5 for rotations.
+        degenerate_axes_: indices of the constant columns of x; 0 to 2 are the position, 3 to 5 the rotation vector.
         converged_: whether the fit converged.
         lower_bound_: mean log-likelihood per sample.
 

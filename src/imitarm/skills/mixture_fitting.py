@@ -85,9 +85,9 @@ def packing(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
     """Return the maps between a symmetric (size, size) matrix and its packed upper triangle.
 
     Returns:
-        Three arrays. The first gives the index of each packed number in the flat matrix. The second, of shape (size,
-        size), gives the index of each matrix entry among the packed numbers. The third gives the factor of each packed
-        number in ``-[1; z]^T M^-1 [1; z] / 2``.
+        Three arrays. The first array gives the index of each packed number in the flat matrix. The second array, of
+        shape (size, size), gives the index of each matrix entry among the packed numbers. The third array gives the
+        factor of each packed number in ``-[1; z]^T M^-1 [1; z] / 2``.
     """
     i, j = np.triu_indices(size)
     unpack = np.empty((size, size), dtype=np.intp)
@@ -350,7 +350,7 @@ def try_numbers_of_components(
         more: further numbers to try, in this order, while every bias so far is above 1 % of the motion's extent.
 
     Raises:
-        InputError: when there are fewer samples than the smallest number.
+        InputError: when there are fewer samples than the smallest number of components.
     """
     n_samples = _samples_needed(tables)
     tables = [_thinned(table, n_samples) for table in tables]

@@ -83,7 +83,7 @@ class RhythmicDMP:
 
     Raises:
         InputError: when an option is out of range.
-        UnknownNameError: when there are no gains of that name.
+        UnknownNameError: when no gains have that name.
     """
 
     weights_: Array

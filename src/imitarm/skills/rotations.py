@@ -185,8 +185,8 @@ class QuaternionDMP:
     Here, c is an external angular acceleration. The logarithm is taken only of ``r``, the rotation from the target,
     never of the rotation to the goal. Therefore a rotation by 270 degrees, or by three full revolutions, is reproduced
     as demonstrated. (Formulations that use log(q_goal conj(q)) rotate in the opposite direction beyond 180 degrees.)
-    The target is a cubic spline through quaternions with continuous signs, normalised. Another start or goal rotates
-    the target in the base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. The
+    The target is a normalised cubic spline through quaternions with continuous signs. Another start or goal rotates the
+    target in the base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. The
     rotations ``d_start`` and ``d_goal`` are each at most 180 degrees.
 
     Args:
@@ -214,8 +214,8 @@ class QuaternionDMP:
             exact_ends: whether to start and end exactly at the first and the last rotation instead of smoothing them.
 
         Raises:
-            InputError: when it has no quaternions, or two neighbouring rotations are more than 90 degrees apart, so
-                that the rotation between them is ambiguous.
+            InputError: when ``trajectory`` has no quaternions, or two neighbouring rotations are more than 90 degrees
+                apart, so that the rotation between them is ambiguous.
         """
         instance(trajectory, Trajectory, "QuaternionDMP.fit: trajectory")
         flag(exact_ends, "QuaternionDMP.fit: exact_ends")
@@ -371,7 +371,7 @@ def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, go
 
 
 def rotodilatation(learned: Array, asked: Array, path_length: float) -> Array:
-    """Return the product of a factor and the smallest rotation that maps ``learned`` to ``asked``, shape (3, 3).
+    """Return the smallest rotation, times a scale factor, that maps ``learned`` to ``asked``, shape (3, 3).
 
     The method follows Ginesi, Sansonetto and Fiorini (2019), "DMP++". If the learned motion ends near its start, its
     direction and length are undefined, and the result is the identity.

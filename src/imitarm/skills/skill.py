@@ -44,8 +44,9 @@ class Skill:
     Args:
         n_components: number of Gaussians, or ``"auto"`` (see GMR).
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains` (see DMP).
-        n_basis: number of basis functions of the primitive, or ``"auto"``: 40, 80 or 160, the first that follows the
-            nominal path within 0.1 mm or 0.2 % of the motion's extent (root mean square).
+        n_basis: number of basis functions of the primitive. ``"auto"`` chooses the smallest of 40, 80 and 160 with
+            which the primitive follows the nominal path within 0.1 mm or 0.2 % of the motion's extent (root mean
+            square).
         random_state: seed of all random choices in learning.
 
     Attributes:
@@ -94,7 +95,7 @@ class Skill:
         Args:
             demonstrations: at least one demonstration; three or more show how much the demonstrations vary.
             notes: facts to keep with the skill, for example the findings of lint.
-            date: date of learning; omitted when None, so that the same input gives the same file.
+            date: date of learning; None: the file contains no date, so that the same input gives the same file.
 
         Raises:
             InputError: for the same reasons as :meth:`GMR.fit` and :meth:`DMP.fit`.
@@ -279,7 +280,7 @@ class Skill:
 
         Raises:
             InputError: when there is no such file or it can't be read.
-            FileFormatError: when it is not a skill file, was cut or altered, or has a newer version.
+            FileFormatError: when the file is not a skill file, was cut or altered, or has a newer version.
         """
         document = read_skill(file_path(path, "Skill.load: path"))
         provenance = {k: v for k, v in msgspec.to_builtins(document.provenance).items() if v is not None}

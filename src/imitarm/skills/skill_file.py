@@ -249,7 +249,7 @@ def fit_of(fields: FitFields, sources: list[str], n_components: int) -> FitQuali
     """Build a fit's quality from its fields.
 
     Raises:
-        InputError: when there is not one row of distances for each source.
+        InputError: when the number of rows of distances differs from the number of sources.
     """
     if len(fields.distances) != len(sources) or any(len(row) != 4 for row in fields.distances):
         raise InputError(f"fit: one row of 4 distances needed for each of {len(sources)} sources")
@@ -292,8 +292,8 @@ def read_skill(path: str | os.PathLike[str]) -> SkillDocument:
     """Read and check a skill file.
 
     Raises:
-        InputError: when there is no such file or it can't be read.
-        FileFormatError: when it is not a skill file, was cut or altered, or has an unknown version.
+        InputError: when the file does not exist or can't be read.
+        FileFormatError: when the file is not a skill file, was cut or altered, or has an unknown version.
     """
     source = Path(path)
     try:
