@@ -1,4 +1,4 @@
-"""The errors that imitarm raises; one base class, so that one ``except`` catches them all.
+"""The errors that imitarm raises; they share one base class, so that one ``except`` catches them all.
 
 Every message says what is wrong, where, and what to do about it. Arguments and files are checked when an object is
 constructed or a file is read, not inside a control loop.

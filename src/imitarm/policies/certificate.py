@@ -1,4 +1,4 @@
-"""Proof that a path keeps its clearance: a lower bound of the distance on every straight segment, from convexity.
+"""Proof that a path keeps its clearance: convexity gives a lower bound of the distance on every straight segment.
 
 The signed distance to a convex obstacle is a convex function, so its tangent plane at any point is a lower bound
 everywhere. The tangents at two samples therefore bound the distance on the whole segment between them: the polyline

@@ -326,8 +326,8 @@ class LeastDetour:
     def _scale(self, moved: Index, smoothness: float | None) -> Array:
         """Return the matrix G (m d, m d) with ``delta = G y``, so that the cost of ``delta`` is ``|y|^2``.
 
-        The cost is ``delta^T H delta`` with the demonstrated precisions on the diagonal blocks of H and, where the
-        path is divided or has to be smoother, the squared jerk of the displacement.
+        The cost is ``delta^T H delta``. The diagonal blocks of H contain the demonstrated precisions. If the path is
+        divided or has to be smoother, H also contains the squared jerk of the displacement.
         """
         axes, m, d = self.allowed.axes, len(moved), self.allowed.dimension
         weight = (_SMOOTHNESS if self.exact else 0.0) if smoothness is None else smoothness

@@ -70,8 +70,8 @@ class SimulatedRobot(Robot):
 
         Args:
             arm: the arm with its tool.
-            scene: its obstacles and fixtures become solid bodies; None: no obstacles. The scene's ``stamp`` is the
-                start time of the world. Without fixtures and ``world``, a floor and a pedestal are added.
+            scene: scene whose obstacles and fixtures become solid bodies; None: no obstacles. The scene's ``stamp`` is
+                the start time of the world. Without fixtures and ``world``, a floor and a pedestal are added.
             motion: motions of some obstacles, by name or index. Each motion is a function of the time on the scene's
                 clock, or a recorded :class:`~imitarm.scene.motion.Track`. Other obstacles keep their velocities.
             world: world with the arm, built by :func:`~imitarm.robots.world.arm_world` and possibly extended by

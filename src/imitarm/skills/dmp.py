@@ -307,8 +307,8 @@ class DMP:
             dt: [s], above 0.
             goal: another goal position (3,) [m] from now on, for a goal that moves.
             coupling: function from position (3,) [m] and velocity (3,) [m/s] to an acceleration (3,) [m/s^2] that is
-                added during this step, for example away from an obstacle. If it returns six numbers, the last three are
-                an angular acceleration [rad/s^2].
+                added during this step, for example away from an obstacle. If ``coupling`` returns six numbers, the last
+                three are an angular acceleration [rad/s^2].
             measured: measured position of the robot (3,) [m]. The primitive's clock slows down by
                 ``1 / (1 + |lag| / patience)`` (phase stopping), so that the primitive waits for a robot that lags.
             patience: lag at which the primitive's clock runs at half speed [m].

@@ -298,7 +298,7 @@ class GMR:
         return np.asarray(h / h.sum(axis=1, keepdims=True))
 
     def _regress(self, t: Array, n_columns: int) -> tuple[Array, Array]:
-        """Return mean (n, D) and covariance (n, D, D) of the first columns of x at clamped times."""
+        """Return mean (n, D) and covariance (n, D, D) of the first columns of x, for times in the learned span."""
         u = t[:, None] - self.time_means_
         h = self._responsibilities(u)
         powers = np.concatenate([h, h * u, h * u * u], axis=1)
