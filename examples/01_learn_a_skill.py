@@ -1,8 +1,8 @@
 """Learn a skill: read, check and align recordings, learn, save and load the skill, and move to another goal.
 
 The recordings are part of the package: a simulated teacher guides a simulated Sawyer with a brush eight times to sweep
-crumbs into a dustpan. Use recordings of your own robot instead; `docs/demonstrations.md` lists the formats
-that can be read.
+crumbs into a dustpan. You can use recordings of your own robot instead; `docs/demonstrations.md` lists the file
+formats.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ def main() -> None:
     # Align. People never repeat a motion at exactly the same speed; averaging at equal times would flatten every bend.
     ready = align(shown)
     before = np.ptp([one.trajectory.duration for one in shown])
-    print(f"\naligned to {ready[0].trajectory.duration:.1f} s (durations differed by {before:.1f} s)")
+    print(f"\naligned to {ready[0].trajectory.duration:.1f} s (durations before differed by {before:.1f} s)")
 
     # Learn. The number of Gaussians is the smallest that reproduces a demonstration it has not seen as well as any and
     # rounds off little (bias); where none does both, the one with the least held-out error. BIC alone would go on
     # falling with more of them, because neighbouring samples are not independent.
     skill = Skill().fit(ready)
-    print("\ncomponents, held-out error [mm], bias [mm], BIC")
+    print("\nnumber of components, held-out error [mm], bias [mm], BIC")
     for tried in skill.gmr_.selection_:
         mark = "  <- chosen" if tried.n_components == skill.gmr_.n_components_ else ""
         errors = f"{tried.held_out_rmse_mm:6.2f}  {tried.bias_rmse_mm:6.2f}"
@@ -64,13 +64,19 @@ def main() -> None:
     skill.save(path)
     again = Skill.load(path)
     np.testing.assert_array_equal(again.generate().positions, skill.generate().positions)
-    print(f"\nsaved and loaded {path}, {path.stat().st_size / 1000:.0f} kB; the motion is the same to the last bit")
+    print(
+        f"\nsaved and loaded {path}, {path.stat().st_size / 1000:.0f} kB; the loaded skill gives exactly the same "
+        f"motion"
+    )
 
     # Move to another goal, in half the time.
     goal = again.goal_.position + np.array([0.0, 0.06, 0.0])
     motion = again.generate(goal=goal, duration=0.5 * again.duration_, dt=0.01)
     away = 1e3 * np.linalg.norm(motion.positions[-1] - goal)
-    print(f"to a goal 6 cm farther in {motion.duration:.2f} s: {len(motion)} poses, ends {away:.2f} mm from it")
+    print(
+        f"motion to a goal 6 cm farther away: {motion.duration:.2f} s, {len(motion)} poses, ends {away:.2f} mm "
+        f"from the goal"
+    )
 
 
 if __name__ == "__main__":

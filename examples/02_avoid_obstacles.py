@@ -1,7 +1,7 @@
-"""Adapt a learned path to a scene: a comparison of three methods, forbidden directions, and refusals with reasons.
+"""Adapt a learned path to a scene: compare three methods, forbid directions, and see refusals with their reasons.
 
-No robot moves in this example: `adapt` returns a path and its certified clearance. `03_reproduce_on_an_arm.py`
-    executes one.
+No robot moves in this example: `adapt` returns a path and its certified clearance. The example
+`03_reproduce_on_an_arm.py` lets a simulated robot execute such a path.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ UPRIGHT = [1.0, 0.0, 0.0, 0.0]  # quaternions are w, x, y, z everywhere
 def show(adaptation: Adaptation) -> None:
     verdict = "can be executed" if adaptation.feasible else "refused"
     print(
-        f"  {adaptation.method:9s} {verdict}: {1e3 * adaptation.certified_clearance:.1f} mm certified on the path, "
+        f"  {adaptation.method:9s} {verdict}: {1e3 * adaptation.certified_clearance:.1f} mm certified clearance of "
+        f"the path, "
         f"{int(adaptation.moved.sum())} of {len(adaptation.moved)} components moved, "
-        f"{1e3 * adaptation.rmse_to_nominal:.0f} mm from the learned path"
+        f"{1e3 * adaptation.rmse_to_nominal:.0f} mm from the learned path (RMS)"
     )
     if adaptation.reason:
         print(f"            {adaptation.reason}")
@@ -41,7 +42,7 @@ def main() -> None:
     # The thesis pushes each component along its own normal ("literal", as printed; "mapf", corrected) and does not look
     # at the path between two of them. "certified" chooses a side, moves the components as little as possible, and
     # proves the clearance.
-    print("a cup and a tin on the path, brush kept on the table:")
+    print("a cup and a tin on the path; the brush must stay on the table:")
     for method in ("literal", "mapf", "certified"):
         show(adapt(skill, scene, method, forbidden=HORIZONTAL_ONLY, **options))
 
@@ -50,7 +51,7 @@ def main() -> None:
     alone = adapt(skill, Scene(None, [box]), forbidden=HORIZONTAL_ONLY, **options)
     show(alone)
     same = np.all(alone.trajectory.positions == alone.nominal.positions, axis=1)
-    print(f"  {same.sum()} of {len(same)} samples of the path are exactly where they were learned")
+    print(f"  {same.sum()} of {len(same)} samples of the path are exactly on the learned path")
 
     # Forbidden directions determine how the path avoids an obstacle: above it, or beside it.
     print("\na low wall across the table:")
@@ -58,16 +59,16 @@ def main() -> None:
     show(adapt(skill, wall, forbidden=HORIZONTAL_ONLY, **options))
     over = adapt(skill, wall, forbidden=NOT_DOWN, **options)
     show(over)
-    print(f"  where lifting is allowed the brush rises by up to {1e2 * over.displacement[:, 2].max():.0f} cm")
+    print(f"  if the brush may be lifted, it rises by up to {1e2 * over.displacement[:, 2].max():.0f} cm")
 
     # A refusal names the obstacle and the reason; its path is the best attempt, which must not be executed.
-    print("\na jar on the goal, then one on the dirt:")
+    print("\na jar on the goal, then a jar on the dirt:")
     for place in (skill.goal_.position, task.dirt.position):
         jar = Sphere(place, 0.03, name="jar")
         show(adapt(skill, Scene(None, [jar]), forbidden=HORIZONTAL_ONLY, **options))
 
     # Another goal: the skill first adapts its path to the goal, and the components move with it.
-    print("\nthe same scene, goal moved by 5 cm:")
+    print("\nthe same scene, with the goal moved by 5 cm:")
     goal = Pose(skill.goal_.position + np.array([0.05, 0.0, 0.0]), skill.goal_.quaternion)
     moved = adapt(skill, Scene(goal, scene.obstacles), forbidden=HORIZONTAL_ONLY, **options)
     show(moved)

@@ -1,7 +1,7 @@
 """Reproduce a skill on a simulated arm around obstacles, and let the simulator measure the result.
 
-The plan guarantees the clearance of the brush. The simulator measures, between its own shapes, whether the arm with its
-inertias, limits and servos follows the plan, and whether its links keep the clearance too.
+The plan guarantees the clearance of the brush only. The simulator, with its own shapes, inertias, limits and servos,
+measures whether the arm follows the plan, and whether the links of the arm keep the clearance too.
 """
 
 from __future__ import annotations
@@ -70,14 +70,16 @@ def main() -> None:
 
     adaptation = policy.adaptation
     print(f"{'done' if rollout.success else 'FAILED'}: {rollout.reason}")
-    print(f"  {rollout.trajectory.duration:.1f} s, shown in {skill.duration_:.1f} s")
+    print(f"  {rollout.trajectory.duration:.1f} s, demonstrated in {skill.duration_:.1f} s")
     print(f"  clearance certified for the brush: {1e3 * adaptation.certified_clearance:.1f} mm")
     print(f"  clearance measured, of arm and brush:       {1e3 * rollout.min_clearance:.1f} mm")
     for pair, steps in nearest.most_common(3):
         print(f"    within 5 cm for {0.01 * steps:.1f} s: {pair}")
     effort = np.abs(rollout.torques).max(axis=0) / arm.max_torque
-    print(f"  largest torque: {100 * effort.max():.0f} % of what {arm.joint_names[int(effort.argmax())]} can give")
-    print(f"  commands that a limit changed: {rollout.details['clamped'] or 'none'}")
+    print(
+        f"  largest torque: {100 * effort.max():.0f} % of the rated torque of {arm.joint_names[int(effort.argmax())]}"
+    )
+    print(f"  commands changed by a limit: {rollout.details['clamped'] or 'none'}")
 
     # An impossible task is refused before the robot moves.
     jar = Box(Pose(skill.goal_.position, [1.0, 0.0, 0.0, 0.0]), [0.05, 0.05, 0.1], name="jar")
@@ -103,7 +105,7 @@ def main() -> None:
         joint_names=arm.joint_names,
     )
     try:
-        page = write_report(Report("Sweeping round two boxes", [result]), Path("sweep.html"))
+        page = write_report(Report("Sweeping around two boxes", [result]), Path("sweep.html"))
         print(f"\nwrote {page.name}, {page.stat().st_size / 1e6:.1f} MB: open it in a browser")
     except InputError as error:
         print(f"\nno report: {error}")

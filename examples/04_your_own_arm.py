@@ -1,6 +1,6 @@
 """Load your own arm from a URDF or MJCF file: kinematics, inverse kinematics, gravity, and simulation.
 
-The example first writes a URDF file, so that it needs no other file; use your own file instead.
+The example first writes a URDF file, so that it runs without other files. To load your own arm, replace that file.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ def main() -> None:
     print(f"{arm.name}: {arm.n_joints} joints, {', '.join(arm.joint_names)}")
     print(f"  torque limits {arm.max_torque} N m, speed limits {arm.max_velocity} rad/s")
     # A URDF does not define accelerations: 10 rad/s^2 is assumed. An MJCF file can define them (see ArmModel.load).
-    print(f"  accelerations {arm.max_acceleration} rad/s^2, tool {arm.tool_to_flange.position} m from the flange")
+    print(f"  acceleration limits {arm.max_acceleration} rad/s^2, tool {arm.tool_to_flange.position} m from the flange")
 
     # A posture for a pose. The tool points down: rotated by 180 degrees about y.
     down = [0.0, 0.0, 1.0, 0.0]  # quaternion w, x, y, z
     pose = Pose([0.55, 0.1, 0.3], down)
     q = find_posture(arm, pose)
     print(f"\nposture for {pose.position} m: {np.round(q, 3)} rad")
-    print(f"  off by {np.linalg.norm(arm.tool_pose(q).error_to(pose)):.1e} (m and rad)")
+    print(f"  pose error {np.linalg.norm(arm.tool_pose(q).error_to(pose)):.1e} (m and rad)")
     try:
         find_posture(arm, Pose([1.6, 0.0, 0.3], down), restarts=5)
     except UnreachableError as error:
@@ -75,7 +75,7 @@ def main() -> None:
         line.append(arm.tool_pose(q))
         beside = max(beside, float(np.abs(line[-1].position - pose.position)[[0, 2]].max()))
     length = np.linalg.norm(line[-1].position - pose.position)
-    print(f"\na line of {100 * length:.1f} cm: at most {1e3 * beside:.2f} mm beside it")
+    print(f"\na straight line of {100 * length:.1f} cm: the tool deviates by at most {1e3 * beside:.2f} mm")
 
     # The gravity torques without and with the gripper, also as a fraction of the torque limits.
     holding = arm.gravity_torque(q)
@@ -88,7 +88,10 @@ def main() -> None:
     robot = SimulatedRobot(arm, q=q)
     for _ in range(100):
         state = robot.move(np.zeros(arm.n_joints), dt)
-    print(f"\nafter {state.time:.0f} s of standing: sagged by {np.abs(state.q - q).max():.1e} rad,")
+    print(
+        f"\nafter {state.time:.0f} s of holding the posture: joints sagged by at most "
+        f"{np.abs(state.q - q).max():.1e} rad,"
+    )
     print(f"  drives give    {np.round(state.torque, 1)} N m")
 
 

@@ -1,7 +1,7 @@
 """Write your own policy, register it, and let it reproduce a skill under the same conditions as a built-in policy.
 
-A policy sees an `Observation` (time, state of the arm, pose of the tool, scene) and returns a `Command`. Everything
-else is the same for all policies: robot, safety filter, inverse kinematics, and the measured clearance.
+A policy sees an `Observation` (time, state of the arm, pose of the tool, scene) and returns a `Command`. All policies
+share the robot, the safety filter, the inverse kinematics, and the measurement of clearance.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from imitarm import (
 
 
 class Repelled(Policy):
-    """Follow the learned path in time, pushed away from near obstacles (the repulsive force of thesis Eq 2.19)."""
+    """Follow the learned path in time, while near obstacles push the tool away (repulsive force of thesis Eq 2.19)."""
 
     influence, gain = 0.06, 4.0  # [m], [1/s]
 
     def reset(self, observation: Observation) -> None:
-        """Start the learned path at the tool's measured pose."""
+        """Start the learned path at the measured pose of the tool."""
         self.path = self.skill.generate(observation.tool_to_base, observation.scene.goal)
 
     def step(self, observation: Observation, dt: float) -> Command:
-        """Return a pull towards the path and a push away from every obstacle that is near."""
+        """Return a velocity that pulls the tool towards the path and pushes it away from every near obstacle."""
         positions, quaternions = self.path.at([observation.time + dt])
         twist = self.gain * observation.tool_to_base.error_to(Pose(positions[0], quaternions[0]))
         for obstacle in observation.scene.obstacles:
@@ -48,7 +48,7 @@ class Repelled(Policy):
         return Command(twist, progress=min(observation.time / self.path.duration, 1.0))
 
     def finished(self, observation: Observation) -> bool:
-        """Whether the time is over and the goal is reached."""
+        """Whether the motion has reached its end in time and the goal in space."""
         away = np.linalg.norm(self.path.positions[-1] - observation.tool_to_base.position)
         return observation.time > self.path.duration and bool(away < 0.005)
 
@@ -57,7 +57,7 @@ POLICIES.register("repelled", Repelled)
 
 
 def reaches(start: Pose, goal: Pose, n: int = 5) -> list[Demonstration]:
-    """Generate synthetic demonstrations of a reach along an arch that varies between demonstrations."""
+    """Generate synthetic demonstrations of a reach along an arch; the arch varies between demonstrations."""
     rng = np.random.default_rng(0)
     u = np.linspace(0.0, 1.0, 150)[:, None]
     pace = 10 * u**3 - 15 * u**4 + 6 * u**5
@@ -100,7 +100,7 @@ def main() -> None:
                 safety = SafetyFilter(arm, clearance=clearance)
                 rollout = reproduce(policy, robot, scene.at, timeout=6.0, safety=safety)
                 near = f"clearance {1e3 * rollout.min_clearance:.0f} mm, " if scene.obstacles else ""
-                held = "" if clearance is None else " with links kept clear"
+                held = "" if clearance is None else " with clearance of the links"
                 print(f"  {key}{held}: {near}{rollout.trajectory.duration:.1f} s, {rollout.reason}")
                 if rollout.success:
                     break

@@ -1,7 +1,8 @@
-"""Learn from a person in front of a camera: five recordings become demonstrations, a skill, and a robot motion.
+"""Learn from a person in front of a camera: convert five recordings to demonstrations, and learn and reproduce a skill.
 
-The person and the noisy camera are simulated, so that the example runs anywhere; `open_source("take.csv")` reads a
-recording instead. The true motion is known here, so the errors can be measured.
+The person and the noisy camera are simulated, so that the example runs anywhere; To use a recording of your own, open
+it with `open_source("take.csv")`. The true motion of the simulated person is known, so the errors of the robot can be
+measured.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def take(number: int) -> SkeletonSource:
 
 
 def following(run: Retargeting) -> slice:
-    """The part of a run in which the robot followed the person."""
+    """Return the part of a run in which the robot followed the person, as a demonstration."""
     led = np.flatnonzero(run.states == "following")
     return slice(int(led[0]), int(led[-1]) + 1)
 
@@ -85,12 +86,12 @@ def main() -> None:
         acceleration = np.diff(velocity, axis=0) / 0.01
         print(
             f"{source.name}: {times[-1] - times[0]:.1f} s, {1e3 * apart.mean():.0f} mm from the true hand on average, "
-            f"{100 * np.max(np.abs(velocity) / arm.max_velocity):.0f} % of the velocity and "
-            f"{100 * np.max(np.abs(acceleration) / arm.max_acceleration):.0f} % of the acceleration allowed"
+            f"{100 * np.max(np.abs(velocity) / arm.max_velocity):.0f} % of the velocity limit and "
+            f"{100 * np.max(np.abs(acceleration) / arm.max_acceleration):.0f} % of the acceleration limit"
         )
 
     skill = Skill().fit(align(demonstrations))
-    print(f"learned {skill.gmr_.n_components_} components from {len(demonstrations)} takes of a person")
+    print(f"learned {skill.gmr_.n_components_} components from {len(demonstrations)} recordings of a person")
 
     # The robot reproduces the motion alone, around a ball that was not there in the demonstrations.
     middle = skill.generate(Pose(skill.start_.position, begin.quaternion)).positions
@@ -101,7 +102,7 @@ def main() -> None:
         rollout = reproduce(policy, robot, scene.at, timeout=20.0, safety=SafetyFilter(arm, clearance=0.02))
         ends = 1e3 * np.linalg.norm(rollout.trajectory.positions[-1] - skill.goal_.position)
         near = f", {1e3 * rollout.min_clearance:.0f} mm from the ball" if scene.obstacles else ""
-        print(f"{name}: {rollout.reason}, {ends:.1f} mm from where the person ended{near}")
+        print(f"{name}: {rollout.reason}, {ends:.1f} mm from the person's end point{near}")
 
 
 if __name__ == "__main__":

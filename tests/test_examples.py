@@ -19,13 +19,13 @@ SAYS = {
     "01_learn_a_skill": [
         r"error jump: damaged\.csv, row 150",
         r"<- chosen",
-        r"the same to the last bit",
+        r"gives exactly the same motion",
         r"ends 0\.\d\d mm",
     ],
     "02_avoid_obstacles": [
         r"mapf +refused",
         r"certified can be executed: 2\d\.\d mm certified",
-        r"samples of the path are exactly where they were learned",
+        r"samples of the path are exactly on the learned path",
         r"no path around box \"low wall\"",
         r"sphere \"jar\" covers the goal",
         r"path ends at \[0\.699 0\.39\d 0\.003\]",
@@ -37,13 +37,13 @@ SAYS = {
     ],
     "04_your_own_arm": [
         r"six_axis: 6 joints",
-        r"off by \d\.\de-(0[7-9]|1\d)",
+        r"pose error \d\.\de-(0[7-9]|1\d)",
         r"six_axis can't bring its tool",
         r"a line of 20\.0 cm",
     ],
     "05_your_own_policy": [r"  acfra: clearance \d+ mm, .*finished", r"repelled: .*(touched|not finished)"],
     "06_retarget_a_person": [
-        r"take 4: 5\.\d s, \d{1,2} mm from the true hand on average, (\d\d|100) % of the velocity and (\d\d|100) % of",
+        r"take 4: 5\.\d s, \d{1,2} mm from the true hand on average, (\d\d|100) % of the velocity limit and (\d\d|100) % of",
         r"learned \d+ components from 5 takes of a person",
         r"nothing in the way: finished",
         r"a ball on the path: finished, .*, \d\d mm from the ball",

@@ -197,10 +197,10 @@ def moving_rows(times: Array, positions: Array, quaternions: Array | None = None
     """Return the first and the last row between which the tool moves; None if it never moves.
 
     The first row is found in two steps: find the row at which the tool is first more than 0.5 mm away from its start,
-        then go back to the last row that is within 0.1 mm of the start. The last row is found in the same way, from the
-        end backwards. A margin of 0.1 s is kept on both sides. Speed is not used, so a slow motion is never mistaken
-        for rest. With noisy samples, both distances are raised to at least 4 standard deviations of the averaged noise.
-        Rotation without displacement counts as motion.
+    then go back to the last row that is within 0.1 mm of the start. The last row is found in the same way, from the end
+    backwards. A margin of 0.1 s is kept on both sides. Speed is not used, so a slow motion is never mistaken for rest.
+    With noisy samples, both distances are raised to at least 4 standard deviations of the averaged noise. Rotation
+    without displacement counts as motion.
 
     Args:
         times: strictly increasing, shape (n,) [s].
@@ -391,10 +391,10 @@ def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0
     """Return the time warps that align motions with their common average motion (barycentre).
 
     The first barycentre is the medoid: the motion nearest to all others. Each round matches every motion with the
-        barycentre by :func:`dtw` and smooths the matched times into a warp. The mean of the warped motions is the
-        barycentre of the next round. This is the averaging of Petitjean et al. 2011, except that each motion has one
-        smooth warp in place of sets of matched samples. The warps are centred, which means that their mean is the
-        identity. Therefore the common speed profile is the mean of all speed profiles, not the profile of the medoid.
+    barycentre by :func:`dtw` and smooths the matched times into a warp. The mean of the warped motions is the
+    barycentre of the next round. This is the averaging of Petitjean et al. 2011, except that each motion has one smooth
+    warp in place of sets of matched samples. The warps are centred, which means that their mean is the identity.
+    Therefore the common speed profile is the mean of all speed profiles, not the profile of the medoid.
 
     Args:
         values: features, shape (n_demonstrations, n, d), evenly spaced in time.

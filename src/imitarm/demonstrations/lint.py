@@ -168,8 +168,8 @@ def _jumps(times: Array, values: Array, floor: float) -> tuple[NDArray[np.int64]
     """Return the first sample after each jump of ``values`` (n, d), shape (k,), and the size of each jump, shape (k,).
 
     A step is a jump if it is much larger than the median of four steps near it: the second and third step before it,
-        and the second and third step after it. The direct neighbours are left out, because a single bad sample causes
-        two large steps in a row.
+    and the second and third step after it. The direct neighbours are left out, because a single bad sample causes two
+    large steps in a row.
     """
     if len(times) < 8:
         return np.zeros(0, dtype=np.int64), np.zeros(0)

@@ -1,4 +1,4 @@
-"""Execution of commanded joint positions: by an ideal arm with limits, and by a simulated robot with drives."""
+"""Execution of commanded joint positions by an ideal arm with limits, or by a simulated robot with drives."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ CATCH_UP = 5.0  # [1/s] fraction of the remaining error to the commanded positio
 
 
 def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
-    r"""Return the motion of an arm that keeps its limits and follows commanded positions, (n, n_joints) [rad].
+    r"""Return how an arm that keeps its limits would move when it follows commanded positions, (n, n_joints) [rad].
 
-    In each period the arm takes the commanded velocity and a correction towards the commanded position,
+    In each control period, the velocity of the arm is the commanded velocity plus a correction towards the commanded
+    position,
 
     .. math:: \dot q_k = \mathrm{clip}\left((q^c_{k+1} - q^c_k) / dt + 5\,\mathrm{s}^{-1}\,(q^c_k - q_k)\right)
 
@@ -31,7 +32,7 @@ def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
 
     Args:
         arm: whose limits.
-        joints: commanded positions, shape (n, n_joints) [rad]; the arm starts at rest at the first.
+        joints: commanded positions, shape (n, n_joints) [rad]; the arm starts at rest at the first position.
         dt: sampling period [s].
     """
     commanded = np.asarray(joints, dtype=float)
@@ -48,13 +49,13 @@ def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
 
 @dataclass(frozen=True)
 class Execution:
-    """Measurements on a simulated robot that executed a retargeting.
+    """Measurements on a simulated robot that executed a retargeted motion.
 
     Attributes:
         error_rms: root mean square over time of the position error of the worst joint [rad].
         error_max: largest position error of a joint [rad].
         peak_torque_ratio: largest torque of a drive, relative to the rated torque.
-        limited: frames in which a limit of the robot changed a command.
+        limited: number of frames in which a limit of the robot changed a command.
         clearance: smallest distance of the arm to an obstacle [m]; inf without obstacles.
         touched: names of the obstacles that were touched.
         fault: reason of a protective stop; empty without a protective stop.
@@ -74,13 +75,13 @@ class Execution:
 def execute_on_robot(
     run: Retargeting, scene: Scene | None = None, progress: Callable[[float], None] | None = None
 ) -> Execution:
-    """Let a simulated robot, with drives and weight, execute a retargeting.
+    """Let a simulated robot execute a retargeted motion; the simulation includes drives and gravity.
 
-    The robot's own limits are active: a command beyond them is reduced, and the arm falls behind.
+    The robot enforces its limits. It reduces a command that exceeds them, and then the arm lags behind the motion.
 
     Args:
         run: run of a method.
-        scene: obstacles, as solid bodies.
+        scene: obstacles, which are solid bodies in the simulation.
         progress: function called with the finished fraction, 0 to 1.
     """
     robot = SimulatedRobot(run.arm, scene=scene, q=run.joints[0])

@@ -1,7 +1,7 @@
-"""Statistical uncertainty: bootstrap over persons, paired comparisons by sign flips, Holm's correction.
+"""Statistical uncertainty: bootstrap over persons, paired comparisons by random sign flips, Holm's correction.
 
-Persons are resampled, not frames or recordings: recordings of one person are similar, and treating them as independent
-would make every interval too narrow.
+Persons are resampled, not frames or recordings, because the recordings of one person are similar. Treating them as
+independent would make every interval too narrow.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Interval:
     """A mean over persons and its 95 % confidence interval.
 
     Attributes:
-        mean: mean over persons, each represented by the mean of their recordings.
+        mean: mean over persons of each person's mean over recordings.
         low: lower end of the interval; nan with fewer than two persons.
         high: upper end.
         persons: number of persons.
@@ -45,16 +45,16 @@ class Interval:
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether the whole interval is on one side of zero."""
+        """Whether zero is outside the interval."""
         return self.low > 0.0 or self.high < 0.0
 
 
 Values = Mapping[tuple[int, Any], float]
-"""The measured value of each recording, by person and a second key; nan where it is missing."""
+"""The measured value of each recording, by person and a second key such as the recording; nan if it is missing."""
 
 
 def person_means(values: Values) -> Array:
-    """Return for each person the mean over the recordings with a value, in the order of the persons."""
+    """Return for each person the mean over the recordings that have a value, in the order of the persons."""
     persons: dict[int, list[float]] = {}
     for (person, _), value in sorted(values.items(), key=lambda item: (item[0][0], str(item[0][1]))):
         if math.isfinite(value):
@@ -79,10 +79,11 @@ def interval(values: Values, *, confidence: float = 0.95, seed: int = 0) -> Inte
 
 
 def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) -> tuple[float, float]:
-    r"""Return the bootstrap interval of a mean, by percentiles.
+    r"""Return the percentile bootstrap interval of a mean.
 
-    A resampled mean of n samples has a standard deviation that is too small by :math:`\sqrt{(n-1)/n}`, so its
-    deviations are multiplied by the inverse; with ten samples a plain "95 %" percentile interval covers only 90 %.
+    Resampled means of n samples scatter too little: their standard deviation is too small by the factor
+    :math:`\sqrt{(n-1)/n}`. Their deviations are therefore divided by this factor. Without this correction, a "95 %"
+    interval of ten samples would cover only 90 %.
 
     Args:
         samples: shape (n,).
@@ -104,14 +105,14 @@ def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) ->
 
 @dataclass(frozen=True)
 class Comparison:
-    """One method against another on the same recordings.
+    """Comparison of two methods on the same recordings.
 
     Attributes:
-        difference: mean of first method minus second, over the recordings for which both have a value.
+        difference: mean difference, first method minus second, over the recordings for which both methods have a value.
         relative: ``difference`` relative to the absolute mean of the second method; nan where that mean is zero.
-        p: probability of a difference at least as large if the methods were equal, by sign flips of the persons'
-            differences.
-        corrected: ``p`` after Holm's correction for all comparisons made together.
+        p: probability of a difference at least this large if the two methods were equal, from random sign flips of the
+            persons' differences.
+        corrected: ``p`` after Holm's correction for all comparisons that are made together.
     """
 
     difference: Interval
@@ -121,7 +122,7 @@ class Comparison:
 
 
 def compare(ours: Values, theirs: Values) -> Comparison:
-    """Compare two methods, paired over recordings.
+    """Compare two methods on pairs of values, one pair for each recording.
 
     Args:
         ours: values of the first method, by recording.
@@ -136,19 +137,19 @@ def compare(ours: Values, theirs: Values) -> Comparison:
 
 
 def rate_interval(outcomes: Values) -> Interval:
-    r"""Return a success rate, the mean of the persons' rates, with its 95 % interval.
+    r"""Return the success rate, averaged over persons, with its 95 % interval.
 
-    The interval is Wilson's, with :math:`N / D` trials instead of N (Rao and Scott, Biometrics 1992), because trials of
-    one person are similar. :math:`D = 1 + (m - 1) \rho` is the design effect of m trials per person. :math:`\rho` is
-    the correlation of the trials of one person, estimated from the differences between the persons' rates beyond
-    chance. The estimate from a few persons is poor, so it is averaged with a prior correlation of 0.3 that counts as
-    two persons. If all trials had the same result, or there is only one person, the correlation is 0.3. N / D lies
-    between the number of persons and N.
+    The interval is the Wilson interval for :math:`N / D` trials instead of N, because the trials of one person are
+    similar (Rao and Scott, Biometrics 1992). :math:`D = 1 + (m - 1) \rho` is the design effect of m trials per person.
+    :math:`\rho` is the correlation between trials of one person. It is estimated from how much more the persons' rates
+    differ than by chance. The estimate from a few persons is poor, so it is averaged with a prior correlation of 0.3,
+    which has the weight of two persons. If all trials had the same result, or if there is only one person, the
+    correlation is 0.3. N / D lies between the number of persons and N.
 
-    Failures of only one person indicate that persons differ; an additional failure of another person indicates that
-    they do not. Therefore, an additional failure could narrow the interval. To prevent this, the lower end is the
-    lowest of all results that are at least as good in every trial, and the upper end is the highest of all results that
-    are at least as bad.
+    If only one person fails, this indicates that persons differ. If another person also fails, it indicates that they
+    do not differ, so that one more failure could narrow the interval. To prevent this, the function also computes the
+    interval of every result that is at least as good in each trial, and takes the lowest of the lower ends. Likewise,
+    it takes the highest upper end of all results that are at least as bad in each trial.
 
     Args:
         outcomes: outcome of each trial, 1 for success, 0 for failure.
@@ -166,10 +167,11 @@ def rate_interval(outcomes: Values) -> Interval:
 
 
 def _lower_end(rates: Array, each: float, step: int) -> float:
-    """Return the lowest lower end of all results in which every person has at least this rate.
+    """Return the lowest lower end of the intervals of all results in which every person has at least the given rate.
 
-    Among results with the same mean, the end is lowest where the persons differ most: the best person becomes
-        perfect before another one improves (this result majorises all others). Only these results need to be examined.
+    Among results with the same mean, the lower end is lowest where the persons differ most: the best person becomes
+    perfect before another person improves (this result majorises all others). Therefore only such results need to be
+    examined.
 
     Args:
         rates: success rate of each person, shape (n,).
@@ -185,10 +187,10 @@ def _lower_end(rates: Array, each: float, step: int) -> float:
 
 
 def _design_effect(rates: Array, each: float) -> Array:
-    """Return the design effect: the number of trials of one person that count as one independent trial, (k,).
+    """Return the design effect (k,): how many trials of one person count as one independent trial.
 
     Args:
-        rates: rates of n persons in k results, shape (k, n).
+        rates: success rates of n persons in k results, shape (k, n).
         each: average number of trials per person.
     """
     n, mean = rates.shape[1], rates.mean(axis=1)
@@ -205,7 +207,7 @@ def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tup
     """Return the Wilson score interval of a rate (95 % by default).
 
     Args:
-        successes: number of successes, 0 to ``trials``; neither need be an integer.
+        successes: number of successes, 0 to ``trials``; both numbers may be fractional.
         trials: number of trials, at least 1.
         z: normal quantile of the confidence level.
     """
@@ -217,14 +219,15 @@ def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tup
 
 
 def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
-    """Return the two-sided probability of a mean at least this large if every difference could have either sign.
+    """Return the two-sided p-value of the mean difference, from random sign flips of the differences.
 
-    Exact for up to 14 differences: all sign flips are evaluated. With n differences, the probability can't be less
-        than 2 / 2^n.
+    The p-value is the probability of a mean at least this large if each difference had either sign with equal
+    probability. For up to 14 differences, all sign flips are evaluated, so the result is exact. With n differences, the
+    p-value can't be less than 2 / 2^n.
 
     Args:
         differences: one per person, shape (n,).
-        seed: seed of the random sign flips, when there are more differences.
+        seed: seed of the random sign flips, which are used for more than 14 differences.
 
     Returns:
         The probability; 1 without differences.
@@ -243,7 +246,7 @@ def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Return probabilities corrected for multiple comparisons (Holm 1979), in the order given."""
+    """Return p-values corrected for multiple comparisons (Holm 1979), in the order of the arguments."""
     order = sorted(range(len(p)), key=lambda i: p[i])
     corrected, largest = [0.0] * len(p), 0.0
     for rank, i in enumerate(order):

@@ -1,4 +1,4 @@
-"""MappingMetrics: the measures of a retargeting, computed from the run alone, as plain values."""
+"""MappingMetrics: the measures of a retargeting run, as plain values."""
 
 from __future__ import annotations
 
@@ -41,52 +41,56 @@ _REST = 0.5  # [s] at the end: the last target is averaged over it
 class MappingMetrics:
     """The measures of a retargeting. Unknown values are nan.
 
-    The reference of tool and elbow is the clutch's law applied to the *true* hand since the person began to lead; each
-    engagement has a new reference. Errors are averaged over the frames in which the person led, so compare them
-    together with ``engaged_fraction``; ``tool_rms_from_first`` includes all frames after the first engagement.
+    Errors of tool and elbow are relative to a reference: the motion that results when the clutch law is applied to the
+    person's *true* hand, from the start of the engagement. Each engagement has a new reference. Errors are averaged
+    over the engaged frames (states following, coasting and holding), so compare them together with
+    ``engaged_fraction``. Only ``tool_rms_from_first`` includes all frames after the first engagement.
 
     Attributes:
         duration: duration of the robot's motion [s].
         following_fraction: fraction of the frames with state "following".
-        engaged_fraction: fraction of the frames in which the person led: following, coasting, holding.
-        engagements: how often the person began to lead.
-        tool_rms: distance of the tool to the reference, including the lag, root mean square [m].
-        tool_rms_without_lag: ``tool_rms`` after removing the best constant lag [m].
+        engaged_fraction: fraction of the frames that are engaged: with state "following", "coasting" or "holding".
+        engagements: how often the robot began to follow the person.
+        tool_rms: root mean square distance of the tool to the reference, including the lag [m].
+        tool_rms_without_lag: ``tool_rms`` after removing the constant lag that gives the smallest value [m].
         lag: that lag [s].
-        tool_rms_from_first: distance to the reference of the first engagement over all frames after it, in any state,
-            including the lag [m].
-        executed_rms: distance of the tool to the reference, including the lag, when an arm that keeps its limits of
-            position, velocity and acceleration executes the commands [m]: commands beyond the limits give no advantage.
-        executed_rms_without_lag: ``executed_rms`` after removing the best constant lag [m].
-        target_rms: distance of the tool to the method's own target [m].
-        orientation_rms: angle between the tool's rotation and the reference [rad].
-        elbow_direction_rms: angle between the actual and the correct direction of the robot's upper arm, see
-            :func:`~imitarm.evaluation.tracking.elbow_direction_errors` [rad].
-        elbow_angle_rms: difference between the changes of the robot's and the person's SEW angle [rad].
+        tool_rms_from_first: root mean square distance of the tool to the reference of the first engagement, over all
+            later frames in any state, including the lag [m].
+        executed_rms: as ``tool_rms``, but for an arm that keeps its limits of position, velocity and acceleration while
+            it executes the commands, so that commands beyond the limits give no advantage [m].
+        executed_rms_without_lag: ``executed_rms`` after removing the constant lag that gives the smallest value [m].
+        target_rms: root mean square distance of the tool to the method's own target [m].
+        orientation_rms: root mean square angle between the tool's rotation and the reference [rad].
+        elbow_direction_rms: root mean square angle between the actual and the correct direction of the robot's upper
+            arm, see :func:`~imitarm.evaluation.tracking.elbow_direction_errors` [rad].
+        elbow_angle_rms: root mean square difference between the changes of the robot's and the person's SEW angle
+            (swivel angle of the elbow) since the start of the engagement [rad].
         path_length: path length of the tool [m].
-        settling_time: time from the end of the true hand's motion until the tool stays within 1 cm of the method's last
-            target for 0.5 s [s]; nan when it never does.
+        settling_time: time from the end of the true hand's motion until the tool comes within 1 cm of the method's last
+            target and stays there for 0.5 s [s]; nan when it never does.
         mean_torque: mean absolute torque of each joint [N m].
         rms_torque: root mean square torque of each joint [N m].
-        mean_gravity_torque: mean absolute torque for holding the weight [N m].
-        mean_motion_torque: mean absolute torque without the part for holding the weight [N m].
+        mean_gravity_torque: mean absolute torque that holds each joint against gravity [N m].
+        mean_motion_torque: mean absolute torque of each joint without the part that holds it against gravity [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
-        gravity_effort: ``effort`` of the torques for holding the weight [N^2 m^2 s].
+        gravity_effort: the same integral as ``effort``, of the torques that hold the arm against gravity [N^2 m^2 s].
         peak_torque_ratio: largest torque relative to the rated torque.
-        position_violations: frames in which a joint is outside its range; all violations are computed by finite
-            differences of the positions alone.
-        velocity_violations: frames in which a joint moved too fast.
-        acceleration_violations: frames in which the velocity of a joint changed too fast.
+        position_violations: number of frames in which a joint is outside its range.
+        velocity_violations: number of frames in which a joint exceeds its velocity limit, by finite differences of the
+            positions.
+        acceleration_violations: number of frames in which a joint exceeds its acceleration limit, by finite differences
+            of the positions.
         position_excess: largest distance of a joint from its range [rad].
         velocity_ratio: largest velocity relative to its limit.
         acceleration_ratio: largest acceleration relative to its limit.
         jerk_rms: RMS jerk of the tool's position [m/s^3].
         joint_jerk_rms: RMS jerk of all joints together [rad/s^3].
-        spectral_arc_length: spectral arc length of the tool's speed; 0 is smoothest.
+        spectral_arc_length: spectral arc length of the tool's speed, a measure of smoothness; 0 is smoothest.
         least_singular: smallest singular value of the tool's Jacobian during the motion, with 1 rad counted as 0.3
             m [m/rad].
-        teaching_time: teacher's time that the method's corrections require [s]; 0 for methods without a teacher.
-        failures: number of faults that the method detected but could not fix; 0 for methods without detection.
+        teaching_time: time that a teacher needs for the corrections of the method [s]; 0 for methods without a teacher.
+        failures: number of faults that the method detected in its motion but could not fix; 0 for methods that detect
+            none.
     """
 
     duration: float
@@ -127,7 +131,7 @@ class MappingMetrics:
 
     @property
     def limit_violations(self) -> int:
-        """Frames that exceed a limit of position, velocity or acceleration, counted once for each kind of limit."""
+        """Number of frames that exceed a position limit, plus the same for velocity and for acceleration limits."""
         return self.position_violations + self.velocity_violations + self.acceleration_violations
 
 
@@ -137,8 +141,9 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
     Args:
         run: run of the method.
         correspondence: correspondence between person and robot, the input of the method.
-        true: the person's arm at the times of the run, or, for a method that slows the motion down, at its shown times;
-            None when it is unknown, as with a real camera: the measures that need it are nan.
+        true: the person's true arm at the times of the run. If the method slows the motion down, the arm is taken at
+            the corresponding earlier times. None if the true arm is unknown, as with a real camera; the measures that
+            need it are then nan.
 
     Raises:
         InputError: when the run is shorter than 4 control periods or a joint position is not finite.
@@ -200,7 +205,7 @@ def _tracking(
     correspondence: Correspondence,
     true: TrueArm | None,
 ) -> tuple[float, ...]:
-    """Return the seven measures that need the true arm, in the order of :class:`MappingMetrics`."""
+    """Return the seven measures that need the true arm; the order is that of :class:`MappingMetrics`."""
     if true is None or not periods.engaged.any():
         return (math.nan,) * 7
     scale, engaged = correspondence.scale, periods.engaged
@@ -226,7 +231,7 @@ def _executed(
     correspondence: Correspondence,
     true: TrueArm | None,
 ) -> tuple[float, float]:
-    """Return the error of an arm that keeps its limits, with and without its lag."""
+    """Return the tool error with and without lag when an arm that keeps its limits executes the commands."""
     if true is None or not periods.engaged.any():
         return math.nan, math.nan
     tool = run.arm.tool_path(execute_within_limits(run.arm, run.joints, motion.dt))[0]

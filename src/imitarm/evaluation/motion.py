@@ -1,4 +1,4 @@
-"""Measures of a robot's motion from the joint positions alone: path, torques, limits, smoothness, singularity."""
+"""Measures that need only the joint positions of a robot: path, torques, limits, smoothness, singularity."""
 
 from __future__ import annotations
 
@@ -91,9 +91,9 @@ class Violations:
     """Number of frames in which a motion exceeds the limits of its arm, and the largest excess.
 
     Attributes:
-        position: frames in which a joint is outside its range.
-        velocity: frames in which a joint moved too fast.
-        acceleration: frames in which the velocity of a joint changed too fast.
+        position: number of frames in which a joint is outside its range.
+        velocity: number of frames in which a joint exceeds its velocity limit.
+        acceleration: number of frames in which a joint exceeds its acceleration limit.
         position_excess: largest distance of a joint from its range [rad]; 0 when all joints are inside.
         velocity_ratio: largest velocity relative to its limit.
         acceleration_ratio: largest acceleration relative to its limit.
@@ -108,7 +108,7 @@ class Violations:
 
 
 def violations(arm: ArmModel, joints: ArrayLike, dt: float) -> Violations:
-    """Count the frames that exceed a limit, by finite differences of the positions alone; the motion starts at rest.
+    """Count the frames that exceed a limit, by finite differences of the joint positions; the motion starts at rest.
 
     Args:
         arm: whose limits.
@@ -137,7 +137,7 @@ def path_length(positions: ArrayLike) -> float:
 
 
 def jerk_rms(positions: ArrayLike, dt: float) -> float:
-    """Return the RMS over time of the norm of the third difference of (n, d) / dt^3, in its unit per s^3."""
+    """Return the RMS jerk of ``values`` (n, d), from third differences divided by dt^3 [unit of ``values`` / s^3]."""
     jerk = np.diff(np.asarray(positions, dtype=float), 3, axis=0) / dt**3
     return float(np.sqrt(np.mean(np.sum(jerk * jerk, axis=1))))
 
@@ -149,8 +149,8 @@ def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
               + \left(\tfrac{d\hat V}{d\omega}\right)^2}\, d\omega, \qquad \hat V = |V(\omega)| / |V(0)|
 
     where :math:`\omega_c` is the largest frequency up to 20 Hz at which :math:`\hat V` exceeds 0.05 (SPARC:
-    Balasubramanian et al., J. NeuroEng. Rehabil. 2015). The value depends on the number of movements in a recording, so
-    compare only motions of the same recording.
+    Balasubramanian et al., J. NeuroEng. Rehabil. 2015). The value also depends on the number of movements in a
+    recording, so compare only motions of the same recording.
 
     Args:
         speed: speed of a point, shape (n,) [m/s].

@@ -1,4 +1,4 @@
-"""evaluate_run: evaluate one retargeting; returns measures, a summary line and warnings."""
+"""evaluate_run: evaluate one retargeting run, and return measures, a one-line summary and warnings."""
 
 from __future__ import annotations
 
@@ -29,23 +29,24 @@ _FOLLOWS = 0.5  # of the hand's own motion (RMS); a tool with a larger error doe
 
 @dataclass(frozen=True)
 class TargetTracking:
-    """How well a tool tracked the target that its own method computed.
+    """How well the tool tracked the target that the retargeting method computed.
 
-    It tracked the target if the person led for at least half of the time, the distance was at most :data:`FAR` (RMS),
-    and the tool was farther away for at most :data:`FAR_FRACTION` of the time with a target. These limits are a choice:
-    within 5 cm a gripper is still at the object that it should grasp, and the normal lag of ``modern`` exceeds neither
-    limit.
+    The tool tracked the target if three conditions hold: the robot was engaged for at least half of the time, the RMS
+    distance was at most :data:`FAR`, and the tool was farther away than :data:`FAR` for at most :data:`FAR_FRACTION` of
+    the time with a target. These limits were chosen for two reasons. Within 5 cm, a gripper is still at the object that
+    it should grasp; and the normal lag of the method ``modern`` exceeds neither limit.
 
     Attributes:
         title: title of the method.
-        rms: root mean square distance to the target [m]; nan when there was none.
+        rms: root mean square distance to the target [m]; nan when there was no target.
         far_fraction: fraction of the time with a target in which the tool was farther away than :data:`FAR`, 0 to
             1; nan without a target.
         far_time: time in which the tool was farther away than :data:`FAR` [s].
         farthest: largest distance to the target [m]; nan without a target.
-        engagements: number of times that the person began to lead.
-        engaged_fraction: fraction of the whole time in which the person led, 0 to 1.
-        violations: frames in which a joint exceeded a limit.
+        engagements: number of times that the robot began to follow the person.
+        engaged_fraction: fraction of the whole time in which the robot was engaged (following, coasting, holding), 0 to
+            1.
+        violations: number of frames in which a joint exceeded a limit.
     """
 
     title: str
@@ -59,7 +60,7 @@ class TargetTracking:
 
     @classmethod
     def of(cls, run: Retargeting, metrics: MappingMetrics) -> TargetTracking:
-        """Return how a run tracked its target.
+        """Compute how well the tool of a run tracked its target.
 
         Args:
             run: run of a method.
@@ -81,17 +82,17 @@ class TargetTracking:
 
     @property
     def near(self) -> bool:
-        """Whether the tool was near its target whenever there was a target."""
+        """Whether the tool was near its target while there was a target (the conditions with FAR and FAR_FRACTION)."""
         return self.rms <= FAR and self.far_fraction <= FAR_FRACTION
 
     @property
     def mostly_engaged(self) -> bool:
-        """Whether the person led for at least half of the time."""
+        """Whether the robot was engaged for at least half of the time."""
         return self.engaged_fraction >= _LEAST_ENGAGED
 
     @property
     def followed(self) -> bool:
-        """Whether the tool tracked its target; see the class."""
+        """Whether the tool tracked its target, by the three conditions in the description of this class."""
         return self.near and self.mostly_engaged
 
     @property
@@ -117,12 +118,12 @@ class RunEvaluation:
 
     Attributes:
         run: the evaluated run.
-        metrics: comparison with the person's arm.
-        tracking: how well the tool tracked its own target.
-        target_lag: lag of the tool behind its own target [s]; nan when it does not follow.
-        hand_lag: lag of the tool behind the hand [s]; nan when it does not follow.
-        link_distance: smallest distance between links that are not neighbours [m], measured between the spheres
-            that cover them.
+        metrics: measures of the run, some of them relative to the person's arm.
+        tracking: how well the tool tracked the method's target.
+        target_lag: lag of the tool behind the method's target [s]; nan when the tool does not follow the target.
+        hand_lag: lag of the tool behind the hand [s]; nan when the tool does not follow the hand.
+        link_distance: smallest distance between links that are not neighbours, measured between spheres that cover the
+            links [m].
         truth_known: whether the measures compare with the true hand; otherwise they compare with the hand measured
             by the camera.
         warnings: remarks for the user about this run, one sentence each.
@@ -144,7 +145,7 @@ def evaluate_run(
     correspondence: Correspondence,
     truth: Truth | None = None,
 ) -> RunEvaluation:
-    """Measure the quality of a retargeting.
+    """Measure the quality of a retargeting run.
 
     Args:
         run: run of a method.
@@ -196,7 +197,9 @@ def warnings_of(
         lines.append("the robot never moved: the arm was not seen for half a second without a gap")
     stopped = int(np.sum(run.states == "stopped")) + _waiting_again(run.states)
     if stopped:
-        lines.append(f"the robot stopped or waited for {stopped * dt:.1f} s in between, because the arm was not seen")
+        lines.append(
+            f"the robot stopped or waited for {stopped * dt:.1f} s during the motion, because the arm was not seen"
+        )
     if tracking.far_time >= _BRIEF:
         lines.append(
             f"the tool was more than {1e2 * FAR:.0f} cm from its target for {tracking.far_time:.1f} s (at most "
@@ -215,16 +218,21 @@ def warnings_of(
     }
     beyond = [f"{what} in {count} frames" for what, count in exceeded.items() if count]
     if beyond:
-        lines.append(f"exceeds limits of {', '.join(beyond)}: a real arm can't execute this")
+        lines.append(f"exceeds limits of {', '.join(beyond)}: a real arm can't execute this motion")
     if link_distance < 0.0:
-        lines.append("links come so close that they may touch: choose another start (--fit) or scale")
+        lines.append(
+            "links of the arm come so close that they may touch each other: choose another start (--fit) or scale"
+        )
     if run.closed.any():
-        lines.append("the hand closed in between; a demonstration has no gripper, so this is not kept")
+        lines.append(
+            "the person's hand closed during the motion; a demonstration does not contain gripper "
+            "commands, so this is lost"
+        )
     return lines
 
 
 def winding(run: Retargeting) -> float:
-    """Return the largest difference between two headings of the tool's target, including full rotations [rad]."""
+    """Return the range of the heading of the tool's target, counting full rotations [rad]."""
     rotations = run.targets[1]
     rotations = rotations[np.isfinite(rotations).all(axis=1)]
     if not len(rotations):
@@ -234,13 +242,13 @@ def winding(run: Retargeting) -> float:
 
 
 def _waiting_again(states: NDArray[np.str_]) -> int:
-    """Return the number of frames in which the robot waited after it had followed."""
+    """Return the number of frames in which the robot waited or stopped after it had begun to follow."""
     followed = np.flatnonzero(states == "following")
     return int(np.sum(states[followed[0] :] == "waiting")) if len(followed) else 0
 
 
 def _percent(fraction: float) -> str:
-    """Return a fraction as text; it is 0 % or 100 % only if the fraction is exactly 0 or 1."""
+    """Return a fraction as a percentage; the text is 0 % or 100 % only if the fraction is exactly 0 or 1."""
     whole = round(100.0 * fraction)
     if 0.0 < fraction < 0.01:
         return "under 1 %"

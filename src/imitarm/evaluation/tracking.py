@@ -1,4 +1,4 @@
-"""Tracking errors of a robot's tool and elbow, relative to a person's true or measured arm."""
+"""Tracking errors of a robot's tool and elbow, in comparison with a person's true or measured arm."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class TrueArm:
     """Positions of a person's arm, in the axes of the robot's base.
 
     Attributes:
-        times: times of the samples of the run with which it is compared, shape (n,) [s]; non-decreasing.
+        times: times of the samples of the run with which the arm is compared, shape (n,) [s]; non-decreasing.
         shoulder: position of the shoulder, shape (n, 3) [m].
         elbow: position of the elbow, shape (n, 3) [m].
         wrist: position of the wrist, shape (n, 3) [m].
@@ -51,13 +51,13 @@ class TrueArm:
 
     @classmethod
     def of(cls, truth: Truth, times: ArrayLike, correspondence: Correspondence, *, start: float = 0.0) -> TrueArm:
-        """Sample the true positions of a simulated or captured person.
+        """Sample the true positions of the arm of a simulated or motion-captured person.
 
         Args:
             truth: the person's skeleton over time; called in the order of the times.
             times: times of a run, shape (n,) [s].
             correspondence: correspondence with the side of the arm and the pose of the sensor.
-            start: time of the person at the run's time 0, which is the time of the first skeleton [s].
+            start: time on the person's clock at time 0 of the run; this is the time of the first skeleton [s].
         """
         t = np.asarray(times, dtype=float)
         return cls.from_points(
@@ -66,7 +66,7 @@ class TrueArm:
 
     @classmethod
     def from_points(cls, times: ArrayLike, points: ArrayLike, correspondence: Correspondence) -> TrueArm:
-        """Convert an arm's points over time.
+        """Convert the recorded points of an arm to the axes of the robot's base.
 
         Args:
             times: time stamps, shape (n,) [s].
@@ -82,14 +82,14 @@ class TrueArm:
         return cls(t, points[:, 0], points[:, 1], points[:, 2], matrix_to_quaternion(hands))
 
     def wrist_at(self, times: Array) -> Array:
-        """Return the position of the wrist at times (m,) [s], shape (m, 3) [m]; beyond the ends it is constant."""
+        """Return the position of the wrist at times (m,) [s], shape (m, 3) [m]; outside the recorded times it is constant."""
         return np.column_stack([np.interp(times, self.times, column) for column in self.wrist.T])
 
 
 def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Correspondence) -> TrueArm:
-    """Return a person's arm as recorded, with the noise, interpolated linearly between frames.
+    """Return a person's arm as the camera measured it, including noise, interpolated linearly between frames.
 
-    In a comparison with a recording, the camera's noise limits the accuracy of every method, and a smooth method
+    If a run is compared with a recorded arm, the camera's noise adds to the error of every method, and a smooth method
     appears slightly worse than it is.
 
     Args:
@@ -102,7 +102,7 @@ def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Co
     """
     arms = [arm for arm in (skeleton.arm(correspondence.side) for skeleton in skeletons) if arm.seen]
     if not arms:
-        raise TaskFailedError(f"the {correspondence.side} arm is never seen; choose the other one (--side)")
+        raise TaskFailedError(f"the {correspondence.side} arm is never seen; choose the other arm (--side)")
     t = np.asarray(times, dtype=float)
     at = np.array([arm.time for arm in arms]) - skeletons[0].time
     points = correspondence.sensor_to_base.apply(np.array([arm.points for arm in arms]).reshape(-1, 3))
@@ -121,12 +121,13 @@ def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Co
 
 @dataclass(frozen=True, eq=False)
 class EngagementPeriods:
-    """Times at which the person led during a run, and the start of each engagement.
+    """The frames of a run in which the robot was engaged (following, coasting, holding), and the starts of engagements.
 
     Attributes:
-        engaged: whether the person led, shape (n,).
-        start: for each frame, the last frame before the person began to lead, shape (n,); undefined where nobody led.
-        count: number of times that the person began to lead.
+        engaged: for each frame, whether the robot was engaged, shape (n,).
+        start: for each engaged frame, the index of the last frame before its engagement, shape (n,); undefined
+            elsewhere.
+        count: number of engagements.
     """
 
     engaged: Mask
@@ -135,12 +136,12 @@ class EngagementPeriods:
 
     @classmethod
     def of(cls, states: ArrayLike, *, first_only: bool = False) -> EngagementPeriods:
-        """Find the engagements in the states of a run, shape (n,).
+        """Find the engagements in a run from its states.
 
         Args:
-            states: values of :class:`~imitarm.retarget.engagement.EngagementState`.
-            first_only: whether to treat all frames after the first engagement as one engagement, as if the person
-                had never been lost.
+            states: values of :class:`~imitarm.retarget.engagement.EngagementState` in each frame, shape (n,).
+            first_only: whether to treat all frames from the first engagement on as one engagement, as if the camera had
+                never lost the person.
         """
         engaged = engaged_samples(states)
         begins = np.flatnonzero(engaged & ~np.concatenate([[False], engaged[:-1]]))
@@ -157,33 +158,33 @@ class EngagementPeriods:
 def reference_positions(
     true: TrueArm, tool: Array, periods: EngagementPeriods, scale: float, lag: float = 0.0
 ) -> Array:
-    r"""Return the correct position of the tool: the clutch's law with the true hand (docs/retargeting.md).
+    r"""Return the correct position of the tool, which is the clutch law applied to the true hand (docs/retargeting.md).
 
     .. math:: p(t) = p_{home} + \rho\,(W(t - lag) - W(t_e))
 
-    where :math:`t_e` is the time at which the person began to lead, and :math:`p_{home}` the position of the tool at
-    that time.
+    where :math:`W` is the position of the true wrist, :math:`\rho` the scale, :math:`t_e` the time at which the
+    engagement began, and :math:`p_{home}` the position of the tool at that time.
 
     Args:
         true: the person's arm, in the axes of the base.
         tool: positions of the tool, shape (n, 3) [m].
-        periods: times at which the person led.
+        periods: the engaged frames.
         scale: rho.
-        lag: largest time by which the tool may be late [s].
+        lag: time by which the tool may be late [s].
 
     Returns:
-        shape (n, 3) [m]; undefined where nobody led.
+        shape (n, 3) [m]; undefined in frames that are not engaged.
     """
     return tool[periods.start] + scale * (true.wrist_at(true.times - lag) - true.wrist[periods.start])
 
 
 def reference_rotations(true: TrueArm, quaternions: Array, periods: EngagementPeriods, orientation: str) -> Array:
-    """Return the correct rotation of the tool: the clutch's law with the true hand, quaternions wxyz, shape (n, 4).
+    """Return the correct rotations of the tool (n, 4), wxyz, which are the clutch law applied to the true hand.
 
     Args:
         true: the person's arm, in the axes of the base.
         quaternions: quaternions of the tool, wxyz, shape (n, 4).
-        periods: times at which the person led.
+        periods: the engaged frames.
         orientation: ``"hand"``, ``"upright"`` or ``"fixed"``, see
             :class:`~imitarm.retarget.correspondence.Correspondence`.
     """
@@ -199,7 +200,7 @@ def reference_rotations(true: TrueArm, quaternions: Array, periods: EngagementPe
 
 
 def rms(errors: ArrayLike) -> float:
-    """Return the root mean square of numbers (n,) or of the norms of vectors (n, d); nan without numbers."""
+    """Return the root mean square of numbers (n,), or of the norms of vectors (n, d); nan if there are none."""
     values = np.asarray(errors, dtype=float)
     if len(values) == 0:
         return float("nan")
@@ -208,10 +209,10 @@ def rms(errors: ArrayLike) -> float:
 
 
 def best_lag(true: TrueArm, tool: Array, periods: EngagementPeriods, scale: float) -> tuple[float, float]:
-    """Return the constant lag with which the tool follows best [s], and the remaining RMS error [m].
+    """Return the constant lag that explains the tool's motion best [s], and the RMS error that remains without it [m].
 
-    Lags from -0.1 to 0.8 s are tried; the result is the minimum of the parabola through the best and its neighbours.
-    Both are nan if nobody led; the lag is also nan if the hand did not move.
+    Lags from -0.1 to 0.8 s are tried. A parabola through the lag with the smallest error and its two neighbours gives
+    the minimum. Both results are nan if no frame is engaged. The lag is also nan if the hand did not move.
     """
     engaged = periods.engaged
     if not engaged.any():
@@ -230,7 +231,7 @@ def best_lag(true: TrueArm, tool: Array, periods: EngagementPeriods, scale: floa
 
 
 def target_lag(times: ArrayLike, tool: ArrayLike, targets: ArrayLike) -> float:
-    """Return the constant lag with which a tool follows its target best [s], from 0 to 0.8 s.
+    """Return the constant lag, from 0 to 0.8 s, that explains best how a tool follows its target [s].
 
     Args:
         times: evenly spaced times, shape (n,) [s].
@@ -238,9 +239,9 @@ def target_lag(times: ArrayLike, tool: ArrayLike, targets: ArrayLike) -> float:
         targets: target positions, shape (n, 3) [m]; nan where there is no target.
 
     Returns:
-        The lag is nan when there is no target, it does not move, or the tool does not follow it: at every lag its
-            error exceeds
-        half of the target's own motion about its mean (RMS).
+        The lag. It is nan when there is no target, when the target does not move, or when the tool does not follow it.
+        The tool does not follow if, at every lag, its RMS error exceeds half of the RMS motion of the target about its
+        mean.
     """
     t, p, aim = (np.asarray(values, dtype=float) for values in (times, tool, targets))
     known = np.isfinite(aim).all(axis=1)
@@ -258,7 +259,7 @@ def target_lag(times: ArrayLike, tool: ArrayLike, targets: ArrayLike) -> float:
 
 
 def rotation_errors(first: Array, second: Array) -> Array:
-    """Return the angles between rotations, quaternions wxyz (n, 4), shape (n,) [rad]."""
+    """Return the angles between two series of quaternions wxyz (n, 4), shape (n,) [rad]."""
     both = quaternion_multiply(quaternion_conjugate(first), second)
     return 2.0 * np.arctan2(np.linalg.norm(both[:, 1:], axis=1), np.abs(both[:, 0]))
 
@@ -266,13 +267,14 @@ def rotation_errors(first: Array, second: Array) -> Array:
 def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) -> Array:
     """Return the angle between the actual and the correct direction of the robot's upper arm, shape (n,) [rad].
 
-    The correct direction follows from the direction at the start of the engagement by the smallest rotation that maps
-    the person's upper arm at that time to its current direction.
+    The correct direction is the direction of the robot's upper arm at the start of the engagement, rotated in the same
+    way as the person's upper arm has rotated since then. This rotation is the smallest one between the two directions
+    of the person's upper arm.
 
     Args:
         true: the person's arm, in the axes of the base.
         sew: robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
-        periods: times at which the person led.
+        periods: the engaged frames.
     """
     person, robot = _unit(true.elbow - true.shoulder), _unit(sew[:, 1] - sew[:, 0])
     wanted = _rotated(person[periods.start], person, robot[periods.start])
@@ -280,15 +282,15 @@ def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods
 
 
 def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) -> Array:
-    """Return the difference of the changes of the SEW angles of robot and person since the person began to lead.
+    """Return how differently the SEW angles (swivel angles) of robot and person changed since the engagement began.
 
     Args:
         true: the person's arm, in the axes of the base.
         sew: robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
-        periods: times at which the person led.
+        periods: the engaged frames.
 
     Returns:
-        shape (n,) [rad], 0 to pi; nan where one of the arms is so straight that its elbow angle is poorly defined.
+        shape (n,) [rad], 0 to pi; nan where one of the arms is so straight that its swivel angle is poorly defined.
     """
     person = sew_derivatives(true.shoulder, true.elbow, true.wrist)
     robot = sew_derivatives(sew[:, 0], sew[:, 1], sew[:, 2])
@@ -298,7 +300,7 @@ def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) ->
 
 
 def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, rest: float = 0.5) -> float:
-    """Return the time at which a point came within ``radius`` [m] of its mean position in the last ``rest`` seconds.
+    """Return when a point came within ``radius`` [m] of its final position: the mean over the last ``rest`` seconds.
 
     Args:
         times: time stamps, shape (n,) [s].
@@ -315,7 +317,7 @@ def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, res
 def settling_time(
     times: ArrayLike, positions: ArrayLike, goal: ArrayLike, end: float, radius: float = 0.01, stay: float = 0.5
 ) -> float:
-    """Return the time from ``end`` until a point comes within ``radius`` of the goal and stays for ``stay`` seconds.
+    """Return the time from ``end`` until a point is within ``radius`` of the goal and stays there for ``stay`` seconds.
 
     Args:
         times: evenly spaced times, shape (n,) [s].
@@ -326,7 +328,7 @@ def settling_time(
         stay: [s].
 
     Returns:
-        The time [s], at least 0; nan if the point never comes that close, or the recording ends before it has stayed.
+        The time [s], at least 0; nan if the point never comes that close, or if the recording ends too early to tell.
     """
     t = np.asarray(times, dtype=float)
     inside = np.linalg.norm(np.asarray(positions, dtype=float) - np.asarray(goal, dtype=float), axis=1) <= radius
@@ -343,7 +345,7 @@ def _unit(vectors: Array) -> Array:
 
 
 def _rotated(before: Array, after: Array, vectors: Array) -> Array:
-    """Return vectors (n, 3) rotated by the smallest rotations that take unit vectors ``before`` to ``after``."""
+    """Return vectors (n, 3), rotated by the smallest rotations that take the unit vectors ``before`` to ``after``."""
     both = before + after
     factor = np.sum(both * vectors, axis=1) / np.maximum(1.0 + np.sum(before * after, axis=1), 1e-12)
     return vectors - factor[:, None] * both + 2.0 * np.sum(before * vectors, axis=1, keepdims=True) * after

@@ -1,4 +1,4 @@
-"""Tasks: complete scenes with a success test."""
+"""Tasks: complete simulated scenes, each with a test of success."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class StackEvaluation:
     """The evaluation of a stacking run.
 
     Attributes:
-        success: whether all four cubes are stacked in order, without support.
+        success: whether all four cubes are stacked in order, without support by the gripper.
         failure: one of :data:`FAILURES`; empty on success.
         stacked: number of cubes in the tower, counted from cube 1.
         reason: explanation.
@@ -78,11 +78,11 @@ class StackEvaluation:
 
 @dataclass
 class CubeHistory:
-    """The history of the cubes so far; :meth:`StackTask.watch` updates it.
+    """What has happened to the cubes so far; :meth:`StackTask.watch` updates this history.
 
     Attributes:
-        highest: largest height of each cube's center, shape (4,) [m].
-        tallest: largest number of cubes in the tower while the gripper touched no cube.
+        highest: largest height of each cube's center so far, shape (4,) [m].
+        tallest: largest number of cubes in the tower so far, at times when the gripper touched no cube.
         lost: indices of the cubes that left the gripper in the air.
         held: index of the cube in the gripper; None if there is none.
     """
@@ -95,13 +95,14 @@ class CubeHistory:
 
 @dataclass(frozen=True)
 class StackTask:
-    """A Sawyer with a parallel gripper at a table with four 32 mm cubes, numbered 1 to 4 by colour and pips.
+    """A Sawyer with a parallel gripper at a table with four cubes of 32 mm; colours and pips show their numbers 1 to 4.
 
-    Cube 1 stays in its place; cubes 2, 3 and 4 are stacked on it in this order. The task succeeds if the tower stands
-    in the order of the numbers, without support, and each cube is centred on the cube below to within the tolerance.
+    Cube 1 stays in its place; cubes 2, 3 and 4 are stacked on it in this order. The task succeeds if the cubes stand in
+    the order of their numbers without support by the gripper, and each cube is centred on the cube below it to within
+    the tolerance.
 
-    Contacts use MuJoCo's elliptic friction cones with ``impratio`` 10, so that a held cube does not slip out of the
-    fingers; ``condim`` 4 gives the pads torsional friction.
+    Contacts use MuJoCo's elliptic friction cones with ``impratio`` 10, so that a grasped cube does not slip out of the
+    fingers. The setting ``condim`` 4 gives the finger pads torsional friction.
 
     Attributes:
         seed: seed of the small random changes of the cubes' positions and rotations.
@@ -120,7 +121,7 @@ class StackTask:
 
     @staticmethod
     def arm() -> ArmModel:
-        """Return the Sawyer with the gripper."""
+        """Load the Sawyer with the gripper."""
         return ArmModel.load("sawyer", tool="gripper")
 
     def places(self) -> tuple[Array, Array]:
@@ -145,8 +146,8 @@ class StackTask:
 
         Args:
             arm: the arm, if it is loaded already.
-            control: control of the drives; by default computed torque, which is more compliant, because contacts
-                are expected.
+            control: control mode of the drives. The default is computed torque, which is more compliant, because
+                contacts are expected.
         """
         arm = self.arm() if arm is None else arm
         robot = SimulatedRobot(arm, world=self.world(arm), control=control, q=self.start_posture(arm))
@@ -163,7 +164,7 @@ class StackTask:
         return np.array([robot.data.body(f"cube/{i + 1}").xpos for i in range(N_CUBES)])
 
     def stacked(self, robot: SimulatedRobot) -> int:
-        """Return the number of cubes in the tower: 1 if only cube 1 stands on the table, 0 if it does not."""
+        """Return the number of cubes in the tower, which begins with cube 1 on the table; 0 if cube 1 is not there."""
         cubes = self.cubes(robot)
         level = self._level(robot)
         for i in range(N_CUBES):
@@ -174,7 +175,7 @@ class StackTask:
         return N_CUBES
 
     def standing(self, robot: SimulatedRobot) -> bool:
-        """Return whether all four cubes stand in order and at rest, and the gripper touches none of them."""
+        """Return whether all four cubes stand in order and at rest while the gripper touches none of them."""
         speed = max(float(np.linalg.norm(robot.data.body(f"cube/{i + 1}").cvel[3:])) for i in range(N_CUBES))
         return self.stacked(robot) == N_CUBES and speed < _STILL and not any(self.touched(robot))
 
@@ -203,9 +204,10 @@ class StackTask:
     def evaluate(self, robot: SimulatedRobot, history: CubeHistory) -> StackEvaluation:  # noqa: PLR0911 (one for each kind of failure)
         """Return success, or the first failure that applies.
 
-        The failures, in this order: the robot has made a protective stop; the tower was higher before; a cube left the
-        gripper in the air and is not in the tower; a cube was put down outside the tower; a cube that was never lifted
-        has turned over or was pushed; the next cube was never lifted; the time is up without any of these.
+        Failures are checked in this order: the robot has made a protective stop; the tower had more cubes before; a
+        cube left the gripper in the air and is not in the tower; a cube was put down outside the tower; a cube that was
+        never lifted turned over or was pushed; the next cube was never lifted; the time limit was reached without any
+        of these failures.
         """
         n = self.stacked(robot)
         if self.standing(robot):
@@ -241,7 +243,7 @@ class StackTask:
 
 
 def _free_below(cubes: Array, i: int) -> bool:
-    """Return whether a cube is in the air, resting neither on the table nor on another cube."""
+    """Return whether a cube is in the air: it rests neither on the table nor on another cube."""
     bottom = cubes[i, 2] - 0.5 * SIDE
     near = np.hypot(*(cubes[:, :2] - cubes[i, :2]).T) < SIDE
     below = near & (cubes[:, 2] < cubes[i, 2] - 0.5 * SIDE)

@@ -63,7 +63,7 @@ class StackResult:
         failure: one of :data:`imitarm.tasks.stack.FAILURES`; empty on success.
         reason: explanation of success or failure.
         stacked: number of cubes in the tower at the end, counted from cube 1.
-        time: time until the person had finished, or the timeout [s].
+        time: time at which the person finished, or the timeout [s].
         path_length: length of the tool's path [m].
         times: times of the log, shape (n,) [s].
         joints: measured joint positions, shape (n, n_joints) [rad].
@@ -71,9 +71,9 @@ class StackResult:
         tool: positions of the tool, shape (n, 3) [m].
         openings: openings of the gripper, shape (n,) [m].
         clamped: number of control steps in which the robot's limits changed the command.
-        lengths: lengths of the person's arm, as measured before the run.
+        lengths: lengths of the person's upper arm and forearm, as measured before the run.
         skeletons: skeletons from the camera.
-        truth: true skeleton for each frame, also for those that the camera lost.
+        truth: true skeleton of each frame, also of frames that the camera lost.
     """
 
     seed: int
@@ -97,13 +97,13 @@ class StackResult:
 
 
 def stack_correspondence(person: Person, lengths: LimbLengths | None = None) -> Correspondence:
-    """Return the correspondence for this task: scale 1, and the gripper always points down."""
+    """Return the correspondence of person and robot for this task: scale 1, and the gripper always points down."""
     lengths = LimbLengths(person.upper_arm, person.forearm) if lengths is None else lengths
     return Correspondence(lengths=lengths, orientation="fixed")
 
 
 def calibrate_limbs(person: Person, camera: SkeletonCamera) -> LimbLengths:
-    """Measure the lengths of a person's arm, which is held in front of the sensor for 3 s."""
+    """Measure the limb lengths of a person who holds the arm in front of the sensor for 3 s."""
     seen, time = [], 0.0
     side = person.shoulder() + np.array([0.35, -0.1, -0.6]) * person.reach
     while time < _CALIBRATION:
@@ -127,21 +127,20 @@ def run_stack(
 ) -> StackResult:
     """Let person number ``seed`` stack the cubes with a retargeter.
 
-    100 times per second, the retargeter receives the camera's newest skeleton, the robot receives the retargeter's
-    joint velocity, and the person receives the resulting view of robot and cubes. The person, the positions of the
-    cubes and the errors of the camera depend only on ``seed`` and ``repeat``. The loop is closed, so the motion of the
-    person also depends on the
-    retargeter.
+    The loop runs 100 times per second. In each step, the retargeter receives the newest skeleton of the camera, the
+    robot receives the joint velocity of the retargeter, and the person sees the robot and the cubes. The person, the
+    positions of the cubes and the errors of the camera depend only on ``seed`` and ``repeat``. The person reacts to
+    what the robot does, so the motion of the person also depends on the retargeter.
 
     Args:
         seed: seed of the person.
         repeat: number of the run of this person.
         factory: function that builds the retargeter.
         arm: the Sawyer with the gripper, if it is loaded already.
-        camera: function that builds the camera from a seed; the default camera has 1 to 2 cm of noise and all other
-            errors.
-        latency: time from exposure until the skeleton arrives [s].
-        control: control of the robot's drives; compliant by default, because contacts are expected.
+        camera: function that builds the camera from a seed; the default camera has noise of 1 to 2 cm and all other
+            simulated errors.
+        latency: time from the exposure of a camera frame until its skeleton arrives [s].
+        control: control mode of the robot's drives; compliant by default, because contacts are expected.
         timeout: longest duration [s].
 
     Raises:
@@ -156,7 +155,7 @@ def run_stack(
 
 
 class _StackRun:
-    """The state of one run."""
+    """The state of one run of the task."""
 
     def __init__(
         self,
@@ -187,7 +186,7 @@ class _StackRun:
         self.tool = self.robot.tool_to_base.position
 
     def run(self, timeout: float) -> StackResult:
-        """Run until the person has finished, the robot makes a protective stop, or the timeout; return the result."""
+        """Run until the person has finished, the robot stops itself, or the timeout is reached; return the result."""
         steps = round(timeout / DT)
         k = 0
         while k < steps and not self.operator.finished and not self.robot.fault:
@@ -218,13 +217,13 @@ class _StackRun:
         self.log.append((time + DT, state.q, state.torque, self.tool, robot.opening))
 
     def view(self, time: float) -> OperatorView:
-        """Return the operator's view."""
+        """Return what the operator sees now."""
         robot = self.robot
         following = self.retargeter.latest.state.engaged
         return OperatorView(time, self.tool, robot.opening, self.task.cubes(robot), following)
 
     def expose(self, time: float) -> None:
-        """Take the camera frames that are due."""
+        """Let the camera take the frames that are due."""
         while self.next_exposure <= time:
             truth = self.operator.act(self.next_exposure)
             self.truth.append(truth)
@@ -268,11 +267,11 @@ class _StackRun:
 
 
 class IdealFollower(Retargeter):
-    """Moves the tool to its target by inverse kinematics, without filters or corrections.
+    """A retargeter that moves the tool to its target by inverse kinematics, without filters or corrections.
 
-    It assumes that every skeleton is exact. With an :func:`ideal_camera`, it behaves like a tool in the person's own
-    hand, with a lag of a few hundredths of a second. The benchmark uses it to record people and gives the same
-    recording to every retargeter.
+    It assumes that every skeleton is exact. With an :func:`ideal_camera`, the robot's tool moves like a tool in the
+    person's own hand, with a lag of a few hundredths of a second. The benchmark uses this retargeter to record simulated
+    people, and then gives the same recordings to every retargeter.
     """
 
     name: ClassVar[str] = "ideal"

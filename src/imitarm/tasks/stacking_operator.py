@@ -1,4 +1,4 @@
-r"""SimulatedOperator: a simulated person who stacks cubes with a robot and watches gripper and cubes.
+r"""SimulatedOperator: a simulated person who stacks cubes with a teleoperated robot and watches gripper and cubes.
 
 This model closes the loop around a retargeter. The operator sees gripper and cubes with delay and noise, and reacts
 with a motion of the hand. The operator does not know the retargeter between hand and gripper.
@@ -44,7 +44,7 @@ _REACHABLE = (0.35, 0.85, 0.40)  # [m] smallest x, largest x and largest |y| at 
 
 @dataclass(frozen=True, eq=False)
 class OperatorView:
-    """The operator's view at one time, in the robot's base frame.
+    """What the operator sees at one time, in the robot's base frame.
 
     Attributes:
         time: time [s].
@@ -63,22 +63,23 @@ class OperatorView:
 
 @dataclass(frozen=True)
 class Habits:
-    """Individual habits of a person in this task.
+    """Habits of a person in this task, which differ from person to person.
 
     Attributes:
         delay: time from seeing an error to the start of the corrective movement [s]; about 0.2 s for a visual
             correction.
-        look_every: time between two looks that may lead to a correction [s].
+        look_every: time between two looks at the gripper, each of which may lead to a correction [s].
         gain: fraction of a small error that one correction covers, below 1.
-        noise: standard deviation of the observed positions on each axis, drawn at each look [m].
+        noise: standard deviation of the error of observed positions on each axis; a new error is drawn at each look
+            [m].
         bias: constant error of the observed position of the gripper, 3 values [m].
         speed: mean speed of the hand over long distances [m/s].
         fine_speed: mean speed of the hand near a contact [m/s].
         tolerance: largest error at which the gripper looks aligned, so that the hand closes or opens [m].
-        sense_of_lag: lag of the robot that the person expects [s]; the same for every retargeter.
+        sense_of_lag: lag of the robot that the person expects, which is the same for every retargeter [s].
         dwell: rest after the hand has closed or opened [s].
         height: additional height of movements over long distances [m].
-        begin: initial time for which the hand is held still, so that the robot can engage [s].
+        begin: time at the start for which the person holds the hand still, so that the robot can begin to follow [s].
     """
 
     delay: float
@@ -123,17 +124,17 @@ class Phase(StrEnum):
     REACH = "reach"
     """Move above the cube."""
     DESCEND = "descend"
-    """Lower the gripper around the cube; close the hand when it looks aligned."""
+    """Lower the gripper around the cube; close the hand when the gripper looks aligned."""
     CLOSE = "close"
-    """Wait until the fingers look closed."""
+    """Wait until the fingers of the gripper look closed."""
     LIFT = "lift"
     """Raise the cube."""
     CARRY = "carry"
     """Move the cube above the tower."""
     LOWER = "lower"
-    """Lower the cube; open the hand when it looks stacked."""
+    """Lower the cube; open the hand when the cube looks stacked."""
     OPEN = "open"
-    """Wait until the fingers look open."""
+    """Wait until the fingers of the gripper look open."""
     RETREAT = "retreat"
     """Raise the gripper, then choose the next cube."""
 
@@ -166,7 +167,7 @@ class StackPlan:
         }
 
     def step(self, view: OperatorView, now: float) -> tuple[Array | None, bool]:
-        """Return the goal of the gripper, shape (3,) [m], or None to rest, and whether to move carefully.
+        """Return the goal of the gripper (3,) [m] (None: keep the hand at rest), and whether to move carefully.
 
         Args:
             view: the operator's view, with delay and noise.
@@ -271,13 +272,13 @@ class StackPlan:
         return float(np.hypot(*(self._tool - goal)[:2]))
 
     def _above(self, place: Array, height: float, away: float) -> Array:
-        """Return the goal above ``place``; if the gripper is low and far away, first a goal straight above it."""
+        """Return a goal above ``place``; while the gripper is low and far away, a goal straight above it."""
         if self._tool[2] < height - 0.03 and away > 0.03:
             return np.array([self._tool[0], self._tool[1], height])
         return np.array([place[0], place[1], height])
 
     def _descent(self, goal: Array, away: float, allowed: float) -> tuple[Array, bool]:
-        """Return the next goal of a descent: fast to a little above ``goal``, then carefully while aligned."""
+        """Return the next goal of a descent: a point above ``goal``, then ``goal`` itself if the gripper is aligned."""
         high = float(self._tool[2] - goal[2])
         if high > _FAST_ABOVE + 0.02:
             return goal + [0.0, 0.0, _FAST_ABOVE], False
@@ -289,7 +290,7 @@ class StackPlan:
         return self._tool - self._target
 
     def _lost(self) -> bool:
-        """Return whether the cube is no longer in the gripper, and start again if so."""
+        """Return whether the cube is no longer in the gripper; if so, the plan starts again and chooses a cube."""
         lost = float(np.linalg.norm(self._offset())) > _HELD
         if lost:
             self.closed = False
@@ -306,7 +307,7 @@ class StackPlan:
         return self._tower_top() + _CLEAR + 0.5 * SIDE + float(self._offset()[2]) + self.habits.height
 
     def _n_stacked(self) -> int:
-        """Return the number of cubes that look stacked; a cube below another cube is not corrected."""
+        """Return the number of cubes that look stacked; a cube below another cube counts even if badly placed."""
         cubes, n = self._view.cubes, 1
         while n < N_CUBES:
             away, up = _separation(cubes[n], cubes[n - 1])
@@ -323,7 +324,7 @@ def _reachable(cube: Array) -> bool:
 
 
 def _separation(upper: Array, lower: Array) -> tuple[float, float]:
-    """Return the horizontal and the vertical distance of two cubes [m]."""
+    """Return the horizontal and the vertical distance between two cubes [m]."""
     x, y, z = upper - lower
     return math.hypot(x, y), float(z)
 
@@ -342,32 +343,33 @@ class _SubMovement:
 
 
 class SimulatedOperator:
-    r"""A person who stacks cubes with a robot and watches the gripper, not the hand.
+    r"""A simulated person who stacks cubes with a robot and watches the gripper, not the own hand.
 
     *Hand.* The motion of the hand is a sum of sub-movements, :math:`h(t) = h_0 + \sum_i d_i\,\mu((t-t_i)/T_i)`, with
     the minimum-jerk profile :math:`\mu(u) = 10u^3-15u^4+6u^5` (intermittent control: Milner 1992, Burdet and Milner
-    1998). Their lengths vary by 4 %. Their duration is :math:`T = |d|/v + 0.25` s, with a small speed v near a
-    contact. Tremor is added by :class:`~imitarm.capture.person.Person`.
+    1998). The lengths of the sub-movements vary randomly by 4 %. A sub-movement lasts :math:`T = |d|/v + 0.25` s, with
+    a low speed v near a contact. Tremor is added by :class:`~imitarm.capture.person.Person`.
 
-    *Eye.* About 7 times per second, the person reacts to the :class:`OperatorView` at the time ``delay`` before, with
-    noise of about a millimetre and a bias. The expected position of the gripper is the observed position plus the
-    displacement
-    that the hand has commanded since then: :math:`\hat p = p(t-\delta) + \rho\,(h_{end} - h(t-\delta-\lambda))`, with
-    the scale :math:`\rho` and the lag :math:`\lambda` that the person expects. The next sub-movement is
-    :math:`d = g\,(p_{goal}-\hat p)/\rho`, with a gain g below 1 over short distances and 1 over long ones.
+    *Eye.* About 7 times per second, the person reacts to the :class:`OperatorView` of the time ``delay`` earlier, whose
+    positions have noise of about a millimetre and a bias. The person expects the gripper at the observed position plus
+    the displacement that the hand has commanded since that time, :math:`\hat p = p(t-\delta) + \rho\,(h_{end} -
+    h(t-\delta-\lambda))`, with the scale :math:`\rho` and the lag :math:`\lambda` that the person expects. The next
+    sub-movement is :math:`d = g\,(p_{goal}-\hat p)/\rho`. The gain g is below 1 over short distances and 1 over long
+    distances.
 
     *Plan.* :class:`StackPlan` chooses the goals. The hand closes or opens when the gripper looks aligned to within the
-    person's tolerance, which grows with impatience. A cube that was missed, lost or has fallen is fetched again.
+    person's tolerance, which grows as the person becomes impatient. If the gripper misses or loses a cube, or a cube
+    falls, the person fetches the cube again.
 
     The hand position depends only on views that are at least ``delay`` old.
 
     Args:
         seed: seed of the person and the habits.
-        repeat: number of the run of this person; seeds the differences between runs.
-        scale: robot motion divided by hand motion, as the person expects it.
+        repeat: number of the run of this person, which seeds the differences between runs.
+        scale: robot motion divided by hand motion that the person expects.
 
     Attributes:
-        person: the person whose arm moves.
+        person: model of the person's body and arm motion.
         habits: habits of this person.
         plan: plan of this person's next actions.
     """
@@ -391,7 +393,7 @@ class SimulatedOperator:
         return self.plan.finished
 
     def see(self, view: OperatorView) -> None:
-        """Show the current view; the person reacts to it ``delay`` later."""
+        """Show the current view to the person, who reacts to it after ``delay``."""
         self._views.append(view)
 
     def hand_displacement(self, time: float) -> Array:
@@ -413,7 +415,7 @@ class SimulatedOperator:
         return self.person.skeleton(time, wrist, swivel=self._swivel, closed=self.plan.closed)
 
     def _look(self, now: float) -> None:
-        """React to the view at the time ``delay`` before."""
+        """React to the view of the time ``delay`` earlier."""
         seen = None
         while self._views and self._views[0].time <= now - self.habits.delay + 1e-9:
             seen = self._views.popleft()

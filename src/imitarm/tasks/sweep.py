@@ -52,9 +52,10 @@ _WOOD, _LEG, _PAN, _DIRT = (
 class SweepTask:
     """A Sawyer with a curved brush, dirt on a table, and a dustpan recessed into the table.
 
-    The brush starts at S, moves to the dirt at T and pushes it to G in the dustpan. The brush moves just above the
-    table with its open side ahead, so that its two ends hold the crumbs when it deviates to the left or right. The task
-    succeeds if the dirt is in the pan and neither the arm nor the brush has touched an obstacle.
+    The brush starts at the point S, moves to the dirt at the point T, and pushes the dirt to the point G in the
+    dustpan. The brush moves just above the table. Its open side points in the direction of motion, so that its two ends
+    keep the crumbs in when it moves to the left or right. The task succeeds if the dirt is in the pan and neither the
+    arm nor the brush has touched an obstacle.
 
     Attributes:
         seed: seed of the positions of the crumbs.
@@ -81,7 +82,7 @@ class SweepTask:
 
     @staticmethod
     def arm() -> ArmModel:
-        """Return the Sawyer with the brush."""
+        """Load the Sawyer with the brush."""
         return ArmModel.load("sawyer", tool="brush")
 
     @staticmethod
@@ -103,7 +104,7 @@ class SweepTask:
     def dirt_time(self, trajectory: Trajectory) -> float:
         """Return the time at which ``trajectory`` is nearest to the dirt [s].
 
-        The path should not be displaced at this time.
+        The path should not be displaced at this time, because the brush must meet the dirt.
         """
         away = np.linalg.norm(trajectory.positions - self.dirt.position, axis=1)
         return float(trajectory.times[np.argmin(away)])
@@ -132,12 +133,12 @@ class SweepTask:
     def robot(
         self, scene: Scene | None = None, *, arm: ArmModel | None = None, control: Control = "position"
     ) -> SimulatedRobot:
-        """Return the simulated robot with its brush at S, in ``scene``.
+        """Return the simulated robot in ``scene``, with its brush at S.
 
         Args:
-            scene: obstacles on the table; None: no obstacles.
-            arm: the arm, if it is loaded already.
-            control: control of the drives.
+            scene: obstacles on the table; None for no obstacles.
+            arm: the arm, if it has been loaded already.
+            control: control mode of the drives.
         """
         arm = self.arm() if arm is None else arm
         return SimulatedRobot(arm, scene=scene, world=self.world(arm), control=control, q=self.start_posture(arm))
@@ -154,9 +155,10 @@ class SweepTask:
         return np.asarray((np.abs(x) < 0.5 * across) & (y > 0.0) & (y < along) & (z > 0.0) & (z < 2.0 * _PAN_WALL[1]))
 
     def evaluate(self, robot: SimulatedRobot, rollout: Rollout) -> Rollout:
-        """Return ``rollout`` with success or the reasons for failure: dirt outside the pan, contact, or not finished.
+        """Return ``rollout`` with success or the reasons for failure (dirt outside the pan, contact, not finished).
 
-        ``details`` receives ``"swept_fraction"`` (fraction of the crumbs in the pan) and ``"swept"`` (for each crumb).
+        Its ``details`` contain ``"swept_fraction"`` (fraction of the crumbs in the pan) and ``"swept"`` (whether each
+        crumb is in the pan).
         """
         swept = self.swept(robot)
         fraction = float(swept.mean())

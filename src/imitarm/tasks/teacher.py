@@ -35,15 +35,15 @@ _TREMOR_BAND = (4.0, 9.0)  # [Hz] physiological tremor of a hand
 
 @dataclass(frozen=True, eq=False)
 class Teacher:
-    """The sweeping motion of one person: the path of the hand, its speed and its tremor.
+    """The sweeping motion of one simulated person: the path of the hand, its speed and its tremor.
 
     The hand follows the minimum-jerk path through S, T, G and two points between them: the quintic spline that starts
-    and ends at rest (Flash and Hogan 1985). People differ in the duration, the fraction of the duration before T, the
-    sideways displacement of the path, the accuracy at T and G, the height of the brush, the rotation of the wrist, the
-    tremor, and the rest before and after.
+    and ends at rest (Flash and Hogan 1985). Persons differ in many respects: total duration, time until T, sideways
+    displacement of the path, accuracy at T and G, height of the brush, rotation of the wrist, tremor, and rest before
+    and after the motion.
 
     Attributes:
-        seed: seed of all these differences.
+        seed: seed of the person, which determines all these quantities.
         duration: duration of the motion [s].
         rest: time at rest before and after the motion, shape (2,) [s].
     """
@@ -87,7 +87,7 @@ class Teacher:
         )
 
     def hand(self, time: float) -> tuple[Pose, Array]:
-        """Return the hand's target pose of the tool and its twist, shape (6,), at ``time`` [s]."""
+        """Return the pose to which the hand pulls the tool at ``time`` [s], and the twist of this pose, shape (6,)."""
         t = float(np.clip(time - self.rest[0], 0.0, self.duration))
         amplitude, frequency, phase = self._tremor
         position = self._path(t) + (amplitude * np.sin(frequency * time + phase)).sum(axis=0)
@@ -97,9 +97,9 @@ class Teacher:
     def demonstrate(self, arm: ArmModel | None = None) -> tuple[Demonstration, SimulatedRobot]:
         """Guide the arm through the sweep; return the demonstration and the robot with its crumbs.
 
-        The hand acts as a spring and a damper, ``f = K (x_hand - x) + D (v_hand - v)``, likewise in rotation; the arm
-        compensates its own weight and follows. The demonstration holds the joint positions every 30 ms, and the
-        corresponding poses of the tool.
+        The hand pulls the tool like a spring and a damper, ``f = K (x_hand - x) + D (v_hand - v)``, and acts on its
+        rotation in the same way. The arm compensates its own weight and follows the hand. The demonstration contains
+        the joint positions every 30 ms, and the corresponding poses of the tool.
 
         Args:
             arm: the Sawyer with the brush, if it is already loaded.
@@ -128,7 +128,7 @@ class Teacher:
         ), robot
 
     def _wrench(self, robot: SimulatedRobot, time: float) -> Array:
-        """Return the wrench of the hand on the tool, shape (6,) [N, N m]."""
+        """Return the wrench that the hand exerts on the tool, shape (6,) [N, N m]."""
         target, twist = self.hand(time)
         state = robot.state()
         error = robot.tool_to_base.error_to(target)
