@@ -82,7 +82,7 @@ class TrueArm:
         return cls(t, points[:, 0], points[:, 1], points[:, 2], matrix_to_quaternion(hands))
 
     def wrist_at(self, times: Array) -> Array:
-        """Return the position of the wrist at times (m,) [s], shape (m, 3) [m]; outside the recorded times it is constant."""
+        """Return the position of the wrist at times (m,) [s], (m, 3) [m]; outside the recorded times it is constant."""
         return np.column_stack([np.interp(times, self.times, column) for column in self.wrist.T])
 
 
