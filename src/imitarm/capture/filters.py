@@ -150,8 +150,9 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     r"""Return the skeleton with left and right assigned as in the previous frame.
 
     Let :math:`l, r` be the positions of a left and a right joint, and :math:`l', r'` their positions in the previous
-    frame, a time t earlier. Left and right are swapped back when this makes the motion since the previous frame shorter
-    by more than the limbs can have moved:
+    frame, a time t earlier.
+
+    Left and right are swapped back if this shortens the motion by more than the limbs can have moved in this time:
 
     .. math:: \sum_j |l_j - l'_j| + |r_j - r'_j| > \sum_j |l_j - r'_j| + |r_j - l'_j| + n\,\max(0.15, v t)
 
@@ -172,7 +173,7 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
 
 
 def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
-    """Return the skeleton with left and right as in ``before``, the positions a ``period`` [s] earlier (25, 3) [m]."""
+    """Return the skeleton with left and right as in ``before``, the positions (25, 3) [m] of ``period`` seconds ago."""
     if not (_gain(skeleton.positions, before, _DECIDING, _LEAST) > 0.0).any():  # nearly always
         return skeleton
     order = np.arange(len(JOINTS))
@@ -204,7 +205,7 @@ def _gain(now: Array, before: Array, pairs: NDArray[np.int64], margin: float) ->
         margin: distance by which the swap must shorten the motion of a pair of joints [m].
 
     Returns:
-        The difference for each joint, shape (2, n) [m]; nan for a joint that is lost in one of the two frames.
+        The result for each joint, shape (2, n) [m]; nan for a joint that is lost in one of the two frames.
     """
     there, here = before[pairs], now[pairs]
     straight, crossed = here - there, here - there[::-1]

@@ -155,7 +155,7 @@ class LandmarkConverter:
 
     @staticmethod
     def _fit(world: Array, uv: Array, visibility: Array) -> Array | None:
-        """Return the translation from the hips to the camera, shape (3,) [m]; None if no translation fits."""
+        """Return the translation t of the hips relative to the camera, shape (3,) [m]; None if no translation fits."""
         weight = visibility[_FITTED]
         if weight.sum() < _LEAST_WEIGHT:
             return None
@@ -212,10 +212,10 @@ _CHATTER = r"[IW]\d{4} |INFO: |WARNING: All log messages"  # what MediaPipe logs
 class MediaPipeSource(SkeletonSource):
     """Skeletons of the person in a video or in front of a webcam.
 
-    MediaPipe tracks one person. It runs in another process, in another environment (see
-    :mod:`imitarm.capture.mediapipe_environment`), and sends its landmarks as lines of text, which
-    :class:`LandmarkConverter` converts to skeletons. In a video, times are counted from its start. For a webcam, they
-    are the times on the monotonic clock at which the images arrived.
+    MediaPipe, which tracks one person, runs in another process and in another environment (see
+    :mod:`imitarm.capture.mediapipe_environment`). The process sends its landmarks as lines of text, and
+    :class:`LandmarkConverter` converts them to skeletons. The times of a video are counted from its start. For a
+    webcam, the time of a skeleton is the time at which its image arrived, on the monotonic clock.
 
     Args:
         film: path of a video file, or the number of a webcam.
@@ -316,7 +316,7 @@ class MediaPipeSource(SkeletonSource):
             return line.split(b" ")
         self._silent += clock.monotonic() - before  # only waiting counts: the caller may have been busy elsewhere
         if self._silent > _SILENT:
-            raise self._failed(f"MediaPipe's process has sent nothing for {_SILENT:g} s; it was ended")
+            raise self._failed(f"MediaPipe's process has sent nothing for {_SILENT:g} s, and was ended")
         return None
 
     def _greeting(self, python: Path) -> tuple[int, int]:

@@ -27,9 +27,7 @@ from typing import IO
 from imitarm.errors import ImitarmError, InputError, TaskFailedError
 
 VARIABLE = "IMITARM_MEDIAPIPE_PYTHON"
-"""Environment variable with the path of a Python interpreter that can import MediaPipe; it takes precedence over
-:func:`folders`.
-"""
+"""Environment variable that can name a Python interpreter with MediaPipe, instead of one in :func:`folders`."""
 
 VERSION = "0.10.21"
 VERSIONS = ((3, 9), (3, 12))  # versions of Python for which it exists
@@ -42,9 +40,10 @@ REQUIREMENTS = (
     "flatbuffers>=2.0",
     "matplotlib",
 )
-"""Packages needed for pose tracking. MediaPipe also declares requirements that pose tracking does not need: jax,
-sentencepiece, sounddevice, and an OpenCV with windows. It is therefore installed without its declared requirements, and
-these packages are installed instead.
+"""Packages that pose tracking needs.
+
+MediaPipe is installed with these packages instead of the packages that it declares as requirements.
+Its declared requirements also include jax, sentencepiece and sounddevice, which pose tracking does not need.
 """
 
 _STAMP = "imitarm-mediapipe.txt"  # written last: without it the environment is incomplete
@@ -174,8 +173,8 @@ class LineProcess:
     Args:
         command: command with all its arguments.
         keep: largest number of unread lines to store.
-        newest: what happens when ``keep`` unread lines are stored: True: the oldest unread line is dropped, but never
-            the program's first line; False: the program waits until a line is read.
+        newest: whether to drop the oldest unread line, but never the program's first line, when ``keep`` unread lines
+            are stored; otherwise, the program waits until a line is read.
         chatter: regular expression for lines on standard error that :meth:`ended` leaves out.
 
     Raises:

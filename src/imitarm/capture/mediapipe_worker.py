@@ -1,16 +1,18 @@
 """The process that runs MediaPipe: it reads images and writes landmarks as lines of text.
 
-It runs in another Python environment (3.9 to 3.12) that has mediapipe 0.10.21 but not imitarm, so it must not import
-imitarm. :mod:`imitarm.capture.mediapipe` starts it and reads its standard output::
+The process runs in another Python environment (3.9 to 3.12) that has mediapipe 0.10.21 but not imitarm, so this file
+must not import imitarm. The class ``MediaPipeSource`` of imitarm starts the process and reads its standard output. Each
+line of the output has one of these forms:
 
-    imitarm-mediapipe 1 WIDTH HEIGHT          first, with the first image
-    frame TIME 198 numbers                    33 times: world x y z [m], image x y (0 to 1), visibility
-    nobody TIME                               an image without a person
-    end IMAGES                                last, when the video is over
-    error TEXT                                last, when it can't go on
+* ``imitarm-mediapipe 1 WIDTH HEIGHT`` is the first line, which is sent with the first image.
+* ``frame TIME NUMBERS`` is an image with a person. For each of 33 landmarks, NUMBERS contains the world position x y z
+  [m], the image position x y (0 to 1) and the visibility.
+* ``nobody TIME`` is an image without a person.
+* ``end IMAGES`` is the last line of a video and contains the number of images.
+* ``error TEXT`` is the last line if the process can't continue.
 
-TIME is the time of the image: the time in the video or, for a webcam, the monotonic clock when the image arrived. By
-hand::
+For a video, TIME is the time in the video. For a webcam, TIME is the time at which the image arrived, on the monotonic
+clock. To start the process by hand, run::
 
     .venv-mediapipe/bin/python -I src/imitarm/capture/mediapipe_worker.py video FILE
 """

@@ -62,7 +62,7 @@ class Person:
         forearm: elbow to wrist [m].
         hand: distance from wrist to finger tip [m].
         position: position of the point on the floor between the feet, x and z in the sensor's frame, shape (2,) [m].
-        swivel: psi while the hand is low: angle of the elbow, outwards from straight down [rad].
+        swivel: angle psi of the elbow while the hand is low, measured outwards from straight down [rad].
         lift: increase of psi with the height of the hand [rad/m].
         tremor: amplitude [m], frequency [rad/s] and phase [rad] of the hand's tremor, for each of n sine waves and each
             axis, shape (3, n, 3).
@@ -214,7 +214,7 @@ def _to_shoulder(stature: float, side: str) -> Array:
 
 @lru_cache(maxsize=64)
 def _standing(stature: float) -> Array:
-    """Return an upright body without arms, relative to the point on the floor between its feet, shape (25, 3) [m]."""
+    """Return the joints of an upright body without arms, relative to the point between its feet, (25, 3) [m]."""
     points = np.zeros((len(JOINTS), 3))
     for name, height in _HEIGHTS.items():
         y = height * stature - SENSOR_HEIGHT

@@ -49,8 +49,8 @@ def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
         unit: length of the unit in which the time stamps were read [s].
 
     Returns:
-        The name of the unit, and the factor by which the times must be multiplied. None when no other unit gives a
-        plausible frame rate.
+        The name of the unit, and the factor by which the times must be multiplied. The
+        result is None when no other unit gives a plausible frame rate.
     """
     low, high = PLAUSIBLE_RATE
     fits = [
@@ -177,11 +177,15 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
 def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
     r"""Find joints that jump away for one to three frames and come back.
 
-    Consider the last frame before and the first frame after a possible spike. A joint is in a spike if it is more than
-    0.2 m from the straight line between its positions in these two frames, if these positions are less than half as far
-    from each other, and if at least one of two conditions holds: the joint moves there and back faster than 10 m/s, or
-    an arm bone that ends at the joint is more than 0.12 m longer or shorter than in these two frames. At the beginning
-    and at the end of a recording, any jump of more than 0.3 m at more than 10 m/s is a spike.
+    Let A and B be the positions of a joint in the last frame before and in the first frame after a possible spike. The
+    joint is in a spike if it satisfies three conditions:
+
+    * Its distance d from the straight line between A and B is more than 0.2 m.
+    * The distance between A and B is less than d / 2.
+    * The joint moves there and back faster than 10 m/s, or an arm bone that ends at the joint is more than 0.12 m
+      longer or shorter than in the frames before and after the spike.
+
+    At the beginning and at the end of a recording, any jump of more than 0.3 m at more than 10 m/s is a spike.
 
     Args:
         times: time stamps, shape (n,) [s], increasing.

@@ -43,9 +43,7 @@ JOINTS = (
     "hand_tip_right",
     "thumb_right",
 )
-"""Names of the 25 joints, in the order of the Kinect v2 SDK; left and right are those of the person, not of the
-image.
-"""
+"""Names of the 25 joints, in the order of the Kinect v2 SDK; left and right are the person's left and right."""
 
 JOINT = {name: index for index, name in enumerate(JOINTS)}
 """Index of each joint."""
@@ -79,9 +77,7 @@ class HandState(IntEnum):
 
 
 CONFIDENCE = np.array([0.0, 0.2, 1.0])
-"""Confidence of a joint's position for each state of :class:`Tracking`; docs/retargeting.md describes how it is
-used.
-"""
+"""Confidence of a joint's position for each state of :class:`Tracking`; docs/retargeting.md describes its use."""
 CONFIDENCE.setflags(write=False)
 
 

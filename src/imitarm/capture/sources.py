@@ -21,7 +21,7 @@ def open_source(word: str | Path, *, realtime: bool = False) -> SkeletonSource:
             as fast as the skeletons are read.
 
     Raises:
-        UnknownNameError: when there is neither such a file nor such a source.
+        UnknownNameError: when the name is neither the path of a file nor the name of a source.
         InputError: when the argument after the colon is wrong, a recording can't be read, or a device or a program
             that the source needs is missing; the message says what to do.
     """
@@ -34,7 +34,7 @@ def find_source(word: str | Path) -> tuple[type[SkeletonSource], str]:
     """Return the source of this name and its argument, without opening it.
 
     Raises:
-        UnknownNameError: when there is neither such a file nor such a source.
+        UnknownNameError: when the name is neither the path of a file nor the name of a source.
         InputError: when the source's argument is missing or not allowed, or the package that provides the source is
             faulty.
     """
@@ -85,7 +85,7 @@ def source_words() -> dict[str, str]:
 
 
 def is_live(word: str | Path) -> bool:
-    """Return whether the source of this name is live, which means that it runs until it is stopped; do not open it.
+    """Return whether the source of this name is live and runs until it is stopped; the source is not opened.
 
     Raises:
         InputError: for the same reasons as :func:`find_source`.

@@ -23,8 +23,8 @@ RETARGETERS: Registry[type[Retargeter]] = Registry(
 )
 """All methods by name.
 
-Other packages add methods under the entry-point group ``imitarm.retargeters``. These methods then appear in ``imitarm
-retarget``, ``imitarm teleoperate``, ``imitarm benchmark mapping`` and in the reports.
+Other packages add methods under the entry-point group ``imitarm.retargeters``.
+These methods then appear in all commands that take a retargeting method, and in the reports.
 """
 
 __all__ = [

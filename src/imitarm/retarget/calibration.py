@@ -48,8 +48,8 @@ class Calibration:
         sensor_to_base: pose of the sensor in the robot's base frame.
         sensor_rms: RMS residual of the sensor's pose [m].
         scale: motion of the tool divided by the motion of the hand; None: 1.
-        orientation: how the tool rotates with the hand (:class:`~imitarm.retarget.correspondence.Correspondence`);
-            None: exactly like the hand.
+        orientation: how the tool rotates with the hand (see :class:`~imitarm.retarget.correspondence.Correspondence`);
+            if this is None, the tool rotates exactly like the hand.
 
     Raises:
         InputError: when a value is not usable.

@@ -18,8 +18,9 @@ Array = NDArray[np.float64]
 Orientation = Literal["hand", "upright", "fixed"]
 
 FACING = Pose(np.zeros(3), matrix_to_quaternion(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])))
-"""``sensor_to_base`` for a person who faces the sensor and imagines standing in the robot's place: the robot's x
-axis points in the person's forward direction, its y axis to the person's left, and its z axis up.
+"""``sensor_to_base`` for a person who faces the sensor and imagines standing in the robot's place.
+
+The robot's x axis points in the person's forward direction, its y axis to the person's left, and its z axis up.
 """
 
 

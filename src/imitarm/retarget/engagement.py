@@ -60,10 +60,10 @@ class EngagementRule:
 
     Attributes:
         seen_for: time for which the person's arm must be visible before the robot follows it.
-        follow_until: time since the arm was last seen after which FOLLOWING ends; it bridges frames that a camera
+        follow_until: FOLLOWING ends this long after the arm was last seen; the delay bridges frames that a camera
             drops.
-        coast_until: time since the arm was last seen after which COASTING ends.
-        hold_until: time since the arm was last seen after which HOLDING ends; inf: the robot never stops.
+        coast_until: COASTING ends this long after the arm was last seen.
+        hold_until: HOLDING ends this long after the arm was last seen; inf: the robot never stops.
     """
 
     seen_for: float = SEEN_FOR

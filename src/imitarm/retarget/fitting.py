@@ -177,7 +177,7 @@ class _Search:
         return q if apart and (self._room(q)[self._kept_off] >= 0.0).all() else None
 
     def _room(self, q: Array) -> Array:
-        """Return how much farther each sphere of the arm is from each fixture than it must be (n_fixtures, m) [m]."""
+        """Return each sphere's distance to each fixture minus the required distance, shape (n_fixtures, m) [m]."""
         centers, radii = self.arm.collision_spheres(q)
         return distances(self._fixtures, centers) - radii - _APART
 

@@ -1,7 +1,8 @@
 r"""Kinematics of the person's arm: seven joint angles, forward and inverse (thesis Eq 3.5; docs/retargeting.md).
 
 The kinematic chain consists of shoulder, upper arm, elbow, forearm and wrist. When all angles are zero, the arm is
-straight along the x axis of the base, and the joints have the following axes:
+straight along the x axis of the base. With the lengths :math:`L_U` of the upper arm and :math:`L_F` of the forearm, the
+chain of rotations and lengths is
 
 .. math:: R = R_z(q_0) R_y(q_1) R_x(q_2)\;|\,L_U\,|\;R_y(q_3) R_x(q_4)\;|\,L_F\,|\;R_y(q_5) R_x(q_6)
 
@@ -27,8 +28,10 @@ HUMAN_ARM_DH = (
     np.array([0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]),
     np.array([-0.5 * np.pi, 0.5 * np.pi, -0.5 * np.pi, 0.5 * np.pi, -0.5 * np.pi, 0.5 * np.pi, 0.0]),
 )
-"""Denavit-Hartenberg table of the arm: offsets of theta, and alpha, shape (7,) each [rad]; a is 0, and d is the length
-of the upper arm in the third row and the forearm in the fifth.
+"""Denavit-Hartenberg table of the arm: the offsets of theta and the angles alpha, shape (7,) each [rad].
+
+The parameter a is 0 in all rows.
+The parameter d is the length of the upper arm in row 3, the length of the forearm in row 5, and otherwise 0.
 """
 
 _TO_HAND = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # from the table's last frame

@@ -139,8 +139,8 @@ def correct_limbs(
 def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds: int = 3) -> Array:
     r"""Move shoulder, elbow and wrist as little as possible so that the bones have their true lengths.
 
-    The result is the most likely arm if every point is measured with an error; each point is weighted by its confidence
-    c:
+    The function minimises the sum of the squared displacements, weighted by the confidences :math:`c_j`. The result is
+    the most likely arm if every point is measured with an error.
 
     .. math:: \min \sum_j c_j |x_j - \tilde x_j|^2 \quad\text{s.t.}\quad |E - S| = L_U,\; |W - E| = L_F
 

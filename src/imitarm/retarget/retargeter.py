@@ -76,17 +76,18 @@ class Retargeter(ABC):
 
     :meth:`start` defines the posture in which the robot begins at rest. :meth:`step` is then called once per control
     period ``dt`` with the skeleton that arrived since the last call, or None. Cameras deliver 30 frames per second, but
-    a robot takes 100 commands per second, so most calls get None. For all methods, a control step has the same four
-    parts:
+    a robot takes 100 commands per second, so most calls get None.
+
+    Every control step has four parts, which are the same for all methods:
 
     1. ``_see`` computes an estimate of the person's arm from a new skeleton;
     2. the :class:`~imitarm.retarget.engagement.Engagement` decides whether the robot follows the person;
     3. if the robot follows the person, ``_hand`` and ``_target`` compute the desired pose of the tool;
     4. ``_advance`` returns the joint positions of the next period: **this is the method**.
 
-    A method is a subclass that implements ``_advance``. It may also override the other functions whose names begin with
-    an underscore, which have default implementations. It sets its ``name``, and its ``title`` and ``caption`` for
-    tables and reports::
+    A method is a subclass that implements ``_advance``. The subclass may also override the other functions whose names
+    begin with an underscore; these functions have default implementations. The subclass sets its ``name``, and its
+    ``title`` and ``caption`` for tables and reports::
 
         class Damped(Retargeter):
             name, title = "damped", "Damped least squares"

@@ -15,13 +15,13 @@ Array = NDArray[np.float64]
 
 STAGES = {
     "expose": "from exposure to sending by the capture process",
-    "arrive": "from sending to receiving by the retargeting process",
-    "wait": "from receiving to the start of the next control step",
+    "arrive": "from sending to receipt by the retargeting process",
+    "wait": "from receipt to the start of the next control step",
     "retarget": "from the start of the control step to the computed command",
     "send": "from the computed command to its sending",
-    "robot": "from sending the command to receiving by the robot process",
-    "apply": "from receiving by the robot process to applying",
-    "total": "total, from exposure to applying",
+    "robot": "from sending the command to its receipt by the robot process",
+    "apply": "from receipt by the robot process to applying the command",
+    "total": "total, from exposure to applying the command",
 }
 """Processing stages of a skeleton, in order, with the interval that each stage covers.
 

@@ -232,9 +232,11 @@ class AdaptiveControl(BaselineRetargeter):
     (:class:`JointPlant`). The joint positions that the simulated arm reaches are the command to the robot. The method
     tracks joint angles, so the tool and the hand are at different positions.
 
-    Only the torque limits bound the joint velocity. ``notes`` contains ``"saturated"``, how often a joint reached its
-    rated torque, counted over all joints and control steps; ``"peak_torque"``, the largest torque before limiting, as a
-    multiple of the rated torque; and ``"rms_torque"``, the root mean square torque over all joints and steps [N m].
+    Only the torque limits bound the joint velocity. In ``notes``, there are three values:
+
+    * ``"saturated"``: number of times that a joint reached its rated torque, over all joints and control steps;
+    * ``"peak_torque"``: largest torque before limiting, as a multiple of the rated torque;
+    * ``"rms_torque"``: root mean square torque over all joints and control steps [N m].
 
     Args:
         arm: the robot's arm with its tool.

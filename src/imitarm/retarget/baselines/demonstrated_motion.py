@@ -238,10 +238,10 @@ class FeasibilityCheck:
 def stretch(joints: Array) -> Array:
     r"""Return the stretch of a person's arm, shape (n,), for joint positions of the robot (n, n_joints) [rad].
 
-    The stretch is the distance from shoulder to wrist divided by the length of the straight arm. It is computed for a
-    person's arm at these joint angles, with upper arm and forearm of equal length (Sawyer's lengths are 0.412 and 0.411
-    m), so it is :math:`|\cos(q_3/2)|`. The robot's own distance from shoulder to wrist is largest with a bent elbow,
-    because of the offsets between its links.
+    The stretch is the distance from shoulder to wrist divided by the length of the straight arm. For a person's arm
+    at these joint angles, with upper arm and forearm of equal length, the stretch is :math:`|\cos(q_3/2)|`. (Sawyer's
+    upper arm and forearm are 0.412 and 0.411 m long.) The distance from shoulder to wrist of the robot itself is not
+    used. Because of the offsets between the links, this distance is largest when the elbow is bent.
     """
     return np.asarray(np.abs(np.cos(0.5 * joints[:, ELBOW])))
 

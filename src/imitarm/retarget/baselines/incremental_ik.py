@@ -31,7 +31,7 @@ class IncrementalIK(BaselineRetargeter):
 
     where :math:`\Delta x_d` is the displacement of the target since the last frame, and e the error relative to the
     target of the last frame. The displacement is spread evenly over the control steps of one frame. The pseudo-inverse
-    is not damped: it inverts even the smallest singular value, so the displacement grows without bound near the edge of
+    is not damped. It inverts even the smallest singular value, so the displacement grows without bound near the edge of
     the workspace. Each joint is then limited to its velocity limit, which changes the direction of the tool's motion,
     and to its range. In ``notes``, ``"capped_steps"`` counts the control steps in which a velocity limit was active,
     and ``"caps"`` counts the limited joints in all of these steps.

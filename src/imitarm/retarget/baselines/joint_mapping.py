@@ -17,8 +17,9 @@ from imitarm.validation import flag
 Array = NDArray[np.float64]
 
 _STRETCHED = ((0.0,) * 7, (0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0))
-"""Postures to try, in one of which a robot arm is stretched forward: zero (Sawyer), the second joint at a right angle
-(the Panda, which points up at zero), and the second joint at the opposite angle.
+"""Postures in which a robot arm may be stretched forward; the mapping uses the first one that is.
+
+At zero, Sawyer's arm points forward. The Panda's arm points up at zero, and forward with its second joint at 90 degrees.
 """
 _ALIGNED = 0.999  # smallest cosine between a joint's axis and the person's
 _ANY = LimbLengths(0.3, 0.26)  # where only rotations matter

@@ -392,7 +392,11 @@ def _strength(problem: _Problem, confidence: Array, smoothing: Smoothing, sigma:
 
 
 def _cross_validated(problem: _Problem, confidence: Array) -> float:
-    r"""Return the mu with the lowest :math:`k\,RSS / (k - \mathrm{tr} H)^2`; RSS: residual sum, H: smoothing matrix."""
+    r"""Return the mu with the lowest score of generalised cross-validation.
+
+    The score is :math:`k\,RSS / (k - \mathrm{tr} H)^2` for k samples, the residual sum of squares RSS, and the
+    smoothing matrix H, which maps the samples to the points of the curve.
+    """
     count = float((confidence > 0.0).sum())
     eye = np.eye(problem.n_control)
 
@@ -418,11 +422,11 @@ def _least(score: Callable[[float], float]) -> float:
 
 
 def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
-    r"""Return the weights w (n,), with mean 1, from a least-squares problem weighted by the previous denominators W.
+    r"""Return the weights w (n,), with mean 1, from a least-squares problem.
 
-    The cost :math:`\sum_k \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is
-    quadratic in X and w. X is eliminated. If several weights w are equally good, the function returns those closest to
-    1.
+    Let :math:`W_k` be the denominator of the curve at sample k with the previous weights. The cost :math:`\sum_k
+    \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is quadratic in X and w. X is
+    eliminated. If several weights w are equally good, the function returns those closest to 1.
     """
     n = problem.n_control
     basis = np.zeros((len(problem.first), n))

@@ -59,8 +59,9 @@ _UNSEEN = 0.2  # weight of a hand rotation that was not seen but moved with the 
 class HumanArmTracker:
     r"""Tracks a person's arm in joint angles (thesis 3.1.1 and 3.1.2).
 
-    In each frame, the tracker starts from the angles :math:`\tau` of the previous frame and repeats the following
-    update one to three times:
+    In each frame, the tracker starts from the angles :math:`\tau` of the previous frame.
+
+    It then repeats an update one to three times:
 
     .. math:: \tau \leftarrow \tau + J^+ \varepsilon, \qquad
         \varepsilon = \begin{pmatrix} p_d - p(\tau) \\ \log(R_d R(\tau)^T) \end{pmatrix}
