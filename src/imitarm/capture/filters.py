@@ -22,11 +22,11 @@ _TORSO = np.array([JOINT[name] for name in ("spine_shoulder", "spine_mid", "neck
 class PersonFilter(SkeletonSource):
     """Selects one person from a source that may deliver several persons.
 
-    The filter follows the first person who appears, and ignores everybody else. It follows another person only after
-    the first person has been out of view for more than ``patience`` on the source's clock; by then, every retargeter
-    has stopped and must engage again. A camera that tracks only one person at a time may give the next person the same
-    number. The filter therefore also ignores a person who appears farther away than the followed person can have
-    walked.
+    The filter follows the first person who appears, and ignores everybody else. The filter follows another person only
+    after the first person has been out of view for more than ``patience`` on the source's clock. By then, every
+    retargeter has stopped and must engage again. A camera that tracks only one person at a time may give the next
+    person the same number. The filter therefore also ignores a person who appears farther away than the followed person
+    can have walked.
 
     Args:
         source: the source to filter.
@@ -157,10 +157,9 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     .. math:: \sum_j |l_j - l'_j| + |r_j - r'_j| > \sum_j |l_j - r'_j| + |r_j - l'_j| + n\,\max(0.15, v t)
 
     summed over the n pairs of joints that are visible in both frames. First, the inequality for shoulders and hips (v =
-    0.5 m/s) decides about the whole body. Then the inequality for the hands, with or without the elbows (v = 4 m/s),
-    decides about arms that were swapped while the rest of the body was not. Hands that touch are too close to each
-    other to satisfy the inequality, so they are not swapped. If one joint of a pair is lost, only the other joint is
-    used.
+    0.5 m/s) decides whether the whole body is swapped back. Then, the inequality for the hands, with or without the
+    elbows (v = 4 m/s), decides whether only the arms are swapped back. Hands that touch are too close to each other to
+    satisfy the inequality, so they are not swapped. If one joint of a pair is lost, only the other joint is used.
 
     Args:
         skeleton: skeleton as the camera reports it.

@@ -104,13 +104,13 @@ class LandmarkConverter:
 
     .. math:: \min_t \sum_j k_j^2 \left( (X_j + t_x - u_j (Z_j + t_z))^2 + (Y_j + t_y - v_j (Z_j + t_z))^2 \right)
 
-    This is a linear least-squares problem. Across the line of sight, t is accurate to centimetres. Along the line of
-    sight, t is noisy, and its accuracy depends on MediaPipe's scale and on the field of view. The distance along the
+    Finding t is a linear least-squares problem. Across the line of sight, t is accurate to centimetres. Along the line
+    of sight, t is noisy, and its accuracy depends on MediaPipe's scale and on the field of view. The distance along the
     line of sight is therefore averaged over 0.1 s, and the other two components of t are then fitted again. All joints
     move by the same t, so positions relative to other joints do not change.
 
-    **Perspective.** MediaPipe's positions in metres assume a camera that looks straight at the person. They are
-    therefore rotated by the angle between the camera's axis and the line of sight to the hips.
+    **Perspective.** MediaPipe's positions in metres assume a camera that looks straight at the person. The positions
+    are therefore rotated by the angle between the camera's axis and the line of sight to the hips.
 
     Args:
         size: width and height of the image [pixels]; only their ratio matters.

@@ -43,7 +43,7 @@ REQUIREMENTS = (
 """Packages that pose tracking needs.
 
 MediaPipe is installed with these packages instead of the packages that it declares as requirements.
-Its declared requirements also include jax, sentencepiece and sounddevice, which pose tracking does not need.
+MediaPipe's declared requirements also include jax, sentencepiece and sounddevice, which pose tracking does not need.
 """
 
 _STAMP = "imitarm-mediapipe.txt"  # written last: without it the environment is incomplete

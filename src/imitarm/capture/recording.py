@@ -304,7 +304,7 @@ def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
 
 
 def _between(before: Skeleton, after: Skeleton, fraction: float) -> Skeleton:
-    """Return a skeleton between two skeletons, at ``fraction`` of the time from the first to the second."""
+    """Interpolate between two skeletons of a person, at ``fraction`` of the time from the first to the second."""
     tracking = np.minimum(before.tracking, after.tracking)
     lost = tracking == Tracking.LOST
     positions = before.positions + fraction * (after.positions - before.positions)

@@ -94,7 +94,7 @@ def is_live(word: str | Path) -> bool:
 
 
 def followed(source: SkeletonSource, *, person: int | None = None) -> PersonFilter:
-    """Return a source with the skeletons of one person, with swaps of left and right undone, as a retargeter needs it.
+    """Return a source that delivers one person of another source, with left and right corrected, for a retargeter.
 
     Args:
         source: opened source.

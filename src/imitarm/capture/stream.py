@@ -98,7 +98,8 @@ class UdpSource(SkeletonSource):
 
     A :class:`~imitarm.transmission.datagram_filter.DatagramFilter` drops and counts datagrams that are late, damaged,
     hostile, or from another sender. A sender that is killed and started again is accepted after half a second of
-    silence. Its times are shifted so that they continue after the gap, and every retargeter engages again.
+    silence. The times of the restarted sender are shifted so that they continue after the gap, and every retargeter
+    engages again.
 
     Args:
         port: port to listen on; 0: any free port.

@@ -36,7 +36,7 @@ class SyntheticSource(SkeletonSource):
         name: name for messages.
 
     Attributes:
-        truth: true positions, as given.
+        truth: function that returns the true positions of all joints at a time [s].
 
     Raises:
         InputError: when the duration is not positive, or longer than a day.

@@ -24,7 +24,7 @@ RETARGETERS: Registry[type[Retargeter]] = Registry(
 """All methods by name.
 
 Other packages add methods under the entry-point group ``imitarm.retargeters``.
-These methods then appear in all commands that take a retargeting method, and in the reports.
+Methods of other packages then appear in all commands that take a retargeting method, and in the reports.
 """
 
 __all__ = [

@@ -150,8 +150,8 @@ class ArmEstimator:
     def _weights(self, confidence: Array) -> Array:
         """Return the weights of shoulder, elbow and wrist; an inferred elbow with a large error gets a small weight.
 
-        With a large weight, an error of the elbow would move the wrist, because the forearm has a fixed length. The
-        tool follows the wrist, so the error would also move the tool.
+        If an inferred elbow had a large weight, its error would move the wrist, because the forearm has a fixed length.
+        The tool follows the wrist, so the elbow's error would also move the tool.
         """
         offset = self._offsets.offset(1)
         if offset == 0.0:

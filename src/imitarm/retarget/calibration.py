@@ -298,7 +298,7 @@ class SensorFit:
     def accepted(self) -> bool:
         """Whether the fit is good enough for teleoperation.
 
-        This requires an RMS residual of at most 2 cm, and that every pair fits the others.
+        A fit is good enough if its RMS residual is at most 2 cm and every pair of points fits the others.
         """
         return self.rms <= GOOD and self.suspect is None
 

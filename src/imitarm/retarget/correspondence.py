@@ -110,8 +110,8 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 def _about_vertical(hand: Array, before: Array, home: Array) -> Array:
     """Rotate ``home`` by the hand's rotation about the base's z axis since ``before``; quaternions, shape (4,).
 
-    The rotation about z is the twist of the swing-twist decomposition. It is computed with plain floats, because only
-    two components of its quaternion are not zero.
+    The rotation about z is the twist of the swing-twist decomposition. The function computes the twist with plain
+    floats, because only two components of its quaternion are not zero.
     """
     (a, b, c, d), (e, f, g, h), (w, x, y, z) = hand.tolist(), before.tolist(), home.tolist()
     real, up = a * e + b * f + c * g + d * h, d * e - a * h + c * f - b * g

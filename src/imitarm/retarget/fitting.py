@@ -164,7 +164,7 @@ class _Search:
     def _posture(self, position: Array, near: Array, smallest: float) -> Array | None:
         """Return a posture near a given posture, shape (n_joints,).
 
-        None if no such posture is far enough from singularities.
+        The result is None if no posture near the given one is far enough from singularities.
         """
         try:
             q = find_posture(self.arm, Pose(position, self.home.quaternion), q0=near, restarts=2)

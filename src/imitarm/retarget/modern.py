@@ -53,10 +53,10 @@ class ModernRetargeter(Retargeter):
        :math:`\tau` = 50 ms;
     2. compute the tool's target and the twist towards it, :math:`K \log(T_d T^{-1})`, plus a fraction of the hand's
        velocity (feed-forward);
-    3. solve a quadratic programme for the joint velocities. Its tasks are the twist of the tool and the elbow's SEW
-       angle (shoulder-elbow-wrist). Its limits are the joint limits of position, velocity and acceleration, bounds that
-       keep elbow and wrist away from their singularities, and the distances of the links to each other and to the
-       scene. While the robot follows nobody, it is at rest;
+    3. solve a quadratic programme for the joint velocities. The tasks of the programme are the twist of the tool and
+       the elbow's SEW angle (shoulder-elbow-wrist). The constraints of the programme are the joint limits of position,
+       velocity and acceleration, the distances of the links to each other and to the scene, and bounds that keep elbow
+       and wrist away from their singularities. While the robot follows nobody, it is at rest;
     4. limit the jerk of the joints (:class:`JerkLimiter`) and check all limits again. If something blocks the arm, the
        arm does not push harder, and the target stays near the blocked tool.
 
@@ -223,8 +223,8 @@ class ModernRetargeter(Retargeter):
     def _slip(self, target: Pose, measured: Array) -> None:
         """Shift the clutch's origin, so that the target does not move away from a tool that is blocked and at rest.
 
-        Otherwise, the tool would jump to the target as soon as it is free, and could hit an object on its path. A robot
-        that only responds with a delay keeps moving, so it is not mistaken for a blocked robot.
+        Without the shift, the tool would jump to the target as soon as it is free, and could hit an object on its path.
+        A robot that only responds with a delay keeps moving, so it is not mistaken for a blocked robot.
         """
         at = self.arm.tool_pose(measured).position
         moved, offset = at - self._held_at, target.position - at
@@ -270,7 +270,7 @@ class JerkLimiter:
 
     .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a D'}, \qquad D' = D - \tfrac12 v\,dt,
 
-    or :math:`2 D'/dt` if D' is negative.
+    If D' is negative, the bound is :math:`2 D'/dt` instead.
 
     A joint that satisfies this bound once can satisfy it in all later steps by braking with a_max. Near a position
     limit, clipping to this velocity may exceed the jerk limit, but the limits of position, velocity and acceleration

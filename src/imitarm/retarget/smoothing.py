@@ -42,9 +42,9 @@ class OneEuro:
 
     The speed is the norm of the whole velocity vector, so the filter acts equally in all directions. The velocity is
     computed from the difference of two successive measured values. The original filter uses the difference between a
-    measured value and the previous smoothed value. This difference contains the lag of the filter and is too large
-    during steady motion, which would distort a prediction from the velocity. The weight :math:`\alpha` of a value is
-    multiplied by the value's confidence.
+    measured value and the previous smoothed value. The difference of the original filter contains the filter's own lag
+    and is too large during steady motion, which would distort predictions that use the velocity. The weight
+    :math:`\alpha` of a value is multiplied by the value's confidence.
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].
@@ -299,7 +299,7 @@ class TrackingOffsets:
     def _changed(self, joint: int, confidence: float, continued: list[float]) -> list[float]:
         """Return the offset of a joint whose tracking has changed.
 
-        This is the recent offset for the new tracking state if there is one, or else a new offset.
+        The result is the recent offset for the new tracking state if there is one, or else a new offset.
         """
         when, offset = self._kept.get((joint, confidence), (-math.inf, continued))
         if self._clock - when > _FLICKER:

@@ -109,7 +109,8 @@ class Teleoperation:
         stream: UDP stream from which ``source`` reads, used to measure latencies; None: ``source`` reads no UDP stream.
         recorder: records the robot's motion, beginning when a person first moves the robot; None: no recording.
         confirm_enable: function called as ``confirm_enable(reason, stopped)`` in each step in which a robot on a server
-            cannot be controlled. It returns whether the robot may be enabled. None: the robot is never enabled again.
+            cannot be controlled. The function returns whether the robot may be enabled. If ``confirm_enable`` is None,
+            the robot is never enabled again.
         on_step: function called after every step.
         clock_ns: function that returns the time [ns], on the same clock as ``stream`` and ``robot``.
         rate_limiter: timer that starts the control steps; None: a timer in real time.

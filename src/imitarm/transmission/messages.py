@@ -131,10 +131,12 @@ class JointCommand:
     def _unpack(cls, flags: int, body: tuple[Any, ...], numbers: Array) -> Self:
         n, mode, challenge, arm, opening = body
         _require(flags <= _GRIPPER, "unknown flags")
-        _require(1 <= n <= MAX_JOINTS and mode <= max(CommandMode), "number of joints or mode")
-        _require(0.0 <= opening <= 1.0, "opening of the gripper")
+        _require(1 <= n <= MAX_JOINTS and mode <= max(CommandMode), "the number of joints or the mode")
+        _require(0.0 <= opening <= 1.0, "the opening of the gripper")
         q, velocity = numbers.reshape(2, MAX_JOINTS)[:, :n]
-        _require(_magnitude(q) <= _MAX_ANGLE and _magnitude(velocity) <= _MAX_SPEED, "joint position or velocity")
+        _require(
+            _magnitude(q) <= _MAX_ANGLE and _magnitude(velocity) <= _MAX_SPEED, "a joint position or a joint velocity"
+        )
         given = opening if flags & _GRIPPER else None
         return cls(CommandMode(mode), q, velocity, arm, challenge, given)
 
@@ -200,13 +202,13 @@ class JointState:
     def _unpack(cls, flags: int, body: tuple[Any, ...], numbers: Array) -> Self:
         n, status, challenge, arm, owner, echo, sent, received, applied, time_, opening, widest, words = body
         _require(flags <= _GRIPPER, "unknown flags")
-        _require(1 <= n <= MAX_JOINTS and status <= max(RobotStatus), "number of joints or status")
+        _require(1 <= n <= MAX_JOINTS and status <= max(RobotStatus), "the number of joints or the status")
         _require(abs(time_) <= _MAX_TIME, "time")
-        _require(abs(opening) <= 1.0 and 0.0 <= widest <= 1.0, "opening of the gripper")
+        _require(abs(opening) <= 1.0 and 0.0 <= widest <= 1.0, "the opening of the gripper")
         vectors = numbers.reshape(5, MAX_JOINTS)[:, :n]
         q, velocity, torque, set_point, set_velocity = vectors
-        _require(max(_magnitude(q), _magnitude(set_point)) <= _MAX_ANGLE, "joint position")
-        _require(max(_magnitude(velocity), _magnitude(set_velocity)) <= _MAX_SPEED, "joint velocity")
+        _require(max(_magnitude(q), _magnitude(set_point)) <= _MAX_ANGLE, "a joint position")
+        _require(max(_magnitude(velocity), _magnitude(set_velocity)) <= _MAX_SPEED, "a joint velocity")
         _require(_magnitude(torque) <= _MAX_TORQUE, "torque")
         reason = words.rstrip(b"\0").decode("utf-8", "replace")
         _require(not reason or reason.isprintable(), "reason")  # it will be shown in a terminal

@@ -218,7 +218,7 @@ class DemonstrationModification(BaselineRetargeter):
         }
 
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
-        """Complete the shown times: ``shown`` belongs to the last steps; in the steps before these, the robot waits."""
+        """Append ``shown``, the shown times of the newest steps, after times for the steps in which the robot waits."""
         rest = len(steps) - len(self._shown_times) - len(shown)
         begin = float(self._shown_times[-1]) if len(self._shown_times) else -self.dt
         waited = begin + self.dt * np.arange(1, rest + 1)

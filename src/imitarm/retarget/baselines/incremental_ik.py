@@ -31,13 +31,14 @@ class IncrementalIK(BaselineRetargeter):
 
     where :math:`\Delta x_d` is the displacement of the target since the last frame, and e the error relative to the
     target of the last frame. The displacement is spread evenly over the control steps of one frame. The pseudo-inverse
-    is not damped. It inverts even the smallest singular value, so the displacement grows without bound near the edge of
-    the workspace. Each joint is then limited to its velocity limit, which changes the direction of the tool's motion,
-    and to its range. In ``notes``, ``"capped_steps"`` counts the control steps in which a velocity limit was active,
-    and ``"caps"`` counts the limited joints in all of these steps.
+    is not damped. Without damping, even the smallest singular value is inverted, so the displacement grows without
+    bound near the edge of the workspace. Each joint is then limited to its velocity limit, which changes the direction
+    of the tool's motion, and to its range. In ``notes``, ``"capped_steps"`` counts the control steps in which a
+    velocity limit was active, and ``"caps"`` counts the limited joints in all of these steps.
 
-    The movement primitives of the cited paper are left out. They belong to the learned skill and can be used with every
-    method. If they were included, a comparison would evaluate the primitives instead of the mappings.
+    The movement primitives of the cited paper are left out. Movement primitives belong to the learned skill and can be
+    used with every method. If M3 included movement primitives, a comparison would evaluate the primitives instead of
+    the mappings.
 
     Args:
         arm: the robot's arm with its tool.

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 _STRETCHED = ((0.0,) * 7, (0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0))
 """Postures in which a robot arm may be stretched forward; the mapping uses the first one that is.
 
-At zero, Sawyer's arm points forward. The Panda's arm points up at zero, and forward with its second joint at 90 degrees.
+At zero, Sawyer's arm points forward. The Panda's arm points forward when its second joint is at a right angle.
 """
 _ALIGNED = 0.999  # smallest cosine between a joint's axis and the person's
 _ANY = LimbLengths(0.3, 0.26)  # where only rotations matter
@@ -39,11 +39,11 @@ class JointMapping:
               q_i = q_{i,0} + \sigma_i\,(\theta_i - \theta_{i,0}) \quad\text{(relative)},
 
     where :math:`q_{i,0}` and :math:`\theta_{i,0}` are the joint positions of robot and person when the robot began to
-    follow the person. These equations determine the joints of shoulder and elbow (the first four). The last three
-    joints are computed in closed form from the desired rotation of the tool. In the absolute mapping, this is the
-    hand's rotation, if the orientation of the correspondence is ``"hand"``; in all other cases, it is the rotation of
-    the clutch's target. The mapping does not use link lengths, so the tool and the hand are at different positions.
-    Every mapping of joints has this property.
+    follow the person. The two equations determine only the first four joints (shoulder and elbow). The last three
+    joints are computed in closed form from the desired rotation of the tool. The desired rotation is the hand's
+    rotation if the mapping is absolute and the orientation of the correspondence is ``"hand"``; otherwise, it is the
+    rotation of the clutch's target. The mapping does not use link lengths, so the tool and the hand are at different
+    positions. Every mapping of joints has this property.
 
     The angles are continuous from frame to frame, without jumps by 360 degrees. An angle that is undefined keeps its
     value.

@@ -186,7 +186,7 @@ def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
 
 
 class _Problem:
-    """The samples, their basis functions, and the parts of the normal equations without the confidences."""
+    """Data of a fit: the samples, their basis functions, and the confidence-free parts of the normal equations."""
 
     def __init__(self, first: Indices, values: Array, points: Array, rows: Array) -> None:
         self.first, self.values, self.points, self.rows = first, values, points, rows
@@ -253,7 +253,7 @@ def fit_nurbs(
         robust: whether to reduce the weight of samples that are farther than 2.5 sigma from the curve (Huber weights),
             in three passes.
         rational: whether to fit the weights w too, which are then between 0.2 and 5 with mean 1; otherwise, all weights
-            are 1. This is needed only for exact arcs.
+            are 1. Fitted weights are needed only for exact arcs.
 
     Raises:
         InputError: when shapes do not match, times do not increase, fewer than p + 1 samples have a confidence above 0,
@@ -331,13 +331,14 @@ def bends(knots: Array, degree: int) -> Array:
     r"""Return the second differences D of the control points, shape (n - 2, 3); row j acts on points j, j+1, j+2.
 
     Each control point corresponds to a parameter, the mean of p knots :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`.
-    These parameters are denser near the ends. There, plain differences :math:`P_{j+1} - 2 P_j + P_{j-1}` would not
-    vanish for a straight uniform motion and would slow it down. The second differences are therefore divided
-    differences,
+    The parameters :math:`g_j` are denser near the ends of the curve. Near the ends, plain differences :math:`P_{j+1} -
+    2 P_j + P_{j-1}` would not vanish for a straight uniform motion, so a fit would slow this motion down. The second
+    differences are therefore divided differences,
 
     .. math:: h \left( \frac{P_{j+1} - P_j}{g_{j+1} - g_j} - \frac{P_j - P_{j-1}}{g_j - g_{j-1}} \right)
 
-    where h is the mean distance of successive :math:`g_j`. For uniform knots, they equal the plain differences.
+    where h is the mean distance of successive :math:`g_j`. For uniform knots, the divided differences equal the plain
+    differences.
     """
     means = np.convolve(knots[1:-1], np.full(degree, 1.0 / degree), "valid")
     apart = np.diff(means)

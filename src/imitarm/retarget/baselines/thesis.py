@@ -61,7 +61,7 @@ class HumanArmTracker:
 
     In each frame, the tracker starts from the angles :math:`\tau` of the previous frame.
 
-    It then repeats an update one to three times:
+    The tracker then repeats an update one to three times:
 
     .. math:: \tau \leftarrow \tau + J^+ \varepsilon, \qquad
         \varepsilon = \begin{pmatrix} p_d - p(\tau) \\ \log(R_d R(\tau)^T) \end{pmatrix}
@@ -142,8 +142,8 @@ class HumanArmTracker:
 def roll_pitch_yaw(rotation: Array) -> Array:
     """Return roll, pitch and yaw of a rotation Rz(yaw) Ry(pitch) Rx(roll), shape (3,) [rad].
 
-    The thesis uses differences of these angles as the orientation error. Such differences are not a rotation vector,
-    wrap at 180 degrees, and are singular at a pitch of 90 degrees.
+    The thesis uses differences of these angles as the orientation error. Differences of roll, pitch and yaw are not a
+    rotation vector, wrap at 180 degrees, and are singular at a pitch of 90 degrees.
     """
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
     return np.array(
@@ -161,7 +161,7 @@ def _unit(vector: Array) -> Array:
 
 
 def _nearest_rotation(matrix: Array) -> Array:
-    """Return the rotation closest to the product of the matrices that the thesis prints, which is not a rotation."""
+    """Return the rotation closest to ``matrix``, the product of the printed matrices, which is not a rotation."""
     left, values, right = np.linalg.svd(matrix)
     if values[1] < 1e-9:  # almost no direction is left
         return carried(None, None, left[:, 0])
@@ -288,7 +288,7 @@ class ThesisRetargeter(Retargeter):
         return HandSample(estimate.time, wrist, hand, (known, max(rotated, _UNSEEN)))
 
     def _hand(self) -> tuple[Array, Array]:
-        """Return wrist and hand on the smoothed curve; the clutch engages at these, so that the tool does not jump."""
+        """Return wrist and hand on the smoothed curve; the clutch engages at this pose, so the tool does not jump."""
         hand = self._curve.now()
         assert hand is not None
         return hand
