@@ -116,8 +116,8 @@ DRAWINGS: dict[str, tuple[_Shape, tuple[float, float, float], tuple[float, float
 def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "circle") -> Truth:
     r"""Return the motion of a person who draws a shape repeatedly with the right hand.
 
-    The angle along the shape is :math:`\omega\,s(t)`. The warped time s stands still during the first second and at the
-    end, and advances as fast as the time t in between. In the transitions, its rate follows a minimum-jerk profile.
+    The angle along the shape is :math:`\omega\,s(t)`. The warped time s is constant during the first second and at the
+    end; in between, s advances as fast as the time t. In the transitions, its rate follows a minimum-jerk profile.
 
     Args:
         person: who moves.
@@ -145,7 +145,7 @@ def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "c
 
 
 def _warped_time(time: float, duration: float) -> float:
-    """Return the warped time s [s], which stands still at the beginning and at the end."""
+    """Return the warped time s [s], which is constant at the beginning and at the end."""
     begun = min(max(time, REST), duration) - REST
     ended = begun - (duration - REST - _RAMP)
     passed = max(begun - _RAMP, 0.0) + _RAMP * _ramped(min(begun / _RAMP, 1.0))

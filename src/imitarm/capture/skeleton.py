@@ -203,7 +203,7 @@ class Skeleton:
 
 
 def number_after_colon(word: str, what: str, text: str, largest: int) -> int:
-    """Return the number that a user wrote after the colon of a source.
+    """Return the number after the colon in the name of a source, for example 0 in ``webcam:0``.
 
     Raises:
         InputError: when the text is not a whole number from 0 to ``largest``.

@@ -93,7 +93,7 @@ class JointPlant:
         return float(self._data.energy.sum())
 
     def step(self, torque: Array) -> None:
-        """Advance by ``dt`` with torques (n_joints,) [N m] on the joints."""
+        """Simulate one control period with constant torques on the joints, shape (n_joints,) [N m]."""
         self._data.qfrc_applied[self._dofs] = torque
         mujoco.mj_step(self._model, self._data, self.substeps)
 

@@ -98,8 +98,8 @@ class DemonstrationModification(BaselineRetargeter):
     * ``"infeasible_before"`` and ``"infeasible_after"``: number of infeasible samples before and after the corrections;
     * ``"failures"``: number of segments that remain infeasible;
     * ``"execution_time"``: duration of the robot's motion [s]; ``"shown_time"``: duration of the person's motion [s];
-    * ``"teaching_time"``: assumed working time of a teacher [s]; in each round, this is the duration of each segment
-      plus ``annotation_time``.
+    * ``"teaching_time"``: assumed working time of a teacher [s], who needs the duration of a segment plus
+      ``annotation_time`` for every segment in every round.
 
     Args:
         arm: the robot's arm with its tool.
@@ -261,7 +261,7 @@ def slowed(
     r"""Slow a segment of a motion down: each sample takes :math:`1 + w\,(s - 1)` times as long.
 
     Args:
-        motion: motion with joint positions.
+        motion: motion whose joints have been mapped to the robot.
         first: first sample of the segment.
         past: index of the sample after the segment.
         weight: weight w of each sample, shape (past - first,).
@@ -282,8 +282,8 @@ def pull(points: Array, joints: Array) -> Array:
     r"""Return the factor :math:`\kappa` by which to shorten the distance from shoulder to wrist, shape (n,).
 
     With this factor, the stretch is at most 78/80. If the elbow angles of robot and person are equal, :math:`\kappa =
-    \frac{78}{80} L / |W - S|`, where L is the length of the straight arm. If they differ (relative mapping), the
-    person's elbow is bent further by the angle by which the robot's elbow must still bend.
+    \frac{78}{80} L / |W - S|`, where L is the length of the straight arm. In a relative mapping, the two elbow angles
+    can differ. The person's elbow is then bent further by the angle that the robot's elbow needs to reach this stretch.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].

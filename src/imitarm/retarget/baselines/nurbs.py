@@ -171,7 +171,7 @@ def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
     """Return knots spaced like the data, so that every knot span contains data (Piegl and Tiller, Eq 9.69).
 
     Args:
-        u: parameters of the data, increasing, shape (k,), k at least ``n_control``.
+        u: parameters of the data, increasing, shape (k,), with k at least ``n_control``.
         n_control: number of control points.
         degree: degree of the curve.
 

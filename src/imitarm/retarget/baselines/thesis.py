@@ -142,8 +142,8 @@ class HumanArmTracker:
 def roll_pitch_yaw(rotation: Array) -> Array:
     """Return roll, pitch and yaw of a rotation Rz(yaw) Ry(pitch) Rx(roll), shape (3,) [rad].
 
-    The thesis uses differences of these angles as the orientation error. Differences of roll, pitch and yaw are not a
-    rotation vector, wrap at 180 degrees, and are singular at a pitch of 90 degrees.
+    The thesis uses differences of roll, pitch and yaw as the orientation error. Differences of roll, pitch and yaw are
+    not a rotation vector, wrap at 180 degrees, and are singular at a pitch of 90 degrees.
     """
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
     return np.array(
