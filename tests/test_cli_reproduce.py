@@ -149,5 +149,5 @@ def test_a_certificate_that_needs_a_schedule_is_void_when_the_motion_stops(sweep
     arguments = ["--tool", "brush", "--scene", str(scene), "--report", str(report)]
     assert main(["reproduce", str(sweep), *arguments]) == 1
     text = " ".join(capsys.readouterr().out.split())
-    assert "void" in text and "on schedule, which was not completed" in text, text
-    assert "on schedule, which was not completed" in report.read_text()
+    assert "void" in text and "on schedule, but the motion was not completed" in text, text
+    assert "on schedule, but the motion was not completed" in report.read_text()
