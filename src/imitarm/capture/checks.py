@@ -278,7 +278,7 @@ def _gaps(view: _View) -> Iterator[RecordingIssue]:
         stops = int((steps > _STOP).sum())
         message = f"{int(long.sum())} gaps between frames, the longest {steps[i]:.2f} s; {stops} are long enough "
         message += f"(over {_STOP:g} s) for a robot to stop"
-        yield view.issue("warning", "gap", message, "cut there by trim, or record again", i)
+        yield view.issue("warning", "gap", message, "cut the recording there with trim, or record again", i)
 
 
 def _frozen(view: _View) -> Iterator[RecordingIssue]:
@@ -328,7 +328,7 @@ def _jumps(view: _View) -> Iterator[RecordingIssue]:
         count = int(jump.any(axis=1).sum())
         message = f"{count} jump{'' if count == 1 else 's'} without return, the largest of {size[i, joint]:.2f} m from "
         message += f"one frame to the next ({JOINTS[joints[joint]]}, {speed[i, joints[joint]]:.0f} m/s)"
-        remedy = "cut there by trim, or record again"
+        remedy = "cut the recording there with trim, or record again"
         first = int(np.argmax(jump.any(axis=1))) + 1
         yield view.issue("warning", "jump", message, remedy, int(view.later[first]))
 

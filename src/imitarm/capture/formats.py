@@ -283,7 +283,7 @@ def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]
     times = captured.times - captured.times[0]
     skeletons = [Skeleton(time, truth(time).positions, tracking) for time in times.tolist()]
     message = "motion capture of a right arm; the rest of the body is synthetic"
-    return skeletons, [RecordingIssue("note", "arm-only", message, remedy="follow the right arm")]
+    return skeletons, [RecordingIssue("note", "arm-only", message, remedy="let the robot follow the right arm")]
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,7 +135,7 @@ class KinectV2Source(BodyCamera):
 
     Raises:
         InputError: when driver or camera is missing; the message says which, and what to do.
-        TaskFailedError: from :meth:`read`, when the camera is gone.
+        TaskFailedError: from :meth:`read`, when the camera is unplugged or the driver fails.
     """
 
     name = "kinect2"
@@ -221,7 +221,7 @@ class AzureKinectSource(BodyCamera):
 
     Raises:
         InputError: when driver, SDK or camera is missing; the message says which, and what to do.
-        TaskFailedError: from :meth:`read`, when the camera is gone.
+        TaskFailedError: from :meth:`read`, when the camera is unplugged or the driver fails.
     """
 
     name = "azure"

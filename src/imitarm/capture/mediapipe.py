@@ -97,10 +97,10 @@ class PoseLandmarks:
 class LandmarkConverter:
     r"""Converts landmarks to skeletons.
 
-    **Where the person stands.** MediaPipe's positions in metres are relative to the hips. Without a correction, a hand
-    at rest would therefore seem to move whenever the hips move. The translation t of the hips is chosen so that the
-    landmarks :math:`X_j, Y_j, Z_j` agree with the image. Let :math:`u, v` be image coordinates relative to the image's
-    middle, in units of the focal length, and :math:`k` the visibility. The translation t solves
+    **Position.** MediaPipe's positions in metres are relative to the hips. Without a correction, a hand at rest would
+    therefore seem to move whenever the hips move. The translation t of the hips is chosen so that the landmarks
+    :math:`X_j, Y_j, Z_j` agree with the image. Let :math:`u, v` be image coordinates relative to the image's middle, in
+    units of the focal length, and :math:`k` the visibility. The translation t solves
 
     .. math:: \min_t \sum_j k_j^2 \left( (X_j + t_x - u_j (Z_j + t_z))^2 + (Y_j + t_y - v_j (Z_j + t_z))^2 \right)
 
@@ -310,7 +310,7 @@ class MediaPipeSource(SkeletonSource):
         try:
             line = self._process.line(min(timeout, max(_SILENT - self._silent, 0.0) + _TICK))
         except EOFError:
-            raise self._failed(f"MediaPipe's process is gone ({self._process.ended()})") from None
+            raise self._failed(f"MediaPipe's process has ended ({self._process.ended()})") from None
         if line is not None:
             self._silent = 0.0
             return line.split(b" ")

@@ -58,8 +58,8 @@ class Person:
     Attributes:
         seed: seed from which :meth:`from_seed` computed the other attributes.
         stature: height [m].
-        upper_arm: shoulder to elbow [m].
-        forearm: elbow to wrist [m].
+        upper_arm: distance from shoulder to elbow [m].
+        forearm: distance from elbow to wrist [m].
         hand: distance from wrist to finger tip [m].
         position: position of the point on the floor between the feet, x and z in the sensor's frame, shape (2,) [m].
         swivel: angle psi of the elbow while the hand is low, measured outwards from straight down [rad].

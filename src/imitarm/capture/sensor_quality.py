@@ -253,7 +253,7 @@ def main(arguments: list[str]) -> int:
     """Print how well MediaPipe tracks each video, and how well the videos agree; return the exit status."""
     try:
         if not arguments:
-            raise InputError("name one or more video files")
+            raise InputError("give one or more video files")
         views = []
         for path in arguments:
             with MediaPipeSource(Path(path)) as source:

@@ -87,7 +87,7 @@ class SyntheticSource(SkeletonSource):
         """Return the synthetic person whose seed a user wrote after the colon.
 
         Raises:
-            InputError: when it is not a whole number.
+            InputError: when the seed is not a whole number.
         """
         return cls.from_seed(number_after_colon("synthetic", cls.argument, argument, 2**31 - 1), realtime=realtime)
 

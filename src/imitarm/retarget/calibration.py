@@ -43,7 +43,7 @@ class Calibration:
     """Measurements of a person and a sensor; a value that was not measured is None.
 
     Attributes:
-        side: arm of the person, ``"left"`` or ``"right"``.
+        side: side of the measured arm, ``"left"`` or ``"right"``.
         lengths: bone lengths of this arm.
         sensor_to_base: pose of the sensor in the robot's base frame.
         sensor_rms: RMS residual of the sensor's pose [m].
@@ -117,7 +117,7 @@ class Calibration:
         """Read a file written by :meth:`save`.
 
         Raises:
-            InputError: when there is no such file.
+            InputError: when the file does not exist.
             FileFormatError: when the file is not a calibration, is damaged, or has an unknown version.
         """
         content = _read(Path(path))

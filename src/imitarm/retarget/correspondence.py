@@ -46,7 +46,7 @@ class Correspondence:
             vertical, so that a tool that points down keeps pointing down; ``"fixed"``: not at all.
 
     Raises:
-        InputError: when a value is not usable.
+        InputError: when a value has the wrong type or is out of range.
     """
 
     side: str = "right"

@@ -121,7 +121,7 @@ def correct_limbs(
         shoulder: measured shoulder position, shape (..., 3) [m].
         elbow: measured elbow position, same shape.
         wrist: measured wrist position, same shape.
-        lengths: lengths of this person.
+        lengths: bone lengths of this person's arm.
         as_printed: whether to use the equations as printed in the thesis: their signs place the elbow on the wrong side
             of the shoulder, and the forearm begins at the measured elbow instead of the corrected elbow.
 
@@ -151,7 +151,7 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
     Args:
         points: shoulder, elbow, wrist, shape (3, 3) [m].
         confidence: confidence of each point, above 0, shape (3,).
-        lengths: lengths of this person.
+        lengths: bone lengths of this person's arm.
         rounds: number of Gauss-Newton steps.
 
     Returns:

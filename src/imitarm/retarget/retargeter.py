@@ -59,7 +59,7 @@ class Goal(NamedTuple):
         estimate: estimate of the person's arm, from the last frame that shows it.
         fresh: whether the frame of the estimate arrived in this step.
         age: time since the frame of the estimate arrived [s].
-        state: FOLLOWING, COASTING or HOLDING.
+        state: state of the engagement, which is FOLLOWING, COASTING or HOLDING.
         clutch: the poses of hand and tool when the robot began to follow the person.
     """
 

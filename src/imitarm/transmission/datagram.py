@@ -102,19 +102,19 @@ def decode(data: bytes) -> tuple[Header, Message]:
             ``"version"``, ``"kind"``, ``"checksum"`` or ``"range"``.
     """
     if len(data) < _HEAD.size:
-        raise DatagramError("length", f"{len(data)} bytes are shorter than a header")
+        raise DatagramError("length", f"the datagram has only {len(data)} bytes, fewer than a header")
     magic, version, number, flags, session, sequence, time_ns, checksum = _HEAD.unpack_from(data)
     if magic != MAGIC:
-        raise DatagramError("magic", "not sent by imitarm")
+        raise DatagramError("magic", "the datagram was not sent by imitarm")
     if version != VERSION:
         raise DatagramError(
             "version", f"format version {version}, but this imitarm uses {VERSION}; use the same version on both sides"
         )
     kind = KINDS.get(number)
     if kind is None:
-        raise DatagramError("kind", f"unknown kind {number}")
+        raise DatagramError("kind", f"unknown message type {number}")
     if len(data) != size_of(kind):
-        raise DatagramError("length", f"{len(data)} bytes where {size_of(kind)} are expected")
+        raise DatagramError("length", f"the datagram has {len(data)} bytes, but {size_of(kind)} are expected")
     if zlib.crc32(data[_HEAD.size :], zlib.crc32(data[:_SIGNED])) != checksum:
         raise DatagramError("checksum", "damaged (wrong checksum)")
     body = kind.BODY.unpack_from(data, _HEAD.size)

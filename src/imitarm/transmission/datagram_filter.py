@@ -194,7 +194,7 @@ class DatagramFilter:
         dropped: number of dropped datagrams for each reason; the reasons are the keys of :data:`DROP_REASONS`.
 
     Raises:
-        InputError: when a time is not positive.
+        InputError: when ``max_age`` or ``session_timeout`` is not positive.
     """
 
     def __init__(self, *, max_age: float = 0.1, session_timeout: float = 0.5) -> None:

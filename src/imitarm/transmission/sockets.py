@@ -36,7 +36,7 @@ def resolved(address: Address) -> Address:
     """Return an address in which the host name is replaced by its IP address.
 
     Raises:
-        InputError: when there is no such host.
+        InputError: when the host is unknown.
     """
     host, port = address
     try:
@@ -71,7 +71,7 @@ def connected(address: Address) -> socket.socket:
     """Return a socket that sends to an address and receives only from this address.
 
     Raises:
-        InputError: when there is no such host, or no route to it.
+        InputError: when the host is unknown, or there is no route to it.
     """
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     one.setblocking(False)

@@ -42,7 +42,7 @@ class JointPlant:
     these effects, so a controller that uses an ``ArmModel`` does not know them.
 
     Args:
-        arm: whose dynamics.
+        arm: arm model to simulate.
         dt: control period, during which the torque is constant [s].
 
     Attributes:
@@ -141,7 +141,7 @@ class AdaptiveLaw:
 
     Args:
         arm: arm model that provides M, C, G and the rated torques.
-        period: T [s].
+        period: control period T [s].
 
     Raises:
         InputError: when the arm does not have seven joints; the gains are defined for seven joints only.
@@ -232,7 +232,7 @@ class AdaptiveControl(BaselineRetargeter):
     (:class:`JointPlant`). The joint positions that the simulated arm reaches are the command to the robot. The method
     tracks joint angles, so the tool and the hand are at different positions.
 
-    Only the torque limits bound the joint velocity. In ``notes``, there are three values:
+    The torque limits are the only limit of the joint velocity. ``notes`` contains three values:
 
     * ``"saturated"``: number of times that a joint reached its rated torque, over all joints and control steps;
     * ``"peak_torque"``: largest torque before limiting, as a multiple of the rated torque;

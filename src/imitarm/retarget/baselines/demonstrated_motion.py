@@ -106,7 +106,7 @@ def engagements(
     Args:
         frames: frames in order of time.
         correspondence: correspondence between the person's arm and the robot's.
-        rule: the times of the engagement.
+        rule: times at which the engagement changes its state.
     """
     estimator, engagement = ArmEstimator(correspondence), Engagement(correspondence, rule)
     collected: list[ArmEstimate] = []

@@ -362,7 +362,7 @@ def repaired(
         joints: joint positions of the whole motion, shape (n, n_joints) [rad].
         first: first sample of the segment.
         past: index of the sample after the segment.
-        check: the feasibility check.
+        check: feasibility check that decides whether a posture is feasible.
         rng: random generator for the postures that are drawn.
 
     Returns:
@@ -417,7 +417,7 @@ class SegmentCorrector:
     Args:
         mapping: mapping from the person's joints to the robot's joints, started at the robot's current posture.
         clutch: clutch of this engagement.
-        check: the feasibility check.
+        check: feasibility check that finds the infeasible samples.
         rng: random generator for the postures that a repair draws.
 
     Attributes:

@@ -63,7 +63,7 @@ def fit_rotations(
     """Fit a curve to rotations; :func:`fit_nurbs` fits their rotation vectors relative to the mean rotation.
 
     Args:
-        times: strictly increasing, shape (k,) [s].
+        times: times of the samples, strictly increasing, shape (k,) [s].
         quaternions: unit quaternions wxyz, shape (k, 4); signs do not matter.
         confidence: confidences from 0 to 1, shape (k,); None: all 1.
         degree: degree of the curve, as in :func:`fit_nurbs`.

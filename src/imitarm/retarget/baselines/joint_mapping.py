@@ -42,8 +42,8 @@ class JointMapping:
     follow the person. The two equations determine only the first four joints (shoulder and elbow). The last three
     joints are computed in closed form from the desired rotation of the tool. The desired rotation is the hand's
     rotation if the mapping is absolute and the orientation of the correspondence is ``"hand"``; otherwise, it is the
-    rotation of the clutch's target. The mapping does not use link lengths, so the tool and the hand are at different
-    positions. Every mapping of joints has this property.
+    rotation of the clutch's target. Like every mapping of joints, this mapping does not use link lengths, so the tool
+    and the hand are at different positions.
 
     The angles are continuous from frame to frame, without jumps by 360 degrees. An angle that is undefined keeps its
     value.
@@ -155,7 +155,7 @@ class Approach:
         self.active = True
 
     def towards(self, q: Array, goal: Array) -> Array:
-        """Return the position one period after ``q``.
+        """Return the joint positions one control period after ``q``.
 
         The result is a step towards ``goal``, or ``goal`` itself once it has been reached.
         """

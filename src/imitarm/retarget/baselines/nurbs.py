@@ -41,7 +41,7 @@ def basis_functions(knots: Array, degree: int, u: ArrayLike) -> tuple[Indices, A
 
     Args:
         knots: knots, non-decreasing, the first and the last repeated degree + 1 times, shape (m,).
-        degree: p.
+        degree: degree p of the curve.
         u: parameters, shape (k,); clipped to the range of the knots.
 
     Returns:
@@ -136,8 +136,8 @@ class NURBS:
         \frac1W \bigl(A^{(r)} - \sum_{j=1}^r \binom rj W^{(j)} C^{(r-j)}\bigr)`.
 
         Args:
-            u: parameters; a single number gives shape (d,). Beyond the ends of the curve, the derivative at the end is
-                returned.
+            u: parameters, shape (k,); for a single number, the result has shape (d,). Beyond the ends of the curve, the
+                derivative at the end is returned.
             order: 0 (the point itself) to ``degree``.
 
         Raises:
@@ -176,7 +176,7 @@ def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
         degree: degree of the curve.
 
     Returns:
-        shape (n_control + degree + 1,).
+        The knots, shape (n_control + degree + 1,).
     """
     inner = np.arange(1, n_control - degree) * (len(u) / (n_control - degree))
     i = inner.astype(int)
@@ -244,7 +244,7 @@ def fit_nurbs(
         times: times of the samples, strictly increasing, shape (k,) [s].
         points: sample points Q, shape (k, d); a point whose confidence is 0 is ignored and may be nan.
         confidence: confidence c of each sample, 0 to 1, shape (k,); None: all 1.
-        degree: p.
+        degree: degree p of the curve.
         n_control: number of control points; None: k/4 + p, for k samples and degree p.
         smoothing: the weight :math:`\mu`, or a rule that chooses it: ``"gcv"``: generalised cross-validation, which
             assumes independent errors; ``"morozov"``: the weight with which the residual equals ``sigma``.

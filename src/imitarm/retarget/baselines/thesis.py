@@ -198,7 +198,7 @@ class ThesisRetargeter(Retargeter):
             its limits in any case.
         smoothing: ``"live"``: a curve is fitted to the last 0.6 s; ``"global"``: :meth:`run` fits one curve to the
             whole recording, without lag, but :meth:`step` uses a live curve; None: no curve.
-        lag: lag of the live curve [s].
+        lag: time by which the evaluated point of the live curve lies in the past [s].
         iterations: number of increments of the person's joint angles per frame.
         gain: gain K of the tool's twist :math:`K \log(T_d T^{-1})` [1/s]; the default is the inverse of the frame
             period.
