@@ -83,8 +83,8 @@ class SkeletonCamera:
 
     A joint at position x is measured at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma``
     on each axis across the line of sight, and ``1.4 sigma`` along the line of sight. For finger tips and thumbs, both
-    values are 1.5 times as large. The slow error is a Matern process of order 3/2 over a variable u that combines the
-    time t and the path length :math:`|dx|` of the joint,
+    standard deviations are 1.5 times as large. The slow error is a Matern process of order 3/2 over a variable u that
+    combines the time t and the path length :math:`|dx|` of the joint,
 
     .. math:: du = dt / 5\,\mathrm{s} + |dx| / 8\,\mathrm{cm}, \qquad
               \mathrm{E}\,[c(0)\,c(u)] = \sigma^2 (1 + u)\,e^{-u},

@@ -130,7 +130,9 @@ def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[Recordi
         lost = "; the frame that was being written is lost" if torn else ""
         message = f"was not closed: its writer was stopped or is still running; {n} whole frames were read{lost}"
         issues.append(
-            RecordingIssue("note", "not-closed", message, n - 1, remedy="save it under another name to keep it")
+            RecordingIssue(
+                "note", "not-closed", message, n - 1, remedy="save the recording under another name to keep it"
+            )
         )
     persons = _persons(table, content)
     joints = table.values[:, 4:].reshape(n, len(JOINTS), 4)

@@ -117,7 +117,7 @@ def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "c
     r"""Return the motion of a person who draws a shape repeatedly with the right hand.
 
     The angle along the shape is :math:`\omega\,s(t)`. The warped time s is constant during the first second and at the
-    end; in between, s advances as fast as the time t. In the transitions, its rate follows a minimum-jerk profile.
+    end; in between, s advances as fast as the time t. In the transitions, the rate of s follows a minimum-jerk profile.
 
     Args:
         person: who moves.

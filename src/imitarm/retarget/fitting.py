@@ -103,7 +103,7 @@ def fit_motion(
         tried *= _SHRINK
     raise UnreachableError(
         f"fit: a motion of {span[0]:.2f} x {span[1]:.2f} x {span[2]:.2f} m is not within reach of {arm.name} even at a "
-        f"scale of {_SMALLEST:g}; cut it (--trim), or choose a larger arm"
+        f"scale of {_SMALLEST:g}; cut the recording (--trim), or choose a larger arm"
     )
 
 

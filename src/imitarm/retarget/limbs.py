@@ -146,7 +146,7 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
 
     A few Gauss-Newton steps solve this problem, each with a 2 x 2 system of equations for the Lagrange multipliers.
     :func:`correct_limbs` is the special case in which the shoulder is assumed to be exact and only the directions of
-    the bones are used; it transfers the errors of shoulder and elbow to the wrist.
+    the bones are used. The special case transfers the errors of shoulder and elbow to the wrist.
 
     Args:
         points: shoulder, elbow, wrist, shape (3, 3) [m].

@@ -95,12 +95,12 @@ class Teleoperation:
 
     In each period, the retargeter turns the newest skeleton into a joint velocity, the safety filter corrects this
     velocity, and :meth:`Robot.move <imitarm.robots.robot.Robot.move>` sends it to the robot. Sometimes the robot cannot
-    be controlled, because it was stopped, was slowed down or does not answer. When it can be controlled again, it is
-    first brought to rest. The retargeter then starts from the arm's current position and engages again, so the arm
-    never jumps.
+    be controlled, because it was stopped, was slowed down or does not answer. When the robot can be controlled again,
+    it is first brought to rest. The retargeter then starts from the arm's current position and engages again, so the
+    arm never jumps.
 
     Args:
-        source: skeletons of one person, live or in real time.
+        source: skeletons of one person, live or replayed in real time.
         retargeter: the mapping from human arm to robot arm.
         robot: robot to control.
         safety: safety filter that checks every command; None: the default filter, which keeps the arm within its
