@@ -82,7 +82,7 @@ def test_the_worker_is_told_what_to_read_and_may_not_import_what_lies_around(wor
         (said("imitarm-mediapipe 2 1280 720"), InputError, "does not send the lines"),
         (said("imitarm-mediapipe 1 wide high"), InputError, "no image size"),
         (said("imitarm-mediapipe 1 0 720"), InputError, "needs an image size"),
-        (said(HELLO, frame(0)) + "\nos.kill(os.getpid(), signal.SIGKILL)", TaskFailedError, "ended.*status -9.*1 image"),
+        (said(HELLO, frame(0)) + "\nos.kill(os.getpid(), signal.SIGKILL)", TaskFailedError, "end.*status -9.*1 image"),
         (said(HELLO, frame(0), "error it is cut off"), TaskFailedError, "it is cut off; 1 images were processed"),
         (said(HELLO, frame(0), "frame 0.1 1 2 3"), TaskFailedError, "sent an invalid line: 'frame 0.1 1 2 3'"),
         (said(HELLO, frame(0), frame(1)[:-3] + "nan"), TaskFailedError, "sent an invalid line"),
