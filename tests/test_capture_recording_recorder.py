@@ -118,7 +118,7 @@ def test_nothing_that_is_there_is_overwritten(tmp_path):
     with pytest.raises(InputError, match="already exists"):
         SkeletonRecorder(path)
     first = SkeletonRecorder(path, replace=True)
-    with pytest.raises(InputError, match=r"a\.csv\.part: was left .* or is being written"):
+    with pytest.raises(InputError, match=r"a\.csv\.part: an earlier recording left .* is writing it"):
         SkeletonRecorder(path, replace=True)
     assert len(read_recording(path)) == 2  # until the new one is whole
     first.write(skeletons(1)[0])
