@@ -62,4 +62,4 @@ def test_what_is_not_in_a_checkout_is_named_by_its_version(checkout, tmp_path_fa
 def test_a_page_says_when_its_results_are_of_other_code():
     assert origin([code_version()] * 2) == f"Results of {code_version()}."
     mixed = origin([code_version(), "commit 0123456789"])
-    assert "commit 0123456789" in mixed and "run the command again" in mixed
+    assert "commit 0123456789" in mixed and "Run the command again" in mixed

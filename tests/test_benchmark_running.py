@@ -53,7 +53,7 @@ def test_a_result_is_read_as_it_was_written(tmp_path):
 def test_a_foreign_file_is_no_result(tmp_path, content):
     path = tmp_path / "r.json"
     path.write_text(content)
-    with pytest.raises(FileFormatError, match="delete it and run again"):
+    with pytest.raises(FileFormatError, match="delete the file and run"):
         Result.load(path)
 
 

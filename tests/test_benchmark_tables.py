@@ -28,7 +28,7 @@ def test_a_document_says_when_its_results_are_of_other_code(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(f"{BEGIN}\n{END}\n")
     Place(page, "avoidance").fill([TABLE], "imitarm benchmark avoidance", ["commit 0123456789"])
-    assert "Results of commit 0123456789, not of the code that made these tables" in page.read_text()
+    assert "Results of commit 0123456789. Other code made these tables" in page.read_text()
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_a_document_says_when_its_results_are_of_other_code(tmp_path):
 def test_a_document_without_a_place_for_the_tables_is_refused(tmp_path, wrong):
     page = tmp_path / "page.md"
     page.write_text(wrong)
-    with pytest.raises(InputError, match="the tables go between"):
+    with pytest.raises(InputError, match="the tables belong between"):
         Place(page, "avoidance")
     assert page.read_text() == wrong
     with pytest.raises(InputError, match="can't be read"):

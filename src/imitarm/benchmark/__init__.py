@@ -1,1 +1,1 @@
-"""Experiments: seeded families of scenes and recordings, resumable runs, saved results, and tables."""
+"""Benchmarks: reproducible random scenes and recordings, runs that can be resumed, saved results, and tables."""

@@ -1,6 +1,6 @@
-"""Rate at which a method keeps its clearance in hundreds of seeded scenes: ``imitarm benchmark avoidance``.
+"""``imitarm benchmark avoidance``: how often each method keeps its clearance in hundreds of random scenes.
 
-Success is evaluated on 4000 points of the path that would be executed, not on the samples of the plan.
+Success is evaluated at 4000 points of the path that would be executed, not at the coarser samples of the plan.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a method in one scene.
+    """Result of one method in one scene.
 
     Attributes:
         accepted: whether the method accepts the scene and returns a path to execute.
-        kept: whether the path keeps the required clearance (minus 0.5 mm) at all dense points.
-        collision_free: whether the path touches no obstacle at any dense point.
-        clearance: smallest distance at the dense points [m].
+        kept: whether the path keeps the required clearance (with 0.5 mm tolerance) at all evaluated points.
+        collision_free: whether the path touches no obstacle at any evaluated point.
+        clearance: smallest distance to an obstacle at the evaluated points [m].
         rmse: root mean square distance to the nominal path [m].
-        unmoved: fraction of the components that did not move.
+        unmoved: fraction of the Gaussian components that were not moved.
         seconds: compute time [s].
     """
 
@@ -69,7 +69,7 @@ def learn(*, planar: bool) -> tuple[Skill, Array]:
 
 
 def evaluate(case: Case, adaptation: Adaptation) -> Outcome:
-    """Measure an adaptation at dense points of its path."""
+    """Measure an adaptation at many points along its path."""
     times = adaptation.trajectory.times
     points, _ = adaptation.trajectory.at(np.linspace(times[0], times[-1], _DENSE))
     clearance = float(np.min(case.scene.clearance(points))) - TOOL_RADIUS
@@ -85,7 +85,7 @@ def evaluate(case: Case, adaptation: Adaptation) -> Outcome:
 
 
 def run_family(skill: Skill, cases: Iterable[Case], method: str = "certified") -> list[Outcome]:
-    """Let one method adapt one skill to every case."""
+    """Let one method adapt one skill to each of the scenes."""
     outcomes = []
     for case in cases:
         adaptation = adapt(
@@ -96,7 +96,7 @@ def run_family(skill: Skill, cases: Iterable[Case], method: str = "certified") -
 
 
 def _families(path: Array, planar: bool) -> list[tuple[str, bool, Callable[[int], Case]]]:
-    """Return the name of each family, whether its scenes have a solution, and the function that makes them."""
+    """Return the families of scenes: name, whether the scenes have a solution, and the function that makes a scene."""
     rows: list[tuple[str, bool, Callable[[int], Case]]] = [
         (f"{k} on the path", True, lambda s, k=k: sparse_clutter(s, path, n_obstacles=k, planar=planar))  # type: ignore[misc]
         for k in (1, 2, 3)
@@ -131,13 +131,13 @@ def success_table(
     methods: Sequence[str] = tuple(ADAPTERS),
     on_done: Callable[[int, int], None] | None = None,
 ) -> Table:
-    """Run every method over every family.
+    """Run every method in the scenes of every family, and return the table of results.
 
     Args:
-        seeds: scenes in each family.
-        first: first seed; 2000 and on are the test seeds.
+        seeds: number of scenes in each family.
+        first: first seed; seeds from 2000 on are for testing.
         methods: names in :data:`imitarm.policies.adaptation.ADAPTERS`.
-        on_done: function called with the number of finished rows and the total number.
+        on_done: function called with the number of finished table rows and the total number of rows.
     """
     rows: list[tuple[str, ...]] = []
     planned = [(planar, *learn(planar=planar)) for planar in (True, False)]

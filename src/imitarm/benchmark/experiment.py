@@ -1,4 +1,4 @@
-"""Experiment and Result: one method with one recording, or in one closed-loop trial; the result is a saved file."""
+"""Experiment and Result: run one method on one recording or in one closed-loop trial, and save the result in a file."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ _NO_RECORDING = "the recording could not be made"
 
 @dataclass(frozen=True)
 class Method:
-    """A retargeting method with its options: a row of the tables.
+    """A retargeting method with its options; each method is a row of the tables.
 
     Attributes:
         retargeter: name of the method in :data:`imitarm.retarget.RETARGETERS`.
-        label: name of the row in tables and figures; empty: the method's title.
+        label: name of the row in tables and figures; if empty, the title of the retargeter.
         options: options for the method's constructor.
     """
 
@@ -61,10 +61,12 @@ class Method:
 
 
 MAIN: Mapping[str, Method] = {name: Method(name) for name in RETARGETERS}
-"""Every registered method with its default options. The built-in methods appear in thesis Table 3.1 and Figs 3.6 to
-3.8: ``thesis`` is its method Me with the equations corrected, M1 to M3 are our interpretation of its baselines;
-``modern`` is
-this library's own. Methods of other packages are added by entry points."""
+"""Every registered method with its default options.
+
+The thesis compares its method Me with the baselines M1 to M3 (Table 3.1 and Figs 3.6 to 3.8). ``thesis`` is Me with
+corrected equations, ``m1`` to ``m3`` are our interpretations of the baselines, and ``modern`` is the method of this
+library. Other packages can add methods by entry points.
+"""
 
 VARIANTS: Mapping[str, Method] = {
     "me-thesis": Method("thesis", "Me-thesis", {"smoothing": "global", "small_angle": "thesis"}),
@@ -74,9 +76,9 @@ VARIANTS: Mapping[str, Method] = {
     "m1-scaled": Method("m1", "M1, scaled", {"velocity_scaling": True}),
     "m3-scaled": Method("m3", "M3, scaled", {"velocity_scaling": True}),
 }
-"""Methods with one changed option, to show its effect. Me-thesis fits one NURBS to the whole recording and
-uses the small-angle term; "as printed" keeps every misprint that can be run; "scaled" slows all joints together where
-one would be too fast."""
+"""Methods with changed options, to show the effects of the options. "Me-thesis" fits one NURBS to the whole recording
+and uses the small-angle term. "as printed" keeps every misprint with which the method still runs. "scaled" slows all
+joints down together where one joint would be too fast."""
 
 METHODS: Mapping[str, Method] = {**MAIN, **VARIANTS}
 """All methods by name."""
@@ -95,9 +97,10 @@ def method(name: str) -> Method:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One method in one task, as plain values that can be sent to another process or machine.
+    """The definition of one run of one method in one task; plain values that can be sent to another process or machine.
 
-    ``Experiment("edge", "modern", seed=3).run()`` makes the recording, lets the method follow it, and measures.
+    ``Experiment("edge", "modern", seed=3).run()`` makes the recording, lets the method follow it, and measures the
+    result.
 
     Attributes:
         task: one of :data:`REPLAYS`, or :data:`LIVE`.
@@ -107,7 +110,7 @@ class Experiment:
         repeat: number of the recording or trial of this person.
         seconds: approximate duration of reaches and drawings [s].
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
-        data: folder of real recordings, for the task that needs them.
+        data: folder of real recordings, for the task with motion capture.
 
     Raises:
         UnknownNameError: when task, method or robot is not known.
@@ -135,24 +138,24 @@ class Experiment:
 
     @property
     def plan(self) -> Plan:
-        """The recording that the method follows; for the live task, the recording with the same seeds."""
+        """Definition of the recording that the method follows; for the live task, a recording with the same seeds."""
         kind = "stacking" if self.task == LIVE else self.task
         return Plan(kind, self.seed, self.repeat, self.seconds, self.sigma, self.data)
 
     @property
     def name(self) -> str:
-        """A short name for the experiment."""
+        """A short name of the experiment, for messages and files."""
         return f"{self.task.replace(' ', '-')}-{self.method}-{self.robot}-{self.seed:02d}-{self.repeat}"
 
     def run(self, folder: str | Path | None = None) -> Result:
-        """Run the method, and measure.
+        """Run the method, and measure the result.
 
         Args:
-            folder: folder for recordings, so that the next method can use the same file; None: recordings are not
+            folder: folder in which the recording is saved, so that the next method can use the same file; None: not
                 saved.
 
         Returns:
-            The result. When the method fails, it has no values, and ``failure`` holds the reason.
+            The result. If the method fails, the result has no values, and ``failure`` states the reason.
         """
         began = clock.perf_counter()
         try:
@@ -163,7 +166,7 @@ class Experiment:
         return Result(self, code_version(), values, failure, clock.perf_counter() - began)
 
     def recording(self, folder: Path | None = None) -> MappingRecording:
-        """Return the recording: read from ``folder`` if it exists there, otherwise made and saved there."""
+        """Return the recording; it is read from ``folder``, or made and saved there if it does not exist yet."""
         if folder is None:
             return make_recording(self.plan, _arm(self.robot))
         facts = json.dumps([asdict(self.plan), self.robot, code_version()])
@@ -196,21 +199,23 @@ class Experiment:
 
 @dataclass(frozen=True)
 class StackingOutcome:
-    """The outcome of one closed-loop trial of stacking; the torques are the drives' torques, including contacts.
+    """The outcome of one closed-loop trial of stacking.
+
+    Torques are those of the drives, and include the effect of contacts.
 
     Attributes:
         success: whether four cubes stand in order.
         failure: one of :data:`imitarm.tasks.stack.FAILURES`; empty on success.
         reason: reason in words.
-        stacked: cubes in the tower at the end.
-        time: time until the person had finished, or the time limit [s].
+        stacked: number of cubes in the tower at the end.
+        time: time at which the person finished, or the time limit [s].
         path_length: path length of the tool [m].
         mean_torque: mean of the absolute torque of each joint [N m].
         rms_torque: root mean square of each joint's torque [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
         peak_torque_ratio: largest torque relative to the rated torque.
         velocity_ratio: largest measured joint velocity relative to its limit.
-        clamped: control steps in which the robot's limits changed the command.
+        clamped: number of control steps in which the robot's limits changed the command.
     """
 
     success: bool
@@ -230,7 +235,7 @@ class StackingOutcome:
 def run_stacking(
     method_name: str, person: int, repeat: int = 0, sigma: float | None = None, arm: ArmModel | None = None
 ) -> StackingOutcome:
-    """Let a simulated person stack cubes with a method, a noisy camera and contact physics; measure.
+    """Let a simulated person stack cubes with a method, a noisy camera and simulated contacts, and measure the outcome.
 
     Args:
         method_name: one of :data:`METHODS`.
@@ -258,12 +263,12 @@ def run_stacking(
 
 
 def camera_maker(sigma: float | None) -> Callable[[int], SkeletonCamera]:
-    """Return a function from a seed to a camera with realistic errors; ``sigma`` [m] as in Experiment."""
+    """Return a function that makes a camera with realistic errors from a seed; ``sigma`` [m] as in Experiment."""
     return SkeletonCamera.from_seed if sigma is None else partial(SkeletonCamera, sigma=sigma)
 
 
 def count_failures(outcomes: Sequence[str]) -> str:
-    """Return how often each failure happened, in words, the most frequent first; ``outcomes`` are "" on success."""
+    """Return a text on how often each failure happened, the most frequent first; "" in ``outcomes`` is success."""
     counted = Counter(outcome for outcome in outcomes if outcome)
     return ", ".join(f"{n} {what}" for what, n in counted.most_common()) or "none"
 
@@ -275,10 +280,11 @@ class Result:
     Attributes:
         experiment: experiment that was run.
         code: version of the code that ran, see :func:`imitarm.benchmark.provenance.code_version`.
-        values: measures by name: those of :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics` with
-            ``recorded`` [s], ``beyond_reach`` (fraction of the time) and the method's own ``notes``; or those of
-            :class:`StackingOutcome`; empty after a failure.
-        failure: reason why there are no measures; empty if there are.
+        values: measures by name. For a recording, these are the measures of
+            :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics`, ``recorded`` [s], ``beyond_reach`` (fraction of
+            the time) and the ``notes`` of the method. For a closed-loop trial, these are the measures of
+            :class:`StackingOutcome`. Empty after a failure.
+        failure: reason why there are no measures; empty if there are measures.
         seconds: computing time [s].
     """
 
@@ -294,18 +300,18 @@ class Result:
         return f": {_NO_RECORDING}: " in self.failure
 
     def value(self, name: str) -> float:
-        """Return a measure; nan when it is not known."""
+        """Return the measure with this name; nan when it is unknown."""
         found = self.values.get(name)
         return math.nan if found is None else float(found)
 
     @staticmethod
     def path(folder: Path, experiment: Experiment) -> Path:
-        """Return the path of an experiment's result; its name contains a digest of the configuration."""
+        """Return the path of an experiment's result; the file name contains a hash of the configuration."""
         facts = json.dumps(asdict(experiment), sort_keys=True)
         return folder / f"{experiment.name}-{hashlib.sha256(facts.encode()).hexdigest()[:12]}.json"
 
     def save(self, folder: Path) -> Path:
-        """Write the result atomically, and return its path."""
+        """Write the result to a file without ever leaving an incomplete file, and return the path."""
         folder.mkdir(parents=True, exist_ok=True)
         path = self.path(folder, self.experiment)
         content = {
@@ -322,7 +328,7 @@ class Result:
 
     @classmethod
     def load(cls, path: Path) -> Result:
-        """Read a file that :meth:`save` wrote; null in the file represents nan.
+        """Read a result that :meth:`save` wrote; null in the file stands for nan.
 
         Raises:
             FileFormatError: when the file is not such a result.
@@ -330,18 +336,22 @@ class Result:
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             if content["format"] != FORMAT or content["version"] != VERSION:
-                raise FileFormatError(f"{path}: is not a result of this version; delete it and run again")
+                raise FileFormatError(
+                    f"{path}: is not a result of this version; delete the file and run the benchmark again"
+                )
             experiment = Experiment(**content["experiment"])
             values = {name: math.nan if value is None else value for name, value in content["values"].items()}
             return cls(experiment, str(content["code"]), values, str(content["failure"]), float(content["seconds"]))
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             if isinstance(error, FileFormatError):
                 raise
-            raise FileFormatError(f"{path}: can't be read as a result ({error}); delete it and run again") from error
+            raise FileFormatError(
+                f"{path}: can't be read as a result ({error}); delete the file and run the benchmark again"
+            ) from error
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` with numbers that are not finite as None, ready for JSON."""
+    """Return ``value`` for JSON: numbers that are not finite become None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -350,7 +360,7 @@ def plain(value: Any) -> Any:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file under a temporary name and rename it, so that no reader finds an incomplete file."""
+    """Write a text file under a temporary name, then rename it, so that no other process reads an incomplete file."""
     aside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         aside.write_text(text, encoding="utf-8")

@@ -1,7 +1,7 @@
-"""Seeded families of scenes around one seeded skill; the same seed gives the same scene on every machine.
+"""Families of random scenes around a synthetic skill; the same seed gives the same scene on every machine.
 
-Every scene is a :class:`Case`: obstacles, forbidden directions, and whether a solution exists. The existence of a
-solution follows from the construction of the scene, not from a tested method.
+Every scene is a :class:`Case`: obstacles, forbidden directions, and whether a solution exists. Whether a solution
+exists follows from the construction of the scene, not from any of the tested methods.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _WALL = 2.0  # [m] length of a wall that can't be passed at its outer end
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One scene to be solved or refused.
+    """One scene, which a method must solve or refuse.
 
     Attributes:
         scene: the obstacles.
-        forbidden: directions in which nothing may move, shape (m, 3).
+        forbidden: directions in which the path must not be displaced, shape (m, 3).
         solvable: whether a path with the required clearance exists.
     """
 
@@ -75,10 +75,10 @@ KINDS = (*SIMPLE, "capsule", "cylinder", "ellipsoid", "convex hull")
 
 
 class _Draft(NamedTuple):
-    """The parameters of a random obstacle; drawing them is much faster than building the obstacle.
+    """The parameters of a random obstacle. Drawing random parameters is much faster than building the obstacle.
 
-    ``outer`` is the radius of a sphere about ``centre`` that holds it, ``inner`` the distance from ``centre`` to a
-    point of it [m].
+    ``outer`` is the radius of a sphere around ``centre`` that contains the obstacle [m]. ``inner`` is the distance from
+    ``centre`` to some point of the obstacle [m].
     """
 
     build: Callable[[], Obstacle]
@@ -89,7 +89,7 @@ class _Draft(NamedTuple):
 def random_obstacle(
     rng: np.random.Generator, centre: Array, *, planar: bool, kinds: tuple[str, ...] = KINDS
 ) -> Obstacle:
-    """Make an obstacle of a random kind, 2 to 10 cm across; in a planar scene it stands upright on the table."""
+    """Make an obstacle of a random shape, 2 to 10 cm in size; in a planar scene, it stands upright on the table."""
     return _draft(rng, centre, planar, kinds).build()
 
 
@@ -120,16 +120,16 @@ def _draft(rng: np.random.Generator, centre: Array, planar: bool, kinds: tuple[s
 
 
 def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, kinds: tuple[str, ...] = KINDS) -> Case:
-    """Family S1/S3: obstacles of all kinds placed on the path, well apart.
+    """Families S1 and S3: obstacles of all shapes on the path, far apart.
 
-    Solvable, because a path can go round each of them.
+    The scene is solvable, because a path can go around each obstacle.
 
     Args:
         seed: number of the scene.
         path: nominal path on which the obstacles are placed, shape (n, 3) [m].
         n_obstacles: how many.
         planar: whether the path must stay in its plane.
-        kinds: shapes from which to choose.
+        kinds: names of the shapes from which obstacles are chosen.
     """
     rng = np.random.default_rng([11, n_obstacles, planar, seed])
     ends, free = path[[0, -1]], TOOL_RADIUS + _FREE_ENDS
@@ -162,7 +162,7 @@ def narrow_gap(seed: int, path: Array, *, solvable: bool) -> Case:
     Args:
         seed: number of the scene.
         path: nominal path, shape (n, 3) [m].
-        solvable: whether the gap lets the tool through with the required clearance.
+        solvable: whether the gap is wide enough for the tool with the required clearance.
     """
     rng = np.random.default_rng([14, solvable, seed])
     need = 2.0 * (TOOL_RADIUS + CLEARANCE)
@@ -186,7 +186,7 @@ def narrow_gap(seed: int, path: Array, *, solvable: bool) -> Case:
 
 
 def covered_end(seed: int, path: Array, *, planar: bool) -> Case:
-    """Family S6: an obstacle over the start or the goal, which must be refused.
+    """Family S6: an obstacle covers the start or the goal, so the scene must be refused.
 
     Args:
         seed: number of the scene.
@@ -205,15 +205,15 @@ def covered_end(seed: int, path: Array, *, planar: bool) -> Case:
 
 @dataclass(frozen=True, eq=False)
 class RandomScene:
-    """One random scene with everything that :func:`imitarm.policies.adapt` needs besides the skill.
+    """One random scene, with all arguments that :func:`imitarm.policies.adapt` needs besides the skill.
 
     Attributes:
         seed: number of the scene.
         family: name of the rule by which the obstacles were placed.
-        scene: obstacles; some move.
-        tool_spheres: rows x y z r in the tool's frame, shape (m, 4) [m].
+        scene: obstacles, some of which may move.
+        tool_spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
         clearance: required [m].
-        forbidden: directions in which nothing may move, shape (m, 3).
+        forbidden: directions in which the path must not be displaced, shape (m, 3).
         pinned: times at which the path must not move [s].
         n_samples: number of samples along the path.
     """
@@ -232,13 +232,13 @@ RANDOM_FAMILIES = ("on the path", "cluster", "gap", "near an end", "huge", "thin
 
 
 def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> RandomScene:
-    """Make a random scene, which need not have a solution.
+    """Make a random scene, which may have no solution.
 
     Args:
         seed: number of the scene.
         path: nominal path, shape (n, 3) [m].
         duration: duration of the path [s].
-        rotates: whether the skill rotates the tool, so that the tool may have spheres away from the tip.
+        rotates: whether the skill rotates the tool; only then may the tool have spheres away from the tip.
     """
     rng = np.random.default_rng([31, seed])
     family = RANDOM_FAMILIES[int(rng.choice(len(RANDOM_FAMILIES), p=[0.1, 0.1, 0.3, 0.12, 0.06, 0.06, 0.16, 0.1]))]
@@ -271,7 +271,7 @@ def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> R
 
 
 def _any_obstacle(rng: np.random.Generator, centre: Array, planar: bool, scale: float = 1.0) -> Obstacle:
-    """Make an obstacle of any kind, ``scale`` times 2 to 10 cm across; upright in a planar scene."""
+    """Make an obstacle of any shape, ``scale`` times 2 to 10 cm in size; in a planar scene, it stands upright."""
     pose = Pose(centre, quaternion_exp(_rotation(rng, planar)))
     half = scale * rng.uniform(0.012, 0.05, size=3)
     along = pose.rotation[:, 0] * half[0]
@@ -320,7 +320,7 @@ def _cluster(
 
 
 def _gap(rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float) -> tuple[Obstacle, ...]:
-    """Two long walls across the path that leave a gap, wide enough or not."""
+    """Two long walls across the path with a gap between them, which may be too narrow."""
     at, _ = _heading(rng, path)
     ahead = path[min(at + 5, len(path) - 1)] - path[at - 5]
     yaw = np.array([0.0, 0.0, np.arctan2(ahead[1], ahead[0])])
@@ -337,7 +337,7 @@ def _gap(rng: np.random.Generator, path: Array, duration: float, planar: bool, r
 def _near_an_end(
     rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float
 ) -> tuple[Obstacle, ...]:
-    """An obstacle close to the start or the goal, with little more than the required clearance."""
+    """An obstacle near the start or the goal, at little more than the required clearance."""
     forward = bool(rng.random() < 0.5)
     end, inward = (path[0], path[len(path) // 9] - path[0]) if forward else (path[-1], path[-len(path) // 9] - path[-1])
     direction = inward / np.linalg.norm(inward) + rng.choice([0.1, 0.5]) * rng.normal(size=3)
@@ -367,7 +367,7 @@ def _thin(rng: np.random.Generator, path: Array, duration: float, planar: bool, 
 def _enclosing(
     rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float
 ) -> tuple[Obstacle, ...]:
-    """Walls on several sides of a point of the path, as in a shelf or a box; some leave no opening."""
+    """Walls on several sides of a point of the path, as in a shelf or a box, sometimes without any opening."""
     at, ahead = _heading(rng, path)
     at = int(rng.choice([0, at, len(path) - 1]))
     yaw = np.array([0.0, 0.0, np.arctan2(ahead[1], ahead[0])])
@@ -383,7 +383,7 @@ def _enclosing(
 
 
 def _moving(rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float) -> tuple[Obstacle, ...]:
-    """Obstacles that cross the path at 0.1 to 0.6 m/s, at about the time when the tool is there."""
+    """Obstacles that cross the path at 0.1 to 0.6 m/s, each at about the time when the tool passes this place."""
     made = []
     for _ in range(int(rng.integers(1, 4))):
         at = int(rng.uniform(0.15, 0.85) * (len(path) - 1))

@@ -1,4 +1,4 @@
-"""The mapping benchmark: its experiments, its tables, and the files that it writes."""
+"""The mapping benchmark, which compares retargeting methods: its experiments, tables, and output files."""
 
 from __future__ import annotations
 
@@ -33,16 +33,18 @@ class MappingBenchmark:
 
     Attributes:
         people: number of simulated persons.
-        first: number of the first person; the persons are ``first`` to ``first + people - 1``. Persons below 200
-            are for developing
-            methods, those from 200 on for testing: no method is tested with a person that it was tuned with.
-        repeats: closed-loop trials of each person; there is one recording of each kind and person to replay.
+        first: number of the first person; the persons are ``first`` to ``first + people - 1``. Numbers below 200 are
+            for developing methods, and numbers from 200 on are for testing. Therefore no method is tested with a person
+            with whom it was tuned.
+        repeats: number of closed-loop trials of each person. For replay, there is one recording of each kind and
+            person.
         methods: names in :data:`imitarm.benchmark.experiment.METHODS`.
         kinds: kinds of recordings, from :data:`imitarm.benchmark.recordings.KINDS`.
         seconds: approximate duration of a recording [s].
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
-        live: whether the main methods among ``methods`` also stack cubes in closed loop.
-        data: folder of real recordings; empty: the captured arm is left out.
+        live: whether the main methods among ``methods`` are also tested in closed loop, in which the person stacks
+            cubes.
+        data: folder of real recordings; if empty, the recordings from motion capture are left out.
 
     Raises:
         InputError: when there is nothing to run.
@@ -64,7 +66,7 @@ class MappingBenchmark:
         if self.first < 0:
             raise InputError(f"the first person must be at least 0, got {self.first}")
         if not self.methods or not (self.kinds or self.live or self.data):
-            raise InputError("the benchmark needs a method, and a kind of recording or the closed loop")
+            raise InputError("nothing to run: choose a method, and a kind of recording or closed-loop trials")
 
     def experiments(self) -> list[Experiment]:
         """Return all experiments, grouped by recording."""
@@ -101,7 +103,7 @@ _TORQUES = {
 
 
 def tables(results: Results) -> list[Table]:
-    """Return all tables for which there are results, the claims of the thesis first."""
+    """Return all tables for which there are results, with the table on the claims of the thesis first."""
     replayed, found = results.tasks(), []
     if replayed:
         stacking = results.tasks(["stacking"]) or replayed

@@ -1,4 +1,4 @@
-"""Comparisons of ``modern`` with each other method, and of the thesis's claims with the results."""
+"""Compare the method ``modern`` with every other method, and the claims of the thesis with the results."""
 
 from __future__ import annotations
 
@@ -32,20 +32,21 @@ COMPARED = (
     Figure("limit_violations", "frames beyond a limit", digits=0),
     *SMOOTHNESS,
 )
-"""The measures in which ``modern`` is compared with the other methods: all measures in the tables of accuracy, effort,
-torque
-and smoothness, and the frames that break a limit."""
+"""The measures in which ``modern`` is compared with the other methods: all measures of accuracy, effort, torque and
+smoothness, and the number of frames that exceed a limit."""
 STACKED = Figure("success", "stacked [%]", 100.0, 0, more=True)
 LIVE_COMPARED = (STACKED, *LOOP, TORQUES[1], EFFORT[4], EFFORT[6])
-"""The measures that are compared in closed loop; all except the success rate use only trials in which both methods
-succeeded."""
+"""The measures that are compared in closed loop.
+
+The success rate uses all trials; all other measures use only trials in which both methods succeeded.
+"""
 
 
 def _compared(results: Results, tasks: Sequence[str]) -> Iterator[tuple[Figure, str, Comparison, float]]:
     """Yield one comparison of ``modern`` for each measure and each other method.
 
-    Each is a measure, the name of the other method, the difference ``modern`` minus that method, and p after Holm's
-    correction over the methods within this measure.
+    Each comparison consists of the measure, the name of the other method, the difference (``modern`` minus the other
+    method), and the p-value after Holm's correction for the number of methods in this measure.
     """
     baselines = [name for name in results.methods if name != OURS and results.of(name, tasks)]
     if not results.of(OURS, tasks):
@@ -58,7 +59,7 @@ def _compared(results: Results, tasks: Sequence[str]) -> Iterator[tuple[Figure, 
 
 
 def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return the comparisons of ``modern`` with each other method, paired over the same recordings or trials."""
+    """Return a table that compares ``modern`` with each other method on pairs of the same recordings or trials."""
     rows = [
         (_titled(figure), METHODS[name].title, *_difference(comparison, figure), f"{p:.3f}")
         for figure, name, comparison, p in _compared(results, tasks)
@@ -74,7 +75,7 @@ def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
 
 
 def better_methods_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return the measures in which another method is better than ``modern``."""
+    """Return a table of the measures in which another method is better than ``modern``."""
     rows = []
     for task in [*tasks, LIVE]:
         for figure, name, comparison, p in _compared(results, [task]):
@@ -118,7 +119,7 @@ def _difference(comparison: Comparison, figure: Figure) -> tuple[str, str, str]:
 
 
 PRINTED_PATH = np.array([7.03, 7.43, 9.04, 9.26, 8.72, 9.53, 6.4, 8.36, 9.32, 10.24])
-"""Path length of Table 3.1, in its unit "cm.10", which the thesis does not explain."""
+"""Path length of Table 3.1, in the unit "cm.10" that the thesis prints but does not explain."""
 PRINTED_TORQUES = np.array(
     [
         [13.035, 13.58, 23.45, 18.42, 11.03, 20.45, 28.08],
@@ -138,14 +139,14 @@ PRINTED_TIME = np.array([22.23, 18.43, 17.72, 19.2, 15.82, 14.21, 13.03, 9.01, 9
 """Execution time of Table 3.1 [s]."""
 
 ME = ("thesis", "modern")
-"""The two methods that represent the thesis's own method, Me: its corrected equations, and this library's method."""
+"""The two methods that represent the thesis method Me: its corrected equations, and the method of this library."""
 BASELINES = ("m1", "m2", "m3")
 _TORQUE_FIGURE = Figure("mean_torque", "mean torque [N m]", digits=2)
 _PATH_FIGURE = Figure("path_length", "path [m]", digits=2)
 
 
 def printed_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return Table 3.1 beside our results: means over its ten experiments, and over our persons."""
+    """Return a table with thesis Table 3.1 (means over its ten experiments) and our results (means over persons)."""
     arm = ArmModel.load("sawyer", tool="gripper")
     rows = [
         (
@@ -180,12 +181,12 @@ def _spread(column: Array) -> str:
 
 
 def _times(results: Results, method: str) -> Values:
-    """Return the time of each closed-loop trial; nan where it failed."""
+    """Return the time of each closed-loop trial; nan for a trial that failed."""
     return results.values(method, [LIVE], "time")
 
 
 def claims_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return the claims of the thesis and whether they hold for its corrected method and for our method."""
+    """Return a table of the thesis's claims: whether they hold for the corrected thesis method and for ``modern``."""
     rows = []
     for claim, evaluate in CLAIMS:
         cells: list[str] = []
@@ -203,17 +204,17 @@ def claims_table(results: Results, tasks: Sequence[str]) -> Table:
 
 
 Verdict = tuple[str, str]
-"""The measurement as text, and whether the claim held."""
+"""The measured values as text, and the verdict: "yes", "no", "not shown" or "not run"."""
 
 
 def verdict(comparisons: Sequence[Comparison], sign: float) -> str:
-    """Return whether a claim held against all baselines.
+    """Return whether a claim holds in comparison with every baseline: "yes", "no" or "not shown".
 
-    A difference counts when its interval excludes zero and p, corrected for the number of baselines, is below 0.05; so
-    with only two persons no claim can be confirmed.
+    A difference counts if its interval excludes zero and its p-value, corrected for the number of baselines, is below
+    0.05. With only two persons, p can't be that small, so no claim can be confirmed.
 
     Args:
-        comparisons: the evaluated method minus each baseline.
+        comparisons: comparison of the evaluated method with each baseline (method minus baseline).
         sign: claimed sign of the differences, -1 or 1.
     """
     corrected = holm([c.p for c in comparisons])
@@ -227,7 +228,7 @@ def verdict(comparisons: Sequence[Comparison], sign: float) -> str:
 
 
 def _against(pairs: Sequence[tuple[str, Values, Values]], sign: float) -> Verdict:
-    """Compare Me with baselines, each given by its name, the values of Me, and its own values."""
+    """Compare Me with baselines; each entry holds a baseline's name, the values of Me, and the baseline's values."""
     found = [(name, compare(ours, theirs)) for name, ours, theirs in pairs]
     texts = [
         f"{METHODS[name].title} {100 * c.relative:+.0f} %" if math.isfinite(c.relative) else f"{METHODS[name].title} –"
@@ -252,7 +253,7 @@ def _quicker(results: Results, me: str, _: Sequence[str]) -> Verdict:
 
 
 def _two_leads(results: Results, me: str, tasks: Sequence[str]) -> Verdict:
-    """M2 has the smallest torque of all and takes the longest time."""
+    """Evaluate the claim that M2 has the smallest torque of all methods and takes the longest time."""
     others = [name for name in (me, "m1", "m3") if name in results.methods]
     if "m2" not in results.methods or not results.of("m2", [LIVE]):
         return "–", "not run"
@@ -264,7 +265,7 @@ def _two_leads(results: Results, me: str, tasks: Sequence[str]) -> Verdict:
 
 
 def _farther_from_singular(results: Results, me: str, _: Sequence[str]) -> Verdict:
-    """The smallest singular value at the edge of reach is larger than for M3, which does not treat singularities."""
+    """Evaluate the claim that singularities are avoided: the smallest singular value is larger than with M3."""
     if not results.tasks(["edge"]) or "m3" not in results.methods:
         return "–", "not run"
     ours, theirs = (results.values(name, ["edge"], "least_singular") for name in (me, "m3"))
@@ -274,7 +275,7 @@ def _farther_from_singular(results: Results, me: str, _: Sequence[str]) -> Verdi
 
 
 def _rated(results: Results, me: str, tasks: Sequence[str]) -> Verdict:
-    """The mean torque of each joint is within the printed interval."""
+    """Evaluate the claim on mean torques: the mean torque of each joint is within the printed interval."""
     inside = 0
     for joint, column in enumerate(PRINTED_TORQUES.T):
         low, high = bootstrap(column)
@@ -303,4 +304,4 @@ CLAIMS: Sequence[tuple[str, Callable[[Results, str, Sequence[str]], Verdict]]] =
     (f"mean torques of {min(_MEANS):.0f} to {max(_MEANS):.0f} N m at every joint (Table 3.1)", _rated),
     (f"four cubes stacked in {PRINTED_TIME.mean():.1f} s (Table 3.1)", _like_printed_time),
 )
-"""The claims, and the functions that evaluate them."""
+"""The claims of the thesis, and the functions that evaluate them."""

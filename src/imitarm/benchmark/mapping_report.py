@@ -1,6 +1,6 @@
-"""The mapping benchmark as one self-contained HTML page with tables, figures and playback of person and robot.
+"""The results of the mapping benchmark as one self-contained HTML page: tables, figures, playback of person and robot.
 
-The figures follow Figs 3.6 to 3.8 of the thesis; each is one ``<svg>`` element.
+The figures correspond to Figs 3.6 to 3.8 of the thesis. Each figure is one ``<svg>`` element.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ _SHOWN: Final = 9.0  # [s] of the recording that is played
 _WORDS: Final = {
     "Interval": "The 95 % confidence interval of a mean over persons, from resampling the persons. Overlapping "
     "intervals do not rule out a difference; the paired comparison tests for it.",
-    "Lag": "The constant delay at which the path of the tool fits the true path of the hand best.",
-    "From first hold": "The distance between the tool and its true target from the first engagement to the end, "
-    "including the time in which the method does not follow.",
+    "Lag": "The constant delay that gives the best match between the path of the tool and the true path of the hand.",
+    "From first hold": "The distance between the tool and its true target, from the time at which the robot begins "
+    "to follow until the end. It includes the time in which the method does not follow.",
     "SPARC": "Spectral arc length of the speed: the closer to 0, the smoother the motion.",
-    "Our interpretation": "The thesis describes its baselines only in words. These methods implement that description.",
+    "Our interpretation": "The thesis describes its baselines only in words. These methods are our implementation "
+    "of that description.",
 }
 
 
@@ -43,10 +44,10 @@ def write_mapping_report(
 
     Args:
         results: results of the benchmark.
-        tables: tables printed by the command.
+        tables: tables that the command also prints.
         path: the file to write; its folder must exist.
         provenance: facts needed to repeat the benchmark.
-        folder: folder of the recordings; None: they were not saved.
+        folder: folder of the recordings; None if they were not saved.
 
     Returns:
         Absolute path of the page.
@@ -64,7 +65,10 @@ def mapping_report_html(
     """Return the whole page; see :func:`write_mapping_report`."""
     shared, players = _players(results, folder)
     verdict, good = _verdict(results)
-    summary = "Every method follows the same recordings of simulated people, and the same people stack cubes with it."
+    summary = (
+        "Every method follows the same recordings of simulated people. The same people also stack cubes with "
+        "every method."
+    )
     return render(
         "mapping.html",
         Header("Mapping benchmark", verdict, good, summary, _tiles(results)),
@@ -120,7 +124,7 @@ def _figures(results: Results) -> list[Figure]:
 
 
 def _table(table: Table) -> dict[str, Any]:
-    """Return a table for the template; text columns wrap, and a heading that is a symbol keeps its case."""
+    """Return a table for the page template: text columns may wrap, and headings that are symbols keep their case."""
     columns = [
         {
             "title": column.removesuffix(">"),
@@ -132,7 +136,7 @@ def _table(table: Table) -> dict[str, Any]:
 
 
 def _players(results: Results, folder: Path | None) -> tuple[tuple[str, str] | None, list[Tab]]:
-    """Return the playback of one recording by each of the main methods: the first one at the edge of reach."""
+    """Return the playback of one recording, the first one at the edge of reach, by each of the main methods."""
     replayed = [r.experiment for r in results.all if r.experiment.task != LIVE and not r.failure]
     chosen = next((e for e in replayed if e.task == "edge"), next(iter(replayed), None))
     if chosen is None:
@@ -215,7 +219,7 @@ def times(results: Results, *, name: str = "times") -> str:
 
 
 def successes(results: Results, *, name: str = "successes") -> str:
-    """Draw the rate of successful towers, with intervals over persons."""
+    """Draw how often each method stacked all four cubes, with intervals over persons."""
 
     def rate(method: str) -> Interval:
         return _scaled(rate_interval(results.values(method, [LIVE], "success")), 100.0)
@@ -246,7 +250,7 @@ def _scaled(found: Interval, factor: float) -> Interval:
 def _grouped(
     name: str, description: str, unit: str, groups: Sequence[str], series: Sequence[tuple[str, Sequence[Interval]]]
 ) -> str:
-    """Draw bars in groups, one bar of each series in a group, with intervals; return an empty text without values."""
+    """Draw groups of bars with intervals, one bar for each series; return an empty text if there are no values."""
     if not any(math.isfinite(found.mean) for _, bars in series for found in bars):
         return ""
     rows = -(-len(series) // 2)

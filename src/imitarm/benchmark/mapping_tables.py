@@ -14,17 +14,17 @@ from imitarm.benchmark.tables import Table
 from imitarm.evaluation.intervals import Interval, Values, interval, rate_interval
 
 TEST = 200
-"""First of the test persons, which are not used for developing methods."""
+"""Number of the first test person; test persons are not used for developing methods."""
 _DEGREES = 180.0 / math.pi
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A measure with its title and the unit in which it is reported.
+    """A measure in a table, with its title and unit.
 
     Attributes:
         name: name in ``Result.values``.
-        title: title with the unit.
+        title: title of the table column, with the unit.
         factor: factor from SI units to the reported unit.
         digits: number of decimals.
         more: whether a larger value is better.
@@ -68,7 +68,7 @@ TORQUES = (
     Figure("rms_torque", "RMS torque [N m]", digits=2),
     Figure("mean_motion_torque", "mean torque without gravity [N m]", digits=2),
 )
-"""Titles of the means over the joints, by the titles of the torque tables."""
+"""The torque measures, averaged over the joints; each of them also has a table with one column for each joint."""
 LOOP = (Figure("time", "time [s]", digits=0), Figure("path_length", "path [m]", digits=2), TORQUES[0])
 
 _RECORDED = (Figure("recorded", "length [s]"), Figure("beyond_reach", "beyond reach [%]", 100.0))
@@ -85,7 +85,7 @@ _ONE = -1  # person of the captured arm: it is the same whichever simulated body
 
 
 class Results:
-    """Results by method, task and measure."""
+    """All results of a benchmark, with access by method, task and measure."""
 
     def __init__(self, results: Iterable[Result]) -> None:
         self.all = list(results)
@@ -100,14 +100,15 @@ class Results:
         return [task for task in among if any(r.experiment.task == task for r in self.all)]
 
     def values(self, method: str, tasks: Sequence[str], name: str, joint: int | None = None) -> Values:
-        """Return one value for each recording, by person and recording; nan where it is unknown.
+        """Return the value of a measure for each recording, by person and recording; nan if it is unknown.
 
         Args:
             method: whose.
-            tasks: tasks to evaluate.
-            name: name of the measure; ``"limit_violations"`` is the sum of the three counts. In closed loop,
-                ``"success"`` is 1 or 0, and the other measures are known only for successful trials.
-            joint: index of the joint, for measures of each joint; None: the mean over the joints.
+            tasks: tasks whose results are included.
+            name: name of the measure. ``"limit_violations"`` is the sum of the violations of position, velocity and
+                acceleration limits. In closed loop, ``"success"`` is 1 or 0, and the other measures are known only for
+                successful trials.
+            joint: index of the joint, for measures with one value for each joint; None for the mean over the joints.
         """
         return {
             (_person(r), (r.experiment.task, r.experiment.repeat)): number(r, name, joint)
@@ -120,7 +121,7 @@ def _person(result: Result) -> int:
 
 
 def number(result: Result, name: str, joint: int | None = None) -> float:
-    """Return one number of a result, see :meth:`Results.values`."""
+    """Return one measure of one result; for the names, see :meth:`Results.values`."""
     if result.experiment.task == LIVE:
         done = bool(result.values.get("success"))
         if name == "success" or not done:
@@ -134,7 +135,7 @@ def number(result: Result, name: str, joint: int | None = None) -> float:
 
 
 def written(found: Interval, figure: Figure) -> str:
-    """Return mean, interval and, when some recordings have no value, the number of recordings with a value."""
+    """Return a table cell: mean, interval and, if values are missing, the number of recordings with a value."""
     if not math.isfinite(found.mean):
         return f"– (0 of {found.of})" if found.of else "–"
     values = [figure.factor * v for v in (found.mean, found.low, found.high)]
@@ -145,7 +146,7 @@ def written(found: Interval, figure: Figure) -> str:
 
 
 def written_each(values: Values, figure: Figure) -> str:
-    """Return a mean and, in brackets, the smallest and largest value, for measures without an interval."""
+    """Return a table cell without interval: mean and, in brackets, smallest and largest value."""
     known = [figure.factor * value for _, value in sorted(values.items()) if math.isfinite(value)]
     if not known:
         return f"– (0 of {len(values)})" if values else "–"
@@ -156,7 +157,7 @@ def written_each(values: Values, figure: Figure) -> str:
 
 
 def _cells(results: Results, name: str, task: str, figures: Sequence[Figure]) -> list[str]:
-    """Return the values for one kind of recording, with intervals over persons or, for the captured arm, the range."""
+    """Return table cells for one kind of recording: means with intervals or, for motion capture, with ranges."""
     found = [results.values(name, [task], figure.name) for figure in figures]
     if task == CAPTURED:
         return [written_each(values, figure) for values, figure in zip(found, figures, strict=True)]
@@ -164,7 +165,7 @@ def _cells(results: Results, name: str, task: str, figures: Sequence[Figure]) ->
 
 
 def recordings_table(results: Results) -> Table:
-    """Return the number and duration of the recordings, and how often the target is beyond the robot's reach."""
+    """Return a table of the recordings: number, duration, and how often the target is beyond the robot's reach."""
     rows = []
     for task in results.tasks(REPLAYS):
         runs = [r for r in results.all if r.experiment.task == task]
@@ -196,7 +197,7 @@ def persons_note(results: Results) -> str:
 
 
 def accuracy_table(results: Results, task: str) -> Table:
-    """Return how well the methods follow the true arm in one kind of recording."""
+    """Return a table of how well the methods follow the true arm in one kind of recording."""
     rows = []
     for name in results.methods:
         engaged = interval(results.values(name, [task], "engaged_fraction")).mean
@@ -208,12 +209,12 @@ def accuracy_table(results: Results, task: str) -> Table:
 
 
 def effort_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return path, settling and torque."""
+    """Return a table of path length, settling time and torque."""
     return _figures(results, tasks, EFFORT, "Times, path, torques")
 
 
 def smoothness_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return jerk, spectral arc length and distance from singularity."""
+    """Return a table of jerk, spectral arc length and distance from singularity."""
     return _figures(results, tasks, SMOOTHNESS, "Smoothness and singularity")
 
 
@@ -227,7 +228,7 @@ def _figures(results: Results, tasks: Sequence[str], figures: Sequence[Figure], 
 
 
 def torque_table(results: Results, tasks: Sequence[str], name: str, title: str) -> Table:
-    """Return a torque of each joint (Fig 3.6)."""
+    """Return a table of one torque measure for each joint (Fig 3.6)."""
     rows = []
     for method in results.methods:
         found = [interval(results.values(method, tasks, name, joint)) for joint in range(7)]
@@ -238,7 +239,7 @@ def torque_table(results: Results, tasks: Sequence[str], name: str, title: str) 
 
 
 def limits_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return the frames that exceed limits, by finite differences of the joint positions alone."""
+    """Return a table of frames that exceed limits, computed by finite differences of the joint positions."""
     rows = []
     for name in results.methods:
         made = [r for r in results.of(name, tasks) if not r.without_recording]
@@ -264,7 +265,7 @@ def limits_table(results: Results, tasks: Sequence[str]) -> Table:
 
 
 def success_table(results: Results) -> Table:
-    """Return how often four cubes were stacked in closed loop, with time and path of the successful trials."""
+    """Return a table on stacking in closed loop: success rate, and time and path of the successful trials."""
     rows = []
     for name in results.methods:
         runs = results.of(name, [LIVE])

@@ -1,7 +1,7 @@
-"""Policies on a simulated arm, with seeded obstacles on the path: rates of arrival, refusal and contact.
+"""Test policies on a simulated arm with random obstacles on the path: how often they arrive, refuse or make contact.
 
-Each placement puts one to three obstacles on the learned path of a skill. Every policy reproduces the skill there,
-behind the same safety filter, and the simulator's own geometry measures what happens.
+Each placement puts one to three obstacles on the learned path of a skill. Every policy reproduces the skill there with
+the same safety filter. The simulator measures clearance and contact with its own geometry.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from imitarm.skills import Skill
 Array = NDArray[np.float64]
 
 OUTCOMES = ("arrived", "refused", "waited", "too near", "touched", "stopped")
-"""Possible outcomes of a placement: arrived with the clearance kept; refused before any motion; not finished in time;
-finished, but closer than required; contact (including self-collision); a protective stop or a failure."""
+"""Possible outcomes of a placement, in this order: arrived and kept the clearance; refused before any motion; not
+finished in time; finished, but came closer to an obstacle than required; contact (including self-collision); protective
+stop or other failure."""
 
 CLEARANCE = 0.02  # [m] required
 _DT = 0.01  # [s]
@@ -50,9 +51,9 @@ class Setup:
     """A skill and the arm that reproduces it.
 
     Attributes:
-        skill: path of a skill file.
-        robot: name of an arm, or a path.
-        tool: name of a tool, or a path; None: no tool.
+        skill: path of the skill file.
+        robot: name of an arm, or the path of its file.
+        tool: name of a tool, or the path of its file; None for no tool.
     """
 
     skill: str
@@ -69,10 +70,10 @@ class PlacementResult:
         setup: the skill and the arm.
         seed: seed of the placement.
         outcome: one of :data:`OUTCOMES`.
-        clearance: smallest measured distance of arm and tool to an obstacle [m]; nan without a motion.
-        duration: duration of the motion divided by that of the skill; nan without a motion.
-        planning: wall time until the policy accepted or refused [s].
-        reason: reason in words.
+        clearance: smallest measured distance from arm and tool to an obstacle [m]; nan if the arm did not move.
+        duration: duration of the motion divided by the duration of the skill; nan if the arm did not move.
+        planning: computing time until the policy accepted or refused the scene [s].
+        reason: explanation of the outcome.
     """
 
     policy: str
@@ -86,16 +87,16 @@ class PlacementResult:
 
 
 def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
-    """Return a scene with one to three obstacles on the learned path, clear of the arm at the start.
+    """Return a scene with one to three obstacles on the learned path that do not touch the arm in its start posture.
 
     Args:
         skill: whose path.
-        arm: arm whose tool must be clear of obstacles at start and goal.
-        seed: seed of the scene; every third has one obstacle.
+        arm: arm, whose tool must not touch an obstacle at start and goal.
+        seed: seed of the scene; every third seed gives a scene with one obstacle.
         start: joint positions at the start, shape (n_joints,) [rad].
 
     Raises:
-        InputError: when the tool leaves no place for an obstacle.
+        InputError: when there is no place for an obstacle that the tool does not touch at start and goal.
     """
     rng = np.random.default_rng([31, seed])
     path = skill.generate()
@@ -228,7 +229,7 @@ def _joblib() -> Any:
 
 
 def placement_table(results: Sequence[PlacementResult]) -> Table:
-    """Return one row for each policy: the frequency of each outcome, and the smallest clearance."""
+    """Return a table with one row for each policy: how often each outcome occurred, and the smallest clearance."""
     rows = []
     for policy in dict.fromkeys(result.policy for result in results):
         own = [result for result in results if result.policy == policy]
@@ -251,12 +252,13 @@ def placement_table(results: Sequence[PlacementResult]) -> Table:
         "Placements of one to three obstacles on the learned path",
         (*headings, "smallest clearance when arrived [mm]>", "time to refuse, median [ms]>"),
         tuple(rows),
-        f"A simulated arm, {1e3 * CLEARANCE:.0f} mm required of every part of it; intervals: Wilson, 95 %.",
+        f"On a simulated arm; every part of the arm must keep a clearance of {1e3 * CLEARANCE:.0f} mm. Intervals: "
+        f"Wilson, 95 %.",
     )
 
 
 def packaged_setup(folder: Path) -> Setup:
-    """Learn the packaged sweep, save it in ``folder`` and return it with the Sawyer and its brush."""
+    """Learn the skill 'sweep' of the package, save it in ``folder``, and return it with the Sawyer and its brush."""
     from imitarm.demonstrations import align, read  # noqa: PLC0415 (only here)
     from imitarm.tasks.sweep import DEMONSTRATIONS  # noqa: PLC0415 (only here)
 

@@ -1,4 +1,4 @@
-"""Version of the code that produced a result: the commit of its checkout, or the installed version."""
+"""Find out which version of the code produced a result: the Git commit of a checkout, or the installed version."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _PACKAGE = Path(imitarm.__file__).parent
 
 @lru_cache(maxsize=1)
 def code_version() -> str:
-    """Return the version of the running code as text; it is determined once per process.
+    """Return the version of the running code as text; the version is determined only once per process.
 
-    In a checkout this is the last commit that changed the package; commits of documentation or tests do not change it.
-    Uncommitted changes of the package are identified by a hash of their text, so that results of two different states
-    of a working tree are never confused.
+    In a Git checkout, this is the last commit that changed the package, so commits to documentation or tests do not
+    matter. Uncommitted changes of the package are identified by a hash of their text, so that results of two different
+    states of a working tree are never confused.
 
     Returns:
         ``"commit 0123456789"``, ``"commit 0123456789 with uncommitted changes 01234567"``, or ``"version 0.1.0"`` when
@@ -32,7 +32,7 @@ def version_of(package: Path, installed: str) -> str:
     """Return the version of the code in a folder, see :func:`code_version`.
 
     Args:
-        package: the folder, with an ``__init__.py``.
+        package: folder of the package, which contains ``__init__.py``.
         installed: text to return when the folder is not in a Git repository.
     """
     if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
@@ -58,11 +58,11 @@ def origin(versions: Iterable[str]) -> str:
     if found == [now]:
         return f"Results of {now}."
     text = f"Results of {' and '.join(found) or 'no run'}"
-    return f"{text}, not of the code that made these tables ({now}): run the command again for current figures."
+    return f"{text}. Other code made these tables ({now}). Run the command again to update the results."
 
 
 def _git(folder: Path, *words: str) -> bytes | None:
-    """Return what a Git command prints; None when it fails, or there is no Git."""
+    """Return what a Git command prints; None if the command fails or Git is not installed."""
     try:
         done = subprocess.run(["git", "-C", folder, *words], capture_output=True, check=False, timeout=60)
     except (OSError, subprocess.SubprocessError):

@@ -1,4 +1,4 @@
-"""Recordings of real people drive simulated arms: ``imitarm benchmark people``."""
+"""``imitarm benchmark people``: retarget recordings of real people to simulated arms."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _GESTURES = {
 
 
 class Motion(NamedTuple):
-    """A motion of a real person: its name, the skeletons, the side of the arm that moves."""
+    """A recorded motion of a real person: name, skeletons, and the side of the arm that moves."""
 
     name: str
     skeletons: list[Skeleton]
@@ -83,7 +83,7 @@ def _person(word: str) -> list[Skeleton]:
 
 
 def tables(motions: Sequence[Motion]) -> list[Table]:
-    """Return two tables: ``modern`` on every motion and arm at each speed, and all methods on the first motion.
+    """Return two tables: ``modern`` with every motion, arm and playback speed; and all methods with the first motion.
 
     Args:
         motions: at least one motion.
@@ -104,10 +104,10 @@ def tables(motions: Sequence[Motion]) -> list[Table]:
 
 
 class Start(NamedTuple):
-    """The setup of an arm that follows a motion, with a start from which the whole motion is within reach.
+    """The input for retargeting a motion to an arm, with a start from which the whole motion is within reach.
 
-    The fields are the arm, the skeletons at the playback speed, the correspondence, the first posture (n_joints,)
-    [rad], and the largest speed of the target [m/s].
+    The fields are the arm, the skeletons at the playback speed, the correspondence, the start posture (n_joints,)
+    [rad], and the highest speed of the target [m/s].
     """
 
     arm: ArmModel
@@ -128,7 +128,7 @@ def _start(motion: Motion, arm: ArmModel, speed: float) -> Start:
 
 
 def _row(start: Start, method: str) -> list[str]:
-    """Return the cells of one motion by one method on one arm."""
+    """Return the table cells for one motion, one method and one arm."""
     arm, follow = start.arm, start.follow
     run = RETARGETERS[method](arm, follow, dt=_PERIOD).run(start.skeletons, start.q)
     m, execution, links = measure(run, follow), execute_on_robot(run), SelfClearance(arm)

@@ -1,4 +1,4 @@
-"""Recordings of the mapping benchmark: simulated people and simulated cameras, the same for every method."""
+"""Recordings of simulated people by simulated cameras for the mapping benchmark, the same for all methods."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ from imitarm.tasks.stack_run import IdealFollower, calibrate_limbs, ideal_camera
 Array = NDArray[np.float64]
 
 KINDS = ("inside", "edge", "drawing", "stacking")
-"""Kinds of recordings of simulated people: reaches well inside the workspace; reaches with the arm stretched out every
-few seconds, beyond the reach of the robot; circles, eights and waves; stacking of four cubes."""
+"""Kinds of recordings of simulated people: reaches well inside the workspace; reaches in which the arm is stretched
+every few seconds, beyond the reach of the robot; drawings of circles, eights and waves; stacking of four cubes."""
 CAPTURED = "captured"
-"""The kind that needs real data: an arm recorded by motion capture, in front of a simulated camera."""
+"""The kind of recording that needs real data: a simulated camera observes an arm that was recorded by motion
+capture."""
 
 REPEATS = 100
-"""Largest number of recordings of one kind and person: a larger number would use the seeds of the next person."""
+"""Largest number of recordings of one kind and person; more recordings would use the seeds of the next person."""
 _LONGEST = 120.0  # [s] of a recording
 
 REACH = 0.80  # [m] from the Sawyer's shoulder to its wrist when it is stretched
@@ -54,10 +55,11 @@ class Plan:
 
     Attributes:
         kind: one of :data:`KINDS`, or :data:`CAPTURED`.
-        person: seed of the person, whose limbs and habits differ.
-        repeat: number of this person's recording, 0 to 99, which seeds motion and camera; for the captured arm,
-            number of the camera.
-        seconds: approximate duration of reaches and drawings [s]; a capture is cut to it; stacking ignores it.
+        person: seed of the person; persons differ in limb lengths and habits.
+        repeat: number of this person's recording, 0 to 99, which seeds motion and camera; for motion capture, number of
+            the simulated camera.
+        seconds: approximate duration of reaches and drawings [s]. Motion capture is cut to this duration; stacking
+            ignores it.
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
         data: folder of real recordings, for :data:`CAPTURED`.
 
@@ -95,13 +97,13 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class MappingRecording:
-    """A recording with the input of the methods, and the true motion, which the methods do not get.
+    """A recording: the input of the methods, and the true motion, which the methods do not see.
 
     Attributes:
         plan: the definition of the recording.
         skeletons: skeletons measured by the camera.
-        correspondence: correspondence for all methods.
-        start: first posture of the robot, shape (n_joints,) [rad].
+        correspondence: correspondence between person and robot for all methods.
+        start: start posture of the robot, shape (n_joints,) [rad].
         true_times: times of the true positions since the first skeleton, shape (m,) [s].
         true_points: true positions of shoulder, elbow, wrist, hand, hand tip and thumb, shape (m, 6, 3) [m], in the
             sensor's frame.
@@ -115,13 +117,13 @@ class MappingRecording:
     true_points: Array
 
     def true_arm(self, times: Array) -> TrueArm:
-        """Return the true arm at the times (n,) of a run [s]; before the first and after the last sample it rests."""
+        """Return the person's true arm at times (n,) of a run [s]; it rests outside the recorded times."""
         flat = self.true_points.reshape(len(self.true_times), -1)
         points = np.column_stack([np.interp(times, self.true_times, column) for column in flat.T])
         return TrueArm.from_points(times, points.reshape(-1, 6, 3), self.correspondence)
 
     def save(self, path: Path) -> None:
-        """Write the recording atomically; the file contains only arrays and nothing executable."""
+        """Write the recording to a file of arrays without executable code; an incomplete file is never left."""
         c, lengths = self.correspondence, self.correspondence.lengths
         assert lengths is not None
         aside = path.with_name(f".{path.name}.{np.random.default_rng().integers(1 << 62):x}.part")
@@ -164,11 +166,12 @@ def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
 
     Args:
         plan: the definition of the recording.
-        arm: the robot that will follow it.
+        arm: the robot that will follow the recording.
 
     Raises:
-        InputError: when it needs real data that are missing.
-        TaskFailedError: when this person can't stack the cubes even with a gripper that moves exactly with the hand.
+        InputError: when the recording needs real data that are missing.
+        TaskFailedError: when the person can't stack the cubes even with an ideal gripper that moves exactly with the
+            hand.
     """
     person = Person.from_seed(plan.person)
     truth, end, task = _MAKERS[plan.kind](plan, person)
@@ -195,12 +198,12 @@ def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
 
 
 def _scale(plan: Plan, person: Person) -> float:
-    """Return the scale from the person's motion to the robot's: 1 except in the kind "edge"."""
+    """Return the scale, robot motion divided by the person's motion: 1 except in recordings of the kind "edge"."""
     return BEYOND * REACH / (person.upper_arm + person.forearm) if plan.kind == "edge" else 1.0
 
 
 def _start(plan: Plan, arm: ArmModel, points: Array) -> Array:
-    """Return the first posture: that of the stacking task, or one that corresponds to the person's wrist."""
+    """Return the start posture: the one of the stacking task, or a posture that corresponds to the person's wrist."""
     if plan.kind == "stacking":
         return StackTask().start_posture(arm)
     s, e, w = FACING.apply(points[:3])
@@ -220,7 +223,7 @@ def _inside(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
 
 
 def _edge(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
-    """Return reaches like the kind "inside", with the arm fully stretched every few seconds."""
+    """Return reaching motions as in the kind "inside", but with the arm fully stretched every few seconds."""
     inside, shoulder = reaching(person, plan.number, duration=plan.seconds), person.shoulder()
     begun, ended = REST, max(plan.seconds - 1.0, REST + _STRETCH)
     cycles = max(round((ended - begun) / _STRETCH), 1)
@@ -242,18 +245,21 @@ def _drawing(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
 
 
 def _stacking(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
-    """Return a person who stacks with a gripper that moves exactly with the hand, independent of all methods."""
+    """Return the motion of a person who stacks with a gripper that moves exactly with the hand, without any method."""
     for k in range(_TRIES):
         done = run_stack(plan.person, plan.repeat + REPEATS * k, IdealFollower, camera=ideal_camera)
         if done.success:
             return _between(done.truth), done.truth[-1].time, "fixed"
-    raise TaskFailedError(f"person {plan.person} stacked no tower in {_TRIES} trials with the ideal gripper")
+    raise TaskFailedError(f"person {plan.person} did not stack the tower in {_TRIES} trials with the ideal gripper")
 
 
 def _captured(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
     path = Path(plan.data) / _MOCAP
     if not path.is_file():
-        raise InputError(f"{path}: the motion capture is not there; give the folder that holds {_MOCAP} with --data")
+        raise InputError(
+            f"{path}: the motion capture data are missing; give with --data the folder that contains "
+            f"{_MOCAP} with --data"
+        )
     capture = MotionCapture.load(path)
     moving = capture.truth(person)
     end = min(capture.duration, plan.seconds)
@@ -275,13 +281,13 @@ _MAKERS: dict[str, Callable[[Plan, Person], tuple[Truth, float, Orientation]]] =
 
 
 def _end(truth: Truth, latest: float) -> float:
-    """Return the time at which a motion ends [s], at most ``latest`` [s]."""
+    """Return the time at which a motion ends, but at most ``latest`` [s]."""
     times = np.arange(0.0, latest, 0.02)
     return motion_end(times, np.array([truth(t).arm("right").wrist for t in times]))
 
 
 def _between(frames: tuple[Skeleton, ...]) -> Truth:
-    """Return a person in motion, by linear interpolation between frames."""
+    """Return the motion of a person as a function of time, by linear interpolation between frames."""
     times = np.array([frame.time for frame in frames])
     positions = np.array([frame.positions for frame in frames])
 
@@ -295,9 +301,9 @@ def _between(frames: tuple[Skeleton, ...]) -> Truth:
 
 
 def beyond_reach(recording: MappingRecording, arm: ArmModel) -> float:
-    """Return the fraction of the time in which the target of the robot's wrist is farther away than its arm is long.
+    """Return the fraction of the time in which the target of the robot's wrist is farther away than the arm can reach.
 
-    The target is the start plus the scaled displacement of the person's wrist; the tool keeps its orientation.
+    The target is the start position plus the scaled displacement of the person's wrist. The tool keeps its orientation.
 
     Raises:
         InputError: when the arm's file does not define shoulder and wrist.

@@ -1,18 +1,19 @@
-"""An oracle that decides whether a path exists, to check refusals. It shares no code with the library's search.
+"""An oracle that decides whether a path exists, to check refusals.
 
-It considers displacements of the nominal path, on one grid for each of many times (layers), and gives one of three
-answers:
+The oracle shares no code with the library's search for a path. It considers displacements of the nominal path at many
+times, called layers. In each layer, displacements are cells of a grid. The oracle gives one of three answers:
 
-* **impossible**: a proof. A box of the grid counts as free if any of its points may be free at any time of an interval.
-  If no chain of such boxes leads from the start to the goal, then no continuous displacement does either.
-* **possible**: a path was found and verified. A cell counts as free if its centre is free; the distance during moves
-  between neighbours and between layers is bounded from below by tangents. The cheapest chain is then fitted by sums of
-  the skill's components or, where these are too wide, of hat functions in time.
-* **undecided**: neither was shown with the finest grid.
+* **impossible**: a proof. A box of positions counts as free if any of its points may be free at any time of an
+  interval. If no chain of free boxes leads from the start to the goal, then no continuous displacement of the path
+  exists.
+* **possible**: a path was found and verified. A cell counts as free if its centre is free. Tangents give a lower bound
+  of the distance during moves between neighbouring cells and between layers. The cheapest chain of cells is then fitted
+  by sums of the skill's components, or by sums of hat functions in time where the components are too wide.
+* **undecided**: even the finest grid gave neither a proof nor a path.
 
-The oracle uses the limits of the library: no sample is displaced by more than 0.5 m, no step is longer than 8 times
-the longest step of the nominal path, fixed times do not move, and no displacement has a component in forbidden
-directions.
+The oracle uses the limits of the library. No sample is displaced by more than 0.5 m. No step is longer than 8 times the
+longest step of the nominal path. The path is not displaced at fixed times, and no displacement has a component in a
+forbidden direction.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def answer(question: Question) -> Answer:
 def is_solved(
     question: Question, axes: Array | None = None, grids_to_search: Sequence[tuple[float, float]] | None = None
 ) -> bool:
-    """Return whether a path is found and verified, on all grids or on given grids (reach and cell size [m])."""
+    """Return whether a path is found and verified; grids are given by reach and cell size [m], by default all grids."""
     axes = question.axes() if axes is None else axes
     if separation(question, question.nominal.times, question.nominal.positions) >= -1e-9:
         return True
@@ -90,9 +91,9 @@ def is_solved(
 
 
 def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Array, Array] | None:
-    """Return times (k,) and displacements (k, 3) of the cheapest chain of free cells, or None.
+    """Return the times (k,) and displacements (k, 3) of the cheapest chain of free cells; None if there is no chain.
 
-    Cell centres are multiples of ``h``, so that the nominal position is one of them.
+    Cell centres are multiples of ``h`` [m], so that the undisplaced position is a cell centre.
     """
     d, half = len(axes), round(reach / h)
     side, n = 2 * half + 1, len(question.nominal)
@@ -155,7 +156,7 @@ def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Arr
 def _advanced(
     cost: Array, middle: tuple[int, ...], away: Array, longest: float, from_fixed: bool, to_fixed: bool
 ) -> Array:
-    """Return the costs at the next layer: displacements stay in their cell, except next to a fixed point."""
+    """Return the costs of cells in the next layer; displacements stay in their cell, except next to a fixed time."""
     if from_fixed and not to_fixed:
         return np.where(away <= longest, cost[middle] + _CHANGE_COST * away, np.inf)
     if to_fixed and not from_fixed:
@@ -189,7 +190,7 @@ def _layer(
     from_fixed: bool,
     to_fixed: bool,
 ) -> tuple[list[tuple[Array, Array]], list[Bools], Bools, Bools]:
-    """Return distances and gradients of a layer, free moves along each axis and from the layer before, free cells."""
+    """Return distances and gradients of a layer, free moves along axes and from the previous layer, free cells."""
     shape = (side,) * d
     free, ahead = np.ones(shape, dtype=bool), np.ones(shape, dtype=bool)
     sides = [np.ones(shape, dtype=bool) for _ in range(d)]
@@ -235,10 +236,11 @@ def _layer(
 
 
 def _keeps(need: float, f0: Array, f1: Array, slope0: Array, slope1: Array, step: Array) -> Bools:
-    """Return whether :func:`_tangent_bound` is at least ``need`` [m] along a step.
+    """Return whether the distance to an obstacle is proven to be at least ``need`` [m] along a step.
 
-    A distance changes by at most the length of the step. So the bound decides only where both ends keep the distance
-    and neither keeps more than the length of the step beyond it.
+    The distance changes by at most the length of the step. If it exceeds ``need`` by more than this length at one end,
+    it is large enough along the whole step. If it is below ``need`` at one end, it is too small. Only in the other
+    cases is :func:`_tangent_bound` needed.
 
     Args:
         need: required distance [m].
@@ -255,14 +257,14 @@ def _keeps(need: float, f0: Array, f1: Array, slope0: Array, slope1: Array, step
 
 
 def _tangent_bound(f0: Array, a: Array, f1: Array, b: Array) -> Array:
-    """Return a lower bound on [0, 1] of a convex function with values f0, f1 and slopes a, b at the ends."""
+    """Return a lower bound of a convex function on [0, 1] with values f0, f1 and slopes a, b at the two ends."""
     inside = (a < 0.0) & (b > 0.0)
     s = np.clip((f1 - f0 - b) / np.where(inside, a - b, -1.0), 0.0, 1.0)
     return np.where(inside, np.maximum(f0 + a * s, f1 + b * (s - 1.0)), np.minimum(f0, f1))
 
 
 def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
-    """Return the costs when one more move is allowed: to a cell beside it with no obstacle between the two."""
+    """Return the costs when one more move is allowed, to a neighbouring cell that no obstacle separates."""
     d = cost.ndim
     result = cost.copy()
     for axis in range(d):
@@ -278,7 +280,7 @@ def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
 def _backtracked(
     costs: list[Array], sides: list[list[Bools]], arrivals: list[Any], away: Array, middle: tuple[int, ...], h: float
 ) -> Array:
-    """Return the coordinates (k, d) [m] of the last cell of the cheapest chain in each layer."""
+    """Return the coordinates (k, d) [m] of the cheapest chain: its last cell in each layer."""
     chain = np.zeros((len(costs), len(middle)))
     cell = middle
     for k in range(len(costs) - 1, 0, -1):
@@ -311,7 +313,7 @@ def _neighbours(
 
 
 def _fits(question: Question, axes: Array, chain: tuple[Array, Array]) -> bool:
-    """Return whether sums of components, or of hat functions in time, can follow a chain and keep the clearance."""
+    """Return whether sums of components or of hat functions can follow a chain with the required clearance."""
     times = question.nominal.times
     wanted = np.stack([np.interp(times, chain[0], column) for column in chain[1].T], axis=1)
     return any(
@@ -320,7 +322,7 @@ def _fits(question: Question, axes: Array, chain: tuple[Array, Array]) -> bool:
 
 
 def _hats(question: Question, every: int) -> Array:
-    """Return hat functions in time (n, m), with a peak every few samples, and more of them near fixed times."""
+    """Return m hat functions of time (n, m), with a peak at every ``every``-th sample and near fixed times."""
     times, n = question.nominal.times, len(question.nominal)
     fixed = [int(np.argmin(np.abs(times - time))) for time in question.fixed_times]
     peaks = set(range(0, n, every)) | {n - 1}
@@ -332,7 +334,7 @@ def _hats(question: Question, every: int) -> Array:
 
 
 def _fit(question: Question, axes: Array, basis: Array, wanted: Array) -> bool:
-    """Fit displacements (n, 3) by least squares under tangents of the distances, and verify the result."""
+    """Fit displacements (n, 3) by least squares, constrained by tangents of the distances, and verify the result."""
     times = question.nominal.times
     d, m = len(axes), basis.shape[1]
     tip, relative = question.at(times)
@@ -373,7 +375,7 @@ def _fit(question: Question, axes: Array, basis: Array, wanted: Array) -> bool:
 def _tangent_rows(
     question: Question, axes: Array, basis: Array, tip: Array, relative: Array, here: Array, extra: Array
 ) -> tuple[Array, Array]:
-    """Return rows (r, m d) and lower bounds (r,): the tangents of all near distances along ``tip + here``."""
+    """Return linear constraints, rows (r, m d) and lower bounds (r,): tangents of small distances at ``tip + here``."""
     times = question.nominal.times
     j, s = extra[:, 0].astype(int), extra[:, 1:2]
 
@@ -397,10 +399,10 @@ def _tangent_rows(
 
 
 def _close_points(question: Question, times: Array, tip: Array, relative: Array, here: Array) -> Array:
-    """Return where the path comes too close to an obstacle, shape (r, 2).
+    """Return the r places at which the path comes too close to an obstacle, shape (r, 2).
 
-    On each segment 49 points are examined. If one is too close, the closest is returned as the index of the segment's
-    first sample and the fraction of the segment before the point.
+    On each segment between samples, 49 points are examined. If any point is too close, the closest point of the segment
+    is returned, as the index of the segment's first sample and the fraction of the segment before the point.
     """
     found = []
     fractions = np.linspace(0.02, 0.98, 49)[:, None, None]

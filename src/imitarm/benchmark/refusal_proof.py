@@ -1,7 +1,7 @@
 """Proof that no path exists, by a flood fill of boxes in space over time.
 
-A box counts as free if any of its points may be free at any time of an interval. If no chain of such boxes leads from
-the start to the goal, then no continuous displacement of the path does either.
+A box of positions counts as free if any of its points may be free at any time of an interval. If no chain of free boxes
+leads from the start to the goal, then no continuous displacement of the path exists.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ _ROUNDING = 1e-9  # [m]
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """A scene in the form that the oracle uses.
+    """The question whether a path exists in a scene, in the form that the oracle uses.
 
     Attributes:
         nominal: the nominal path, n samples.
         basis: influence of the skill's components on the samples, shape (n, n_components).
-        obstacles: obstacles at time 0; they keep their velocity.
-        spheres: spheres of the tool, rows x y z r, shape (m, 4) [m].
+        obstacles: obstacles at time 0; each obstacle moves with constant velocity.
+        spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
         clearance: required [m].
-        forbidden: directions in which nothing may move, shape (k, 3).
-        fixed_times: times at which the path must not move [s].
+        forbidden: directions in which the path must not be displaced, shape (k, 3).
+        fixed_times: times at which the path must not be displaced [s].
     """
 
     nominal: Trajectory
@@ -52,7 +52,7 @@ class Question:
     fixed_times: tuple[float, ...]
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return the tip (m, 3) and the centres of the spheres relative to it (n_spheres, m, 3) at times (m,)."""
+        """Return at times (m,) the tip (m, 3) and the sphere centres relative to the tip (n_spheres, m, 3)."""
         tip, quaternions = self.nominal.at(times)
         if quaternions is None:
             return tip, np.zeros((len(self.spheres), len(times), 3))
@@ -72,11 +72,11 @@ class Question:
 
 
 def separation(question: Question, times: Array, positions: Array) -> float:
-    """Return the smallest proven distance along a path, minus the required clearance [m].
+    """Return a proven lower bound of the distance along a path, minus the required clearance [m].
 
-    A point is at least ``u . p - max_x u . x`` away from a convex obstacle, for any unit vector u; the maximum over the
-    points x of the obstacle is its support function. The proof uses no other geometry of the library; the library's
-    distance gradient only proposes u.
+    For any unit vector u, a point p is at least ``u . p - max_x u . x`` away from a convex obstacle. The maximum over
+    all points x of the obstacle is its support function. The proof uses no other geometry code of the library; the
+    library's distance gradient only proposes u.
 
     Args:
         question: obstacles, spheres and clearance.
@@ -99,13 +99,14 @@ def separation(question: Question, times: Array, positions: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Boxes that fill a region of positions.
+    """A regular grid of equal boxes that fills a region of positions.
 
     Attributes:
-        frame: rows are the directions of the edges, an orthonormal basis of the permitted plane, line or space, (d, 3).
+        frame: directions of the edges in rows, which are an orthonormal basis of the permitted line, plane or space,
+            (d, 3).
         size: size of a box along each edge, shape (d,) [m].
         lowest: smallest coordinates of all boxes, shape (d,) [m].
-        counts: boxes along each edge, shape (d,).
+        counts: number of boxes along each edge, shape (d,).
     """
 
     frame: Array
@@ -114,7 +115,7 @@ class _Cells:
     counts: tuple[int, ...]
 
     def window(self, centre: Array) -> tuple[tuple[int, int], ...]:
-        """Return, along each edge, the first index of the boxes in reach and the index after the last."""
+        """Return the range of boxes within the largest displacement: along each edge, first index and end index."""
         low = np.floor((self.frame @ centre - MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         high = np.ceil((self.frame @ centre + MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         return tuple((max(a, 0), min(b, n)) for a, b, n in zip(low, high, self.counts, strict=True))
@@ -122,12 +123,12 @@ class _Cells:
     def within(
         self, window: tuple[tuple[int, int], ...], obstacle: Obstacle, shift: Array, need: float
     ) -> tuple[tuple[int, int], ...] | None:
-        """Return the part of a window whose boxes fit between the faces of an obstacle's bounding box.
+        """Return the part of a window whose boxes fit into the bounding box of an inflated obstacle.
 
         Only these boxes can have all corners, moved by ``shift`` (3,) [m], within ``need`` [m] of the obstacle.
 
         Returns:
-            The first and the past-the-last index along each edge; None when no box fits.
+            The first index and the index after the last along each edge; None when no box fits.
         """
         part = []
         for axis, (a, b), low, size in zip(self.frame, window, self.lowest, self.size, strict=True):
@@ -140,7 +141,7 @@ class _Cells:
         return tuple(part)
 
     def corners(self, window: tuple[tuple[int, int], ...], centre: Array) -> Array:
-        """Return the corners of the boxes in a window, (n_0 + 1, ..., 3) [m], in the plane through ``centre``."""
+        """Return the corners (n_0 + 1, ..., 3) [m] of the boxes in a window, in the plane through ``centre``."""
         ticks = [
             low + size * np.arange(a, b + 1) for (a, b), low, size in zip(window, self.lowest, self.size, strict=True)
         ]
@@ -149,7 +150,7 @@ class _Cells:
 
 
 def grids(question: Question, axes: Array) -> Iterator[_Cells]:
-    """Yield grids to try: coarse cubes, flat boxes aligned with each obstacle that has a frame, finer cubes."""
+    """Yield grids to try: first coarse cubes, then flat boxes aligned with obstacles, finally finer cubes."""
     d = len(axes)
     coarse, thin, fine = _PROOF_SIZES[d]
     yield _cells(question, axes, np.full(d, coarse))
@@ -179,7 +180,7 @@ def _extent(obstacle: Obstacle, direction: Array) -> float:
 
 
 def _aligned(rotation: Array, axes: Array) -> Array:
-    """Return an orthonormal basis of the span of ``axes`` (d, 3) that is aligned with the rows of a rotation."""
+    """Return an orthonormal basis of the span of ``axes`` (d, 3), aligned with the rows of a rotation matrix."""
     d = len(axes)
     inside = rotation @ axes.T @ axes
     first = inside[int(np.argmax(np.linalg.norm(inside, axis=1)))]
@@ -197,11 +198,11 @@ def _cells(question: Question, frame: Array, size: Array) -> _Cells:
 
 
 def is_impossible(question: Question, cells: _Cells) -> bool:
-    """Prove that there is no path: flood, in each interval, every box that may be free during a part of it.
+    """Return whether there is provably no path, because a flood fill of possibly free boxes can't reach the goal.
 
-    A box is blocked when all of its corners are inside the same inflated obstacle, because the obstacle is convex.
-    Boxes are fixed in space, so the motion of the tip does not matter. All other motion (out of the permitted plane, of
-    spheres away from the tip, of the obstacles) is subtracted from the distance.
+    A box is blocked if all of its corners are inside the same inflated obstacle, because the obstacle is convex. Boxes
+    are fixed in space, so the motion of the tip does not matter. All other motion makes the obstacles smaller: motion
+    out of the permitted plane, motion of spheres away from the tip, and motion of obstacles.
     """
     d = len(cells.frame)
     moving = any(obstacle.velocity.any() for obstacle in question.obstacles)
@@ -251,7 +252,7 @@ def is_impossible(question: Question, cells: _Cells) -> bool:
 
 
 def _touching(cells: _Cells, window: tuple[tuple[int, int], ...], point: Array) -> Bools:
-    """Return whether each box of a window touches a point."""
+    """Return for each box of a window whether it touches a point."""
     at = (cells.frame @ point - cells.lowest) / cells.size
     lines = [
         (np.arange(a, b) - 1e-9 <= x) & (x <= np.arange(a, b) + 1.0 + 1e-9)
@@ -264,7 +265,7 @@ def _touching(cells: _Cells, window: tuple[tuple[int, int], ...], point: Array) 
 
 
 def _shifted(values: Bools, old: tuple[tuple[int, int], ...], new: tuple[tuple[int, int], ...]) -> Bools:
-    """Return the values of boxes in another window; False outside the old window."""
+    """Return the values of boxes for another window of the grid; boxes outside the old window get False."""
     answer = np.zeros([b - a for a, b in new], dtype=bool)
     low = [max(a, c) for (a, _), (c, _) in zip(old, new, strict=True)]
     high = [min(b, e) for (_, b), (_, e) in zip(old, new, strict=True)]
@@ -282,7 +283,7 @@ def _inside(question: Question, start: float, end: float) -> Array:
 def _leftover_motion(
     question: Question, cells: _Cells, times: Array, tip: Array, relative: Array, middle: int
 ) -> Array:
-    """Return the largest displacement of spheres relative to obstacles since ``middle``, (n_obstacles, m) [m]."""
+    """Return how far spheres move relative to obstacles from sample ``middle`` at most, shape (n_obstacles, m) [m]."""
     out_of_plane = tip - tip @ cells.frame.T @ cells.frame
     bow = np.linalg.norm(question.spheres[:, :3], axis=1) * 1e-3 * bool(np.abs(np.diff(relative, axis=1)).max() > 0.0)
     answer = np.empty((len(question.obstacles), len(question.spheres)))
@@ -301,7 +302,7 @@ def _maybe_free(
     relative: Array,
     slack: Array,
 ) -> Bools:
-    """Return whether each box may be free."""
+    """Return for each box whether any of its points may be free of obstacles."""
     d = len(cells.frame)
     blocked = np.zeros([b - a for a, b in window], dtype=bool)
     for i, obstacle in enumerate(question.obstacles):
@@ -322,7 +323,7 @@ def _maybe_free(
 def _permitted(
     question: Question, cells: _Cells, window: tuple[tuple[int, int], ...], times: Array, tip: Array
 ) -> Bools:
-    """Return whether one-sided forbidden directions permit each box at some time of an interval."""
+    """Return for each box whether the forbidden directions permit it at some time of an interval."""
     answer = np.ones([b - a for a, b in window], dtype=bool)
     corners: Array | None = None
     for f in question.forbidden:
@@ -339,7 +340,7 @@ def _permitted(
 
 
 def halves(axis: int, d: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Return two indices: all but the last, and all but the first entry along an axis of a d-dimensional array."""
+    """Return two indices of a d-dimensional array: along ``axis``, all entries but the last, and all but the first."""
     first, last = [slice(None)] * d, [slice(None)] * d
     first[axis], last[axis] = slice(None, -1), slice(1, None)
     return tuple(first), tuple(last)

@@ -1,4 +1,4 @@
-"""Checks of accepted paths and of refusals. Random scenes and an oracle: ``imitarm benchmark refusals``."""
+"""``imitarm benchmark refusals``: check accepted paths and refusals in random scenes with an oracle."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Verdict:
     Attributes:
         seed: number of the scene.
         family: name of the family of the scene.
-        accepted: whether the adaptation is feasible.
-        margin: smallest proven distance minus required clearance along an accepted path [m]; nan when refused.
+        accepted: whether the library found a feasible adaptation.
+        margin: proven lower bound of the distance along an accepted path, minus required clearance [m]; nan if refused.
         oracle: answer of the oracle for the scene; for an accepted scene, "possible" or "undecided".
         seconds: compute time of the adaptation [s].
     """
@@ -52,7 +52,7 @@ class Verdict:
 
 
 def skills_to_adapt(files: Sequence[Path] = ()) -> list[Skill]:
-    """Return the skills of the benchmark: an S-shaped reach, the packaged sweep, and any others from files."""
+    """Return the skills of the benchmark: an S-shaped reach, the packaged sweep, and skills from files."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of one demonstration or of an axis that does not move: no matter here
         packaged = Skill(n_components=12).fit(align(read(DEMONSTRATIONS)))
@@ -66,7 +66,7 @@ def scene_for(skill: Skill, seed: int) -> RandomScene:
 
 
 def question_of(skill: Skill, case: RandomScene) -> Question:
-    """Return a scene in the form that the oracle takes."""
+    """Return a scene in the form that the oracle uses."""
     path = ComponentPath.of_skill(skill, n_samples=case.n_samples, pinned=case.pinned)
     forbidden = np.array(case.forbidden, dtype=float).reshape(-1, 3)
     return Question(
@@ -94,7 +94,7 @@ def adapted(skill: Skill, case: RandomScene) -> Adaptation:
 
 
 def evaluate_scene(skill: Skill, seed: int) -> Verdict:
-    """Adapt a skill to one random scene, and check the answer."""
+    """Adapt a skill to one random scene, and check with the oracle whether the path or the refusal is right."""
     case = scene_for(skill, seed)
     adaptation = adapted(skill, case)
     question = question_of(skill, case)
@@ -113,7 +113,7 @@ def refusal_table(
     files: Sequence[Path] = (),
     on_done: Callable[[int, int], None] | None = None,
 ) -> tuple[Table, list[Verdict]]:
-    """Run random scenes, with the skills in turn, and count the results.
+    """Adapt the skills, one after the other, to random scenes, and count the results.
 
     Args:
         n_scenes: how many.

@@ -1,4 +1,4 @@
-"""Running many experiments in parallel; each result is saved at once, so an interrupted benchmark can be continued."""
+"""Run many experiments in parallel; each result is saved immediately, so an interrupted benchmark can be continued."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LOCAL = "loky"
 _RUNS, _RECORDINGS = "runs", "recordings"
 
 OnDone = Callable[[int, int], None]
-"""Called with the number of finished experiments and the total number."""
+"""Type of a function that is called with the number of finished experiments and the total number."""
 
 
 def run_all(
@@ -36,24 +36,25 @@ def run_all(
 ) -> list[Result]:
     """Run experiments in parallel and return their results in the same order.
 
-    Each result is a separate file in ``folder/runs``, written as soon as the experiment is finished. A saved result of
-    the same configuration and the same code is read instead of run again. The values do not depend on ``jobs``.
+    Each result is a separate file in ``folder/runs``, written as soon as the experiment is finished. If there is a
+    saved result of the same configuration and the same code, it is read instead of running the experiment again. The
+    measured values do not depend on ``jobs``.
 
     Args:
         experiments: the experiments to run.
         folder: folder for results and recordings; created if missing.
         jobs: number of processes; None: one for each processor; 1: only this process.
         fresh: whether to ignore saved results and run all experiments again.
-        reuse: whether to use saved results of the same configuration even if other code produced them; each result
-            names its code.
+        reuse: whether to use saved results of the same configuration even if another version of the code produced them;
+            each result names the version.
         backend: a backend of joblib: ``"loky"`` (local processes), or one whose workers see the same folder, such as
             ``"dask"`` or ``"ray"``.
         on_done: function called with the progress.
 
     Raises:
         InputError: when the folder can't be written to, or the backend does not exist.
-        TaskFailedError: when a worker process was lost; the results that were finished are kept.
-        KeyboardInterrupt: after Ctrl-C; the results that were finished are kept.
+        TaskFailedError: when a worker process ended unexpectedly; finished results are kept.
+        KeyboardInterrupt: after Ctrl-C; finished results are kept.
     """
     place = _prepared(folder)
     known = {} if fresh else {e: found for e in experiments if (found := _kept(place, e, reuse)) is not None}
@@ -84,7 +85,7 @@ def _prepared(folder: str | Path) -> Path:
 
 
 def _kept(place: Path, experiment: Experiment, reuse: bool) -> Result | None:
-    """Return the saved result; None when it is missing or unreadable, or (unless ``reuse``) other code produced it."""
+    """Return the saved result; None if it is missing, unreadable or (without ``reuse``) produced by other code."""
     path = Result.path(place / _RUNS, experiment)
     try:
         found = Result.load(path) if path.exists() else None
@@ -98,7 +99,7 @@ Job = tuple[Experiment, str, str, int]
 
 
 def _make(job: Job) -> Experiment:
-    """Make the recording of an experiment; if that fails, the experiment fails later with the reason."""
+    """Make the recording of an experiment; an error is ignored here, because the experiment reports it later."""
     experiment, folder, _, parent = job
     _end_with(parent)
     with contextlib.suppress(ImitarmError):
@@ -110,7 +111,9 @@ def _run(job: Job) -> Experiment:
     experiment, folder, version, parent = job
     _end_with(parent)
     if code_version() != version:
-        raise TaskFailedError("the code was changed while the benchmark ran; start it again, valid results are kept")
+        raise TaskFailedError(
+            "the code was changed while the benchmark ran; start the benchmark again; valid results are kept"
+        )
     experiment.run(Path(folder) / _RECORDINGS).save(Path(folder) / _RUNS)
     return experiment
 
@@ -125,14 +128,16 @@ def _parallel(
         pool: Any = joblib.Parallel(workers, backend=backend, batch_size=1, return_as="generator_unordered")
         yield from pool(joblib.delayed(function)(job) for job in jobs)
     except BrokenProcessPool as error:
-        raise TaskFailedError(f"a worker process was lost ({error}); start again, valid results are kept") from error
+        raise TaskFailedError(
+            f"a worker process ended unexpectedly ({error}); start the benchmark again; valid results are kept"
+        ) from error
     except (ValueError, ImportError) as error:
         raise InputError(f"backend {backend!r}: {error}") from error
 
 
 @lru_cache(maxsize=1)
 def _end_with(parent: int) -> None:
-    """End this worker when its parent has ended, because workers survive a killed parent."""
+    """End this worker process when its parent process has ended, because workers survive if the parent is killed."""
     if os.getppid() == parent:
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 

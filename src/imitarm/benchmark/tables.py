@@ -1,4 +1,4 @@
-"""Table: results of a benchmark as rows of text, for a terminal, a page or a document."""
+"""Table: results of a benchmark as rows of text, for a terminal, a report page or a Markdown document."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ class Table:
 
 @dataclass(frozen=True)
 class Place:
-    """The location of a benchmark's tables in a document.
+    """The place of a benchmark's tables in a Markdown document.
 
     Attributes:
         document: path of the Markdown document.
-        benchmark: its name; the tables are between the lines ``<!-- imitarm benchmark NAME -->`` and
+        benchmark: name of the benchmark; its tables are between the lines ``<!-- imitarm benchmark NAME -->`` and
             ``<!-- end -->``.
 
     Raises:
-        InputError: when the document can't be read, or does not have these two lines in this order, once each.
+        InputError: when the document can't be read, or does not contain these two lines once each, in this order.
     """
 
     document: Path
@@ -55,12 +55,13 @@ class Place:
         return f"<!-- imitarm benchmark {self.benchmark} -->"
 
     def fill(self, found: Sequence[Table], command: str, versions: Iterable[str]) -> None:
-        """Put tables into the document, without any other change.
+        """Replace the tables in the document; the rest of the document stays unchanged.
 
         Args:
             found: the tables.
             command: the command that printed the tables.
-            versions: code version of each result; the document says if it differs from the running code.
+            versions: code version of each result; the document states whether it differs from the version of the
+                running code.
         """
         head, tail = self._parts()
         body = "\n".join(table.markdown() for table in found)
@@ -78,7 +79,7 @@ class Place:
         others = (head + tail).count("<!-- imitarm benchmark ")  # each has an end of its own
         if not found or not ended or self.begin in rest or (head + tail).count(f"{END}\n") != others:
             raise InputError(
-                f"{self.document}: the tables go between a line {self.begin!r} and a line {END!r} after it; write "
+                f"{self.document}: the tables belong between a line {self.begin!r} and a line {END!r} after it; write "
                 "both, once each"
             )
         return head, tail
