@@ -83,7 +83,9 @@ def _text(node: ast.AST) -> str | None:
 
 
 def _docstring(node: ast.AST) -> ast.Constant | None:
-    """Return the constant that holds a docstring."""
+    """Return the constant that holds a docstring, also that of a variable."""
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+        return node.value
     if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
         first = node.body[0]
         if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str):

@@ -136,7 +136,7 @@ def _table(table: Table) -> dict[str, Any]:
 
 
 def _players(results: Results, folder: Path | None) -> tuple[tuple[str, str] | None, list[Tab]]:
-    """Return the playback of one recording, the first one at the edge of reach, by each of the main methods."""
+    """Return 3-D playbacks of the first recording at the edge of reach, one for each of the main methods."""
     replayed = [r.experiment for r in results.all if r.experiment.task != LIVE and not r.failure]
     chosen = next((e for e in replayed if e.task == "edge"), next(iter(replayed), None))
     if chosen is None:

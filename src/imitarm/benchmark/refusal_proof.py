@@ -115,7 +115,7 @@ class _Cells:
     counts: tuple[int, ...]
 
     def window(self, centre: Array) -> tuple[tuple[int, int], ...]:
-        """Return the range of boxes within the largest displacement: along each edge, first index and end index."""
+        """Return the range of boxes (first index, end index) along each edge within the largest displacement."""
         low = np.floor((self.frame @ centre - MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         high = np.ceil((self.frame @ centre + MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         return tuple((max(a, 0), min(b, n)) for a, b, n in zip(low, high, self.counts, strict=True))

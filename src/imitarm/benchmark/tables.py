@@ -15,7 +15,7 @@ END = "<!-- end -->"
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text with title, columns, rows and note; a column name that ends in ``>`` marks numbers."""
+    """A table of text with title, columns, rows and note; a column whose name ends in ``>`` holds numbers."""
 
     title: str
     columns: tuple[str, ...]

@@ -161,7 +161,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not any(tracking.engagements for _, tracking in done):
         raise TaskFailedError(
             f"{arguments.source}: the {correspondence.side} arm was never seen for {SEEN_FOR:g} s without a gap, so "
-            "the robot did not move and nothing is written; keep the arm in view, or choose the other one with --side"
+            "the robot did not move and nothing is written; keep the arm in view, or choose the other arm with --side"
         )
     source = f"{Path(arguments.source).name}, {correspondence.side} arm"
     for name, (result, tracking) in zip(names, done, strict=True):

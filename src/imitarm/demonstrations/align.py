@@ -303,8 +303,8 @@ def dtw(a: Array, b: Array, *, band: int, price: float = 0.0) -> tuple[Array, In
 
     Returns:
         cost: cost D(n-1, n-1) of the cheapest path of each pair, shape (pairs,).
-        path: matched samples as index pairs (i, j), from the end to (0, 0) and padded with (0, 0), shape (pairs, 2 n -
-            1, 2).
+        path: index pairs (i, j) of matched samples, shape (pairs, 2 n - 1, 2). Each path runs backwards, from (n-1,
+            n-1) to (0, 0); the remaining rows are (0, 0).
     """
     n = a.shape[1]
     # one row for each anti-diagonal i + j, one column for each offset i - j; cells outside grid or band cost inf

@@ -122,7 +122,8 @@ class ReadOptions:
         """
         if None not in (self.quaternion_order, said) and self.quaternion_order != said:
             raise InputError(
-                f"{source}: says its order is {said}, which contradicts quaternion_order={self.quaternion_order!r}; "
+                f"{source}: states the quaternion order {said}, which contradicts "
+                f"quaternion_order={self.quaternion_order!r}; "
                 f"leave out that option"
             )
         return quaternions[..., list(QUATERNION_ORDERS[self.quaternion_order or said or "wxyz"])]

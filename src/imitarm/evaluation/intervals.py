@@ -141,10 +141,10 @@ def rate_interval(outcomes: Values) -> Interval:
 
     The interval is the Wilson interval for :math:`N / D` trials instead of N, because the trials of one person are
     similar (Rao and Scott, Biometrics 1992). :math:`D = 1 + (m - 1) \rho` is the design effect of m trials per person.
-    :math:`\rho` is the correlation between trials of one person. It is estimated from how much more the persons' rates
-    differ than by chance. The estimate from a few persons is poor, so it is averaged with a prior correlation of 0.3,
-    which has the weight of two persons. If all trials had the same result, or if there is only one person, the
-    correlation is 0.3. N / D lies between the number of persons and N.
+    :math:`\rho` is the correlation between trials of one person. This correlation is estimated from how much more the
+    rates of persons differ than chance explains. The estimate from a few persons is poor, so it is averaged with a
+    prior correlation of 0.3, which has the weight of two persons. If all trials had the same result, or if there is
+    only one person, the correlation is 0.3. N / D lies between the number of persons and N.
 
     If only one person fails, this indicates that persons differ. If another person also fails, it indicates that they
     do not differ, so that one more failure could narrow the interval. To prevent this, the function also computes the

@@ -60,7 +60,9 @@ class ArmMotion:
         """
         t, q = np.asarray(times, dtype=float), np.asarray(joints, dtype=float)
         if len(t) < 4 or q.shape != (len(t), arm.n_joints):
-            raise InputError(f"ArmMotion: needs 4 samples of {arm.n_joints} joints, got {t.shape} and {q.shape}")
+            raise InputError(
+                f"ArmMotion: needs at least 4 samples of {arm.n_joints} joints, got {t.shape} and {q.shape}"
+            )
         dt = float(t[-1] - t[0]) / (len(t) - 1)
         if not np.allclose(np.diff(t), dt, rtol=1e-3, atol=1e-6) or not np.isfinite(q).all():
             raise InputError("ArmMotion: times must be evenly spaced and positions finite")

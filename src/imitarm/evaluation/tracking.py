@@ -209,7 +209,7 @@ def rms(errors: ArrayLike) -> float:
 
 
 def best_lag(true: TrueArm, tool: Array, periods: EngagementPeriods, scale: float) -> tuple[float, float]:
-    """Return the constant lag that explains the tool's motion best [s], and the RMS error that remains without it [m].
+    """Return the constant lag that explains the tool's motion best [s], and the RMS error after removing this lag [m].
 
     Lags from -0.1 to 0.8 s are tried. A parabola through the lag with the smallest error and its two neighbours gives
     the minimum. Both results are nan if no frame is engaged. The lag is also nan if the hand did not move.

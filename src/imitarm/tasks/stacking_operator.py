@@ -343,7 +343,7 @@ class _SubMovement:
 
 
 class SimulatedOperator:
-    r"""A simulated person who stacks cubes with a robot and watches the gripper, not the own hand.
+    r"""A simulated person who stacks cubes with a robot and watches the gripper instead of the hand.
 
     *Hand.* The motion of the hand is a sum of sub-movements, :math:`h(t) = h_0 + \sum_i d_i\,\mu((t-t_i)/T_i)`, with
     the minimum-jerk profile :math:`\mu(u) = 10u^3-15u^4+6u^5` (intermittent control: Milner 1992, Burdet and Milner
