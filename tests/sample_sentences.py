@@ -1,7 +1,7 @@
 """Draw sentences from the documentation, the docstrings and the messages, to be read as a newcomer would read them.
 
-``python tests/sample_sentences.py --count 200 --seed 1`` prints each sentence with its place. Code blocks, formulas and
-table cells that hold only numbers are left out.
+``python tests/sample_sentences.py --count 200 --seed 1`` prints each sentence with its place. Code blocks, formulas, and
+cells or strings that hold only numbers or code, such as names of tests, are left out.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ _START = re.compile(_ITEM + ")")
 _ARGUMENT = re.compile(_ITEM + r"|[\w*, ().]+:$|\w[\w, *]*(?: \([^)]*\))?: )")
 _END = re.compile(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*`$\[]*[A-Z0-9])")
 _ABBREVIATION = re.compile(r"\b(?:Eq|Eqs|Fig|Figs|e\.g|i\.e|et al|vs|cf|Trans|No|[A-Z])\.$")
-_WORD = re.compile(r"[A-Za-z]{2,}")
+_WORD = re.compile(r"(?<![\w\\])[A-Za-z]{2,}(?!\w)")
+_CODE = re.compile(r"``?[^`]*``?|\$[^$]*\$|\S*[_/\\:]\S*\w")
 
 
 @dataclass(frozen=True)
@@ -113,10 +114,10 @@ def _code(path: Path) -> Iterator[Sentence]:
 
 
 def sentences() -> list[Sentence]:
-    """Return every sentence of at least four words, each text once."""
+    """Return every sentence with at least four words that are not code, each text once."""
     found = [sentence for path in PAGES for sentence in _prose(path)]
     found += [sentence for path in [*SOURCES, *EXAMPLES] for sentence in _code(path)]
-    once = {sentence.text: sentence for sentence in found if len(_WORD.findall(sentence.text)) >= 4}
+    once = {sentence.text: sentence for sentence in found if len(_WORD.findall(_CODE.sub(" ", sentence.text))) >= 4}
     return list(once.values())
 
 
