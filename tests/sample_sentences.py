@@ -1,7 +1,7 @@
 """Draw sentences from the documentation, the docstrings and the messages, to be read as a newcomer would read them.
 
-``python tests/sample_sentences.py --count 200 --seed 1`` prints each sentence with its place. Code blocks, formulas, and
-cells or strings that hold only numbers or code, such as names of tests, are left out.
+``python tests/sample_sentences.py --count 200 --seed 1`` prints each sentence with its place. Left out are code blocks,
+formulas, and cells or strings that hold only numbers or code, such as names of tests.
 """
 
 from __future__ import annotations
