@@ -91,7 +91,7 @@ def test_a_served_robot_is_led_with_enable(person, served, capfd):
     SkeletonRecording(skeletons(120)).save(person)
     to = f"127.0.0.1:{served.address[1]}"
     text = until_it_succeeds(["teleoperate", str(person), "--to", to, "--enable", "--rate", "100"], capfd)
-    assert "interruptions" in text and "dropped states" in text and "sent to received by the robot" in text
+    assert "interruptions" in text and "dropped states" in text and "to its receipt by the robot" in text
     assert served.supervisor.datagram_filter.accepted > 20
 
 
