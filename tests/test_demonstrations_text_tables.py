@@ -383,7 +383,7 @@ def test_other_remarks_are_no_names(tmp_path, first):
 def test_the_order_of_quaternions_that_a_remark_states_is_not_to_be_contradicted(tmp_path):
     file = write(tmp_path / "a.txt", np.column_stack([0.1 * np.arange(30), POSES]), first="# rotations wxyz")
     assert np.allclose(read(file)[0].trajectory.quaternions, POSES[:, 3:])
-    with pytest.raises(InputError, match="its order is wxyz, which contradicts quaternion_order='xyzw'"):
+    with pytest.raises(InputError, match="the quaternion order wxyz, which contradicts quaternion_order='xyzw'"):
         read(file, quaternion_order="xyzw")
 
 
