@@ -38,7 +38,7 @@ def main() -> None:
     # Align. People never repeat a motion at exactly the same speed; averaging at equal times would flatten every bend.
     ready = align(shown)
     before = np.ptp([one.trajectory.duration for one in shown])
-    print(f"\naligned to {ready[0].trajectory.duration:.1f} s (durations before differed by {before:.1f} s)")
+    print(f"\naligned to {ready[0].trajectory.duration:.1f} s (before, the durations differed by {before:.1f} s)")
 
     # Learn. The number of Gaussians is the smallest that reproduces a demonstration it has not seen as well as any and
     # rounds off little (bias); where none does both, the one with the least held-out error. BIC alone would go on

@@ -71,8 +71,8 @@ def main() -> None:
     adaptation = policy.adaptation
     print(f"{'done' if rollout.success else 'FAILED'}: {rollout.reason}")
     print(f"  {rollout.trajectory.duration:.1f} s, demonstrated in {skill.duration_:.1f} s")
-    print(f"  clearance certified for the brush: {1e3 * adaptation.certified_clearance:.1f} mm")
-    print(f"  clearance measured, of arm and brush:       {1e3 * rollout.min_clearance:.1f} mm")
+    print(f"    certified clearance of the brush:  {1e3 * adaptation.certified_clearance:.1f} mm")
+    print(f"    measured clearance of arm and brush: {1e3 * rollout.min_clearance:.1f} mm")
     for pair, steps in nearest.most_common(3):
         print(f"    within 5 cm for {0.01 * steps:.1f} s: {pair}")
     effort = np.abs(rollout.torques).max(axis=0) / arm.max_torque

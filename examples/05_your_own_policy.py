@@ -48,7 +48,7 @@ class Repelled(Policy):
         return Command(twist, progress=min(observation.time / self.path.duration, 1.0))
 
     def finished(self, observation: Observation) -> bool:
-        """Whether the motion has reached its end in time and the goal in space."""
+        """Return whether the duration of the motion is over and the tool has reached the goal."""
         away = np.linalg.norm(self.path.positions[-1] - observation.tool_to_base.position)
         return observation.time > self.path.duration and bool(away < 0.005)
 

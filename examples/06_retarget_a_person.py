@@ -1,6 +1,6 @@
 """Learn from a person in front of a camera: convert five recordings to demonstrations, and learn and reproduce a skill.
 
-The person and the noisy camera are simulated, so that the example runs anywhere; To use a recording of your own, open
+The person and the noisy camera are simulated, so that the example runs anywhere. To use a recording of your own, open
 it with `open_source("take.csv")`. The true motion of the simulated person is known, so the errors of the robot can be
 measured.
 """
@@ -37,7 +37,7 @@ REST, DURATION = 1.0, 6.0  # [s] with the hand at rest, so that the robot can en
 
 
 def take(number: int) -> SkeletonSource:
-    """One recording: the person moves an object over an edge from right to left, with small variations."""
+    """Record the simulated person, who moves an object over an edge from right to left, with small variations."""
     person = Person.from_seed(4)
     varied = np.random.default_rng(number).normal(0.0, 0.01, (3, 3))
     shoulder = person.shoulder("right", 0.0)

@@ -147,7 +147,8 @@ def _note(verdicts: Sequence[Verdict]) -> str:
     parts = []
     if accepted:
         solved = sum(v.oracle is Answer.POSSIBLE for v in accepted)
-        parts.append(f"Smallest margin of an accepted path: {1e6 * min(v.margin for v in accepted):.2f} um.")
+        margin = 1e6 * min(v.margin for v in accepted)
+        parts.append(f"The clearance of each accepted path exceeds the required clearance by at least {margin:.2f} um.")
         parts.append(f"The oracle solves {100 * solved / len(accepted):.1f} % of the accepted scenes.")
     if refused:
         right = sum(v.oracle is Answer.IMPOSSIBLE for v in refused)
@@ -156,7 +157,8 @@ def _note(verdicts: Sequence[Verdict]) -> str:
             f"{100 * right / len(refused):.1f} % of the refusals are right (95 % interval {100 * low:.1f} to "
             f"{100 * high:.1f} %; an undecided refusal counts as wrong)."
         )
-    for name, group in (("Accepted", accepted), ("Refused", refused)):
+    for name, group in (("accepted", accepted), ("refused", refused)):
         if group:
-            parts.append(f"{name} in {1e3 * np.median([v.seconds for v in group]):.1f} ms (median).")
+            seconds = np.median([v.seconds for v in group])
+            parts.append(f"Median computing time of {name} scenes: {1e3 * seconds:.1f} ms.")
     return " ".join(parts)
