@@ -96,7 +96,7 @@ def test_rotation_goes_round_with_the_position() -> None:
 
 def test_bad_input_is_named(dmp: RhythmicDMP) -> None:
     t = np.linspace(0.0, 2.0, 201)
-    with pytest.raises(InputError, match=r"after a period of 1\.3 s the motion is"):
+    with pytest.raises(InputError, match=r"positions one period of 1\.3 s apart differ by"):
         RhythmicDMP().fit(Trajectory(t, wiping(t)), period=1.3)
     with pytest.raises(InputError, match="period must be a finite number above 0"):
         RhythmicDMP().fit(Trajectory(t, wiping(t)), period=5.0)

@@ -121,7 +121,7 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
     def at(self, times: ArrayLike) -> tuple[Array, Array | None]:
-        """Interpolate positions linearly and rotations along the shortest arc; outside the motion, return its ends.
+        """Interpolate positions linearly and rotations along the shortest arc; hold the ends outside the time span.
 
         Args:
             times: query times [s], shape (m,), or one number.

@@ -72,10 +72,10 @@ def reproduce(
             been measured earlier; its ``stamp`` is the time of that measurement [s].
         dt: control period [s]; for a simulated robot, it must be a multiple of the simulation's timestep.
         timeout: longest duration [s].
-        safety: safety filter; None: a filter that keeps the arm within its joint limits, its links 10 mm apart and the
-            whole arm out of contact with obstacles. The filter's ``dt`` must equal this ``dt``.
-        on_step: function called after each step, for progress or drawing; an exception in it stops the robot and is
-            raised again.
+        safety: safety filter; None: a filter that keeps the arm within its joint limits, its links at least 10 mm apart
+            and the whole arm out of contact with obstacles. The filter's ``dt`` must equal this ``dt``.
+        on_step: function called after each step, for progress or drawing; if the function raises an exception, the
+            robot is stopped and the exception is raised again.
 
     Returns:
         The measured motion from rest to rest. ``success`` means that the motion finished in time, touched nothing, and
@@ -198,7 +198,7 @@ class _Log:
         if not fault and required is not None and nearest < required:
             fault = f"clearance fell to {1e3 * nearest:.1f} mm, {1e3 * required:.1f} mm required"
             if self.clearances[0] < required:
-                fault += f"; it was {1e3 * self.clearances[0]:.1f} mm at the start"
+                fault += f"; the clearance was {1e3 * self.clearances[0]:.1f} mm at the start"
         details: dict[str, Any] = {
             "twists": np.array(self.twists),
             "clamped": dict(self.clamped),

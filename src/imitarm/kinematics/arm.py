@@ -1,6 +1,6 @@
 """ArmModel: kinematics and dynamics of a robot arm.
 
-ArmState: its joint positions, velocities and torques at one time.
+ArmState: joint positions, velocities and torques of an arm at one time.
 """
 
 from __future__ import annotations
@@ -127,9 +127,10 @@ class ArmModel(ArmKinematics):
         standard element for speed and acceleration limits, so write them as ``<custom><numeric name="max_velocity"
         data="..."/></custom>`` (and ``max_acceleration``), one value for each joint.
 
-        ``home`` is the keyframe of that name, else the first keyframe. If the file has no keyframe, ``home`` is the
-        middle of the joints' ranges, provided that this posture is not singular and keeps the links 20 mm apart.
-        Otherwise ``home`` is the best of 1024 sampled postures by these criteria.
+        The posture ``home`` comes from the file's keyframe ``home``, or else from its first keyframe. If the file has
+        no keyframe, ``home`` is the middle of the joints' ranges, provided that this posture is not singular and keeps
+        the links at least 20 mm apart. Otherwise ``home`` is the posture that meets these two criteria best among 1024
+        samples.
 
         Args:
             name_or_path: ``"sawyer"``, ``"panda"`` or a path.
@@ -150,7 +151,7 @@ class ArmModel(ArmKinematics):
                 raise InputError(f"{what} must be a name or a path, got {value!r}")
         folders = (package_path,) if isinstance(package_path, str | Path) else package_path
         if not isinstance(folders, Sequence) or not all(isinstance(folder, str | Path) for folder in folders):
-            raise InputError(f"package_path must be a folder or several, got {package_path!r}")
+            raise InputError(f"package_path must be one folder or several folders, got {package_path!r}")
         options = {
             "tool": tool,
             "flange": None if flange is None else text(flange, "flange"),
@@ -351,7 +352,7 @@ class ArmModel(ArmKinematics):
 
 
 def _working_model(file: ArmFile, whole: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model that kinematics and dynamics are computed with.
+    """Return the MuJoCo model that computes the kinematics and dynamics.
 
     Shapes without mass are left out, which makes the kinematics about three times as fast. Joints that are not part of
     the arm, such as those of fingers, are fixed at their position in ``file.home``, so the Jacobians have columns only

@@ -149,7 +149,7 @@ def read_arm(
 
 
 def _located(source: str | Path, packaged: Mapping[str, str], kind: str) -> Path:
-    """Return the path of a packaged name or of a file."""
+    """Return the path of ``source``, which is either a packaged name or itself a path."""
     if str(source) in packaged:
         return Path(str(resources.files("imitarm") / "robots" / "models" / packaged[str(source)]))
     path = Path(source).expanduser()
@@ -282,8 +282,8 @@ def compiled(spec: mujoco.MjSpec, what: object) -> mujoco.MjModel:
     """Compile a copy of ``spec``.
 
     Raises:
-        FileFormatError: when MuJoCo can't compile the spec; the message repeats MuJoCo's and adds a remedy for the
-            usual cause.
+        FileFormatError: when MuJoCo can't compile the spec; the message quotes MuJoCo's message and adds a remedy for
+            the usual cause.
     """
     try:
         return spec.copy().compile()
@@ -321,7 +321,7 @@ def _separate_contact_shapes(spec: mujoco.MjSpec) -> None:
 def _set_flange(
     spec: mujoco.MjSpec, flange: str | None, path: Path, root: XmlElement
 ) -> tuple[tuple[str, ...], list[str]]:
-    """Add a site ``flange`` if it is missing; return the names of the joints from the base to it, and notes."""
+    """Add a site ``flange`` if it is missing; return the names of the joints from base to flange, and notes."""
     notes: list[str] = []
     site = spec.site(flange or "flange")
     if site is not None:

@@ -105,7 +105,7 @@ def _check_numbers(path: Path, root: XmlElement) -> None:
 
 
 def _numbers(value: str) -> list[float]:
-    """Return the numbers of an attribute; an empty list when it holds anything else."""
+    """Return the numbers in an attribute's value; an empty list when the value holds anything but numbers."""
     try:
         return [float(word) for word in value.split()]
     except ValueError:
@@ -149,7 +149,7 @@ def _check_ranges(path: Path, root: XmlElement) -> None:
 
 
 def check_key_lengths(n_positions: int, path: Path, root: XmlElement) -> None:
-    """Reject a keyframe whose number of positions differs from the model's, which MuJoCo would silently fill up."""
+    """Reject a keyframe with more or fewer positions than the model; MuJoCo would silently fill up such a keyframe."""
     for key in (e for e in root.walk() if e.tag == "key"):
         n = len(_numbers(key.get("qpos")))
         if n not in (0, n_positions):

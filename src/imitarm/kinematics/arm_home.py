@@ -45,7 +45,7 @@ def usable_posture(
     order = np.argsort(-scores, kind="stable")
     best = next((q for q in candidates[order[:_TRIED]] if search.apart(q)), None)
     if best is None:
-        return candidates[order[0]], ("home: no posture was found in which all links keep 20 mm apart",)
+        return candidates[order[0]], ("home: no posture was found in which all links are at least 20 mm apart",)
     for index in range(len(best)):  # a joint that makes no difference, such as the first, stands in its middle
         tidier = np.where(np.arange(len(best)) == index, middle, best)
         if search.score(tidier) >= _AS_GOOD * search.score(best) and search.apart(tidier):
@@ -113,7 +113,7 @@ class _HomeSearch:
         return bend * min(1.0, 4.0 * margin) * (0.5 if below else 1.0)
 
     def apart(self, q: Array) -> bool:
-        """Return whether links that do not share a joint keep 20 mm apart."""
+        """Return whether links that do not share a joint are at least 20 mm apart."""
         return all(self._distance(pair, q) >= _APART for pair in self._pairs)
 
     def _distance(self, pair: tuple[int, int], q: Array) -> float:

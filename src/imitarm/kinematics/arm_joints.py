@@ -182,7 +182,7 @@ def _parallel_mimics(spec: mujoco.MjSpec, owners: Mapping[str, mujoco.MjsBody]) 
 
 
 def mimics(spec: mujoco.MjSpec) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return every coupling of two joints, (follower, leader), with the offset and the linear factor."""
+    """Return every coupling of two joints as {(follower, leader): (offset, linear factor)}."""
     return {
         (equality.name1, equality.name2): (float(equality.data[0]), float(equality.data[1]))
         for equality in spec.equalities
@@ -361,7 +361,7 @@ def _torque_limit(model: mujoco.MjModel, name: str) -> float:
 
 
 def _located(names: list[str], all_names: tuple[str, ...], root: XmlElement) -> str:
-    """Return the names of joints with their lines, or "all joints" if no joint is missing."""
+    """Return ``names`` with their lines in the file, or "any joint" if ``names`` contains all joints."""
     if len(names) == len(all_names):
         return "any joint"
     lines = {e.get("name"): e.line for e in reversed(list(root.walk())) if e.tag == "joint"}
@@ -420,10 +420,10 @@ def complete_home(
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return a position for every joint of ``model``, and notes on the choice.
 
-    A joint in ``given`` keeps its position from there. A tool's fingers are open, other joints that do not belong to
+    A joint in ``given`` has the position that is given. A tool's fingers are open, other joints that do not belong to
     the arm are in the middle of their ranges, and coupled joints follow their leader. The arm's own joints are also in
-    the middle of their ranges if that posture is not singular and its links are apart. Otherwise the function chooses
-    the best of many postures.
+    the middle of their ranges if that posture is not singular and its links are at least 20 mm apart. Otherwise the
+    function chooses the best of many postures.
     """
     home: dict[str, float] = {}
     for index in range(model.njnt):

@@ -45,8 +45,9 @@ class Landmarks:
         sites: indices of the three sites.
         elbow: index of the elbow joint among the arm's joints.
         wrist: index of the joint that bends the wrist among the arm's joints.
-        elbow_straight: position of the elbow joint at which the arm is stretched and singular [rad], from the file's
-            ``<custom><numeric name="elbow_straight" data="..."/></custom>``, else 0.
+        elbow_straight: position of the elbow joint at which the arm is stretched and singular [rad]. The value comes
+            from the file's ``<custom><numeric name="elbow_straight" data="..."/></custom>``, or is 0 if the file has no
+            such entry.
     """
 
     sites: tuple[int, int, int]
@@ -200,7 +201,7 @@ class ArmKinematics:
         return memory
 
     def site(self, frame: str) -> int:
-        """Return the index of the site of a frame, ``"tool"`` or ``"flange"``, in :meth:`at`.
+        """Return the index of the site that marks the frame ``"tool"`` or ``"flange"``.
 
         Raises:
             UnknownNameError: if the frame is not known.

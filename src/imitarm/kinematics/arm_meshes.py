@@ -25,9 +25,9 @@ _MOST_FOLDERS = 300  # of one folder that are looked into
 def find_meshes(spec: mujoco.MjSpec, path: Path, root: XmlElement, package_path: Iterable[Path]) -> None:
     """Replace the file name of every mesh in ``spec`` by the path at which it was found.
 
-    Each file is searched for under the path as written (in the file's ``meshdir``), relative to the robot's file, and
-    in the folders of ``package_path``. In ``package://NAME/...``, NAME is a ROS package, which is a folder of that name
-    or a folder whose ``package.xml`` has that name. Packages are searched for above and beside the robot's file, in
+    Each mesh is searched for in the ``meshdir`` of the robot's file, then in the folder of the robot's file, then in
+    the folders of ``package_path``. In ``package://NAME/...``, NAME is a ROS package, which is a folder of that name or
+    a folder whose ``package.xml`` has that name. Packages are searched for above and beside the robot's file, in
     ``package_path``, and in the folders of the environment variables ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
 
     Raises:
@@ -102,7 +102,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def _declared_name(folder: Path) -> str | None:
-    """Return the name in a folder's ``package.xml``; None when the folder is no package."""
+    """Return the name in a folder's ``package.xml``; None when the folder is not a package."""
     manifest = folder / "package.xml"
     try:
         if not manifest.is_file():
@@ -124,8 +124,8 @@ def _name_in(manifest: Path, _changed: int) -> str | None:
 def _check_format(mesh: Path, where: str) -> None:
     """Reject a mesh that MuJoCo can't read; the message names its format."""
     convert = (
-        "convert it to binary STL or to OBJ (for example with MeshLab or Blender) and name the new file, or leave all "
-        "meshes out with discard_meshes=True (--discard-meshes on the command line)"
+        "convert it to binary STL or to OBJ (for example with MeshLab or Blender) and write the new file's name into "
+        "the robot's file, or leave all meshes out with discard_meshes=True (--discard-meshes on the command line)"
     )
     suffix = mesh.suffix.lower()
     with mesh.open("rb") as file:

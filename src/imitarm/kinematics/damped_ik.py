@@ -43,7 +43,7 @@ def damped_with_small_angle(problem: IKProblem) -> Array:
 
 
 def _damped(problem: IKProblem, squares: Array, basis: Array, threshold: float) -> Array:
-    """Solve with the squared singular values and left singular vectors; damp values below the threshold."""
+    """Solve from squared singular values and left singular vectors; damp if a singular value is below the threshold."""
     scaled, target, _ = problem.tasks[0]
     least = math.sqrt(max(float(squares[0]), 0.0))
     if least >= threshold:

@@ -43,7 +43,7 @@ class IKStep:
         velocity: velocity of the joints, shape (n_joints,) [rad/s].
         missing: target velocity minus achieved velocity of each task, in the weighted units of the task.
         limited: whether each joint velocity is at a bound of the box, shape (n_joints,) bool.
-        slack: violation of each row, shape (m,); 0 where the row holds.
+        slack: violation of each row, shape (m,); 0 where the row is satisfied.
     """
 
     velocity: Array
@@ -67,15 +67,17 @@ class IKSolver:
     accept one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one
     :class:`~imitarm.kinematics.tasks.PostureTask`, and no limits except boxes. These methods are the following:
 
-    * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9): in joints scaled by their velocity limits
-      :math:`v = J^T (J J^T+\lambda^2)^{-1} t`, with :math:`\lambda=0` for :math:`s_{min}\ge d`,
-      :math:`\lambda^2=s_{min}(d-s_{min})` for :math:`d/2\le s_{min}<d` and :math:`\lambda=d/2` for smaller
-      :math:`s_{min}`, where :math:`d=|t|`. This damping keeps the norm of the scaled velocity at most 1.
-    * ``"dls_small_angle"``: the same with half of the smallest singular value subtracted from d, as the thesis prints
-      after Eq 3.9; this weakens the damping and is kept for comparison.
-    * ``"svd"``, numerical filtering (Maciejewski and Klein 1988):
-      :math:`v=\sum_i s_i/(s_i^2+\lambda_i^2)\, v_i u_i^T t` with :math:`\lambda_i^2=0.06^2(1-(s_i/0.06)^2)` where
-      :math:`s_i<0.06`.
+    * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9), computes :math:`v = J^T (J J^T+\lambda^2)^{-1} t` in
+      joints scaled by their velocity limits. Let :math:`s_{min}` be the smallest singular value of J, and
+      :math:`d=|t|`. There is no damping (:math:`\lambda=0`) if :math:`s_{min}\ge d`. The damping is
+      :math:`\lambda^2=s_{min}(d-s_{min})` if :math:`d/2\le s_{min}<d`, and :math:`\lambda=d/2` if :math:`s_{min}` is
+      smaller. This damping keeps the norm of the scaled velocity at most 1.
+    * ``"dls_small_angle"`` is ``"dls"`` with half of the smallest singular value subtracted from d, as the thesis
+      prints after Eq 3.9. The subtraction weakens the damping; the method is kept for comparison.
+    * ``"svd"``, numerical filtering (Maciejewski and Klein 1988), damps only the directions whose singular value
+      :math:`s_i` is below 0.06. With the singular vectors :math:`u_i` and :math:`v_i`, the velocity is :math:`v=\sum_i
+      s_i/(s_i^2+\lambda_i^2)\, v_i u_i^T t`. The damping is :math:`\lambda_i^2=0.06^2(1-(s_i/0.06)^2)` if
+      :math:`s_i<0.06`, and 0 otherwise.
 
     These three methods scale the whole velocity down when a joint would be too fast, then clip it to the box. A solver
     keeps no state between steps and can be used by several threads.

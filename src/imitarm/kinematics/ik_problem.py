@@ -62,7 +62,7 @@ class TaskRows(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class IKProblem:
-    """The problem of one control step: the arm's state, and the rows of the tasks and limits so far.
+    """The problem of one control step: the arm's state, and the rows of the tasks and limits collected so far.
 
     Attributes:
         arm: the arm.
@@ -71,7 +71,8 @@ class IKProblem:
         velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: unknown, so accelerations are
             not limited.
         dt: length of the control step [s].
-        box: hard bounds of the joint velocity; initially the arm's velocity limits, which the limits then narrow.
+        box: hard bounds of the joint velocity; at first the arm's velocity limits, then narrowed by each limit of the
+            solver.
         tasks: rows of the tasks; the tool's rows come first.
         rows: soft inequalities.
         max_speed: largest norm of a twist, for tasks without their own limit [m/s].

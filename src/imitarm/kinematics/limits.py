@@ -51,8 +51,8 @@ class JointLimits(Limit):
 
     This :math:`v_b` is the solution of :math:`v^2/(2a) + v\,dt = D`. The upper bound is :math:`\min(v_{max},\; v_p +
     a\,dt,\; \max(v_b(D),\, v_p - a\,dt))` where :math:`v_p` is the previous velocity; the lower bound is its mirror
-    image. If :math:`v_p` satisfied this bound in the previous step, braking with a satisfies it in this step. The box
-    is therefore never empty.
+    image. If :math:`v_p` satisfied this bound in the previous step, braking with the acceleration a satisfies the bound
+    in this step. The box is therefore never empty.
 
     The bound assumes that the joint moves by :math:`v\,dt` in one step. A robot with constant acceleration moves by
     :math:`(v_p + v)\,dt/2`; ``imitarm.robots.limit_velocity`` therefore evaluates this box at :math:`q + v_p\,dt/2`.
@@ -181,10 +181,10 @@ class WristSingularityLimit(Limit):
     r"""Softly keeps the wrist joint at least 0.1 rad away from its singular positions.
 
     The wrist is singular at every multiple of pi, because the joint axes before and after the wrist joint are parallel
-    there. If the joint is farther than 0.1 rad from the nearest such multiple, let D be the excess. The joint's
-    velocity away from the multiple must then be at least :math:`-v_b(D)` (see :class:`JointLimits`). If the joint is
-    closer than 0.1 rad, this velocity must be at least 5/s times the distance that is missing to 0.1 rad. The price of
-    a violation is low, so that the wrist can rotate through a singular position if necessary.
+    there. Let e be the joint's distance from the nearest multiple [rad]. If e exceeds 0.1, the joint's velocity away
+    from the multiple must be at least :math:`-v_b(e - 0.1)` (see :class:`JointLimits`). If e is smaller, this velocity
+    must be at least 5/s times :math:`0.1 - e`. The price of a violation is low, so that the wrist can rotate through a
+    singular position if necessary.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.

@@ -194,7 +194,7 @@ def mean_quaternion(quaternions: ArrayLike) -> Array:
 
 
 def checked_unit_quaternions(quaternions: ArrayLike, what: str) -> Array:
-    """Return ``quaternions`` (..., 4) scaled to length one; raise an error if a length is off by over 1e-3.
+    """Return ``quaternions`` (..., 4) scaled to length one; raise an error if a length is not within 1e-3 of one.
 
     Args:
         quaternions: quaternions wxyz, shape (..., 4).
@@ -314,7 +314,7 @@ class Pose:
         return np.asarray(given @ self.rotation.T + self.position)
 
     def error_to(self, target: Pose) -> Array:
-        r"""Return the translation and rotation from this pose to ``target``, in the frame of both poses, shape (6,).
+        r"""Return the translation and rotation from this pose to ``target``, in the reference frame of both, (6,).
 
         The linear part is :math:`p_{target} - p` [m], the angular part :math:`\log(R_{target} R^T)` [rad] (Lynch and
         Park, Modern Robotics, 2017, section 3.2.3).

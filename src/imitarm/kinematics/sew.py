@@ -24,7 +24,9 @@ Array = NDArray[np.float64]
 Vector = tuple[Any, Any, Any]
 
 UP = (0.0, 0.0, 1.0)
-"""With the wrist ahead of the shoulder, the angle is 0 for an elbow above and pi for an elbow below the line."""
+"""Upward direction.
+If the wrist is ahead of the shoulder, the angle is 0 when the elbow is above the line between shoulder and wrist.
+The angle is pi when the elbow is below this line."""
 _LOST = 1e-12  # squared sine below which an angle is only rounding
 
 
@@ -84,7 +86,7 @@ def sew_angle(
 def sew_derivatives(
     shoulder: ArrayLike, elbow: ArrayLike, wrist: ArrayLike, *, convention: str = "stereographic"
 ) -> SewAngle:
-    """Return the angle of :func:`sew_angle`, with the same arguments, and its derivatives by the three positions."""
+    """Return the angle of :func:`sew_angle`, with the same arguments, and its derivatives by the three points."""
     formula = _formula(convention)
     points = [np.asarray(point, dtype=float) for point in (shoulder, elbow, wrist)]
     if any(point.shape[-1:] != (3,) for point in points):
@@ -120,7 +122,7 @@ def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereogr
 def one_angle(
     shoulder: Sequence[float], elbow: Sequence[float], wrist: Sequence[float], convention: str = "stereographic"
 ) -> SewAngle | None:
-    """Return the angle of one arm with derivatives as triples of floats, many times faster than for arrays.
+    """Return the angle and derivatives of one arm as plain floats, which is many times faster than with arrays.
 
     Args:
         shoulder: three floats [m].

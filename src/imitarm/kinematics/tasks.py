@@ -46,8 +46,8 @@ class TwistTask(NamedTuple):
     r"""Move the tool (or the flange) with a twist.
 
     A rotation of 1 rad is weighted like a displacement of ``rotation_length``. A twist whose weighted norm exceeds
-    ``max_speed`` is scaled down. Without this, damped least squares would stop short of its target, because its damping
-    grows with the error (thesis Eq 3.9).
+    ``max_speed`` is scaled down. Without this scaling, damped least squares would stop short of its target, because its
+    damping grows with the error (thesis Eq 3.9).
 
     Attributes:
         twist: desired velocity in the base frame, linear rows first, shape (6,) [m/s, rad/s].
@@ -132,9 +132,9 @@ class PostureTask(NamedTuple):
 class ElbowTask(NamedTuple):
     r"""Rotate the elbow to an SEW angle without affecting the task of the tool.
 
-    The elbow moves by the arm's self-motion, a joint motion that does not move the tool. Its unit vector n points along
-    :math:`(I - J^+ J) J_\psi^T`, where J is the Jacobian of the tool's task (the first task) and e the target of that
-    task. The elbow task adds :math:`\tfrac{w}2\,(n^T v - s)^2` with
+    The elbow moves by the arm's self-motion, a joint motion that does not move the tool. The unit vector n of the
+    self-motion points along :math:`(I - J^+ J) J_\psi^T`, where J is the Jacobian of the tool's task (the first task)
+    and e the target of that task. The elbow task adds the cost :math:`\tfrac{w}2\,(n^T v - s)^2`, where
 
     .. math:: s = c\,\min(1, 10\sin^2\!\beta)\;\frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
 
@@ -142,7 +142,7 @@ class ElbowTask(NamedTuple):
     The elbow's speed goes to zero as the arm becomes straight, and near the one direction in which the stereographic
     angle is undefined. From one step to the next, s changes by at most half of the change that the joints'
     accelerations allow. As long as no limit is active, the task does not affect the tool, whatever its weight. When a
-    limit is active, the weights decide between the tool's task and the elbow's.
+    limit is active, the weights decide between the tool's task and the elbow task.
 
     Attributes:
         angle: desired SEW angle :math:`\psi_h` [rad].
@@ -210,8 +210,7 @@ def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] 
 
     Returns:
         The motion as a unit vector (n_joints,), the rate at which it changes the quantity, and :math:`g^T J^+`, shape
-        (m,);
-        None when no such motion changes it.
+        (m,); None when no self-motion changes the quantity.
     """
     gram = jacobian.dot(jacobian.T)
     gram += _scaled_eye(len(gram), _DAMPING)

@@ -53,7 +53,7 @@ class Intrinsics:
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, vertical: float) -> Intrinsics:
-        """Return the camera with square pixels, the optical axis in the middle and a vertical field of view [rad]."""
+        """Return the camera with square pixels, a centred optical axis and the given vertical field of view [rad]."""
         height = whole_number(height, "height", at_least=1)
         angle = finite_number(vertical, "vertical field of view", "rad", above=0.0)
         if angle >= np.pi:

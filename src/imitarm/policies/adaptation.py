@@ -169,8 +169,8 @@ def adapt(
 
     The method ``certified`` moves the affected components by the smallest displacement that keeps the clearance on the
     whole path, or refuses and says why. The methods ``mapf`` and ``literal`` are the thesis's potential fields (see
-    ``potential_components``), which may fail. The path does not move at its start, at its goal and at the ``pinned``
-    times. Specify the tool by exactly one of ``tool_radius``, ``tool_spheres`` and ``arm``.
+    ``potential_components``), which may fail. The path keeps its position at its start, at its goal and at the
+    ``pinned`` times. Specify the tool by exactly one of ``tool_radius``, ``tool_spheres`` and ``arm``.
 
     The motion begins at time 0. At that time, the obstacles are at the poses given by the scene; from then on, they
     move with their velocities.
@@ -295,7 +295,8 @@ def _unit_rows(directions: ArrayLike) -> Array:
 def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
     """Return the detour that the method finds.
 
-    No search is made when no obstacle blocks the path or when an obstacle covers a fixed point.
+    No method searches when the path is already clear. When an obstacle covers a fixed point, only the methods that
+    never refuse (``refuses`` is False) search.
     """
     path, clearance, lowest = problem.path, problem.clearance, problem.nominal.lowest
     still = np.zeros((path.n_components, 3))

@@ -3,10 +3,10 @@
 The signed distance to a convex obstacle is a convex function, so its tangent plane at any point is a lower bound
 everywhere. The tangents at two samples therefore bound the distance on the whole segment between them: the polyline
 itself is certified, not a set of samples. Where that bound is too low, the distance is measured at further points of
-the segment, until either the bound reaches the required clearance or one of the points is closer than that.
+the segment, until either the bound reaches the required clearance or one of these points is too close.
 
-An obstacle that moves at a constant velocity ``v`` stands still in coordinates that move with it. Subtracting
-``t v`` from the path makes the same proof exact for it, as long as the path is executed on time.
+An obstacle that moves at a constant velocity ``v`` stands still in coordinates that move with it. If ``t v`` is
+subtracted from the path, the same proof is exact for a moving obstacle, as long as the path is executed on time.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class ClosePoints:
     Attributes:
         pair: index of the pair of a sphere and an obstacle, shape (m,).
         segment: index of the sample before the point, shape (m,).
-        fraction: position of the point between that sample (0) and the next (1), shape (m,).
+        fraction: position of the point between the sample before it (0) and the sample after it (1), shape (m,).
     """
 
     pair: Index
@@ -72,7 +72,7 @@ class ToolAmongObstacles:
         radii: radii of the spheres, shape (n_spheres,) [m].
         offsets: for each obstacle, an array of shape (n_spheres, n, 3) [m]. The array contains, for each sample, the
             vectors from the tip to the centres of the spheres, minus the obstacle's displacement since time 0, in the
-            base frame. None when all of them are zero.
+            base frame. The entry is None when all its vectors are zero.
         bows: largest distance of a centre from the straight line between two samples while the tool rotates, shape
             (n_spheres, n - 1) [m].
     """
@@ -259,9 +259,9 @@ class PathClearance:
 
         Near a corner of an obstacle, the bound from the tangents at the two ends of a segment is much too low. The
         distance is therefore measured at the point where the tangents cross. If the distance there is below the
-        clearance, the path really is too close to the obstacle. Otherwise the tangent at that point replaces the
-        tangent at the end from which the distance decreases towards the point. The minimum of the distance therefore
-        stays between two tangents that converge to it.
+        clearance, the path really is too close to the obstacle. Otherwise that point replaces one end of the segment:
+        the first end if the distance still decreases at the point, the last end if the distance increases. The minimum
+        of the distance therefore stays between two tangents that converge to it.
 
         Args:
             clearance: required clearance [m].
@@ -281,7 +281,7 @@ class PathClearance:
         return bounds, found
 
     def _closer_look(self, pair: int, j: Index, bounds: Array, clearance: float) -> tuple[Array, Array]:
-        """Return refined bounds (m,) of segments ``j`` (m,) of a pair, and where each is lowest (m,)."""
+        """Return refined bounds (m,) of segments ``j`` (m,) of a pair, and the fractions of their minima (m,)."""
         start = self.tool.centres(pair, self.positions[j], j)
         step = self.tool.centres(pair, self.positions[j + 1], j + 1) - start
         bow = self.tool.bows[pair % self.tool.n_spheres, j]

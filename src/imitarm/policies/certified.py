@@ -8,8 +8,8 @@ The algorithm of :func:`find_detour`:
    quadratic program computes the smallest amplitudes of the components that give this lift. The search follows the
    direction of least cost first, until nothing is violated. The cost is the displacement relative to the demonstrated
    variance, plus the remaining violation. The other directions are kept and tried later if this direction fails.
-2. **Least detour** (:mod:`~imitarm.policies.least_detour`): the smallest displacement on that side that keeps the
-   clearance.
+2. **Least detour** (:mod:`~imitarm.policies.least_detour`): the smallest displacement that keeps the clearance and
+   passes each obstacle on the chosen side.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
    samples.
 4. If the search over sides finds no path, a second search treats all samples together

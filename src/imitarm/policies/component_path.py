@@ -56,7 +56,7 @@ class ComponentPath:
         nominal: the path without obstacles, n samples.
         fixed_times: times at which the path must not move: start, pinned times, goal [s].
         responsibilities: h, shape (n, n_components).
-        basis: w h, shape (n, n_components); never negative.
+        basis: products w h of the window and the responsibilities, shape (n, n_components); never negative.
         means: centres of the components on the nominal path, shape (n_components, 3) [m].
         covariances: position covariances of the components, with the lower bound (5 mm)^2, (n_components, 3, 3) [m^2].
             The covariances also include the motion itself, so a component is long in the direction of the path.
@@ -117,7 +117,7 @@ class ComponentPath:
         """Return this decomposed path of ``skill``, moved to another start or goal.
 
         Args:
-            skill: the skill whose path this is.
+            skill: the skill from which this path was decomposed.
             start: start of the motion; None: the learned start.
             goal: end of the motion; None: the learned goal.
         """
@@ -262,7 +262,7 @@ def _sample_times(n_samples: int, fixed_times: tuple[float, ...]) -> Array:
 
 
 def _window(times: Array, fixed_times: Sequence[float], width: float) -> Array:
-    """Return w (n,): 0 at each fixed time, and 1 if every fixed time is at least ``width`` durations away."""
+    """Return the window w (n,): 0 at each fixed time, 1 where each fixed time is at least ``width`` durations away."""
     distance = np.min(np.abs(times[:, None] - np.asarray(fixed_times)[None, :]), axis=1)
     return quintic_step(distance / (width * (times[-1] - times[0])))
 

@@ -51,7 +51,7 @@ def least_norm(rows: Array, lower: Array, upper: Array) -> Array | None:
 
     Args:
         rows: coefficients of the inequalities, shape (m, n).
-        lower: lower bounds, shape (m,), or (n + m,) when the first n bound y itself.
+        lower: lower bounds, shape (m,), or (n + m,) when the first n entries bound y itself.
         upper: upper bounds, of the same shape as ``lower``.
 
     Returns:
@@ -235,7 +235,7 @@ class LeastDetour:
         self.movable = path.lever > (1e-3 if exact else NEGLIGIBLE_LEVER)
 
     def _beyond_limits(self, positions: Array) -> _Cuts:
-        """Return half-spaces that contain every path within the limits on displacement and steps, but not this path."""
+        """Return half-spaces that exclude ``positions`` and contain every path with allowed displacements and steps."""
         nominal, basis = self.path.nominal.positions, self.path.basis
         away, step = positions - nominal, np.diff(positions, axis=0)
         far, long = np.linalg.norm(away, axis=1), np.linalg.norm(step, axis=1)
@@ -308,7 +308,7 @@ class LeastDetour:
         return best
 
     def smoothed(self, detour: Detour) -> tuple[Detour, float]:
-        """Return a feasible detour near this one with a jerk within the limit, if there is one, and its jerk ratio."""
+        """Return the detour and its jerk ratio, after smoothing it as far as possible if its jerk exceeds the limit."""
         ratio = self.path.jerk_ratio(detour.clearance.positions)
         best, limit = detour, max(MAX_JERK_RATIO, 1.0)
         moved = np.flatnonzero(detour.displacement.any(axis=1)) if not self.exact else None

@@ -136,8 +136,8 @@ class ACFRA(Policy):
 
     The phase ``s`` therefore waits for a robot that lags, for example at its speed limits or when a hand holds it. If
     ``e_0`` is the required clearance, the straight line back to the path cuts a corner by at most half of the
-    clearance, because each point of the line is within ``e_0 / 2`` of the tool or of its target. The tool and its
-    target are both clear of obstacles.
+    clearance. Each point of this line is within ``e_0 / 2`` of the tool or of its target, which are both clear of
+    obstacles.
 
     Among moving obstacles the plan is valid only at the planned times, so the phase follows the clock and does not
     wait. When the tool is farther than ``e_0 / 2`` from its planned position, the plan is no longer valid: the arm

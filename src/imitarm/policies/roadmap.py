@@ -139,8 +139,8 @@ class Roadmap:
     def _edges_between_layers(self) -> tuple[Index, Array, Array]:
         """Return the key, the cost and the missing (unproven) clearance [m] of every existing edge, each (n_edges,).
 
-        The key of an edge from node ``i`` of layer ``l`` to node ``j`` of the next one is ``(l n + i) n + j`` with n
-        nodes in a layer; the keys are sorted.
+        The key of an edge from node ``i`` of layer ``l`` to node ``j`` of layer ``l + 1`` is ``(l n + i) n + j``, where
+        n is the number of nodes in a layer. The keys are sorted.
         """
         start, end = self.pairs_of_nodes
         n_layers, n = self.exists.shape
@@ -218,7 +218,7 @@ class Roadmap:
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether no route exists, or an edge of the cheapest one lacks so much clearance that the route is useless."""
+        """Whether no route exists, or the cheapest route lacks so much clearance at an edge that it is useless."""
         if not self._forward[0][-1, 0] < _BLOCKED:
             return True
         edges = self._edges_of(self._through(len(self.layers) - 1, 0))

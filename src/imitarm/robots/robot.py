@@ -157,7 +157,7 @@ class Robot(ABC):
         return float("nan")
 
     def nearest_pair(self) -> tuple[str, str] | None:
-        """Return the names of the nearest part of the arm and obstacle; None if there is none or it is unknown."""
+        """Return the names of the nearest arm part and obstacle; None if they are unknown or there is no obstacle."""
         return None
 
     def report(self) -> Mapping[str, Any]:

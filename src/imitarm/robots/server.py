@@ -64,10 +64,11 @@ class Supervisor:
     owner until the next stop. Any client may stop the robot.
 
     A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this arm,
-    and is within the joints' position and velocity limits. It must also be at most as far from the set-point as the
-    joints can move in 0.15 s at full speed.
+    and is within the joints' position and velocity limits. The command must also be at most as far from the set-point
+    as the joints can move in 0.15 s at full speed.
 
-    The set-point q moves towards the commanded position :math:`q_c`, which has the velocity :math:`\dot q_c`, at
+    Let :math:`q_c` be the commanded position and :math:`\dot q_c` its velocity. The set-point q moves towards
+    :math:`q_c` at the velocity
 
     .. math:: \dot q = f\,\dot q_c + \mathrm{sign}(e) \min(k |e|, \sqrt{a |e|}), \qquad
               e = q_c + \dot q_c\, s - q
@@ -279,10 +280,10 @@ class RobotServer:
         on_event: function called with a text when the robot is enabled, slows or stops.
         clock_ns: function that returns the time [ns].
         wait: function that waits until a datagram arrives, at most for the given number of seconds, and returns whether
-            one has arrived; with a simulated clock, this function advances the clock.
+            a datagram has arrived. With a simulated clock, this function advances the clock.
 
     Attributes:
-        address: host and port on which it listens.
+        address: host and port on which the server listens.
         supervisor: checks the commands and moves the robot.
         rate_limiter: timer that starts the control periods and counts the missed ones.
 

@@ -320,9 +320,9 @@ def add_drives(spec: mujoco.MjSpec, arm: ArmModel) -> None:
 class Drives:
     """One drive for each joint; every method makes one physics step.
 
-    ``M`` is the inertia matrix with the rotors, ``h`` the torques of gravity and Coriolis forces, and ``f`` the joints'
-    viscous and dry friction at ``v_d``. ``q_d``, ``v_d`` and ``a_d`` are position, velocity and acceleration of the
-    set-point. The rated torques are never exceeded.
+    The set-point has the position ``q_d``, the velocity ``v_d`` and the acceleration ``a_d``. In the equations, ``M``
+    is the inertia matrix with the rotors, ``h`` the torques of gravity and Coriolis forces, and ``f`` the torques of
+    the joints' viscous and dry friction at ``v_d``. The rated torques are never exceeded.
 
     Args:
         model: the compiled world, with the drives that :func:`add_drives` has added.

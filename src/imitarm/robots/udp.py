@@ -34,8 +34,8 @@ class Echo(NamedTuple):
         sent: time from sending to receiving [s]; if the server is on another machine, relative to the time of the
             fastest command.
         applied: time from receiving the command until the drives had a set-point computed from it [s].
-        applied_ns: time at which the drives had that set-point, on the clock of this process [ns]; if the server is on
-            another machine, the travel time of the fastest command is assumed to be 0.
+        applied_ns: time at which the drives had the set-point computed from the command, on the clock of this process
+            [ns]. If the server is on another machine, the travel time of the fastest command is assumed to be 0.
     """
 
     sequence: int
@@ -47,10 +47,10 @@ class Echo(NamedTuple):
 class UdpRobot(Robot):
     """The client of a :class:`~imitarm.robots.server.RobotServer`.
 
-    :meth:`move` limits a velocity as every robot does and sends the resulting set-point; the server checks it again.
-    The client sends commands only while the newest state from the server is at most 0.1 s old and says that the robot
-    follows this client. Otherwise the client sends no command and adopts the server's set-point. Therefore the arm
-    never jumps after a restart of the client or the server, or after an interrupted connection.
+    :meth:`move` limits a velocity as every robot does and sends the resulting set-point; the server checks the
+    set-point again. The client sends commands only while the newest state from the server is at most 0.1 s old and says
+    that the robot follows this client. Otherwise the client sends no command and adopts the server's set-point.
+    Therefore the arm never jumps after a restart of the client or the server, or after an interrupted connection.
 
     A stopped robot moves again only after :meth:`enable`, which requires a decision by a person.
 
@@ -169,7 +169,7 @@ class UdpRobot(Robot):
     # --- commands
 
     def move(self, velocity: ArrayLike, dt: float) -> ArmState:
-        """Send a command if the robot follows this client; otherwise only ask for its state.
+        """Send a command if the robot follows this client; otherwise only ask for the robot's state.
 
         Args:
             velocity: joint velocities at the end of ``dt``, shape (n_joints,) [rad/s].
@@ -230,7 +230,7 @@ class UdpRobot(Robot):
         return self.state()
 
     def request_enable(self) -> None:
-        """Ask the server to let the robot move again; ``ready`` is true once it does."""
+        """Ask the server to let the robot move again; ``ready`` becomes true when the robot may move."""
         self._command(CommandMode.ENABLE, challenge=self.reported.challenge)
 
     def enable(self, timeout: float = 1.0) -> None:
@@ -286,7 +286,7 @@ class UdpRobot(Robot):
         return sequence
 
     def listen(self) -> bool:
-        """Process the states that have arrived and return whether there was one."""
+        """Process the states that have arrived, and return whether any state has arrived."""
         came = False
         for data, _ in waiting(self._socket):
             now = self._clock_ns()

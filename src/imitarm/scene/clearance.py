@@ -137,9 +137,9 @@ class SelfClearance:
     64 nearest pairs). In addition, each of the ``n_rows`` nearest pairs of links within 15 cm has a row for its nearest
     pair of spheres.
 
-    These pairs are not checked: links that share a joint, links that can't touch within their joint limits
-        (:func:`meeting_links`), and spheres that are nearer than the clearance in the arm's home posture. The base is
-        included in the check. The object on which it stands is not part of the arm: add it to the scene.
+    Three kinds of pairs are not checked: links that share a joint, links that can't touch within their joint limits
+    (:func:`meeting_links`), and spheres that are nearer than the clearance in the arm's home posture. The base is
+    included in the check. The object on which the base stands is not part of the arm; add this object to the scene.
 
     Args:
         arm: the arm with its tool.

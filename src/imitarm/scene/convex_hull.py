@@ -25,7 +25,7 @@ _SAME_PLANE = 1e-12  # neighbouring triangles belong to one face when the cosine
 class Polytope:
     """Faces and edges of a hull in its local frame, so that they stay valid when the hull moves.
 
-    If ``n_i.x = b_i`` are the planes of its faces, the distance inside is ``sd = max_i (n_i.x - b_i)``. Outside, this
+    If ``n_i.x = b_i`` are the planes of the faces, the distance inside is ``sd = max_i (n_i.x - b_i)``. Outside, this
     maximum is a lower bound of the distance. The bound is exact if the foot point ``x - sd n_i`` is on the face;
     otherwise the nearest point is on an edge or at a corner, and the distance is the smallest distance to an edge.
 
@@ -161,7 +161,7 @@ class ConvexHull(Obstacle):
     """The smallest convex solid around ``points``; see :class:`Polytope` for its distance.
 
     Attributes:
-        points: at least 4 that are not all in one plane, in the base frame, shape (n, 3) [m].
+        points: at least 4 points that are not all in one plane, in the base frame, shape (n, 3) [m].
     """
 
     kind: ClassVar[str] = "convex_hull"

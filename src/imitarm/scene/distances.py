@@ -31,7 +31,7 @@ _OF_THE_POSE = frozenset(("positions", "_frames", "_ahead", "_shapes"))
 
 
 class _Members(NamedTuple):
-    """The obstacles of a pack that share one distance formula."""
+    """The obstacles of one ``PackedObstacles`` that share one distance formula."""
 
     formula: Formula
     places: slice  # in the order of ``PackedObstacles._sorted``
@@ -60,7 +60,7 @@ class PackedObstacles:
             radius, length of the axis; cone: radius, height; ellipsoid: semi-axes; convex hull: half extents;
             half-space: not used. Unused entries are 0.
         velocities: velocities of the local frame's origin, shape (n, 3) [m/s].
-        angular_velocities: angular velocities about that origin, in the base frame, shape (n, 3) [rad/s].
+        angular_velocities: angular velocities about the local frame's origin, in the base frame, shape (n, 3) [rad/s].
         covariances: covariances of the positions, shape (n, 3, 3) [m^2]; 0 when unknown.
         stamps: time at which each obstacle was seen, shape (n,) [s].
         track_ids: track number of each obstacle, shape (n,); -1 without a track.
@@ -133,7 +133,7 @@ class PackedObstacles:
         return moved
 
     def __getattr__(self, name: str) -> Array:
-        """Compute ``positions`` after :meth:`after` has moved the obstacles; no other attribute may be missing."""
+        """Compute ``positions`` at the first access after :meth:`after`; raise an error for any unknown attribute."""
         ahead: tuple[PackedObstacles, float] | None = self.__dict__.get("_ahead")
         if name != "positions" or ahead is None:
             raise AttributeError(f"PackedObstacles has no attribute {name!r}")

@@ -32,11 +32,11 @@ DEPTH = 1e3  # [m] a half-space is a box of this half height without ends: same 
 def slabs(
     q: Array, gradient: bool, half: Array, rounding: Array | None, turned: Array | None
 ) -> tuple[Array, Array | None]:
-    """Boxes, cylinders and half-spaces are boxes of half size ``half``, rounded by ``rounding``.
+    """Return distances to boxes, cylinders and half-spaces, all as rounded boxes of half size ``half``.
 
     With ``a = |q| - half`` the distance is ``|max(a, 0)| + min(max_j a_j, 0) - rounding``. A half-space is a box of
-    infinite size. A cylinder (``turned``) is a box in ``(rho, z)`` with ``rho^2 = x^2 + y^2``. If a scene also contains
-    such shapes, a sphere is computed as a rounded point and a capsule as a rounded segment.
+    infinite size. A cylinder (``turned``) is a box in ``(rho, z)`` with ``rho^2 = x^2 + y^2``. If a scene contains
+    boxes, cylinders or half-spaces, a sphere is also computed as a rounded point and a capsule as a rounded segment.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
@@ -102,7 +102,7 @@ class Box(PosedObstacle):
 
     Attributes:
         pose: obstacle_to_base, at the centre.
-        size: full edge lengths along its own x, y and z, shape (3,) [m].
+        size: full edge lengths along the box's own x, y and z, shape (3,) [m].
     """
 
     kind: ClassVar[str] = "box"
@@ -192,7 +192,7 @@ class HalfSpace(Obstacle):
 def cones(
     q: Array, gradient: bool, radius: Array, height: Array, slant: Array, side: Array
 ) -> tuple[Array, Array | None]:
-    """Cones, which are triangles in the half-plane ``(rho, z)``: base at ``-height/2``, tip at ``+height/2``.
+    """Return distances to cones: triangles in the half-plane ``(rho, z)``, base at ``-height/2``, tip at ``+height/2``.
 
     Outside, the distance is the smaller distance to two segments, the slant side and the base; inside, it is the larger
     signed distance to their lines.
@@ -243,7 +243,7 @@ CONES = Family(("cone",), cones, _prepare_cones)
 
 @dataclass(frozen=True, eq=False)
 class Cone(PosedObstacle):
-    """A circular cone with its tip up its own z.
+    """A circular cone whose tip points along its local z axis.
 
     In the half-plane ``(rho, z)`` the cone is a triangle. Outside, the distance is the smaller distance to two
     segments, the slant side and the base; inside, it is the larger signed distance to their lines.

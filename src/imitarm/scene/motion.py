@@ -32,7 +32,7 @@ _STEP = 1e-4  # [s] half of the interval over which velocities are differences
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A recorded motion, interpolated between its samples; before and after it, the obstacle is at rest.
+    """A recorded motion, interpolated between its samples; the obstacle rests before the first and after the last.
 
     Attributes:
         times: strictly increasing, shape (n,) [s].

@@ -182,10 +182,10 @@ class Obstacle(ABC):
 
     The gradient of this distance is a unit vector. Outside, the gradient points from the nearest surface point to
     ``x``; inside, it points from ``x`` to the nearest surface point; on the surface, it is the outward normal. Because
-    the solids are convex, ``sd`` is convex, and between two points it changes by at most their distance. The nearest
-    surface point may not be unique, for example at the centre of a sphere. The gradient then refers to one of the
-    nearest points, which is always the same for the same input. To keep a distance ``r`` from an obstacle, require
-    ``sd(x) >= r``: no inflated copy is needed.
+    the solids are convex, ``sd`` is convex. Between two points, ``sd`` changes by at most the distance between the
+    points. The nearest surface point may not be unique, for example at the centre of a sphere. The gradient then refers
+    to one of the nearest points, which is always the same for the same input. To keep a distance ``r`` from an
+    obstacle, require ``sd(x) >= r``: no inflated copy is needed.
 
     Attributes:
         velocity: velocity of the shape's centre, in the base frame, shape (3,) [m/s].
@@ -346,7 +346,7 @@ class Obstacle(ABC):
         return moved
 
     def placed(self, position: Array, quaternion: Array, velocity: Array, angular_velocity: Array) -> Self:
-        """Return a copy of the obstacle with another pose; the obstacle itself when the pose is the same.
+        """Return a copy of the obstacle with another pose, or the obstacle itself if the pose is the same.
 
         The arguments must be valid.
 

@@ -171,13 +171,13 @@ def _unit(vectors: Array) -> Array:
 
 
 def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor: Array) -> tuple[Array, Array | None]:
-    """Ellipsoids: the supporting plane at the nearest surface point, found by Newton's method.
+    """Return distances to ellipsoids; the nearest surface point and its tangent plane follow from Newton's method.
 
     The surface point nearest to ``y`` is ``e_j = g_j^2 y_j / (t + g_j^2)`` with semi-axes ``g``, where ``t`` is the
-    largest root of ``F(t) = sum_j (g_j y_j / (t + g_j^2))^2 - 1``. With ``s = t + min g^2`` the function
-    ``h(s) = 1 / sqrt(F + 1)`` is concave and increasing, so Newton's method on ``h = 1`` from the left never steps over
-    the root and needs no bracket. With the unit normal ``n`` at ``e`` the distance is ``n.y - sqrt(sum_j g_j^2
-    n_j^2)``. An error in ``n`` has only a quadratic effect on the distance and never makes it too large.
+    largest root of ``F(t) = sum_j (g_j y_j / (t + g_j^2))^2 - 1``. With ``s = t + min g^2`` the function ``h(s) = 1 /
+    sqrt(F + 1)`` is concave and increasing. Newton's method on ``h = 1`` from the left therefore never steps over the
+    root and needs no bracket. With the unit normal ``n`` at ``e`` the distance is ``n.y - sqrt(sum_j g_j^2 n_j^2)``. An
+    error in ``n`` has only a quadratic effect on the distance and never makes it too large.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].

@@ -28,8 +28,8 @@ class Scene:
     Attributes:
         goal: tool_to_base at the end of the motion; None: the learned goal of the skill.
         obstacles: any iterable of obstacles; stored as a tuple.
-        stamp: time for which the poses of the obstacles are valid [s]. For a scene from a sensor, this is the time
-            of the measurement; :meth:`at` predicts from it.
+        stamp: time for which the poses of the obstacles are valid [s]. For a scene from a sensor, this is the time of
+            the measurement, from which :meth:`at` predicts.
         fixtures: objects on which the arm stands or works, such as floor, pedestal and table. Fixtures are part of a
             simulated world and cause contacts. Planners keep no distance from fixtures, because a tool must reach its
             table.
@@ -58,7 +58,7 @@ class Scene:
         Args:
             seen: the scene from which the shapes, the goal and the fixtures are taken.
             packed: the obstacles of ``seen`` with other poses and velocities.
-            stamp: time for which they are valid [s].
+            stamp: time for which the poses of ``packed`` are valid [s].
         """
         scene = object.__new__(cls)
         scene.__dict__.update(goal=seen.goal, stamp=stamp, fixtures=seen.fixtures, packed=packed, _seen=seen)
@@ -102,7 +102,7 @@ class Scene:
         return packed.positions, packed.quaternions
 
     def __getattr__(self, name: str) -> Any:
-        """Build the obstacles of a predicted scene; no other attribute can be missing."""
+        """Build ``obstacles`` at the first access to a predicted scene; raise an error for any unknown attribute."""
         seen: Scene | None = self.__dict__.get("_seen")
         if name != "obstacles" or seen is None:
             raise AttributeError(f"Scene has no attribute {name!r}")

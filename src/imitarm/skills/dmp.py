@@ -110,8 +110,8 @@ class DMP:
     positions are not differentiated, samples may have any times, and the motion reaches the goal at the end of the
     duration.
 
-    **Another start or goal.** Let ``p`` be the fraction of the path that has been travelled, which is a primitive from
-    0 to 1 with weights w_p. The argument ``adjustment`` then selects the weights:
+    **Another start or goal.** Let ``p`` be the fraction of the path that has been travelled. This fraction is itself a
+    primitive from 0 to 1, with weights w_p. The argument ``adjustment`` then selects the weights:
 
     * ``"progress"``: w + (change of g - x_0) w_p. The change of start and goal is added in proportion to the travelled
       path. The motion therefore rests where the demonstration rests, does not reverse when the distance is halved, and
@@ -136,7 +136,7 @@ class DMP:
         start_: learned start x_0, shape (3,) [m].
         goal_: learned goal g, shape (3,) [m].
         start_velocity_: learned start velocity, shape (3,) [m/s].
-        duration_: learned [s].
+        duration_: learned duration [s].
         path_length_: path length of the learned motion [m].
         orientation_: primitive of the rotation; None when the demonstration had no quaternions.
 

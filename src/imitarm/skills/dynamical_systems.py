@@ -91,7 +91,7 @@ def basis_on_grid(n_basis: int, n_steps: int) -> tuple[Array, Array]:
 
 
 class Gains(NamedTuple):
-    """Stiffness and damping of ``tau^2 x'' = K (y - x) - D tau x'``. tau is the duration, so both have no unit.
+    """Stiffness and damping of ``tau^2 x'' = K (y - x) - D tau x'``. Because tau is the duration, K and D have no unit.
 
     Attributes:
         stiffness: K.
@@ -134,10 +134,10 @@ GAINS = {"critical": Gains(139.26, 2.0 * float(np.sqrt(139.26))), "thesis": Gain
 class Propagator(NamedTuple):
     """One step of the spring: ``z_next = transition @ z + drive @ [y_0; ...; y_2m]``, with z = [x; tau x'].
 
-    The step is divided into m equal parts, and the target ``y`` is given at the beginning, middle and end of each. The
-    integration over a part is exact if the target is a parabola within it, so the error falls with the fourth power of
-    the part's length. A part is at most 1/200 of the duration, and at most a fifth of the distance between two basis
-    functions.
+    The step is divided into m equal parts, and the target ``y`` is given at the beginning, middle and end of each part.
+    The integration over a part is exact if the target is a parabola within the part, so the error falls with the fourth
+    power of the part's length. A part is at most 1/200 of the duration, and at most a fifth of the distance between two
+    basis functions.
 
     Attributes:
         transition: transition matrix, shape (2, 2).
@@ -335,18 +335,18 @@ def fit_weights(
 ) -> FittedWeights:
     r"""Return the weights with which the primitive reproduces a path.
 
-    The motion is linear in ``d_i = w_i - (g - x_0)``. With the responses R of the spring to a start, a rate, a goal and
-    each basis function, ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression compares
-    forces (such as ``tau v' + D v``) and needs measured accelerations. Here the spring itself filters both sides, which
-    converts forces to positions. Therefore noise is not differentiated, the samples may have any times, and the
-    regression minimises the error of the reproduction in metres.
+    The motion is linear in ``d_i = w_i - (g - x_0)``. Let R be the responses of the spring to a start, a rate, a goal
+    and each basis function. Then ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression
+    compares forces (such as ``tau v' + D v``) and needs measured accelerations. Here the spring itself filters both
+    sides of the regression, which converts forces to positions. Therefore noise is not differentiated, the samples may
+    have any times, and the regression minimises the error of the reproduction in metres.
 
     The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. If noise
     moves one of these samples more than 0.1 mm away from the path that fits all samples, the end of this path is used
-    instead, because a motion forced through a noisy sample would jerk there. The argument ``exact_ends`` turns this
-    smoothing off. The last drive is 0, so that the target is the goal when the duration is over. (The regression hardly
-    determines the last drive; without this condition, it can pull the tool decimetres away from the goal after the
-    end.)
+    instead. A motion forced through a noisy sample would jerk there. The argument ``exact_ends`` turns this smoothing
+    off. The last drive is 0, so that the target is the goal when the duration is over. (The regression hardly
+    determines the last drive; without this condition, the last drive can pull the tool decimetres away from the goal
+    after the end.)
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).
@@ -398,7 +398,7 @@ def _beside(R: Array, y: Array, n_basis: int, regularisation: float) -> Array:
 
 
 def _ridge(R: Array, y: Array, force: Array, regularisation: float, end: Array | None = None) -> Array:
-    """Return the ridge regression of ``R d = y``, penalising ``force d``; with ``end``, ``R[-1] d = end`` exactly."""
+    """Return d from ridge regression of ``R d = y``, penalising ``force d``; ``end`` prescribes ``R[-1] d``."""
     n = R.shape[1]
     S = R / force
     kkt = np.zeros((n + 1, n + 1))
@@ -429,8 +429,8 @@ def _progress(rate: Array) -> tuple[Array, float]:
 def start_rate(fraction: Array, x: Array, part: float = _START) -> Array:
     """Return the velocity at the first sample, in m per duration, shape (3,).
 
-    The velocity is the slope of a parabola through the first samples. The returned velocity is 0 unless it exceeds
-    three standard errors and a tenth of the mean speed, so that a motion which begins at rest begins exactly at rest.
+    The velocity is the slope of a parabola through the first samples. A velocity below three standard errors, or below
+    a tenth of the mean speed, is replaced by 0. A motion that begins at rest therefore begins exactly at rest.
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).

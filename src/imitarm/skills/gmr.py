@@ -61,9 +61,9 @@ class GMR:
         \hat x(t) = \sum_k h_k m_k, \qquad
         \hat\Sigma(t) = \sum_k h_k \left( S_k + (m_k - \hat x)(m_k - \hat x)^T \right)
 
-    When the demonstrations have quaternions, x has six columns: the position [m] and a rotation vector [rad]
-        relative to a reference rotation (:class:`~imitarm.skills.rotations.RotationReference`). The reference follows
-        the motion if the tool rotates far.
+    If the demonstrations have quaternions, x has six columns: the position [m] and a rotation vector [rad] relative to
+    a reference rotation (:class:`~imitarm.skills.rotations.RotationReference`). The reference follows the motion if the
+    tool rotates far.
 
     Times are counted from the first sample. Outside the demonstrated time span, the regression returns its value at the
     nearest end of the span, because extrapolated linear pieces would drift away.
@@ -136,8 +136,8 @@ class GMR:
     def fit(self, demonstrations: Sequence[Demonstration | Trajectory]) -> Self:
         """Learn from demonstrations that were aligned before (``imitarm.demonstrations.align``).
 
-        Times may start anywhere: the first time of each demonstration is subtracted. Durations that differ by more
-            than 1 % are scaled to their median, and the method issues an :class:`UnalignedWarning`.
+        Times may start anywhere, because the first time of each demonstration is subtracted. Durations that differ by
+        more than 1 % are scaled to their median, and the method issues an :class:`UnalignedWarning`.
 
         Raises:
             InputError: when there is no demonstration, only some have quaternions, or there are fewer samples than

@@ -205,16 +205,16 @@ def expectation_maximisation(
 def responsibilities_by_segments(features: Array, column: Array, numbers: Sequence[int]) -> list[Array]:
     """Divide time into the K segments that are described best by one Gaussian each, for several K at once.
 
-    The range of ``column`` is divided into equal slots. A segment with n of the N samples and covariance Sigma
-    costs ``n (log det Sigma / 2 - log(n / N))``, the negative log-likelihood under a separate Gaussian, plus a small
-    amount for its squared length. This amount makes the lengths equal where the data allow it. Dynamic programming over
-    the slots finds the cheapest division for every K up to the largest. The result is deterministic, and EM converges
-    in fewer iterations from it than from equal bins.
+    The range of ``column`` is divided into equal slots. The cost of a segment with n of the N samples and covariance
+    Sigma is ``n (log det Sigma / 2 - log(n / N))``, its negative log-likelihood under a separate Gaussian. A small cost
+    for the squared length of each segment is added, which makes the lengths equal where the data allow it. Dynamic
+    programming over the slots finds the cheapest division for every K up to the largest. The result is deterministic.
+    When EM starts from this result, it converges in fewer iterations than from equal bins.
 
     Args:
         features: :func:`quadratic_features` of the standardised samples, shape (F, n).
         column: times of the samples, shape (n,).
-        numbers: numbers K of segments to compute.
+        numbers: all numbers K of segments for which to divide the time.
 
     Returns:
         Responsibilities of 0 or 1, shape (K, n), in the order of time, for each K. If there are few samples or gaps in
@@ -308,8 +308,8 @@ def choose(candidates: Sequence[Candidate]) -> int:
       differences between demonstrations. The held-out error alone hardly shows a bias, because the squared bias is
       added to much larger squared differences.
 
-    If no K meets both conditions, only the K that meet the first condition are compared. The result is the smallest of
-    them whose bias is at most 10 % above the smallest bias among them. BIC alone selects ever larger K for time series,
+    If no K meets both conditions, only the K that meet the first condition are compared. Among these K, the result is
+    the smallest K whose bias exceeds the lowest bias by at most 10 %. BIC alone selects ever larger K for time series,
     because neighbouring samples are not independent. BIC decides only if there is a single demonstration, because a
     held-out error needs at least two demonstrations.
     """

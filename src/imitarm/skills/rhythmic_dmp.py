@@ -62,11 +62,11 @@ class RhythmicDMP:
         f(\phi) = \frac{\sum_i w_i \psi_i(\phi)}{\sum_i \psi_i(\phi)}, \quad
         \psi_i(\phi) = \exp(h (\cos(\phi - c_i) - 1))
 
-    Here, tau is the period, g the centre of the motion and r its amplitude. This is the rhythmic form of Ijspeert et
-    al. (2013). The weights come from ridge regression on the positions. The periodic response to each basis function is
-    known exactly, because the spring multiplies the Fourier coefficient at the k-th harmonic by ``K / (K - (2 pi k)^2 +
-    2 pi k D i)``. Rotations are represented by rotation vectors relative to their mean rotation. All rotations must
-    stay within 120 degrees of the mean.
+    Here, tau is the period, g the centre of the motion and r its amplitude. These equations are the rhythmic form of
+    Ijspeert et al. (2013). The weights come from ridge regression on the positions. The periodic response to each basis
+    function is known exactly, because the spring multiplies the Fourier coefficient at the k-th harmonic by ``K / (K -
+    (2 pi k)^2 + 2 pi k D i)``, where i is the imaginary unit. Rotations are represented by rotation vectors relative to
+    their mean rotation. All rotations must stay within 120 degrees of the mean.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
@@ -135,9 +135,8 @@ class RhythmicDMP:
         extent = float(np.linalg.norm(np.ptp(trajectory.positions, axis=0)))
         if gap > _CLOSES * extent:
             raise InputError(
-                f"RhythmicDMP.fit: after a period of {P:g} s the motion is up to {1e3 * gap:.0f} mm from its position "
-                f"one period before (its extent is {1e3 * extent:.0f} mm); give the right period, or record whole "
-                "periods"
+                f"RhythmicDMP.fit: positions one period of {P:g} s apart differ by up to {1e3 * gap:.0f} mm (the "
+                f"motion's extent is {1e3 * extent:.0f} mm); give the right period, or record whole periods"
             )
         columns = trajectory.positions
         self.reference_ = None

@@ -139,9 +139,9 @@ class RotationReference:
 
 
 def left_jacobian(vectors: Array) -> Array:
-    """Return ``J`` (n, 3, 3) with ``exp(r + d) = exp(J d) exp(r)`` to first order, for rotation vectors (n, 3) [rad].
+    """Return ``J`` (n, 3, 3) of rotation vectors r (n, 3) [rad]: ``exp(r + d) = exp(J d) exp(r)`` to first order in d.
 
-    ``J Sigma J^T`` is then the covariance of small rotations in the base frame.
+    If ``Sigma`` is the covariance of r, then ``J Sigma J^T`` is the covariance of the small rotation in the base frame.
     """
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     small = angle < 1e-4

@@ -5,9 +5,9 @@ The same descent is used for two potentials. Let ``d`` be the distance from an o
 
 * ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The last term does not depend on the
   position, so it drops out of the force, and the spread has no effect.
-* ``mapf``: a dimensionless form with the effect that the thesis describes in words,
-  ``U = 1/2 eta s d_th^2 (1/rho - 1)^2`` with ``rho = d / d_th`` and a gain ``s = exp((sigma(n)^2 - mean) / max)``. The
-  gain moves components with a large spread more.
+* ``mapf``: a dimensionless potential with the effect that the thesis describes in words, ``U = 1/2 eta s d_th^2 (1/rho
+  - 1)^2`` with ``rho = d / d_th``. The gain ``s = exp((sigma(n)^2 - median) / max)`` pushes components with a large
+  spread farther than components with a small spread. Here, ``median`` and ``max`` are those of ``sigma(n)^2``.
 
 Neither potential checks whether the path *between* two pushed means is clear. Two components on opposite sides of an
 obstacle are pushed apart, so the path between them passes through the obstacle. Both potentials are kept for
@@ -67,12 +67,13 @@ def literal_force(distance: Array, normal: Array, spread: Array) -> Array:
 
 
 def modified_force(distance: Array, normal: Array, spread: Array) -> Array:
-    """Return ``s d_th (1/rho - 1) / rho^2 n``: minus the gradient of the modified potential (docs/avoidance.md, 9).
+    """Return the force ``s d_th (1/rho - 1) / rho^2 n`` of the modified potential (docs/avoidance.md, 10).
 
     Args:
         distance: distance from the ellipse to the obstacle, (n_obstacles, n_components) [m].
         normal: outward normals, (n_obstacles, n_components, 3).
-        spread: sigma(n), (n_obstacles, n_components) [m]; the gain uses the mean and the maximum of these spreads.
+        spread: sigma(n), (n_obstacles, n_components) [m]; the gain uses the median and the maximum of the squared
+            spreads.
     """
     variance = spread**2
     gain = np.clip(np.exp((variance - np.median(variance)) / variance.max()), *_GAIN_RANGE)
