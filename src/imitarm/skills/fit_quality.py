@@ -99,8 +99,9 @@ class FitQuality:
                 )
         if self.rotation_bias > max(LARGEST_BIAS * self.rotation_extent, _NO_BIAS[1]):
             texts.append(
-                f"the rotation is {np.rad2deg(self.rotation_bias):.1f} degrees (root mean square) from the average of the "
-                f"demonstrations, {self._percent(self.rotation_bias, self.rotation_extent)} of the rotation's extent"
+                f"the rotation is {np.rad2deg(self.rotation_bias):.1f} degrees (root mean square) from the average of "
+                f"the demonstrations, {self._percent(self.rotation_bias, self.rotation_extent)} of the rotation's "
+                "extent"
             )
         if not texts:
             return ""
