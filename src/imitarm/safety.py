@@ -51,7 +51,7 @@ class SafetyFilter:
 
     * always stays inside the position, velocity and acceleration limits of the joints;
     * lets no part of the arm approach an obstacle faster than :class:`~imitarm.scene.clearance.ClearanceLimit` allows,
-      and no link approach another link faster than :class:`~imitarm.scene.clearance.SelfClearance` allows.
+      and lets no link approach another link faster than :class:`~imitarm.scene.clearance.SelfClearance` allows.
 
     If these clearance inequalities contradict the joint limits, no safe motion exists. The velocity then violates the
     inequalities as little as possible, which moves the arm away from objects that are too close, and ``safe`` is False.

@@ -183,7 +183,7 @@ def finite_numbers(value: Any, what: str, unit: str = "") -> Array:
     """Return one finite number or a sequence of them as an array of shape (n,), float64.
 
     Raises:
-        InputError: when the value is neither.
+        InputError: when the value is neither one finite number nor a sequence of finite numbers.
     """
     array = finite_array(value, (...,), what, unit)
     if array.ndim > 1:

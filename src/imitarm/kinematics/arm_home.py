@@ -89,11 +89,11 @@ class _HomeSearch:
     def bend(self, q: Array) -> float:
         """Return a measure of the distance of a posture from a singularity [m/rad]; 0 at a singularity.
 
-        The measure is the smaller of two values: the smallest singular value of the flange's Jacobian, with rotations
-        weighted by 0.3 m, and the smallest singular value of its linear part. The linear part counts separately because
-        an arm with few joints may be unable to move in a direction although it can still rotate. Singular values that
-        are 0 in every posture are ignored, because an arm with three joints can never move its flange in all
-        directions.
+        The measure is the smaller of two values. The first value is the smallest singular value of the flange's
+        Jacobian, with rotations weighted by 0.3 m. The second value is the smallest singular value of the Jacobian's
+        linear part. The linear part counts separately because an arm with few joints may be unable to move in a
+        direction although it can still rotate. Singular values that are 0 in every posture are ignored, because an arm
+        with three joints can never move its flange in all directions.
         """
         return min(float(values[rank - 1]) for values, rank in zip(self._singular_values(q), self._ranks, strict=True))
 

@@ -158,7 +158,7 @@ def _is_hand_name(joint: str, link: str) -> bool:
 
 
 def _is_short_slide(name: str, body: mujoco.MjsBody) -> bool:
-    """Return whether a joint is a slide at the end of a chain of four or more hinges, with a jaw's stroke."""
+    """Return whether a joint is a slide with the stroke of a jaw, at the end of a chain of four or more hinges."""
     joint = next(joint for joint in body.joints if joint.name == name)
     stroke = float(joint.range[1] - joint.range[0])
     if int(joint.type) != SLIDE or not 0.0 < stroke <= _JAW_STROKE or len(_joints_below(body)) > 1:
@@ -167,7 +167,7 @@ def _is_short_slide(name: str, body: mujoco.MjsBody) -> bool:
 
 
 def _parallel_mimics(spec: mujoco.MjSpec, owners: Mapping[str, mujoco.MjsBody]) -> set[str]:
-    """Return each group of coupled joints in which at least two joints are parallel branches, like fingers."""
+    """Return each group of coupled joints in which at least two joints are on parallel branches, like fingers."""
     groups: list[set[str]] = []
     for follower, leader in mimics(spec):
         touched = [group for group in groups if group & {follower, leader}]

@@ -145,7 +145,7 @@ class ArmMemory:
 
 
 class ArmKinematics:
-    """How the joints of an arm move its flange, its tool and its links; the base of :class:`~imitarm.ArmModel`."""
+    """How the joints of an arm move its flange, its tool and its links; base class of :class:`~imitarm.ArmModel`."""
 
     name: str
     joint_names: tuple[str, ...]
@@ -378,7 +378,7 @@ def _error(arm: ArmModel, q: Array, pose: Pose, frame: str) -> Array:
 
 
 def _descend(arm: ArmModel, start: Array, pose: Pose, frame: str) -> tuple[Array, float]:
-    """Return the final posture and its weighted error [m]."""
+    """Search from ``start``, and return the best posture and its weighted error [m]."""
     weights = np.array([1.0, 1.0, 1.0, ROTATION_LENGTH, ROTATION_LENGTH, ROTATION_LENGTH])
     q, best, least, since = start, start, math.inf, 0
     for _ in range(_STEPS):
@@ -395,7 +395,7 @@ def _descend(arm: ArmModel, start: Array, pose: Pose, frame: str) -> tuple[Array
 
 
 def _step(arm: ArmModel, q: Array, jacobian: Array, error: Array, reference: Array) -> Array:
-    """Return one step; a joint at a limit does not move beyond it."""
+    """Return one step of the search; a joint at a limit does not move beyond the limit."""
     free = np.ones(len(q), dtype=bool)
     step = np.zeros(len(q))
     damping = 1e-3 * float(error @ error) + 1e-12

@@ -1,7 +1,7 @@
 """Inverse kinematics with damping: damped least squares, and the filtered singular value decomposition.
 
-:class:`~imitarm.kinematics.ik.IKSolver` explains these methods. Both methods accept one task for the tool, and as
-limits only bounds on each joint velocity (boxes).
+:class:`~imitarm.kinematics.ik.IKSolver` explains these methods. Damped least squares and the filtered decomposition
+accept one task for the tool, and no limits except bounds on each joint velocity (boxes).
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class IKSolver:
     .. math:: \sum_i \tfrac12 |J_i v - t_i|^2 + \tfrac{\mu}2 |v|^2 + \tfrac{w_a}2 |v - v_p|^2
               + \sum_j \tfrac{c_j}2 \max(0, b_j - A_j v)^2 / |A_j|^2
 
-    Each task has a Jacobian :math:`J_i` and a target :math:`t_i`, :math:`v_p` is the previous velocity, and the rows
+    Here, each task has a Jacobian :math:`J_i` and a target :math:`t_i`. The previous velocity is :math:`v_p`. The rows
     :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite price are hard
     constraints, which are kept whenever the boxes allow it. If the boxes do not allow it, the sum of the squared
     violations, in rad/s along each row, is minimised first, and the tasks have second priority. The other methods

@@ -96,8 +96,8 @@ def quaternion_to_matrix(q: ArrayLike) -> Array:
 def matrix_to_quaternion(matrix: ArrayLike) -> Array:
     """Return unit quaternions wxyz (..., 4), w >= 0, of rotation matrices (..., 3, 3).
 
-    The function uses the largest column of the 4x4 matrix ``4 q q^T``, so it is well conditioned at every angle (the
-    usual trace formula loses all digits near 180 degrees).
+    The function uses the largest column of the 4x4 matrix ``4 q q^T`` and is therefore well conditioned at every angle.
+    The usual trace formula loses all digits near 180 degrees.
     """
     m = np.asarray(matrix, dtype=float)
     if m.ndim == 2:

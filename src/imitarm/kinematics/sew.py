@@ -4,8 +4,8 @@ The elbow of an arm with seven joints can move while the hand is at rest. One an
 for a person and for a robot. This angle is measured from a reference direction, and for every choice of that direction
 there are wrist positions at which the angle is undefined (Elias and Wen 2024). The ``"conventional"`` angle, measured
 from a fixed vector v, is undefined when the wrist is on the line through the shoulder along v. The ``"stereographic"``
-angle is undefined only when the wrist is on one half of such a line. This half-line can be placed where the wrist never
-is; in this module it points backwards, behind the base.
+angle is undefined only when the wrist is on one half of a line through the shoulder. This half-line can be placed where
+the wrist never is; in this module it points backwards, behind the base.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class SphereCover:
 
         Args:
             model: model with all shapes.
-            working: model with the same bodies, whose data are passed to the methods.
+            working: model with the same bodies; the methods take the data of this model.
             names: names of the joints to which the columns of the Jacobians belong.
         """
         joints = np.array([model.joint(name).id for name in names])

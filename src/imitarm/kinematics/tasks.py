@@ -52,10 +52,9 @@ class TwistTask(NamedTuple):
     Attributes:
         twist: desired velocity in the base frame, linear rows first, shape (6,) [m/s, rad/s].
         frame: the frame that moves, ``"tool"`` or ``"flange"``.
-        rotation_length: displacement with the same weight as a rotation of 1 rad, used when the joints can't
-            achieve the whole twist [m].
-            With a smaller value, the rotation error becomes larger and the position error smaller. Three numbers
-            apply to rotations about the base's x, y and z axes.
+        rotation_length: displacement with the same weight as a rotation of 1 rad, used when the joints can't achieve
+            the whole twist [m]. With a smaller length, the rotation error becomes larger and the position error
+            smaller. Three numbers apply to rotations about the base's x, y and z axes.
         max_speed: largest weighted norm of the twist [m/s]; None: the default of the solver's method.
     """
 
@@ -108,7 +107,7 @@ class PostureTask(NamedTuple):
     """Drift towards a posture with the joint motion that the other tasks leave free: :math:`v = k (q_{ref} - q)`.
 
     Attributes:
-        q: joint positions of that posture, shape (n_joints,) [rad].
+        q: joint positions of the posture, shape (n_joints,) [rad].
         gain: k [1/s].
         weight: weight of this task [m^2]; the weight of a twist is 1.
     """
@@ -234,7 +233,7 @@ def _root(weight: float, task: str) -> float:
 def _scales(
     rotation_length: float | tuple[float, float, float], frame: str, arm: ArmModel, scaled: bool
 ) -> tuple[Array, Array, float, int]:
-    """Return the weights of a twist (6,), the factors for its Jacobian (6, n_joints) and the effort, and the site."""
+    """Return the weights of a twist (6,), the factors for its Jacobian (6, n_joints), the effort and the site."""
     try:
         lengths = np.broadcast_to(np.asarray(rotation_length, dtype=float), 3)
         usable = bool(np.isfinite(lengths).all() and lengths.min() > 0.0)

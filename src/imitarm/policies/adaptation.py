@@ -50,7 +50,7 @@ ADAPTERS: Registry[PathAdapter] = Registry(
 
 
 def adapter_named(method: str) -> PathAdapter:
-    """Return the method of that name in ``ADAPTERS``; for the default, no search of installed packages is needed.
+    """Return the method ``name`` from ``ADAPTERS``, without a search of installed packages for the default method.
 
     Raises:
         UnknownNameError: when no method has that name.

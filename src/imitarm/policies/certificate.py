@@ -131,7 +131,7 @@ class ToolAmongObstacles:
         return len(self.radii) * len(self.obstacles)
 
     def centres(self, pair: int, positions: Array, samples: Index | slice = slice(None)) -> Array:
-        """Return the centre of a pair's sphere, relative to the position of its obstacle at that time.
+        """Return the centres of a pair's sphere, relative to the obstacle's position at the same time.
 
         Args:
             pair: index of the pair.
@@ -160,12 +160,12 @@ class ToolAmongObstacles:
     def exits(self, pair: int, points: Array, directions: Array, target: float, tolerance: float) -> Array:
         """Return how far points must move along directions to leave the inflated obstacle.
 
-        Newton's method starts from outside. Because the signed distance along a ray is convex, the computed distance
-        decreases to the largest root without passing it.
+        Newton's method starts from outside. Because the signed distance along a ray is convex, the computed
+        displacement decreases to the largest root and never passes this root.
 
         Args:
             pair: index of the pair.
-            points: centres of its sphere, shape (p, 3) [m].
+            points: centres of the pair's sphere, shape (p, 3) [m].
             directions: unit rows, shape (m, 3).
             target: distance to reach [m].
             tolerance: largest accepted excess of the distance over ``target`` [m].
@@ -232,11 +232,11 @@ class PathClearance:
     def segment_bounds(self) -> Array:
         """Bound the distance from below on each segment of the path.
 
-        For a convex function ``f`` on a segment of length L, with slope a at its start and b at its end,
-        ``f(s) >= max(f0 + a s, f1 - b (L - s))``. The minimum of the right side over s is at an end of the segment or
-        at the crossing of the two lines. The tip moves straight between two samples. The centre of a sphere beside the
-        tip leaves the straight line by at most ``|offset| (1 - cos(angle / 2))`` while the tool rotates by ``angle``;
-        the bound is lower by this amount.
+        Let ``f`` be a convex function on a segment of length L, with slope a at the start and b at the end. Then ``f(s)
+        >= max(f0 + a s, f1 - b (L - s))``. The minimum of this bound over s is at an end of the segment or at the
+        crossing of the two lines. The tip moves straight between two samples. While the tool rotates by ``angle``, the
+        centre of a sphere beside the tip leaves the straight line by at most ``|offset| (1 - cos(angle / 2))``. The
+        bound is lowered by this amount.
 
         Returns:
             Shape (n_pairs, n - 1) [m].
@@ -259,9 +259,9 @@ class PathClearance:
 
         Near a corner of an obstacle, the bound from the tangents at the two ends of a segment is much too low. The
         distance is therefore measured at the point where the tangents cross. If the distance there is below the
-        clearance, the path really is too close to the obstacle. Otherwise that point replaces one end of the segment:
-        the first end if the distance still decreases at the point, the last end if the distance increases. The minimum
-        of the distance therefore stays between two tangents that converge to it.
+        clearance, the path really is too close to the obstacle. Otherwise the crossing point replaces one end of the
+        segment: the first end if the distance still decreases at the point, the last end if the distance increases. The
+        minimum of the distance therefore stays between two tangents that converge to it.
 
         Args:
             clearance: required clearance [m].

@@ -261,7 +261,7 @@ class _SideSearch:
         return _STYLE_COST * style + _THINNED * _VIOLATION_COST * violation.sum(axis=0), violation
 
     def _violations_near(self, sampled: Array, here: PathClearance) -> Array:
-        """Return the violation of each pair, summed over the samples (c, m, 3) of displaced paths, (n_pairs, c) [m].
+        """Return the violation of each pair on each displaced path ``sampled`` (c, m, 3), as sums (n_pairs, c) [m].
 
         A distance changes by at most the displacement of the sample, so only samples near an obstacle can violate its
         clearance.
@@ -309,10 +309,10 @@ class _SideSearch:
         return np.flatnonzero((near | in_charge) & (self.path.basis[rows].max(axis=0) > NEGLIGIBLE_LEVER))
 
     def _amplitudes(self, lever: Array, lift: Array, u: Array, affected: Index) -> Array | None:
-        """Return amplitudes a >= 0 with the smallest ``sum a_k^2 / (u^T Y_k u)`` and ``lever @ a >= lift``, or None.
+        """Return amplitudes a >= 0 of least ``sum a_k^2 / (u^T Y_k u)`` with ``lever @ a >= lift``; None if impossible.
 
         Args:
-            lever: basis of the violated samples and affected components, shape (p, k).
+            lever: influence of each affected component on each violated sample, shape (p, k).
             lift: required displacement of each sample, shape (p,) [m].
             u: unit direction (3,).
             affected: indices of the components, shape (k,).

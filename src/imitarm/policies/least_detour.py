@@ -100,7 +100,7 @@ class AllowedDirections:
         return self.axes.shape[1]
 
     def enforced(self, reduced: Array) -> Array:
-        """Return displacements (..., 3) for coordinates (..., d).
+        """Return the displacements (..., 3) with the coordinates (..., d) in the basis ``axes``.
 
         Rounding errors may leave a small part in forbidden directions.
         """

@@ -92,7 +92,7 @@ class Roadmap:
         return np.array(sorted(j for j in chosen if 0 <= j < n), dtype=np.intp)
 
     def _radii(self, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return radii (n_layers, n_rays, n_slots) [m] of nodes, and which of them exist."""
+        """Return the radii (n_layers, n_rays, n_slots) [m] of the nodes, and whether each node exists."""
         centre = self.path.nominal.positions[self.layers]
         shape = (len(centre), len(rays))
         candidates = [np.full(shape, radius) for radius in _RADII]
@@ -179,7 +179,7 @@ class Roadmap:
         return edges.take(slow), cost, violation
 
     def _sweep(self, *, forward: bool) -> tuple[Array, Index]:
-        """Return the lowest cost from the start to each node (or from each node to the goal), and the adjacent node."""
+        """Return the lowest cost from start to each node (or from each node to goal), and the adjacent node."""
         precisions = np.linalg.inv(self.path.tolerance[self.layers] + 0.005**2 * np.eye(3))
         style = np.einsum("lkd,lkd->lk", self.nodes @ precisions, self.nodes) * (
             self.path.n_components / len(self.layers)

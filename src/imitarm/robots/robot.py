@@ -22,7 +22,7 @@ _CHANGED = 1e-9  # relative change of a velocity above which a limit counts as h
 def limit_velocity(
     limits: JointLimits, q: ArrayLike, previous: ArrayLike, velocity: ArrayLike, dt: float
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return the velocity nearest to the requested one that the joints can reach and can still brake from in time.
+    """Return the reachable velocity, nearest to the requested one, from which the joints can still brake in time.
 
     First, all joints are slowed by one factor until none exceeds its maximum velocity, so that the tool keeps its
     direction. Then each joint is clipped to the box of :class:`~imitarm.kinematics.limits.JointLimits`, evaluated at

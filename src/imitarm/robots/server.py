@@ -92,7 +92,8 @@ class Supervisor:
         reason: why the robot is stopped or faulty.
         challenge: number that ENABLE must currently contain; 0 if the robot is not stopped.
         datagram_filter: checks the owner's commands.
-        dropped: number of commands without effect for each reason, in addition to those that the filter dropped.
+        dropped: number of commands that the supervisor ignored, for each reason; commands that the filter dropped are
+            not counted.
     """
 
     def __init__(self, robot: Robot, dt: float, *, on_event: Callable[[str], None] | None = None) -> None:

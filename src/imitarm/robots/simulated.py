@@ -199,8 +199,8 @@ class SimulatedRobot(Robot):
         """Return the smallest distance from the arm or its tool to an obstacle [m].
 
         The distance is measured between the simulator's geoms. The distance is negative when geoms overlap, and inf
-        without obstacles. While two links of the arm touch each other, the result is at most minus the depth of their
-        contact.
+        without obstacles. While two links of the arm touch each other, the result is negative; its magnitude is at
+        least the depth of their contact.
         """
         return self._gauge.measure(self.data)[0]
 

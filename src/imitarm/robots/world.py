@@ -139,7 +139,7 @@ def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
 
 
 class ClearanceGauge:
-    """Smallest distance from an arm to obstacles, and pairs in contact, from the simulator's geoms.
+    """Measures the smallest distance from an arm to obstacles and finds contacts, using the simulator's geoms.
 
     Bounding spheres are evaluated first: the distance between centres minus both radii is a lower bound of a pair's
     distance. Pairs are then measured by ``mj_geomDistance`` in the order of their bounds, until the next bound exceeds

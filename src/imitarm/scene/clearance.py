@@ -37,9 +37,10 @@ _UNMOVED = 1e-6  # [m/rad] a joint that changes a distance by less does not chan
 class ClearanceLimit:
     r"""Inequalities on the joint velocity that keep a clearance between every link (and the tool) and every obstacle.
 
-    Spheres cover the arm and its tool (``ArmModel.collision_spheres``). For the sphere with centre ``c`` and radius
-    ``r`` near an obstacle with signed distance ``sd`` and outward normal ``n``, the remaining distance is ``h = sd(c) -
-    r - clearance``. Let ``v_o`` be the velocity of the obstacle's nearest point. The row for this sphere is
+    Spheres cover the arm and its tool (``ArmModel.collision_spheres``). Let ``c`` and ``r`` be the centre and the
+    radius of a sphere near an obstacle with the signed distance ``sd`` and the outward normal ``n``. The remaining
+    distance is ``h = sd(c) - r - clearance``. Let ``v_o`` be the velocity of the obstacle's nearest point. The row for
+    this sphere is
 
     .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - \xi h
 

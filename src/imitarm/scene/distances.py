@@ -100,7 +100,7 @@ class PackedObstacles:
         return len(self.kinds)
 
     def after(self, dt: float) -> PackedObstacles:
-        """Return the obstacles ``dt`` seconds later, each moved with its velocity and angular velocity [s]."""
+        """Return the obstacles ``dt`` seconds later, each moved with its velocity and angular velocity."""
         if self.still or dt == 0.0:
             return self
         if self.rotating:
@@ -113,7 +113,7 @@ class PackedObstacles:
     ) -> PackedObstacles:
         """Return the same shapes with other poses, seen at ``stamp`` [s].
 
-        The other arguments are the attributes of these names.
+        The other arguments have the names and meanings of the attributes.
         """
         moved = self._copy(
             positions=positions,

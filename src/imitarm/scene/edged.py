@@ -36,7 +36,7 @@ def slabs(
 
     With ``a = |q| - half`` the distance is ``|max(a, 0)| + min(max_j a_j, 0) - rounding``. A half-space is a box of
     infinite size. A cylinder (``turned``) is a box in ``(rho, z)`` with ``rho^2 = x^2 + y^2``. If a scene contains
-    boxes, cylinders or half-spaces, a sphere is also computed as a rounded point and a capsule as a rounded segment.
+    boxes, cylinders or half-spaces, its spheres are computed as rounded points and its capsules as rounded segments.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
@@ -137,7 +137,7 @@ class Cylinder(PosedObstacle):
 
 
 def _rim(v: Array, radius: float) -> Array:
-    """Return the points x y (2, n) of a circle in the directions ``v`` (3, n); the point on x if ``v`` is along z."""
+    """Return the points (x, y) (2, n) of a circle in directions ``v`` (3, n); the point on x where ``v`` is along z."""
     rho = np.hypot(v[0], v[1])
     on_axis = rho < TINY
     rim = radius * v[:2] / np.where(on_axis, 1.0, rho)

@@ -186,7 +186,7 @@ def propagator(gains: Gains, step: float, n_basis: int = 0) -> Propagator:
 
 
 def targets_by_step(step: Propagator, target: Array) -> Array:
-    """Return the targets at the instants of each step, shape (2 m + 1, n, C), of ``target`` (2 n m + 1, C)."""
+    """Return ``target`` (2 n m + 1, C) in groups, one for the instants of each step, shape (2 m + 1, n, C)."""
     stride = len(step.instants) - 1
     last = len(target) - stride
     return np.stack([target[i : last + i : stride] for i in range(stride + 1)])
@@ -264,9 +264,8 @@ class MovingTarget:
     def plan(self, gains: Gains, step: float) -> PlannedSteps | None:
         """Return all steps of length ``step`` [fraction of the duration]; None in the first call with this length.
 
-        The target does not depend on the state, so for a fixed step it is computed only once. A
-        moving goal gives a new target at every step. A target of this kind is used only once, so the first call
-        computes no plan.
+        The target does not depend on the state, so for a fixed step it is computed only once. A moving goal gives a new
+        target at every step. A target for a moving goal is used only once, so the first call computes no plan.
         """
         if step not in self._plans:
             self._plans[step] = None

@@ -83,7 +83,7 @@ class FitQuality:
 
     @property
     def faithful(self) -> bool:
-        """Whether no bias exceeds 5 % of the motion's extent; biases up to 0.5 mm and 1 degree always pass."""
+        """Whether every bias is at most 5 % of the motion's extent; biases up to 0.5 mm and 1 degree always pass."""
         return not self.problem
 
     @property
@@ -173,9 +173,9 @@ def _rms(differences: Array) -> float:
 def _period(times: Array, positions: Array) -> float | None:
     """Return the period [s] of a motion, ignoring a constant drift; None when it repeats less than three times.
 
-    For each lag, the mean squared difference between the motion and the motion one lag later is compared with the value
-    for independent positions. The period is the first local minimum below 10 % of the value for independent positions,
-    provided that the difference exceeded 50 % of this value at a shorter lag.
+    For each lag, the function computes the mean squared difference between the motion and the motion one lag later. The
+    reference is the mean squared difference between independent positions. The period is the first local minimum below
+    10 % of the reference, provided that the difference exceeded 50 % of the reference at a shorter lag.
     """
     n = len(times)
     drift = np.linspace(0.0, 1.0, n)[:, None] * (positions[-1] - positions[0])

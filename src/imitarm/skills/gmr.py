@@ -375,7 +375,7 @@ class GMR:
         return np.asarray(blend @ gaps)
 
     def _mean_ends(self, demonstrations: Sequence[Demonstration | Trajectory]) -> Array:
-        """Return the mean start and the mean goal of the demonstrations, as rows x, shape (2, D)."""
+        """Return the mean start and the mean goal of the demonstrations, as two vectors x, shape (2, D)."""
         motions = [d.trajectory if isinstance(d, Demonstration) else d for d in demonstrations]
         rows = [np.mean([m.positions[i] for m in motions], axis=0) for i in (0, -1)]
         if self.reference_ is not None:

@@ -84,7 +84,7 @@ class RotationReference:
         return CubicSpline(self.times, self.quaternions)
 
     def at(self, times: ArrayLike) -> Array:
-        """Return the reference (n, 4) wxyz at ``times`` (n,) [s], or the nearest key outside the keys' time span."""
+        """Return the reference (n, 4) wxyz at ``times`` (n,) [s]; outside the keys' time span, the nearest key."""
         t = finite_numbers(times, "RotationReference: times", "s")
         if len(self.times) == 1:
             return np.repeat(self.quaternions, len(t), axis=0)
@@ -195,7 +195,7 @@ class QuaternionDMP:
 
     Attributes:
         gains_: stiffness and damping.
-        knots_: knots of the spline over the fraction of the duration, four at 0 and four at 1.
+        knots_: knots of the spline, as fractions of the duration; 0 and 1 occur four times each.
         coefficients_: coefficients of the spline, shape (len(knots_) - 4, 4).
     """
 
@@ -332,11 +332,11 @@ class QuaternionDMP:
         return with_other_ends(self._learned(f), f, state.start_change, state.goal_change)
 
     def step(self, state: RotationState, step: float, acceleration: ArrayLike | None = None) -> RotationState:
-        """Return the state after ``step`` of the duration.
+        """Return the state one step later.
 
         Args:
             state: state returned by :meth:`begin` or by the last step.
-            step: fraction of the duration, above 0.
+            step: length of the step as a fraction of the duration, above 0.
             acceleration: T^2 times an angular acceleration (3,) [rad] in the base frame, constant during the step; T is
                 the duration.
 

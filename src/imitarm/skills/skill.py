@@ -307,7 +307,7 @@ def _pose(position: Array, quaternion: Array | None) -> Pose:
 
 
 def _ends_of(dmp: DMP, gmr: GMR) -> Array:
-    """Return start and goal of a primitive in the columns of a regression, shape (2, D)."""
+    """Return start and goal of a primitive as rows with the columns of a regression, shape (2, D)."""
     ends = np.stack([dmp.start_, dmp.goal_])
     if gmr.reference_ is None or dmp.orientation_ is None:
         return ends

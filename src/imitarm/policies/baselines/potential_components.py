@@ -1,7 +1,8 @@
 r"""ACFRA as printed in the thesis: push the components' means by a repulsive potential (thesis Eqs 4.2-4.8).
 
-The same descent is used for two potentials. Let ``d`` be the distance from an obstacle to the component's ellipse,
-``n`` the outward normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the obstacle.
+The module uses the same gradient descent for two potentials. Let ``d`` be the distance from an obstacle to the
+component's ellipse, ``n`` the outward normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the
+obstacle.
 
 * ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The last term does not depend on the
   position, so it drops out of the force, and the spread has no effect.
@@ -114,8 +115,8 @@ def push_components(
 class PotentialField(PathAdapter):
     """The thesis's method: push components away from obstacles; the result is evaluated by the same certificate.
 
-    The tool is represented by one sphere about its tip that contains all of its spheres. Obstacles are assumed to stay
-    at their poses at time 0.
+    The tool is represented by one sphere about its tip that contains all spheres of the tool. Obstacles are assumed to
+    stay at their poses at time 0.
 
     Args:
         force: a name in ``FORCES``.
