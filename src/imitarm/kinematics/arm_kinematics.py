@@ -271,7 +271,7 @@ class ArmKinematics:
         """Return shoulder, elbow and wrist in the base frame, shape (3, 3) [m].
 
         Raises:
-            InputError: if the arm's file does not define these points.
+            InputError: if the arm's file does not define shoulder, elbow and wrist.
         """
         return np.array(self.at(q).sites[list(self.required_landmarks().sites)])
 
@@ -279,7 +279,7 @@ class ArmKinematics:
         """Return the Jacobians of shoulder, elbow and wrist, shape (3, 3, n_joints) [m/rad].
 
         Raises:
-            InputError: if the arm's file does not define these points.
+            InputError: if the arm's file does not define shoulder, elbow and wrist.
         """
         self.required_landmarks()
         return np.array(self.at(q).landmark_jacobians()).reshape(3, 3, -1)

@@ -197,7 +197,7 @@ class IKSolver:
         """Add the rows of further tasks."""
         for task in tasks:
             if not hasattr(task, "rows"):
-                raise InputError(f"solve_ik: tasks must be tasks such as TwistTask(twist), got {task!r}")
+                raise InputError(f"solve_ik: each task must be an object such as TwistTask(twist), got {task!r}")
             if self.method != "qp":
                 if not (isinstance(task, PostureTask) and problem.tasks) or problem.posture is not None:
                     raise InputError(

@@ -29,7 +29,7 @@ class SphereCover:
         links: number of the arm's joints that move each sphere, shape (m,).
         follows_last_joint: True for spheres that move rigidly with the flange, shape (m,).
         base_centers: centers of the spheres that cover the base, which never moves, shape (b, 3) [m].
-        base_radii: radii of these spheres, shape (b,) [m].
+        base_radii: radii of the base's spheres, shape (b,) [m].
     """
 
     def __init__(self, model: mujoco.MjModel, working: mujoco.MjModel, names: Sequence[str]) -> None:

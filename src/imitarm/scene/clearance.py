@@ -87,8 +87,8 @@ class ClearanceLimit:
             scene: obstacles predicted for the current time, with their velocities.
 
         Returns:
-            One row for each pair of a sphere and an obstacle within ``influence``, except pairs that are too close and
-            whose distance no joint can change; None when there is no pair.
+            One row for each pair of a sphere and an obstacle within ``influence``; None when there is no pair. A pair
+            that is too close has no row if no joint can change its distance.
 
         Raises:
             InputError: when ``q`` is not n_joints finite numbers.
