@@ -27,6 +27,7 @@ _ARGUMENT = re.compile(_ITEM + r"|[\w*, ().]+:$|\w[\w, *]*(?: \([^)]*\))?: )")
 _END = re.compile(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*`$\[]*[A-Z0-9])")
 _ABBREVIATION = re.compile(r"\b(?:Eq|Eqs|Fig|Figs|e\.g|i\.e|et al|vs|cf|Trans|No|[A-Z])\.$")
 _WORD = re.compile(r"(?<![\w\\])[A-Za-z]{2,}(?!\w)")
+_REGULAR = re.compile(r"\(\?:|\[\^|\\[wd](?![A-Za-z])")  # a string that is a regular expression
 _CODE = re.compile(r"``?[^`]*``?|\$[^$]*\$|\S*[_/\\:]\S*\w")
 
 
@@ -107,7 +108,7 @@ def _code(path: Path) -> Iterator[Sentence]:
                     yield Sentence(f"{name}:{line}", sentence)
     inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
     for node in ast.walk(tree):
-        if id(node) not in docstrings and id(node) not in inner and (text := _text(node)):
+        if id(node) not in docstrings and id(node) not in inner and (text := _text(node)) and not _REGULAR.search(text):
             for paragraph in text.split("\n"):
                 for sentence in _sentences(paragraph):
                     yield Sentence(f"{name}:{getattr(node, 'lineno', 0)} (message)", sentence)

@@ -45,7 +45,7 @@ def test_a_stopped_robot_waits_for_enter(keyboard):
     assert [prompt("the server has just started", True) for _ in range(5)] == [False] * 5
     assert printed == [
         "the robot cannot be controlled: the server has just started. "
-        "If the workspace is clear, press Enter to enable it"
+        "If the workspace is clear, press Enter to enable the robot"
     ]
     keyboard.type(b"y", prompt)
     assert not prompt("the server has just started", True)

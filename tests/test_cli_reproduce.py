@@ -27,7 +27,7 @@ def sweep(tmp_path_factory):
 def test_the_demo_does_the_main_job(tmp_path, capsys):
     assert main(["demo", "--out", str(tmp_path / "out")]) == 0
     out = capsys.readouterr().out
-    assert "4 of 4 scenes with obstacles without contact" in out
+    assert "no contact in 4 of 4 scenes with obstacles" in out
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert results["passed"] and len(results["scenes"]) == 5
     for scene in results["scenes"][1:]:
@@ -87,7 +87,7 @@ def test_real_recordings_on_the_panda_around_three_obstacles(real_data, tmp_path
     status = main([*command, "--scene", str(SCENES / f"{scene}.yaml"), "--out", str(tmp_path / "done.csv")])
     out = capsys.readouterr().out
     assert status == 0, out
-    assert "1 of 1 scenes with obstacles without contact" in out
+    assert "no contact in 1 of 1 scenes with obstacles" in out
     done = Demonstration.load(tmp_path / "done.csv")
     assert done.joints is not None and done.joints.shape[1] == 7
 

@@ -199,7 +199,7 @@ def test_an_unknown_unit_is_refused(name, unit, kind):
 def test_units_that_the_file_states_elsewhere(tmp_path):
     raw = named_columns("f", list("txyzabcd"), TABLE, ReadOptions(), SaidUnits(length="cm"))
     assert np.allclose(raw.positions, TABLE[:, 1:4] / 100.0)
-    with pytest.raises(FileFormatError, match="a remark states the unit cm, but a column name mm"):
+    with pytest.raises(FileFormatError, match="a remark states the unit cm, but a column name states mm"):
         named_columns("f", ["t", "x_mm", "y_mm", "z_mm"], TABLE[:, :4], ReadOptions(), SaidUnits(length="cm"))
     file = write(tmp_path / "a.csv", TABLE[:, :4], first="# units: mm, ms\nt,x,y,z", separator=",")
     (raw,) = read_raw(file)

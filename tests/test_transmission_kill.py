@@ -184,7 +184,9 @@ def test_each_process_may_be_killed_and_started_again_and_the_arm_never_jumps(st
     stage.wait_for_status(RobotStatus.STOPPED)
     assert not stage.steps()[3][-1].any()
     stage.start_retargeting()  # nobody has said that the robot may move
-    stage.wait("question", lambda: "If the workspace is clear, press Enter to enable it" in stage.log("retargeting"))
+    stage.wait(
+        "question", lambda: "If the workspace is clear, press Enter to enable the robot" in stage.log("retargeting")
+    )
     stage.assert_still(0.3)
     stage.press_enter()
     stage.wait_for_motion()

@@ -24,7 +24,7 @@ def test_touching_is_contact() -> None:
     touching = make_result(rollout=replace(make_rollout(make_path()), clearance=np.zeros(200)))
     assert touching.contact
     assert not Report("x", [touching]).passed
-    assert Report("x", [touching]).verdict.startswith("0 of 1 scenes with obstacles without contact")
+    assert Report("x", [touching]).verdict.startswith("no contact in 0 of 1 scenes with obstacles")
 
 
 def test_what_was_not_done_is_not_called_clear() -> None:
@@ -32,11 +32,11 @@ def test_what_was_not_done_is_not_called_clear() -> None:
     assert math.isnan(refused.min_clearance) and not refused.contact
     report = Report("x", [make_result("good"), refused])
     assert not report.passed
-    assert report.verdict == "1 of 2 scenes with obstacles without contact; smallest clearance 22.0 mm; 1 not completed"
+    assert report.verdict == "no contact in 1 of 2 scenes with obstacles; smallest clearance 22.0 mm; 1 not completed"
 
 
 def test_the_verdict_counts_scenes_with_obstacles() -> None:
-    assert make_report(scenes=4).verdict == "4 of 4 scenes with obstacles without contact; smallest clearance 22.0 mm"
+    assert make_report(scenes=4).verdict == "no contact in 4 of 4 scenes with obstacles; smallest clearance 22.0 mm"
     assert make_report(scenes=4).passed
     free = make_result("free", scene=Scene(), adaptation=make_adaptation(0.0))
     assert Report("x", [free]).verdict == "1 of 1 scenes completed"

@@ -77,8 +77,8 @@ VARIANTS: Mapping[str, Method] = {
     "m3-scaled": Method("m3", "M3, scaled", {"velocity_scaling": True}),
 }
 """Methods with changed options, to show the effects of the options. "Me-thesis" fits one NURBS to the whole recording
-and uses the small-angle term. "as printed" keeps every misprint with which the method still runs. "scaled" slows all
-joints down together where one joint would be too fast."""
+and uses the small-angle term. "as printed" keeps the misprints of the thesis, except those that stop the method from
+running. "scaled" slows all joints down together where one joint would be too fast."""
 
 METHODS: Mapping[str, Method] = {**MAIN, **VARIANTS}
 """All methods by name."""
@@ -107,7 +107,7 @@ class Experiment:
         method: one of :data:`METHODS`.
         robot: one of :data:`ROBOTS`; stacking needs the Sawyer.
         seed: seed of the person.
-        repeat: number of the recording or trial of this person.
+        repeat: index of the recording or trial of this person, from 0.
         seconds: approximate duration of reaches and drawings [s].
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
         data: folder of real recordings, for the task with motion capture.
@@ -138,7 +138,7 @@ class Experiment:
 
     @property
     def plan(self) -> Plan:
-        """Definition of the recording that the method follows; for the live task, a recording with the same seeds."""
+        """Definition of the recording to follow; for the live task, of a stacking recording with the same seeds."""
         kind = "stacking" if self.task == LIVE else self.task
         return Plan(kind, self.seed, self.repeat, self.seconds, self.sigma, self.data)
 
@@ -240,7 +240,7 @@ def run_stacking(
     Args:
         method_name: one of :data:`METHODS`.
         person: seed of the person.
-        repeat: number of the trial of this person.
+        repeat: index of the trial of this person, from 0.
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
         arm: the Sawyer with the gripper, if it is already loaded.
     """
@@ -268,7 +268,7 @@ def camera_maker(sigma: float | None) -> Callable[[int], SkeletonCamera]:
 
 
 def count_failures(outcomes: Sequence[str]) -> str:
-    """Return a text on how often each failure happened, the most frequent first; "" in ``outcomes`` is success."""
+    """Return a text that counts each kind of failure, the most frequent first; an empty outcome means success."""
     counted = Counter(outcome for outcome in outcomes if outcome)
     return ", ".join(f"{n} {what}" for what, n in counted.most_common()) or "none"
 

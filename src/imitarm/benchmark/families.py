@@ -383,7 +383,7 @@ def _enclosing(
 
 
 def _moving(rng: np.random.Generator, path: Array, duration: float, planar: bool, reach: float) -> tuple[Obstacle, ...]:
-    """Obstacles that cross the path at 0.1 to 0.6 m/s, each at about the time when the tool passes this place."""
+    """Obstacles that cross the path at 0.1 to 0.6 m/s, each at about the time when the tool is at the crossing."""
     made = []
     for _ in range(int(rng.integers(1, 4))):
         at = int(rng.uniform(0.15, 0.85) * (len(path) - 1))

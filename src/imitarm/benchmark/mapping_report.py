@@ -29,11 +29,11 @@ _WORDS: Final = {
     "Interval": "The 95 % confidence interval of a mean over persons, from resampling the persons. Overlapping "
     "intervals do not rule out a difference; the paired comparison tests for it.",
     "Lag": "The constant delay that gives the best match between the path of the tool and the true path of the hand.",
-    "From first hold": "The distance between the tool and its true target, from the time at which the robot begins "
-    "to follow until the end. It includes the time in which the method does not follow.",
+    "From first engagement": "The distance between the tool and its true target, from the time at which the robot "
+    "begins to follow until the end. Time in which the method does not follow is included.",
     "SPARC": "Spectral arc length of the speed: the closer to 0, the smoother the motion.",
-    "Our interpretation": "The thesis describes its baselines only in words. These methods are our implementation "
-    "of that description.",
+    "Our interpretation": "The thesis describes its baselines only in words. The methods M1 to M3 "
+    "are our implementations of these descriptions.",
 }
 
 

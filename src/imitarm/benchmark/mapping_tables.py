@@ -43,7 +43,7 @@ ACCURACY = (
     Figure("lag", "lag [ms]", 1e3, 0),
     Figure("executed_rms", "executed [mm]", 1e3),
     Figure("executed_rms_without_lag", "executed, without lag [mm]", 1e3),
-    Figure("tool_rms_from_first", "from first hold [mm]", 1e3),
+    Figure("tool_rms_from_first", "from first engagement [mm]", 1e3),
     Figure("orientation_rms", "orientation [°]", _DEGREES),
     Figure("elbow_direction_rms", "upper arm [°]", _DEGREES),
     Figure("elbow_angle_rms", "swivel angle [°]", _DEGREES),
@@ -193,7 +193,7 @@ def persons_note(results: Results) -> str:
     if not seen:
         return ""
     text = f"Persons {seen[0]} to {seen[-1]}." if len(seen) > 1 else f"Person {seen[0]}."
-    return text if seen[0] >= TEST else f"{text} Those below {TEST} are for developing methods."
+    return text if seen[0] >= TEST else f"{text} Persons below {TEST} are for developing methods."
 
 
 def accuracy_table(results: Results, task: str) -> Table:
@@ -282,7 +282,8 @@ def success_table(results: Results) -> Table:
         rows.append((METHODS[name].title, *rate, *cells, why))
     columns = ("method", "stacked>", "95 % [%]>", *(f"{figure.title}>" for figure in LOOP), "failures")
     note = (
-        "The interval of the success rate is Wilson's, with an effective number of trials. This number decreases as "
+        "The interval of the success rate is Wilson's, with an effective number of trials. The effective "
+        "number decreases as "
         "the differences between persons increase. One more failure never raises the lower end of the interval. "
         "Time, path and torque are means over persons (95 % interval) and include only the trials that succeeded. "
         f"{persons_note(results)}"

@@ -1,7 +1,7 @@
 """Test policies on a simulated arm with random obstacles on the path: how often they arrive, refuse or make contact.
 
-Each placement puts one to three obstacles on the learned path of a skill. Every policy reproduces the skill there with
-the same safety filter. The simulator measures clearance and contact with its own geometry.
+Each placement puts one to three obstacles on the learned path of a skill. Every policy reproduces the skill around
+these obstacles, with the same safety filter. The simulator measures clearance and contact with its own geometry.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from imitarm.skills import Skill
 Array = NDArray[np.float64]
 
 OUTCOMES = ("arrived", "refused", "waited", "too near", "touched", "stopped")
-"""Possible outcomes of a placement, in this order: arrived and kept the clearance; refused before any motion; not
-finished in time; finished, but came closer to an obstacle than required; contact (including self-collision); protective
-stop or other failure."""
+"""Possible outcomes of a placement: "arrived" (and kept the clearance), "refused" (before any motion), "waited" (not
+finished in time), "too near" (finished, but came closer to an obstacle than required), "touched" (contact, including
+self-collision), and "stopped" (protective stop or other failure)."""
 
 CLEARANCE = 0.02  # [m] required
 _DT = 0.01  # [s]

@@ -58,7 +58,8 @@ def origin(versions: Iterable[str]) -> str:
     if found == [now]:
         return f"Results of {now}."
     text = f"Results of {' and '.join(found) or 'no run'}"
-    return f"{text}. Other code made these tables ({now}). Run the command again to update the results."
+    changed = f"These tables were made by another version of the code ({now})"
+    return f"{text}. {changed}. Run the command again to update the results."
 
 
 def _git(folder: Path, *words: str) -> bytes | None:

@@ -117,7 +117,7 @@ class MappingRecording:
     true_points: Array
 
     def true_arm(self, times: Array) -> TrueArm:
-        """Return the person's true arm at times (n,) of a run [s]; it rests outside the recorded times."""
+        """Return the person's true arm at times (n,) of a run [s]; the arm rests outside the recorded times."""
         flat = self.true_points.reshape(len(self.true_times), -1)
         points = np.column_stack([np.interp(times, self.true_times, column) for column in flat.T])
         return TrueArm.from_points(times, points.reshape(-1, 6, 3), self.correspondence)
@@ -257,8 +257,7 @@ def _captured(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
     path = Path(plan.data) / _MOCAP
     if not path.is_file():
         raise InputError(
-            f"{path}: the motion capture data are missing; give with --data the folder that contains "
-            f"{_MOCAP} with --data"
+            f"{path}: the motion capture data are missing; give the folder that contains {_MOCAP} with --data"
         )
     capture = MotionCapture.load(path)
     moving = capture.truth(person)
@@ -303,7 +302,8 @@ def _between(frames: tuple[Skeleton, ...]) -> Truth:
 def beyond_reach(recording: MappingRecording, arm: ArmModel) -> float:
     """Return the fraction of the time in which the target of the robot's wrist is farther away than the arm can reach.
 
-    The target is the start position plus the scaled displacement of the person's wrist. The tool keeps its orientation.
+    The target is the start position plus the scaled displacement of the person's wrist. The tool is assumed to keep its
+    orientation.
 
     Raises:
         InputError: when the arm's file does not define shoulder and wrist.

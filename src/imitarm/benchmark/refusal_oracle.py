@@ -1,19 +1,22 @@
 """An oracle that decides whether a path exists, to check refusals.
 
 The oracle shares no code with the library's search for a path. It considers displacements of the nominal path at many
-times, called layers. In each layer, displacements are cells of a grid. The oracle gives one of three answers:
+times, called layers. In each layer, displacements are cells of a grid.
+
+The oracle gives one of three answers:
 
 * **impossible**: a proof. A box of positions counts as free if any of its points may be free at any time of an
   interval. If no chain of free boxes leads from the start to the goal, then no continuous displacement of the path
   exists.
 * **possible**: a path was found and verified. A cell counts as free if its centre is free. Tangents give a lower bound
-  of the distance during moves between neighbouring cells and between layers. The cheapest chain of cells is then fitted
-  by sums of the skill's components, or by sums of hat functions in time where the components are too wide.
+  of the distance to the obstacles during moves between neighbouring cells and between layers. The cheapest chain of
+  cells is then fitted by sums of the skill's components, or by sums of hat functions in time where the components are
+  too wide.
 * **undecided**: even the finest grid gave neither a proof nor a path.
 
-The oracle uses the limits of the library. No sample is displaced by more than 0.5 m. No step is longer than 8 times the
-longest step of the nominal path. The path is not displaced at fixed times, and no displacement has a component in a
-forbidden direction.
+The oracle uses the same limits as the library. No sample is displaced by more than 0.5 m. No step is longer than 8
+times the longest step of the nominal path. The path is not displaced at fixed times, and no displacement has a
+component in a forbidden direction.
 """
 
 from __future__ import annotations
@@ -77,7 +80,7 @@ def answer(question: Question) -> Answer:
 def is_solved(
     question: Question, axes: Array | None = None, grids_to_search: Sequence[tuple[float, float]] | None = None
 ) -> bool:
-    """Return whether a path is found and verified; grids are given by reach and cell size [m], by default all grids."""
+    """Return whether a path is found and verified, with the given grids (reach and cell size [m]) or by default all."""
     axes = question.axes() if axes is None else axes
     if separation(question, question.nominal.times, question.nominal.positions) >= -1e-9:
         return True
@@ -190,7 +193,7 @@ def _layer(
     from_fixed: bool,
     to_fixed: bool,
 ) -> tuple[list[tuple[Array, Array]], list[Bools], Bools, Bools]:
-    """Return distances and gradients of a layer, free moves along axes and from the previous layer, free cells."""
+    """Return for one layer: distances and gradients, free moves along axes and from the layer before, free cells."""
     shape = (side,) * d
     free, ahead = np.ones(shape, dtype=bool), np.ones(shape, dtype=bool)
     sides = [np.ones(shape, dtype=bool) for _ in range(d)]
@@ -238,9 +241,9 @@ def _layer(
 def _keeps(need: float, f0: Array, f1: Array, slope0: Array, slope1: Array, step: Array) -> Bools:
     """Return whether the distance to an obstacle is proven to be at least ``need`` [m] along a step.
 
-    The distance changes by at most the length of the step. If it exceeds ``need`` by more than this length at one end,
-    it is large enough along the whole step. If it is below ``need`` at one end, it is too small. Only in the other
-    cases is :func:`_tangent_bound` needed.
+    The distance changes by at most the length of the step. If the distance at one end exceeds ``need`` by more than
+    this length, the whole step keeps the distance. If the distance at one end is below ``need``, the step does not keep
+    the distance. Only the other cases need :func:`_tangent_bound`.
 
     Args:
         need: required distance [m].
@@ -264,7 +267,7 @@ def _tangent_bound(f0: Array, a: Array, f1: Array, b: Array) -> Array:
 
 
 def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
-    """Return the costs when one more move is allowed, to a neighbouring cell that no obstacle separates."""
+    """Return the costs when one more move is allowed, to a neighbouring cell with no obstacle between the two cells."""
     d = cost.ndim
     result = cost.copy()
     for axis in range(d):
@@ -375,7 +378,10 @@ def _fit(question: Question, axes: Array, basis: Array, wanted: Array) -> bool:
 def _tangent_rows(
     question: Question, axes: Array, basis: Array, tip: Array, relative: Array, here: Array, extra: Array
 ) -> tuple[Array, Array]:
-    """Return linear constraints, rows (r, m d) and lower bounds (r,): tangents of small distances at ``tip + here``."""
+    """Return linear constraints, rows (r, m d) and lower bounds (r,): the tangents of all small distances to obstacles.
+
+    The tangents are taken at ``tip + here``.
+    """
     times = question.nominal.times
     j, s = extra[:, 0].astype(int), extra[:, 1:2]
 

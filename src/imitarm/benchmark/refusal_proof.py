@@ -125,7 +125,8 @@ class _Cells:
     ) -> tuple[tuple[int, int], ...] | None:
         """Return the part of a window whose boxes fit into the bounding box of an inflated obstacle.
 
-        Only these boxes can have all corners, moved by ``shift`` (3,) [m], within ``need`` [m] of the obstacle.
+        Every other box has a corner that, after moving by ``shift`` (3,) [m], is farther than ``need`` [m] from the
+        obstacle.
 
         Returns:
             The first index and the index after the last along each edge; None when no box fits.
@@ -200,9 +201,10 @@ def _cells(question: Question, frame: Array, size: Array) -> _Cells:
 def is_impossible(question: Question, cells: _Cells) -> bool:
     """Return whether there is provably no path, because a flood fill of possibly free boxes can't reach the goal.
 
-    A box is blocked if all of its corners are inside the same inflated obstacle, because the obstacle is convex. Boxes
-    are fixed in space, so the motion of the tip does not matter. All other motion makes the obstacles smaller: motion
-    out of the permitted plane, motion of spheres away from the tip, and motion of obstacles.
+    A box is blocked if all of its corners are inside the same inflated obstacle. The corners suffice, because the
+    obstacle is convex. Boxes are fixed in space, so the motion of the tip does not matter. To allow for all other
+    motion, the obstacles are made smaller: motion out of the permitted plane, motion of spheres away from the tip, and
+    motion of obstacles.
     """
     d = len(cells.frame)
     moving = any(obstacle.velocity.any() for obstacle in question.obstacles)
@@ -283,7 +285,7 @@ def _inside(question: Question, start: float, end: float) -> Array:
 def _leftover_motion(
     question: Question, cells: _Cells, times: Array, tip: Array, relative: Array, middle: int
 ) -> Array:
-    """Return how far spheres move relative to obstacles from sample ``middle`` at most, shape (n_obstacles, m) [m]."""
+    """Return the longest relative displacement of spheres and obstacles from a sample, (n_obstacles, m) [m]."""
     out_of_plane = tip - tip @ cells.frame.T @ cells.frame
     bow = np.linalg.norm(question.spheres[:, :3], axis=1) * 1e-3 * bool(np.abs(np.diff(relative, axis=1)).max() > 0.0)
     answer = np.empty((len(question.obstacles), len(question.spheres)))
@@ -323,7 +325,7 @@ def _maybe_free(
 def _permitted(
     question: Question, cells: _Cells, window: tuple[tuple[int, int], ...], times: Array, tip: Array
 ) -> Bools:
-    """Return for each box whether the forbidden directions permit it at some time of an interval."""
+    """Return for each box whether displacements into it have a permitted direction at some time of an interval."""
     answer = np.ones([b - a for a, b in window], dtype=bool)
     corners: Array | None = None
     for f in question.forbidden:

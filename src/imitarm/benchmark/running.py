@@ -95,7 +95,7 @@ def _kept(place: Path, experiment: Experiment, reuse: bool) -> Result | None:
 
 
 Job = tuple[Experiment, str, str, int]
-"""The experiment, the folder, the version of the code, and the parent process."""
+"""The data of one job: the experiment, the folder, the version of the code, and the parent process."""
 
 
 def _make(job: Job) -> Experiment:

@@ -51,7 +51,7 @@ class Place:
 
     @property
     def begin(self) -> str:
-        """The line above the tables."""
+        """The comment line that stands above the tables in the document."""
         return f"<!-- imitarm benchmark {self.benchmark} -->"
 
     def fill(self, found: Sequence[Table], command: str, versions: Iterable[str]) -> None:
@@ -80,6 +80,6 @@ class Place:
         if not found or not ended or self.begin in rest or (head + tail).count(f"{END}\n") != others:
             raise InputError(
                 f"{self.document}: the tables belong between a line {self.begin!r} and a line {END!r} after it; write "
-                "both, once each"
+                "both lines, once each"
             )
         return head, tail

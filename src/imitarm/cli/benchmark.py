@@ -49,17 +49,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping = parsers.add_parser(
         "mapping", help="compare all retargeting methods on the same recordings (thesis Table 3.1)"
     )
-    mapping.add_argument("--people", type=int, metavar="N", help="simulated people; default: 10, with --quick 2")
+    mapping.add_argument("--people", type=int, metavar="N", help="simulated people; default: 10 (2 with --quick)")
     mapping.add_argument(
         "--first",
         type=int,
         metavar="N",
-        help=f"number of the first simulated person; default: {TEST}, with --quick 0. Persons below {TEST} are for "
-        f"developing "
-        "methods, the others for testing them",
+        help=f"number of the first simulated person; default: {TEST} (0 with --quick). Persons below {TEST} are for "
+        "developing methods, the others for testing them",
     )
     mapping.add_argument(
-        "--repeats", type=int, metavar="N", help="closed-loop trials of each person; default: 5, with --quick 1"
+        "--repeats", type=int, metavar="N", help="closed-loop trials of each person; default: 5 (1 with --quick)"
     )
     mapping.add_argument("--quick", action="store_true", help="use a few short recordings, for a quick test")
     mapping.add_argument(
@@ -67,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     mapping.add_argument("--kinds", nargs="+", choices=KINDS, metavar="KIND", help=f"recordings: {', '.join(KINDS)}")
     mapping.add_argument(
-        "--seconds", type=float, metavar="S", help="approximate duration of a recording; default: 10, with --quick 5"
+        "--seconds", type=float, metavar="S", help="approximate duration of a recording; default: 10 (5 with --quick)"
     )
     mapping.add_argument(
         "--sigma", type=float, metavar="MM", help="standard deviation of the camera's error; default: 10 to 20 mm"

@@ -332,12 +332,10 @@ def touched_points(
         if len(points) < LEAST_PAIRS:
             raise InputError(f"sensor calibration: {len(points)} points, at least {LEAST_PAIRS} are needed; add more")
         remark(
-            f"{len(points)} points. At each point: bring the robot's tool there, and put the palm of your {side} "
-            f"hand on the tool's"
+            f"{len(points)} points. At each point, bring the robot's tool there, and put the palm of your {side} "
+            f"hand on the tool's tip."
         )
-        remark(
-            "tip so that the sensor sees the hand. Then hold still and press Enter. Type s to skip a point, q to quit."
-        )
+        remark("The sensor must see the hand. Then hold still and press Enter. Type s to skip a point, q to quit.")
     seen: dict[int, list[float]] = {}
     for i in wanted:
         place = " ".join(f"{100 * value:.1f}" for value in points[i])

@@ -113,7 +113,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _samples_needed(demonstrations: Sequence[Demonstration]) -> int:
     """Return the number of samples of each aligned demonstration.
 
-    It is 200, or more (up to 2000) in proportion to the path length if a path is longer than 6 times its extent.
+    The number is 200 if no path is longer than 6 times its extent. For a longer path, the number grows in proportion to
+    the path length, up to 2000.
     """
     most = 1.0
     for one in demonstrations:

@@ -52,8 +52,8 @@ The robot starts at its home posture, or with --fit at a posture from which the 
 When the camera has seen the person's arm for half a second, the robot's tool begins to follow the hand.
 The demonstration contains only the time in which the tool followed the person.
 The first line of the output says whether the tool followed its target closely enough.
-The tool did not if its RMS distance to the target exceeds {100 * FAR:.0f} cm.
-It also did not if its distance exceeds {100 * FAR:.0f} cm for more than {100 * FAR_FRACTION:.0f} % of the time.
+"Closely enough" means an RMS distance of at most {100 * FAR:.0f} cm between tool and target.
+In addition, the distance may exceed {100 * FAR:.0f} cm for at most {100 * FAR_FRACTION:.0f} % of the time.
 If the tool did not follow its target, the files are written, with a warning.
 The exit status is 1 if the arm was never seen for half a second, so that the robot did not move.
 """

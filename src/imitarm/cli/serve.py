@@ -30,7 +30,7 @@ examples:
   imitarm serve --robot sawyer --trace steps.csv
 
 Control the robot with 'imitarm teleoperate SOURCE --to 127.0.0.1:7500'.
-The robot is stopped until the user of that command enables it.
+The robot stays stopped until the user of 'imitarm teleoperate' enables it.
 After 0.1 s without a command the robot brakes, and after 0.5 s it stays stopped until it is enabled again.
 Anyone who can reach the port can move the robot. Without --host, only this machine can reach the port.
 Ctrl-C brakes the robot and ends the command.

@@ -45,7 +45,8 @@ examples:
   imitarm teleoperate wave.csv --side left --robot panda --latency latency.csv
 
 The robot is simulated in this process, or with --to it is a robot that 'imitarm serve' makes available.
-Such a robot is stopped at first, and moves only after you press Enter here; --enable enables it once at the start.
+A robot of 'imitarm serve' is stopped at first, and moves only after you press Enter here.
+With --enable, the robot is enabled once at the start, without asking.
 The robot begins to follow a person who has been seen for half a second.
 Each recorded sample is written to FILE.part immediately, so that it can be read even if the process is killed.
 The exit status is 1 if the robot never followed a person, or could not be controlled any more.
@@ -267,7 +268,7 @@ class EnablePrompt:
         threading.Thread(target=self._reading, daemon=True).start()
 
     def reset(self) -> None:
-        """Note that the robot can be controlled, so that the user is asked about the next problem."""
+        """Remember that the robot can be controlled now, so that the user is asked about the next problem."""
         self._first, self._asked = False, ("", False)
 
     def __call__(self, problem: str, stopped: bool) -> bool:
@@ -286,7 +287,7 @@ class EnablePrompt:
         if (problem, stopped) != self._asked:
             self._asked = (problem, stopped)
             self._taken()
-            question = ". If the workspace is clear, press Enter to enable it" if stopped else ""
+            question = ". If the workspace is clear, press Enter to enable the robot" if stopped else ""
             self._tell(f"the robot cannot be controlled: {problem}{question}")
             return False
         if stopped and self._ended:

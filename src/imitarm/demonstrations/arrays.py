@@ -138,7 +138,9 @@ def _by_field(path: str, arrays: dict[str, Array], options: ReadOptions) -> list
     }
     for name, shapes in wanted.items():
         if name in arrays and arrays[name].shape not in shapes:
-            raise FileFormatError(f"{path}:{name}: shape {arrays[name].shape}, must be {shapes[0]} as positions are")
+            raise FileFormatError(
+                f"{path}:{name}: shape {arrays[name].shape}, must be {shapes[0]} to match the array 'positions'"
+            )
     if len(shape) == 2:
         return [_of_fields(path, arrays, options)]
     fields = [name for name in _FIELDS if name in arrays]

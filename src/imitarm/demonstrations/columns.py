@@ -353,8 +353,8 @@ def _one_unit(
     stated_units = {units[i] for i in columns} - {None}
     if elsewhere is not None and stated_units - {elsewhere}:
         raise FileFormatError(
-            f"{source}: a remark states the unit {elsewhere}, but a column name {stated_units.pop()}; make them the "
-            f"same"
+            f"{source}: a remark states the unit {elsewhere}, but a column name states "
+            f"{stated_units.pop()}; make them the same"
         )
     return found.pop() if found else None
 

@@ -217,9 +217,9 @@ class RawDemonstration:
         """Return for each row whether it only repeats the previous row, because the recorder outran its sensor.
 
         A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest also repeats
-        values, and so does rounding. These repetitions do not count. Values count as held only if they are repeated
-        many times during the motion and change by more than their last digits in between. The result has the shape
-        (n,).
+        values, and so does rounding. Repetitions caused by rest or rounding do not count. Values count as held only if
+        they are repeated many times during the motion and change by more than their last digits in between. The result
+        has the shape (n,).
         """
         masks = [held_rows(part) for part in (self.positions, self.quaternions, self.joints) if part is not None]
         return max(masks, key=lambda mask: int(mask.sum()), default=np.zeros(len(self), dtype=bool))
@@ -429,7 +429,7 @@ def check_quaternions(raw: RawDemonstration) -> Iterator[Finding]:
         message = (
             f"quaternions have length {length.min():.4f} to {length.max():.4f}; they are scaled to length 1 when read"
         )
-        yield raw.finding("warning", "quaternion-length", message, "write them with more digits", worst)
+        yield raw.finding("warning", "quaternion-length", message, "write the quaternions with more digits", worst)
     flips = np.flatnonzero(np.sum(q[1:] * q[:-1], axis=1) < 0.0) + 1
     if len(flips):
         message = f"the quaternion's sign flips {len(flips)} times (q and -q are the same rotation)"
@@ -461,7 +461,7 @@ def check_notes(raw: RawDemonstration) -> Iterator[Finding]:
         )
         yield raw.finding("warning", "rotation-not-read", message, remedy)
     for note in raw.notes:
-        yield raw.finding("note", "reader", note, "none needed, unless you need these data")
+        yield raw.finding("note", "reader", note, "none needed if you can do without these data")
 
 
 RAW_CHECKS = (check_rows, check_stamps, check_quaternions, check_held, check_notes)

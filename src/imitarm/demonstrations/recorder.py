@@ -80,7 +80,7 @@ class DemonstrationRecorder:
     def close(self) -> None:
         """Write the demonstration to its file. With fewer than two samples, no file is written.
 
-        A second call does nothing.
+        Calling this method again does nothing.
 
         Raises:
             InputError: when the file can't be completed; the samples stay in ``PATH.part``.

@@ -1,7 +1,7 @@
 """Statistical uncertainty: bootstrap over persons, paired comparisons by random sign flips, Holm's correction.
 
-Persons are resampled, not frames or recordings, because the recordings of one person are similar. Treating them as
-independent would make every interval too narrow.
+Persons are resampled, not frames or recordings, because the recordings of one person are similar. Treating recordings
+as independent would make every interval too narrow.
 """
 
 from __future__ import annotations
@@ -141,15 +141,15 @@ def rate_interval(outcomes: Values) -> Interval:
 
     The interval is the Wilson interval for :math:`N / D` trials instead of N, because the trials of one person are
     similar (Rao and Scott, Biometrics 1992). :math:`D = 1 + (m - 1) \rho` is the design effect of m trials per person.
-    :math:`\rho` is the correlation between trials of one person. This correlation is estimated from how much more the
-    rates of persons differ than chance explains. The estimate from a few persons is poor, so it is averaged with a
-    prior correlation of 0.3, which has the weight of two persons. If all trials had the same result, or if there is
-    only one person, the correlation is 0.3. N / D lies between the number of persons and N.
+    :math:`\rho` is the correlation between trials of one person. The correlation is estimated from the differences
+    between the persons' rates, as far as they exceed differences by chance. The estimate from a few persons is poor, so
+    it is averaged with a prior correlation of 0.3, which has the weight of two persons. If all trials had the same
+    result, or if there is only one person, the correlation is 0.3. N / D lies between the number of persons and N.
 
-    If only one person fails, this indicates that persons differ. If another person also fails, it indicates that they
-    do not differ, so that one more failure could narrow the interval. To prevent this, the function also computes the
-    interval of every result that is at least as good in each trial, and takes the lowest of the lower ends. Likewise,
-    it takes the highest upper end of all results that are at least as bad in each trial.
+    When only one person fails, the persons seem to differ. When another person fails as well, the persons seem to be
+    alike. One more failure could therefore narrow the interval. To prevent such narrowing, the function also computes
+    the interval of every result that is at least as good in each trial, and takes the lowest of the lower ends.
+    Likewise, the function takes the highest upper end of all results that are at least as bad in each trial.
 
     Args:
         outcomes: outcome of each trial, 1 for success, 0 for failure.
@@ -169,9 +169,9 @@ def rate_interval(outcomes: Values) -> Interval:
 def _lower_end(rates: Array, each: float, step: int) -> float:
     """Return the lowest lower end of the intervals of all results in which every person has at least the given rate.
 
-    Among results with the same mean, the lower end is lowest where the persons differ most: the best person becomes
-    perfect before another person improves (this result majorises all others). Therefore only such results need to be
-    examined.
+    Among results with the same mean, the lower end is lowest where the persons differ most. In such a result, the best
+    person becomes perfect before another person improves (the result majorises all others). Therefore only results of
+    this kind need to be examined.
 
     Args:
         rates: success rate of each person, shape (n,).

@@ -158,7 +158,7 @@ class EngagementPeriods:
 def reference_positions(
     true: TrueArm, tool: Array, periods: EngagementPeriods, scale: float, lag: float = 0.0
 ) -> Array:
-    r"""Return the correct position of the tool, which is the clutch law applied to the true hand (docs/retargeting.md).
+    r"""Return the correct position of the tool, which the clutch law computes from the true hand (docs/retargeting.md).
 
     .. math:: p(t) = p_{home} + \rho\,(W(t - lag) - W(t_e))
 
@@ -179,7 +179,7 @@ def reference_positions(
 
 
 def reference_rotations(true: TrueArm, quaternions: Array, periods: EngagementPeriods, orientation: str) -> Array:
-    """Return the correct rotations of the tool (n, 4), wxyz, which are the clutch law applied to the true hand.
+    """Return the correct rotations of the tool (n, 4), wxyz, which the clutch law computes from the true hand.
 
     Args:
         true: the person's arm, in the axes of the base.
@@ -239,9 +239,9 @@ def target_lag(times: ArrayLike, tool: ArrayLike, targets: ArrayLike) -> float:
         targets: target positions, shape (n, 3) [m]; nan where there is no target.
 
     Returns:
-        The lag. It is nan when there is no target, when the target does not move, or when the tool does not follow it.
-        The tool does not follow if, at every lag, its RMS error exceeds half of the RMS motion of the target about its
-        mean.
+        The lag; nan when there is no target, the target does not move, or the tool does not follow the target. "Does
+        not follow" means that, at every lag, the tool's RMS error exceeds half of the target's RMS motion about
+        its mean.
     """
     t, p, aim = (np.asarray(values, dtype=float) for values in (times, tool, targets))
     known = np.isfinite(aim).all(axis=1)
@@ -300,7 +300,7 @@ def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) ->
 
 
 def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, rest: float = 0.5) -> float:
-    """Return when a point came within ``radius`` [m] of its final position: the mean over the last ``rest`` seconds.
+    """Return the time at which a point came within ``radius`` [m] of its mean position in the last ``rest`` seconds.
 
     Args:
         times: time stamps, shape (n,) [s].

@@ -146,8 +146,8 @@ class StackTask:
 
         Args:
             arm: the arm, if it is loaded already.
-            control: control mode of the drives. The default is computed torque, which is more compliant, because
-                contacts are expected.
+            control: control mode of the drives. Contacts are expected, so the default is computed torque, which is more
+                compliant than position control.
         """
         arm = self.arm() if arm is None else arm
         robot = SimulatedRobot(arm, world=self.world(arm), control=control, q=self.start_posture(arm))

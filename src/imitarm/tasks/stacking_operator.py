@@ -350,12 +350,12 @@ class SimulatedOperator:
     1998). The lengths of the sub-movements vary randomly by 4 %. A sub-movement lasts :math:`T = |d|/v + 0.25` s, with
     a low speed v near a contact. Tremor is added by :class:`~imitarm.capture.person.Person`.
 
-    *Eye.* About 7 times per second, the person reacts to the :class:`OperatorView` of the time ``delay`` earlier, whose
-    positions have noise of about a millimetre and a bias. The person expects the gripper at the observed position plus
-    the displacement that the hand has commanded since that time, :math:`\hat p = p(t-\delta) + \rho\,(h_{end} -
-    h(t-\delta-\lambda))`, with the scale :math:`\rho` and the lag :math:`\lambda` that the person expects. The next
-    sub-movement is :math:`d = g\,(p_{goal}-\hat p)/\rho`. The gain g is below 1 over short distances and 1 over long
-    distances.
+    *Eye.* About 7 times per second, the person reacts to an :class:`OperatorView` that is ``delay`` old. Its positions
+    have a bias, and noise of about a millimetre. The person expects the gripper at the observed position plus the
+    displacement that the hand has commanded since the time of the view: :math:`\hat p = p(t-\delta) + \rho\,(h_{end} -
+    h(t-\delta-\lambda))`. In this equation, :math:`\delta` is ``delay``, and :math:`\rho` and :math:`\lambda` are the
+    scale and the lag that the person expects. The next sub-movement is :math:`d = g\,(p_{goal}-\hat p)/\rho`. The gain
+    g is below 1 over short distances and 1 over long distances.
 
     *Plan.* :class:`StackPlan` chooses the goals. The hand closes or opens when the gripper looks aligned to within the
     person's tolerance, which grows as the person becomes impatient. If the gripper misses or loses a cube, or a cube
@@ -366,7 +366,7 @@ class SimulatedOperator:
     Args:
         seed: seed of the person and the habits.
         repeat: number of the run of this person, which seeds the differences between runs.
-        scale: robot motion divided by hand motion that the person expects.
+        scale: ratio of robot motion to hand motion that the person expects.
 
     Attributes:
         person: model of the person's body and arm motion.
@@ -415,7 +415,7 @@ class SimulatedOperator:
         return self.person.skeleton(time, wrist, swivel=self._swivel, closed=self.plan.closed)
 
     def _look(self, now: float) -> None:
-        """React to the view of the time ``delay`` earlier."""
+        """React to the view that is ``delay`` old."""
         seen = None
         while self._views and self._views[0].time <= now - self.habits.delay + 1e-9:
             seen = self._views.popleft()

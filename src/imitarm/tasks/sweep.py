@@ -157,8 +157,8 @@ class SweepTask:
     def evaluate(self, robot: SimulatedRobot, rollout: Rollout) -> Rollout:
         """Return ``rollout`` with success or the reasons for failure (dirt outside the pan, contact, not finished).
 
-        Its ``details`` contain ``"swept_fraction"`` (fraction of the crumbs in the pan) and ``"swept"`` (whether each
-        crumb is in the pan).
+        The rollout's ``details`` contain ``"swept_fraction"`` (fraction of the crumbs in the pan) and ``"swept"``
+        (whether each crumb is in the pan).
         """
         swept = self.swept(robot)
         fraction = float(swept.mean())

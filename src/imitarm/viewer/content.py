@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 @runtime_checkable
 class AdaptedPath(Protocol):
-    """The attributes that an adaptation needs to be drawn, such as :class:`imitarm.policies.Adaptation`."""
+    """The attributes that an adapted path needs to be drawn; :class:`imitarm.policies.Adaptation` has them."""
 
     @property
     def nominal(self) -> Trajectory:
@@ -260,7 +260,7 @@ class Report:
         if not obstructed:
             return f"{done} of {len(self.scenes)} scenes completed"
         clear = sum(scene.rollout is not None and not scene.contact for scene in obstructed)
-        parts = [f"{clear} of {len(obstructed)} scenes with obstacles without contact"]
+        parts = [f"no contact in {clear} of {len(obstructed)} scenes with obstacles"]
         if math.isfinite(self.min_clearance):
             parts.append(f"smallest clearance {1000.0 * self.min_clearance:.1f} mm")
         if done < len(self.scenes):

@@ -172,7 +172,7 @@ def script_text(value: Any) -> str:
 
 
 def anchor(kind: str, index: int, name: str) -> str:
-    """Return an anchor for links, made of a number, which makes it unique, and a readable name."""
+    """Return an anchor for links: a number, which makes the anchor unique, and a readable name."""
     return f"{kind}-{index + 1}-" + (re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "x")
 
 

@@ -39,7 +39,7 @@ _KEYS: Final = (
 )
 _WORDS: Final = {
     "Demonstration": "One recording of a motion demonstrated by a person, here by guiding the arm's tool by hand.",
-    "Learned path": "The mean of all demonstrations. The robot follows it when no obstacle is in the way.",
+    "Learned path": "The mean of all demonstrations. The robot follows this path when no obstacle is in the way.",
     "Gaussian component": "The learned motion consists of Gaussian components, which follow one another along the "
     "path. Each component is drawn as an ellipse that contains 95 % of the demonstrated positions in its part of the "
     "motion. Where the ellipse is small, all demonstrations agree, and the task needs precision.",
@@ -48,7 +48,7 @@ _WORDS: Final = {
     "Tolerance": "How far a path may be from the learned path and still resemble the demonstrations: two standard "
     "deviations of the demonstrations to each side.",
     "Clearance": "The smallest distance between any part of the arm or its tool and any obstacle. The simulator "
-    "measures it between the exact shapes while the arm moves; it is not taken from the plan.",
+    "measures this distance between the exact shapes while the arm moves; the value is not taken from the plan.",
     "Certified clearance": "A guaranteed lower bound of the distance between the tool and any obstacle on the whole "
     "planned path.",
     "RMSE": "Root mean square error: the typical distance between the measured path and the demonstrations. The "
@@ -129,7 +129,7 @@ def _header(report: Report) -> Header:
     unmoved = [scene.unmoved_fraction for scene in obstructed if not math.isnan(scene.unmoved_fraction)]
     planning = [scene.adaptation.compute_time for scene in obstructed if scene.adaptation is not None]
     tiles = (
-        Tile(str(clear), f"of {len(obstructed)}", "scenes with obstacles without contact"),
+        Tile(str(clear), f"of {len(obstructed)}", "scenes with obstacles were free of contact"),
         Tile(
             number(MM * report.min_clearance),
             "mm",

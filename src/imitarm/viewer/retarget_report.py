@@ -41,21 +41,21 @@ _FINGER_TIME: Final = 0.25  # [s] for the fingers to open or close
 _WORDS: Final = {
     "Retargeting": "The motion of a person's arm, measured by a camera, is converted to a motion of a robot arm. "
     "The robot's tool follows the hand. If the method supports it, the robot's elbow follows the person's elbow.",
-    "Target": "The position that the method wants the tool to reach. It is the tool's position at the time when the "
-    "robot began to follow the person, plus the displacement of the hand since that time, multiplied by the scale.",
+    "Target": "The position that the method wants the tool to reach. The target is the tool's position at the time when "
+    "the robot began to follow the person, plus the displacement of the hand since that time, multiplied by the scale.",
     "Following, coasting, holding, stopped": "Following: the camera sees the person's arm, and the tool follows the "
     "hand. Coasting: the arm has been lost "
     "for up to 0.1 s, and the motion continues with decaying velocity. Holding: the arm has been lost for up to 0.3 "
     "s, and the target stands still. Stopped: the arm has been lost for longer than 0.3 s; following resumes after "
     "the arm has been seen for 0.5 s.",
     "Frames beyond a limit": "Control periods in which a joint exceeds a limit of position, velocity or "
-    "acceleration. They are computed from the commanded joint positions, which the drives of a real arm would have "
-    "to execute.",
-    "Smallest singular value": "How well the arm can move its tool in the direction in which it is hardest. If the "
+    "acceleration. The frames are counted from the commanded joint positions, which the drives of a real arm would "
+    "have to execute.",
+    "Smallest singular value": "How well the arm can move its tool in the direction in which moving is hardest. If the "
     "value is near 0, the arm is almost stretched or folded, and small motions of the tool need fast motions of the "
     "joints.",
-    "Torque": "The torque that the motion needs, computed by inverse dynamics without friction. Its weight part "
-    "holds the arm against gravity.",
+    "Torque": "The torque that the motion needs, computed by inverse dynamics without friction. The weight "
+    "part of the torque holds the arm against gravity.",
 }
 
 

@@ -2,7 +2,7 @@
 
 :func:`playback_html` draws the model of a :class:`~imitarm.viewer.recording.Recording` with paths and Gaussian
 components around it, and moves the bodies as they were recorded. The package viser draws the page in the reader's
-browser. It needs a server on this machine only while the page is written.
+browser. Viser needs a server on this machine only while the page is written.
 """
 
 from __future__ import annotations
