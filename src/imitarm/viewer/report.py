@@ -39,7 +39,7 @@ _KEYS: Final = (
 )
 _WORDS: Final = {
     "Demonstration": "One recording of a motion demonstrated by a person, here by guiding the arm's tool by hand.",
-    "Learned path": "The mean of all demonstrations. The robot follows this path when no obstacle is in the way.",
+    "Learned path": "The mean of all demonstrations. The robot follows the learned path if no obstacle is in the way.",
     "Gaussian component": "The learned motion consists of Gaussian components, which follow one another along the "
     "path. Each component is drawn as an ellipse that contains 95 % of the demonstrated positions in its part of the "
     "motion. Where the ellipse is small, all demonstrations agree, and the task needs precision.",
