@@ -42,7 +42,8 @@ _WORDS: Final = {
     "Retargeting": "The motion of a person's arm, measured by a camera, is converted to a motion of a robot arm. "
     "The robot's tool follows the hand. If the method supports it, the robot's elbow follows the person's elbow.",
     "Target": "The position that the method wants the tool to reach. The target is the tool's position at the time "
-    "when the robot began to follow the person, plus the displacement of the hand since that time, multiplied by the scale.",
+    "when the robot began to follow the person, plus the displacement of the hand since that time, multiplied "
+    "by the scale.",
     "Following, coasting, holding, stopped": "Following: the camera sees the person's arm, and the tool follows the "
     "hand. Coasting: the arm has been lost "
     "for up to 0.1 s, and the motion continues with decaying velocity. Holding: the arm has been lost for up to 0.3 "
