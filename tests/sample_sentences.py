@@ -27,7 +27,7 @@ _ARGUMENT = re.compile(_ITEM + r"|[\w*, ().]+:$|\w[\w, *]*(?: \([^)]*\))?: )")
 _END = re.compile(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*`$\[]*[A-Z0-9])")
 _ABBREVIATION = re.compile(r"\b(?:Eq|Eqs|Fig|Figs|e\.g|i\.e|et al|vs|cf|Trans|No|[A-Z])\.$")
 _WORD = re.compile(r"(?<![\w\\])[A-Za-z]{2,}(?!\w)")
-_REGULAR = re.compile(r"\(\?:|\[\^|\\[wd](?![A-Za-z])")  # a string that is a regular expression
+_REGULAR = re.compile(r"\(\?:|\[\^|\\[wd](?![A-Za-z])|\\\d")  # a string that is a regular expression
 _CODE = re.compile(r"``?[^`]*``?|\$[^$]*\$|\S*[_/\\:]\S*\w")
 
 

@@ -52,7 +52,7 @@ def test_names_are_unique_and_not_empty() -> None:
 
 def test_every_number_is_there_in_si_units_and_is_json() -> None:
     data = json.loads(json.dumps(as_data(make_report(scenes=2)), allow_nan=False))
-    assert data["passed"] is True and data["verdict"].startswith("2 of 2")
+    assert data["passed"] is True and data["verdict"].startswith("no contact in 2 of 2")
     scene = data["scenes"][1]
     assert scene["required_clearance_m"] == 0.02
     assert scene["min_clearance_m"] == pytest.approx(0.022, abs=1e-3)

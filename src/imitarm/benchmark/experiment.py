@@ -280,9 +280,9 @@ class Result:
     Attributes:
         experiment: experiment that was run.
         code: version of the code that ran, see :func:`imitarm.benchmark.provenance.code_version`.
-        values: measures by name. For a recording, these are the measures of
+        values: measures by name. For a recording, the measures are those of
             :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics`, ``recorded`` [s], ``beyond_reach`` (fraction of
-            the time) and the ``notes`` of the method. For a closed-loop trial, these are the measures of
+            the time) and the ``notes`` of the method. For a closed-loop trial, the measures are those of
             :class:`StackingOutcome`. Empty after a failure.
         failure: reason why there are no measures; empty if there are measures.
         seconds: computing time [s].

@@ -1,7 +1,7 @@
 """An oracle that decides whether a path exists, to check refusals.
 
-The oracle shares no code with the library's search for a path. It considers displacements of the nominal path at many
-times, called layers. In each layer, displacements are cells of a grid.
+The oracle shares no code with the library's search for a path. The oracle considers displacements of the nominal path
+at many times, called layers. In each layer, displacements are cells of a grid.
 
 The oracle gives one of three answers:
 

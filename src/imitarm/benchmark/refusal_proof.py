@@ -202,9 +202,9 @@ def is_impossible(question: Question, cells: _Cells) -> bool:
     """Return whether there is provably no path, because a flood fill of possibly free boxes can't reach the goal.
 
     A box is blocked if all of its corners are inside the same inflated obstacle. The corners suffice, because the
-    obstacle is convex. Boxes are fixed in space, so the motion of the tip does not matter. To allow for all other
-    motion, the obstacles are made smaller: motion out of the permitted plane, motion of spheres away from the tip, and
-    motion of obstacles.
+    obstacle is convex. Boxes are fixed in space, so the motion of the tip does not matter. The obstacles are made
+    smaller to allow for all other motion. The other motion is that out of the permitted plane, that of spheres away
+    from the tip, and that of the obstacles.
     """
     d = len(cells.frame)
     moving = any(obstacle.velocity.any() for obstacle in question.obstacles)

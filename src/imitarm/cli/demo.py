@@ -29,16 +29,16 @@ examples:
 
 The package contains eight demonstrations of a sweep, in which a synthetic teacher guides the simulated Sawyer by hand.
 The command checks and aligns the demonstrations, and learns a skill from them.
-It then reproduces the skill without obstacles and in four scenes with obstacles.
-It writes skill.json, report.html (opens offline in any browser) and results.json to FOLDER.
-It replaces existing files only with --force.
+The command then reproduces the skill without obstacles and in four scenes with obstacles.
+The command writes skill.json, report.html (opens offline in any browser) and results.json to FOLDER.
+The command replaces existing files only with --force.
 The exit status is 1 if a scene fails or the arm touches an obstacle.
 """
 
 _SUMMARY = (
-    "A Sawyer learns from eight demonstrations to sweep crumbs into a dustpan. It then sweeps tables on which new "
-    "obstacles stand in the way. Only the parts of the learned path that are near an obstacle are moved, and only "
-    "as far as needed for the required clearance. A synthetic teacher gave the "
+    "A Sawyer learns from eight demonstrations to sweep crumbs into a dustpan. The Sawyer then sweeps "
+    "tables on which new obstacles stand in the way. Only the parts of the learned path that are near an obstacle are "
+    "moved, and only as far as needed for the required clearance. A synthetic teacher gave the "
     "demonstrations by guiding the simulated arm by hand. Clearance, torques and the number of swept crumbs are "
     "measured in the simulator, not taken from the plan."
 )

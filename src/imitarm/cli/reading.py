@@ -107,7 +107,8 @@ def show_findings(raw: Sequence[RawDemonstration], findings: Sequence[Finding], 
     Args:
         raw: the demonstrations that were read.
         findings: about them.
-        every: whether to print one row for each finding; if False, one row for each kind of finding, with their number.
+        every: whether to print one row for each finding; if False, one row for each kind of finding, with the number of
+            findings.
     """
     groups = [[f] for f in findings] if every else _kinds(findings)
     if findings:

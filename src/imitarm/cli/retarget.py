@@ -269,7 +269,7 @@ def _result(name: str, evaluation: RunEvaluation, execution: Execution | None) -
 
 
 def _demonstration(made: Retargeting, task: str, source: str, whole: bool) -> Demonstration:
-    """Return the part in which the robot followed the person as a demonstration; with ``whole``, the whole run."""
+    """Return as a demonstration the part in which the robot followed the person; with ``whole``, the whole run."""
     engaged = np.flatnonzero(made.engaged)
     first, last = (0, len(made.times) - 1) if whole else (max(int(engaged[0]) - 1, 0), int(engaged[-1]))
     part = slice(first, max(last, first + 1) + 1)

@@ -129,8 +129,8 @@ def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
 def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | None, phases: Sequence[float]) -> float:
     """Return the root mean square distance [m] of the measured tool to all demonstrations at the same phase.
 
-    This is thesis Eq 4.9, with the square root that the printed equation lacks. Positions are compared at the same
-    phase, not at the same time, so that waiting does not count as inaccuracy.
+    The formula is thesis Eq 4.9, with the square root that the printed equation lacks. Positions are compared at the
+    same phase, not at the same time, so that waiting does not count as inaccuracy.
     """
     if rollout is None or not demonstrations or not phases:
         return float("nan")

@@ -392,7 +392,7 @@ def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0
 
     The first barycentre is the medoid: the motion nearest to all others. Each round matches every motion with the
     barycentre by :func:`dtw` and smooths the matched times into a warp. The mean of the warped motions is the
-    barycentre of the next round. This is the averaging of Petitjean et al. 2011, except that each motion has one smooth
+    barycentre of the next round. The averaging is that of Petitjean et al. 2011, except that each motion has one smooth
     warp in place of sets of matched samples. The warps are centred, which means that their mean is the identity.
     Therefore the common speed profile is the mean of all speed profiles, not the profile of the medoid.
 

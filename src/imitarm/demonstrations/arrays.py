@@ -83,7 +83,7 @@ def _check_size(content: bytes) -> None:
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = header(stream)
     if not dtype.hasobject and np.prod(shape, dtype=float) * dtype.itemsize > len(content):
-        raise ValueError(f"its header states the shape {shape}, the file is too short for it")
+        raise ValueError(f"its header states the shape {shape}, but the file is too short for this shape")
 
 
 def _numbers(source: str, array: Any) -> Array:

@@ -305,8 +305,8 @@ def _unit(raw: RawDemonstration, keep: NDArray[np.int64]) -> Array:
 class ValidRows:
     """The valid rows of a raw demonstration.
 
-    A row is valid if its numbers are finite, its time stamp is later than the previous one, and it does not only repeat
-    the previous sample.
+    A row is valid if its numbers are finite, its time stamp is later than the previous one, and it is not a mere
+    repetition of the previous sample.
 
     Attributes:
         raw: the demonstration.

@@ -133,7 +133,7 @@ def _factor(
     source: str, option: str, asked: str | None, said: str | None, known: dict[str, float], default: str
 ) -> float:
     if said is not None and said not in known:
-        raise FileFormatError(f"{source}: says its unit is {said!r}; known: {', '.join(known)}")
+        raise FileFormatError(f"{source}: says its unit is {said!r}; known units: {', '.join(known)}")
     if asked is not None and said is not None and asked != said:
         raise InputError(
             f"{source}: says its unit is {said}, which contradicts {option}={asked!r}; leave out that option"

@@ -50,7 +50,7 @@ class Interval:
 
 
 Values = Mapping[tuple[int, Any], float]
-"""The measured value of each recording, by person and a second key such as the recording; nan if it is missing."""
+"""The measured values by person and a second key, such as the number of the recording; nan if a value is missing."""
 
 
 def person_means(values: Values) -> Array:
@@ -82,8 +82,8 @@ def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) ->
     r"""Return the percentile bootstrap interval of a mean.
 
     Resampled means of n samples scatter too little: their standard deviation is too small by the factor
-    :math:`\sqrt{(n-1)/n}`. Their deviations are therefore divided by this factor. Without this correction, a "95 %"
-    interval of ten samples would cover only 90 %.
+    :math:`\sqrt{(n-1)/n}`. The deviations of the resampled means are therefore divided by this factor. Without this
+    correction, a "95 %" interval of ten samples would cover only 90 %.
 
     Args:
         samples: shape (n,).
@@ -221,9 +221,9 @@ def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tup
 def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
     """Return the two-sided p-value of the mean difference, from random sign flips of the differences.
 
-    The p-value is the probability of a mean at least this large if each difference had either sign with equal
-    probability. For up to 14 differences, all sign flips are evaluated, so the result is exact. With n differences, the
-    p-value can't be less than 2 / 2^n.
+    The p-value is the probability of a mean at least as large as the observed mean if each difference had either sign
+    with equal probability. For up to 14 differences, all sign flips are evaluated, so the result is exact. With n
+    differences, the p-value can't be less than 2 / 2^n.
 
     Args:
         differences: one per person, shape (n,).

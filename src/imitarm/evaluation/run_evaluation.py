@@ -33,8 +33,9 @@ class TargetTracking:
 
     The tool tracked the target if three conditions hold: the robot was engaged for at least half of the time, the RMS
     distance was at most :data:`FAR`, and the tool was farther away than :data:`FAR` for at most :data:`FAR_FRACTION` of
-    the time with a target. These limits were chosen for two reasons. First, a gripper within 5 cm of its target is
-    still at the object that it should grasp. Second, the normal lag of the method ``modern`` exceeds neither limit.
+    the time with a target. The two limits FAR and FAR_FRACTION were chosen for two reasons. First, a gripper within 5
+    cm of its target is still at the object that it should grasp. Second, the normal lag of the method ``modern``
+    exceeds neither limit.
 
     Attributes:
         title: title of the method.

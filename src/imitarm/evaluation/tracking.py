@@ -212,7 +212,7 @@ def best_lag(true: TrueArm, tool: Array, periods: EngagementPeriods, scale: floa
     """Return the constant lag that explains the tool's motion best [s], and the RMS error after removing this lag [m].
 
     Lags from -0.1 to 0.8 s are tried. A parabola through the lag with the smallest error and its two neighbours gives
-    the minimum. Both results are nan if no frame is engaged. The lag is also nan if the hand did not move.
+    the minimum. The lag and the error are nan if no frame is engaged. The lag is also nan if the hand did not move.
     """
     engaged = periods.engaged
     if not engaged.any():
@@ -268,8 +268,8 @@ def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods
     """Return the angle between the actual and the correct direction of the robot's upper arm, shape (n,) [rad].
 
     The correct direction is the direction of the robot's upper arm at the start of the engagement, rotated in the same
-    way as the person's upper arm has rotated since then. This rotation is the smallest one between the two directions
-    of the person's upper arm.
+    way as the person's upper arm has rotated since then. The rotation of the person's upper arm is the smallest
+    rotation between its two directions.
 
     Args:
         true: the person's arm, in the axes of the base.

@@ -72,9 +72,9 @@ class PartFile:
         Calling this method again does nothing.
 
         Args:
-            take: function that is called with the path ``part``. It may create ``PATH`` from that file, and returns
-                whether it renamed the file. If it returns False, ``part`` is removed. If it returns True, nothing is
-                removed, because a new file called ``PATH.part`` would belong to another recorder.
+            take: function that is called with the path ``part``. The function may create ``PATH`` from that file, and
+                returns whether it renamed the file. If it returns False, ``part`` is removed. If it returns True,
+                nothing is removed, because a new file called ``PATH.part`` would belong to another recorder.
             begin: text that replaces the ``begin`` given to the constructor; both must have the same length.
 
         Raises:

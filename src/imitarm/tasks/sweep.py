@@ -53,9 +53,9 @@ class SweepTask:
     """A Sawyer with a curved brush, dirt on a table, and a dustpan recessed into the table.
 
     The brush starts at the point S, moves to the dirt at the point T, and pushes the dirt to the point G in the
-    dustpan. The brush moves just above the table. Its open side points in the direction of motion, so that its two ends
-    keep the crumbs in when it moves to the left or right. The task succeeds if the dirt is in the pan and neither the
-    arm nor the brush has touched an obstacle.
+    dustpan. The brush moves just above the table. The open side of the brush points in the direction of motion. The two
+    ends of the brush therefore keep the crumbs in when the brush moves to the left or right. The task succeeds if the
+    dirt is in the pan and neither the arm nor the brush has touched an obstacle.
 
     Attributes:
         seed: seed of the positions of the crumbs.

@@ -211,8 +211,8 @@ def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:
             yield Figure(
                 svg,
                 "Path around the obstacles",
-                "Path of the tool centre point. The dotted line bounds the area that the tool sweeps. This area "
-                "must stay outside the dashed lines. Arrows show how far components were moved.",
+                "Path of the tool centre point. The dotted line bounds the area that the tool sweeps. "
+                "The swept area must stay outside the dashed lines. Arrows show how far components were moved.",
             )
             lengths = np.linalg.norm(adaptation.displacement, axis=1)
             svg = charts.displacement(lengths, adaptation.moved, name=f"{key}-moved")
