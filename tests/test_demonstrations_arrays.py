@@ -133,7 +133,7 @@ def test_a_header_that_promises_more_than_the_file_holds(tmp_path):
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12, 7)})
     (tmp_path / "a.npy").write_bytes(header.getvalue() + bytes(64))
-    with pytest.raises(FileFormatError, match="the file is too short for it"):
+    with pytest.raises(FileFormatError, match="but the file is too short for this shape"):
         read(tmp_path / "a.npy", duration=1.0)
 
 
