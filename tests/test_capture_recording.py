@@ -226,7 +226,7 @@ def test_trim_counts_from_the_first_frame():
     cut = recording.trim(0.2, 0.5)
     assert [cut.skeletons[0].time, cut.skeletons[-1].time] == pytest.approx([100.2, 100.5])
     assert len(cut) == 10 and len(recording.trim(0.5)) == 16
-    with pytest.raises(InputError, match=r"no frame between 5 and 6 s; it goes from 0 to 1\.00 s"):
+    with pytest.raises(InputError, match=r"no frame between 5 and 6 s; the recording goes from 0 to 1\.00 s"):
         recording.trim(5.0, 6.0)
 
 
@@ -234,7 +234,7 @@ def test_one_person_of_several():
     recording = SkeletonRecording(skeletons(4) + skeletons(3, person=5))
     assert recording.persons == (0, 5)
     assert {s.person for s in recording.person(5).skeletons} == {5} and len(recording.person(5)) == 3
-    with pytest.raises(InputError, match="person 2 is not in it; there is: 0, 5"):
+    with pytest.raises(InputError, match="person 2 is not in this recording, which contains: 0, 5"):
         recording.person(2)
 
 

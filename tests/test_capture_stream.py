@@ -166,7 +166,7 @@ def test_nobody_listening_is_counted_and_harms_nothing(link):
 def test_it_hears_this_machine_only_unless_told_otherwise():
     with UdpSource(0) as near, UdpSource(0, "0.0.0.0") as far:
         assert near.address[0] == "127.0.0.1" and far.address[0] == "0.0.0.0"
-        with pytest.raises(InputError, match="cannot listen there"):
+        with pytest.raises(InputError, match="cannot listen at this address"):
             UdpSource(near.address[1])
-    with pytest.raises(InputError, match="cannot listen there"):
+    with pytest.raises(InputError, match="cannot listen at this address"):
         UdpSource(0, "192.0.2.1")  # an address that no machine has

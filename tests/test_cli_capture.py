@@ -53,7 +53,7 @@ def test_trim_repair_and_one_person(tmp_path, capsys):
     assert main(["capture", str(source), "--out", str(out), "--person", "2", "--force"]) == 0
     assert read_recording(out).persons == (2,) and len(read_recording(out)) == 60
     assert main(["capture", str(source), "--person", "3"]) == 2
-    assert "person 3 is not in it; there is: 1, 2" in capsys.readouterr().err
+    assert "person 3 is not in this recording, which contains: 1, 2" in capsys.readouterr().err
 
 
 def test_a_check_that_finds_an_error_is_told_by_the_exit_status(tmp_path, capsys):

@@ -185,7 +185,7 @@ def test_one_of_two_persons_and_repairs(tmp_path, capsys):
     assert run(source, "--person", 2) == 0
     assert "kept person" not in capsys.readouterr().err
     assert run(source, "--person", 5) == 2
-    assert "person 5 is not in it; there is: 1, 2" in capsys.readouterr().err
+    assert "person 5 is not in this recording, which contains: 1, 2" in capsys.readouterr().err
 
 
 def test_a_stop_on_the_way_is_reported(tmp_path, capsys):

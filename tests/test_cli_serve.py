@@ -77,7 +77,7 @@ def test_a_port_that_is_taken_is_said_and_no_more(tmp_path, capsys):
             == 2
         )
     shown = capsys.readouterr()
-    assert "cannot listen there" in shown.err and shown.err.startswith("imitarm: error: ") and not shown.out
+    assert "cannot listen at this address" in shown.err and shown.err.startswith("imitarm: error: ") and not shown.out
     assert trace.read_text() == "an older one"
 
 

@@ -26,7 +26,7 @@ def test_what_can_not_be_is_refused():
         RobotServer(Paper(), 0, rate=50.0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
-        with pytest.raises(InputError, match="cannot listen there"):
+        with pytest.raises(InputError, match="cannot listen at this address"):
             RobotServer(Paper(), taken.getsockname()[1])
 
 

@@ -75,7 +75,7 @@ _RECORDED = (Figure("recorded", "length [s]"), Figure("beyond_reach", "beyond re
 _MEANS_NOTE = "Each value is the mean over persons (95 % interval)."
 _ACCURACY_NOTE = (
     "Distances are root mean squares. Executed: measured on an arm that keeps its limits, as a real arm does. Engaged: "
-    "fraction of the time in which the person led the robot."
+    "fraction of the time in which the robot followed the person."
 )
 _CAPTURED_NOTE = (
     "All recordings show the motion of one person, so there is no interval: each value is the mean over the cameras "

@@ -68,7 +68,7 @@ def _mixing() -> Array:
 
 
 def _white_ratios() -> Array:
-    """Return the white noise of each joint relative to sigma: at rest, and its increase per m/s, shape (2, 25)."""
+    """Return each joint's white noise at rest, and its increase per m/s, both relative to sigma, shape (2, 25)."""
     return np.array([_WHITE.get(name.removesuffix("_left").removesuffix("_right"), _WHITE_BODY) for name in JOINTS]).T
 
 
@@ -77,7 +77,7 @@ _SHAPE = (len(JOINTS), 3)
 
 
 class SkeletonCamera:
-    r"""A simulated skeleton camera with the errors of a real one.
+    r"""A simulated skeleton camera with the errors of a real camera.
 
     The page docs/capture.md describes how these errors were measured.
 
@@ -89,16 +89,17 @@ class SkeletonCamera:
     .. math:: du = dt / 5\,\mathrm{s} + |dx| / 8\,\mathrm{cm}, \qquad
               \mathrm{E}\,[c(0)\,c(u)] = \sigma^2 (1 + u)\,e^{-u},
 
-    The path length has an effect because, in recordings of a Kinect v2, the length of a bone hardly changes while the
-    arm is at rest, but changes by 1 to 2 cm while the joint moves by 10 to 20 cm. The matrix ``M`` correlates the
-    errors of neighbouring joints, so that the length of the forearm varies less than the length of the upper arm. The
-    white noise ``n`` grows with the joint's speed. With ``sigma`` of 12 mm, its standard deviation for elbow and wrist
-    is 0.2 mm at rest plus 5 mm per m/s. The bias ``b`` is a constant error of the elbow's depth.
+    The slow error depends on the path length, as in recordings of a Kinect v2. In these recordings, the length of a
+    bone hardly changes while the arm is at rest, but changes by 1 to 2 cm while the joint moves by 10 to 20 cm. The
+    matrix ``M`` correlates the errors of neighbouring joints, so that the length of the forearm varies less than the
+    length of the upper arm. The white noise ``n`` grows with the joint's speed. With ``sigma`` of 12 mm, the standard
+    deviation of ``n`` for elbow and wrist is 0.2 mm at rest plus 5 mm per m/s. The bias ``b`` is a constant error of
+    the elbow's depth.
 
-    * Timing: frames arrive at ``rate`` with ``jitter``. 3 % of the intervals are twice as long, and 1 % of the frames
-      show nobody.
-    * Dropouts: ``dropout`` times per second on average, for 2 to 20 frames, an arm is inferred (with three times the
-      error), an arm is lost, or the whole person is lost.
+    * Timing: frames arrive at ``rate`` with ``jitter``. 3 % of the intervals between frames are twice the usual length,
+      and 1 % of the frames show nobody.
+    * Dropouts: for each arm, a dropout begins ``dropout`` times per second on average and lasts 2 to 20 frames. During
+      a dropout, the arm is inferred (with three times the error), the arm is lost, or the whole person is lost.
     * Occlusion: the joints of a forearm behind the torso, and an elbow behind the hand of the same arm, are inferred.
     * Hand states: occasionally, the state of a hand is wrong for one or two frames.
 
@@ -172,7 +173,7 @@ class SkeletonCamera:
         """Return the skeleton that the camera reports, or None if it reports no skeleton.
 
         Args:
-            truth: the true skeleton, later than the skeleton of the previous call.
+            truth: the true skeleton, with a later time than the skeleton of the previous call.
         """
         period = max(truth.time - self._time, 0.0) if math.isfinite(self._time) else 0.0
         error = self._error(truth.positions, period)
@@ -228,7 +229,7 @@ class SkeletonCamera:
 
     @staticmethod
     def _hide(points: Array, tracking: NDArray[np.int8]) -> None:
-        """Mark joints as inferred that are hidden behind parts of the body closer to the sensor."""
+        """Mark a joint as inferred if a part of the body hides it from the sensor."""
         top, low = points[JOINT["spine_shoulder"]], points[JOINT["spine_base"]]
         for index in _ARM.values():
             arm = points[index]

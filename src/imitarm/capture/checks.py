@@ -1,4 +1,4 @@
-"""Find faults in a recording of a person (``check``), and fix those that need no guessing (``repaired``)."""
+"""Find faults in a recording of a person (``check``), and fix the faults that need no guessing (``repaired``)."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ class _View:
         self.other_axes = axes_that_fit(self.positions)
 
     def issue(self, severity: Severity, code: str, message: str, remedy: str, i: int | None = None) -> RecordingIssue:
-        """Build an issue about skeleton ``i`` of this view; None: about the whole recording."""
+        """Build an issue about skeleton ``i`` of this view, or about the whole recording if ``i`` is None."""
         if i is None:
             return RecordingIssue(severity, code, message, remedy=remedy)
         return RecordingIssue(severity, code, message, self.frames[i], float(self.times[i] - self.times[0]), remedy)
@@ -276,8 +276,8 @@ def _gaps(view: _View) -> Iterator[RecordingIssue]:
     if long.any():
         i = int(np.argmax(steps))
         stops = int((steps > _STOP).sum())
-        message = f"{int(long.sum())} gaps between frames, the longest {steps[i]:.2f} s; {stops} are long enough "
-        message += f"(over {_STOP:g} s) for a robot to stop"
+        message = f"{int(long.sum())} gaps between frames, the longest {steps[i]:.2f} s; {stops} of them are longer "
+        message += f"than {_STOP:g} s, after which a robot stops"
         yield view.issue("warning", "gap", message, "cut the recording there with trim, or record again", i)
 
 
@@ -309,8 +309,8 @@ def _spikes(view: _View) -> Iterator[RecordingIssue]:
     if spikes.any():
         frames = np.flatnonzero(spikes.any(axis=1))
         i, joint = divmod(int(np.argmax(size)), len(joints))
-        message = f"single-frame spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints jump away and "
-        message += f"back, at most by {size[i, joint]:.2f} m ({JOINTS[joints[joint]]})"
+        message = f"spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints jump away and "
+        message += f"back, by at most {size[i, joint]:.2f} m ({JOINTS[joints[joint]]})"
         remedy = "repair marks these joints as lost in these frames"
         severity = _severity_of(joints, spikes)
         yield view.issue(severity, "spike", message, remedy, int(view.later[frames[0]]))

@@ -23,10 +23,10 @@ class PersonFilter(SkeletonSource):
     """Selects one person from a source that may deliver several persons.
 
     The filter follows the first person who appears, and ignores everybody else. The filter follows another person only
-    after the first person has been out of view for more than ``patience`` on the source's clock. By then, every
-    retargeter has stopped and must engage again. A camera that tracks only one person at a time may give the next
-    person the same number. The filter therefore also ignores a person who appears farther away than the followed person
-    can have walked.
+    after the first person has been out of view for more than ``patience`` on the source's clock. After that time, every
+    retargeter has stopped, and begins anew with the next person. A camera that tracks only one person at a time may
+    give the next person the same number. The filter therefore also ignores a person who appears farther away than the
+    followed person can have walked.
 
     Args:
         source: the source to filter.
@@ -172,7 +172,7 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
 
 
 def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
-    """Return the skeleton with left and right as in ``before``, the positions (25, 3) [m] of ``period`` seconds ago."""
+    """Return the skeleton with left and right assigned as in ``before``, the positions ``period`` seconds ago [m]."""
     if not (_gain(skeleton.positions, before, _DECIDING, _LEAST) > 0.0).any():  # nearly always
         return skeleton
     order = np.arange(len(JOINTS))
@@ -243,8 +243,8 @@ class SideMemory:
 class SideFilter(SkeletonSource):
     """Undoes swaps of left and right in a source, separately for each person; see :func:`unswapped`.
 
-    The filter uses only motion, and assumes that left and right are correct in the first frame. After half a second
-    without frames, it restarts; by then every retargeter has stopped.
+    The filter decides from the motion alone, and assumes that left and right are correct in the first frame. After half
+    a second without frames, the filter restarts; every retargeter has stopped by this time.
 
     Args:
         source: a source that may swap left and right.

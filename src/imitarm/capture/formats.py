@@ -88,8 +88,8 @@ def native_line(skeleton: Skeleton) -> str:
 def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read imitarm's own format.
 
-    If the recording was not closed, because its writer was killed or is still running, it is read up to the last
-    complete line, and an issue reports this.
+    A recording that was not closed, because its writer was killed or is still running, is read up to the last complete
+    line. An issue then reports that the recording was not closed.
 
     Args:
         path: path of the file, for messages.
@@ -239,8 +239,8 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
         return []
     frame = int(np.argmax(far.any(axis=1)))
     message = (
-        f"{int(far.sum())} joints in {int(far.any(axis=1).sum())} frames are not finite or farther than "
-        f"{FARTHEST:.0f} m, the first is {JOINTS[int(np.argmax(far[frame]))]} in line {int(table.lines[frame])}; "
+        f"{int(far.sum())} joints in {int(far.any(axis=1).sum())} frames are not finite or more than "
+        f"{FARTHEST:.0f} m away; the first is {JOINTS[int(np.argmax(far[frame]))]} in line {int(table.lines[frame])}; "
         "these joints count as lost"
     )
     remedy = "check the unit of length and the sensor"
@@ -306,7 +306,8 @@ class MotionCapture:
     def load(cls, path: str | Path, *, to_body: ArrayLike | None = None) -> MotionCapture:
         """Read markers of a right arm from a file of tab-separated values in millimetres.
 
-        The wrist is taken as the midpoint of the two markers at the end of the hand that is closer to the forearm.
+        The wrist is the midpoint of the markers ``hand_left`` and ``hand_right`` at the end of the hand next to the
+        forearm.
 
         Args:
             path: the file.

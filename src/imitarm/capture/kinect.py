@@ -210,9 +210,9 @@ _FROM = _joint_indices()
 class AzureKinectSource(BodyCamera):
     """Skeletons of all persons in front of an Azure Kinect.
 
-    The SDK's 32 joints are converted to the 25 joints of the Kinect v2, and the depth camera's frame (x right, y down,
-    millimetres) to the frame of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK does not detect whether a hand is
-    open or closed, so hand states are unknown. Times are on the device's clock.
+    The SDK's 32 joints are converted to the 25 joints of the Kinect v2. The positions are converted from the depth
+    camera's frame (x right, y down, millimetres) to the frame of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK
+    does not detect whether a hand is open or closed, so hand states are unknown. Times are on the device's clock.
 
     When the SDK fails, `pykinect-azure` ends the program, but this class raises an error instead. This class fetches
     frames with the C functions of the SDK, because these functions distinguish a late frame from a failure.

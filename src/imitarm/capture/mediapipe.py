@@ -295,7 +295,7 @@ class MediaPipeSource(SkeletonSource):
         return None
 
     def _due(self, time: float, until: float) -> bool:
-        """In real time, wait until a skeleton is due; return False if that is later than ``until``."""
+        """Wait until a skeleton is due in real time; return False if this time is later than ``until``."""
         if not self._realtime:
             return True
         if self._began == -np.inf:

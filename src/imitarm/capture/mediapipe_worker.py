@@ -1,8 +1,9 @@
 """The process that runs MediaPipe: it reads images and writes landmarks as lines of text.
 
 The process runs in another Python environment (3.9 to 3.12) that has mediapipe 0.10.21 but not imitarm, so this file
-must not import imitarm. The class ``MediaPipeSource`` of imitarm starts the process and reads its standard output. Each
-line of the output has one of these forms:
+must not import imitarm. The class ``MediaPipeSource`` of imitarm starts the process and reads its standard output.
+
+Each line of the output has one of these forms:
 
 * ``imitarm-mediapipe 1 WIDTH HEIGHT`` is the first line, which is sent with the first image.
 * ``frame TIME NUMBERS`` is an image with a person. For each of 33 landmarks, NUMBERS contains the world position x y z

@@ -171,7 +171,7 @@ class Person:
         return Skeleton(time, points, hand_states=(states["left"], states["right"]))
 
     def elbow(self, shoulder: Array, wrist: Array, swivel: float, side: str = "right") -> tuple[Array, Array]:
-        """Return the elbow at angle ``swivel`` [rad] and the wrist, moved into reach if necessary, (3,) each [m]."""
+        """Return elbow (at angle ``swivel`` [rad]) and wrist (moved into reach if necessary), (3,) each [m]."""
         to_wrist = wrist - shoulder
         distance = math.sqrt(to_wrist @ to_wrist)
         along = to_wrist / distance if distance > 1e-6 else _FORWARD
@@ -255,10 +255,10 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _rotated(vector: Array, direction: Array) -> Array:
-    """Rotate a vector, perpendicular to forward, by the smallest rotation that takes forward to ``direction``.
+    """Rotate a vector by the smallest rotation that takes the person's forward axis to ``direction``.
 
-    A direction that is defined for an arm pointing forward thus changes continuously as the arm moves, except when the
-    arm points straight backwards.
+    The vector, shape (3,), must be perpendicular to the forward axis. A direction that is defined for an arm pointing
+    forward thus changes continuously as the arm moves, except when the arm points straight backwards.
     """
     both = direction + _FORWARD
     square = float(both @ both)

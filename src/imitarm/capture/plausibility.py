@@ -177,10 +177,10 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
 def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
     r"""Find joints that jump away for one to three frames and come back.
 
-    Let A and B be the positions of a joint in the last frame before and in the first frame after a possible spike. The
-    joint is in a spike if it satisfies three conditions:
+    Let A be the position of a joint in the last frame before a possible spike, and B its position in the first frame
+    after the spike. The joint is in a spike if it satisfies three conditions.
 
-    * Its distance d from the straight line between A and B is more than 0.2 m.
+    * The distance d of the joint from the straight line between A and B is more than 0.2 m.
     * The distance between A and B is less than d / 2.
     * The joint moves there and back faster than 10 m/s, or an arm bone that ends at the joint is more than 0.12 m
       longer or shorter than in the frames before and after the spike.

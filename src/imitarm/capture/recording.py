@@ -108,7 +108,7 @@ class SkeletonRecording(SkeletonSource):
         kept = [skeleton for skeleton in self.skeletons if skeleton.person == number]
         if not kept:
             who = ", ".join(str(person) for person in self.persons) or "nobody"
-            raise InputError(f"{self.name}: person {number} is not in it; there is: {who}")
+            raise InputError(f"{self.name}: person {number} is not in this recording, which contains: {who}")
         return self.with_skeletons(kept)
 
     def trim(self, start: float = 0.0, end: float | None = None) -> SkeletonRecording:
@@ -127,7 +127,8 @@ class SkeletonRecording(SkeletonSource):
         kept = [s for s in self.skeletons if start - 1e-9 <= s.time - first <= last + 1e-9]
         if not kept:
             raise InputError(
-                f"{self.name}: no frame between {start:g} and {last:g} s; it goes from 0 to {self.duration:.2f} s"
+                f"{self.name}: no frame between {start:g} and {last:g} s; "
+                f"the recording goes from 0 to {self.duration:.2f} s"
             )
         return self.with_skeletons(kept)
 
@@ -280,7 +281,7 @@ def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
     """Slow a recording down, for a robot whose joints are slower than a person's.
 
     Frames are inserted so that the frame rate stays about the same. In an inserted frame, the joints are interpolated
-    linearly; a joint that is lost in one of the two original frames keeps its position from the earlier frame. Gaps
+    linearly. A joint that is lost in one of the two original frames keeps its position from the earlier frame. Gaps
     between frames are not filled, and become longer.
 
     Args:

@@ -170,15 +170,16 @@ def bone(recording: SkeletonRecording, side: str, name: str) -> tuple[float, flo
 
 
 def arm_raised(recording: SkeletonRecording, side: str) -> dict[float, float]:
-    """Return, for each time [ms], the angle between the spine and the line from shoulder to wrist [rad].
+    """Return, for each time [s], the angle between the spine and the line from shoulder to wrist [rad].
 
-    The angle does not depend on the position of the camera; times at which the arm is not tracked are left out.
+    The angle does not depend on the position of the camera. Times are rounded to 1 ms; times at which the arm is not
+    tracked are left out.
     """
     return _angles(recording, (f"shoulder_{side}", f"wrist_{side}"), ("spine_base", "spine_shoulder"), side)
 
 
 def elbow_bent(recording: SkeletonRecording, side: str) -> dict[float, float]:
-    """Return, for each time [ms], the angle between forearm and upper arm [rad], as :func:`arm_raised` does."""
+    """Return, for each time [s] at which the arm is tracked, the angle between forearm and upper arm [rad]."""
     return _angles(recording, (f"elbow_{side}", f"wrist_{side}"), (f"elbow_{side}", f"shoulder_{side}"), side)
 
 
@@ -209,11 +210,11 @@ def agreement(one: dict[float, float], other: dict[float, float]) -> tuple[float
 
 
 def wrist_difference(one: SkeletonRecording, other: SkeletonRecording) -> float:
-    """Return the root mean square difference between two views of the wrists, each relative to its shoulder [m].
+    """Return the RMS difference between the wrist positions in two views, each relative to the shoulder [m].
 
     The function first aligns the two views by the one rotation that fits best over the whole recording, so the
-    positions and axes of the cameras have no effect. The result is the combined error of both views; nan if they have
-    fewer than 20 common frames.
+    positions and axes of the cameras have no effect. The result is the combined error of both views; nan if the views
+    have fewer than 20 common frames.
     """
     found = [{round(s.time, 3): s for s in view.skeletons} for view in (one, other)]
     pairs: list[tuple[Array, Array]] = []

@@ -83,8 +83,8 @@ class Arrival(NamedTuple):
 
     Attributes:
         waited: time between exposure and sending [s].
-        queued: time between sending and receiving [s]; if another machine sent the skeleton, by how much this time
-            exceeds the shortest time of the last one to two minutes.
+        queued: time between sending and receiving [s]. If another machine sent the skeleton, the shortest such time of
+            the last one to two minutes is subtracted.
         received_ns: time of receiving, on this machine's clock [ns].
     """
 
@@ -98,8 +98,8 @@ class UdpSource(SkeletonSource):
 
     A :class:`~imitarm.transmission.datagram_filter.DatagramFilter` drops and counts datagrams that are late, damaged,
     hostile, or from another sender. A sender that is killed and started again is accepted after half a second of
-    silence. The times of the restarted sender are shifted so that they continue after the gap, and every retargeter
-    engages again.
+    silence. The times of the restarted sender are shifted so that they continue after the gap. Every retargeter stops
+    in the gap and then begins anew.
 
     Args:
         port: port to listen on; 0: any free port.
@@ -152,7 +152,7 @@ class UdpSource(SkeletonSource):
         self._socket.close()
 
     def flush(self) -> None:
-        """Discard all skeletons that have already arrived, so that :meth:`read` returns a newer one."""
+        """Discard all skeletons that have already arrived, so that :meth:`read` returns a newer skeleton."""
         for _ in waiting(self._socket):
             pass
 

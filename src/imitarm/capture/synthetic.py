@@ -17,13 +17,13 @@ MOTIONS: dict[str, Callable[..., Truth]] = {
     **{kind: partial(reaching, kind=kind) for kind in REACHES},
     **{kind: partial(drawing, kind=kind) for kind in DRAWINGS},
 }
-"""Motions of a synthetic person, by name: each takes a person, a seed and ``duration`` [s]."""
+"""Functions, by name, that return a motion of a given synthetic person for a seed and a ``duration`` [s]."""
 
 
 class SyntheticSource(SkeletonSource):
     """A synthetic person in front of a simulated camera; the same seeds give the same skeletons.
 
-    The measured positions can be compared with the true ones::
+    The measured positions can be compared with the true positions::
 
         source = SyntheticSource.from_seed(3, kind="edge")
         for skeleton in source: error = skeleton.positions - source.truth(skeleton.time).positions

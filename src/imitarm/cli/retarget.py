@@ -224,7 +224,7 @@ def _setting(
     if not arguments.fit:
         return _Setting(arm, arm.home, correspondence, scene)
     duration = skeletons[-1].time - skeletons[0].time
-    times = np.arange(SEEN_FOR, max(duration, SEEN_FOR) + PERIOD, PERIOD)  # the person leads only after that
+    times = np.arange(SEEN_FOR, max(duration, SEEN_FOR) + PERIOD, PERIOD)  # the robot follows only after that
     with working("searching for a start from which the whole motion is within reach"):
         wrist = seen_arm(skeletons, times, correspondence).wrist
         fit = fit_motion(arm, wrist, wrist[0], scale=correspondence.scale)
@@ -375,7 +375,7 @@ def suggestion(
     """
     if tracking.followed:
         return ""
-    if tracking.near:  # it followed while the person led
+    if tracking.near:  # the tool was near its target while the robot followed
         return (
             "nobody controlled the robot for most of the time: keep the arm in view, use --trim, or choose the "
             "arm with --side"

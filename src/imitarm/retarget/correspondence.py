@@ -34,8 +34,9 @@ class Correspondence:
     .. math:: p_d = p_{home} + \rho\, R\,(W - W_0), \qquad R_d = R\,(R_H R_{H,0}^T)\,R^T R_{home}
 
     where :math:`p_d, R_d` is the desired pose of the tool, R the rotation from sensor to base, :math:`\rho` the scale,
-    W the position of the wrist and :math:`R_H` the rotation of the hand, both in the sensor's frame. The values at the
-    time when the robot began to follow are :math:`W_0`, :math:`R_{H,0}`, and :math:`p_{home}, R_{home}` for the tool.
+    W the position of the wrist and :math:`R_H` the rotation of the hand, both in the sensor's frame. At the time when
+    the robot began to follow, the wrist was at :math:`W_0`, the hand had the rotation :math:`R_{H,0}`, and the tool had
+    the pose :math:`p_{home}, R_{home}`.
 
     Attributes:
         side: side of the person's arm that the robot follows, ``"left"`` or ``"right"``.
@@ -108,7 +109,7 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _about_vertical(hand: Array, before: Array, home: Array) -> Array:
-    """Rotate ``home`` by the hand's rotation about the base's z axis since ``before``; quaternions, shape (4,).
+    """Rotate ``home`` about the base's z axis as the hand has rotated since ``before``; quaternions, shape (4,).
 
     The rotation about z is the twist of the swing-twist decomposition. The function computes the twist with plain
     floats, because only two components of its quaternion are not zero.

@@ -1,4 +1,4 @@
-"""Engagement: the state machine that decides when the robot follows a person; all methods use the same one."""
+"""Engagement: the state machine, the same for all methods, that decides when the robot follows a person."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class EngagementState(StrEnum):
     * ``WAITING``: the robot is at rest until the camera has seen the person's arm for half a second.
     * ``FOLLOWING``: the camera sees the person's arm, and the tool follows the hand.
     * ``COASTING``: the camera has just lost the arm; the motion of the hand is extrapolated.
-    * ``HOLDING``: the arm has been lost for longer; the robot holds its last target.
-    * ``STOPPED``: the arm has been lost for too long, so the robot brakes. When the robot is at rest and the camera
-      sees the arm again, the state becomes ``WAITING``.
+    * ``HOLDING``: the arm has been lost for longer than the extrapolation lasts; the robot holds its last target.
+    * ``STOPPED``: the time for holding the target is over, and the robot brakes. The state becomes ``WAITING`` when the
+      robot is at rest and the camera sees the arm again.
     """
 
     WAITING = "waiting"

@@ -8,8 +8,8 @@ where :math:`W` is the position of the person's wrist along the axes of the base
 clutch engages, :math:`p_0` the start position of the tool, and :math:`\rho` the scale. For each scale, the search
 places the middle of the motion at positions near the tool's home position, and then at positions throughout the
 workspace. The scale is reduced until the arm reaches the start and the six outermost points of the motion. At each of
-these points, the tool must have the same orientation as at home, and the arm must be away from singularities, its links
-must be apart, and it must be clear of the fixtures on which it stands.
+these points, the tool must have the same orientation as at home. The arm must be away from singularities, and its links
+must keep a minimum distance from each other and from the fixtures on which the arm stands.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ class _Search:
         return q if apart and (self._room(q)[self._kept_off] >= 0.0).all() else None
 
     def _room(self, q: Array) -> Array:
-        """Return each sphere's distance to each fixture minus the required distance, shape (n_fixtures, m) [m]."""
+        """Return each arm sphere's distance to each fixture minus the required distance, (n_fixtures, m) [m]."""
         centers, radii = self.arm.collision_spheres(q)
         return distances(self._fixtures, centers) - radii - _APART
 

@@ -60,7 +60,7 @@ class LimbLengths:
 
     @property
     def standard_error(self) -> float:
-        """The larger standard error of the two lengths [m]; 0 when the lengths were given."""
+        """The larger of the standard errors of the two lengths [m]; 0 when the lengths were given."""
         return max(self.spread) / self.n_frames**0.5 if self.n_frames else 0.0
 
     @property
@@ -144,9 +144,9 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
 
     .. math:: \min \sum_j c_j |x_j - \tilde x_j|^2 \quad\text{s.t.}\quad |E - S| = L_U,\; |W - E| = L_F
 
-    A few Gauss-Newton steps solve this problem, each with a 2 x 2 system of equations for the Lagrange multipliers.
-    :func:`correct_limbs` is the special case in which the shoulder is assumed to be exact and only the directions of
-    the bones are used. The special case transfers the errors of shoulder and elbow to the wrist.
+    A few Gauss-Newton steps solve this problem. Each step solves a 2 x 2 system of equations for the Lagrange
+    multipliers. :func:`correct_limbs` is the special case in which the shoulder is assumed to be exact and only the
+    directions of the bones are used. The special case transfers the errors of shoulder and elbow to the wrist.
 
     Args:
         points: shoulder, elbow, wrist, shape (3, 3) [m].

@@ -60,9 +60,9 @@ class ModernRetargeter(Retargeter):
     4. limit the jerk of the joints (:class:`JerkLimiter`) and check all limits again. If something blocks the arm, the
        arm does not push harder, and the target stays near the blocked tool.
 
-    The desired elbow angle of the robot changes by as much as the person's elbow angle since the robot began to follow:
-    :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of the elbow task decreases when the camera sees the
-    person's elbow poorly, and when the person's or the robot's arm is nearly straight.
+    From the time when the robot begins to follow, its desired elbow angle changes by as much as the person's elbow
+    angle: :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of the elbow task decreases when the camera sees
+    the person's elbow poorly, and when the person's or the robot's arm is nearly straight.
 
     When the camera loses the person, the robot continues along the extrapolated motion for 0.1 s, then holds its
     target, and stops 0.3 s after the loss. Once the person has been seen again for half a second, the motion restarts
@@ -248,7 +248,7 @@ class ModernRetargeter(Retargeter):
         obstacles = self._obstacles.rows(self._q, self.scene)
         own = None if self._own is None else self._own.rows(self._q, may_search=not self._seeing)
         rows = ([] if obstacles is None else [obstacles]) + ([] if own is None else [own])
-        if not engaged:  # whatever is too close already is corrected once the person leads
+        if not engaged:  # whatever is too close already is corrected once the robot follows
             rows = [Rows(part.matrix, np.minimum(part.lower, 0.0)) for part in rows]
         tasks: list[Task] = [TwistTask(twist, "tool", self._rotation_length, self._max_speed)]
         if elbow is not None:
@@ -265,8 +265,8 @@ class JerkLimiter:
     + 2\omega (v_r - v)` for a reference with position :math:`q_r` and velocity :math:`v_r`. The acceleration is clipped
     to :math:`|a| \le a_{max}` and to :math:`|a - a_p| \le j\,dt`, where :math:`a_p` is the previous acceleration and j
     the jerk limit. The resulting velocity :math:`v + a\,dt` is then clipped so that the joint can still stop before its
-    limit. Let D be the distance to the limit and a the largest acceleration, and let each step move the joint by the
-    mean of two successive velocities. The highest velocity from which the joint can still stop is then
+    limit. Let D be the distance to the limit and a the largest acceleration. Each step moves the joint by the mean of
+    two successive velocities times dt. The highest velocity from which the joint can still stop is then
 
     .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a D'}, \qquad D' = D - \tfrac12 v\,dt,
 
@@ -276,9 +276,9 @@ class JerkLimiter:
     limit, clipping to this velocity may exceed the jerk limit, but the limits of position, velocity and acceleration
     are always kept.
 
-    A blocked arm falls behind its commands, and its drives push harder as the error grows. Therefore, a joint command
-    brakes when it is ahead of the measured position by more than half of ``max_lead``, as if ``max_lead`` were an
-    additional position limit. The command may exceed this limit by the braking distance.
+    A blocked arm falls behind its commands, and its drives push harder as the error grows. The command of a joint
+    therefore brakes when it is ahead of the measured position by more than half of ``max_lead``, as if ``max_lead``
+    were an additional position limit. The command may exceed this limit by the braking distance.
 
     Args:
         arm: arm model that provides the joint limits.

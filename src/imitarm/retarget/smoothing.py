@@ -42,9 +42,9 @@ class OneEuro:
 
     The speed is the norm of the whole velocity vector, so the filter acts equally in all directions. The velocity is
     computed from the difference of two successive measured values. The original filter uses the difference between a
-    measured value and the previous smoothed value. The difference of the original filter contains the filter's own lag
-    and is too large during steady motion, which would distort predictions that use the velocity. The weight
-    :math:`\alpha` of a value is multiplied by the value's confidence.
+    measured value and the previous smoothed value. During steady motion, the difference of the original filter contains
+    the filter's own lag and is too large, so predictions from the velocity would be wrong. The weight :math:`\alpha` of
+    a value is multiplied by the value's confidence.
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].
@@ -176,7 +176,7 @@ class Hampel:
 
     A value x is an outlier if :math:`|x - \mathrm{med}| > \max(4 \cdot 1.4826\,\mathrm{MAD},\; r)`, where med is the
     median of the window and MAD the median absolute deviation from it. A real jump is accepted after half the window,
-    when most values agree with it.
+    when most values in the window are near the new value.
 
     Args:
         window: duration [s].
@@ -216,25 +216,25 @@ class Hampel:
 class TrackingOffsets:
     r"""Compensates for the jumps that occur when a joint changes between tracked and inferred.
 
-    When a joint is hidden, a camera infers its position, with an error that is several times larger than before and
-    differs from the previous error. The jump from the last tracked to the first inferred position is mostly due to this
-    change of the error, and so is the jump back. Therefore, when a joint becomes inferred, an offset o from the
-    measured position :math:`\tilde x` is chosen so that the motion continues,
+    When a joint is hidden, a camera infers its position. The error of the inferred position is several times larger
+    than the error of the tracked position. The jump from the last tracked to the first inferred position is mostly due
+    to this change of the error, as is the jump back to the first tracked position. Therefore, when a joint becomes
+    inferred, an offset o from the measured position :math:`\tilde x` is chosen so that the motion continues,
 
     .. math:: o = x_p + v\,\Delta t - \tilde x, \qquad x = \tilde x + o
 
     where x is the compensated position, :math:`x_p` the previous compensated position, v the velocity and :math:`\Delta
-    t` the time step. While the joint is inferred, the offset is constant, so the motion of the measured position is
-    used, but not the absolute position. When the joint is tracked again, a new offset is chosen in the same way. While
-    the joint is tracked, the offset decays with time and with the distance :math:`|\Delta x|` that the joint moves,
+    t` the time step. While the joint is inferred, the offset is constant, so only the changes of the measured position
+    have an effect. When the joint is tracked again, a new offset is chosen in the same way. While the joint is tracked,
+    the offset decays with time and with the distance :math:`|\Delta x|` that the joint moves,
 
     .. math:: o \leftarrow o\,\exp(-\Delta t / T - |\Delta x| / L).
 
     A person who watches the robot does not notice this decay, but would notice if the robot jumped away and back.
 
     If a joint flickers between tracked and inferred, the filter keeps one offset for each of these two states, for up
-    to 0.12 s. With a new offset at every change, the measured position would never have an effect, and the estimate
-    would drift away. The length of an offset is at most 0.2 m.
+    to 0.12 s. If every change of the state started a new offset, the absolute measured position would never have an
+    effect, and the estimate would drift away. The length of an offset is at most 0.2 m.
 
     Args:
         time: T [s].

@@ -64,7 +64,7 @@ class Summary:
         skeletons: number of skeletons that the retargeter processed.
         engagement: number of steps that the retargeter spent in each of its states.
         interrupted: number of steps in which the robot could not be controlled.
-        clamped: for each limit of the robot, the number of steps in which it changed the command.
+        clamped: for each limit of the robot, the number of steps in which this limit changed the command.
         filtered: number of steps in which the safety filter changed the command.
         unsafe: number of steps in which no joint velocity could satisfy all limits and clearances.
         speed: largest joint velocity of the set-point, as a fraction of the joint's velocity limit.
@@ -96,8 +96,8 @@ class Teleoperation:
     In each period, the retargeter turns the newest skeleton into a joint velocity, the safety filter corrects this
     velocity, and :meth:`Robot.move <imitarm.robots.robot.Robot.move>` sends it to the robot. Sometimes the robot cannot
     be controlled, because it was stopped, was slowed down or does not answer. When the robot can be controlled again,
-    it is first brought to rest. The retargeter then starts from the arm's current position and engages again, so the
-    arm never jumps.
+    it is first brought to rest. The retargeter then begins anew from the arm's current position, so the arm never
+    jumps.
 
     Args:
         source: skeletons of one person, live or replayed in real time.

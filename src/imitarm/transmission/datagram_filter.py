@@ -60,14 +60,16 @@ class ClockOffsetEstimator:
     r"""Estimates the offset between two clocks from the time stamps of datagrams.
 
     A datagram that is sent at :math:`t_s` on the sender's clock and received at :math:`t_r` on the receiver's clock
-    gives the sample :math:`t_r - t_s`. The sample is the clock offset plus the travel time, so the minimum of the
-    samples over the last one to two minutes is the offset plus the shortest travel time. The difference between a
-    datagram's sample and this minimum is the delay of the datagram.
+    gives the sample :math:`t_r - t_s`. The sample is the clock offset plus the travel time. The minimum of the samples
+    over the last one to two minutes is therefore the clock offset plus the shortest travel time. The difference between
+    a datagram's sample and this minimum is the delay of the datagram.
 
     One false time stamp in the future would lower the minimum and make all other datagrams look delayed. A sample that
     lies more than ``max_age / 2`` below the confirmed minimum is therefore *unconfirmed* until a datagram that was sent
     later gives a similar sample. An unconfirmed sample lowers the minimum at once, so that no delayed datagram looks
-    fresh. An unconfirmed sample is rejected as a false time stamp in two cases:
+    fresh.
+
+    An unconfirmed sample is rejected as a false time stamp in two cases:
 
     * Two datagrams that arrive later have an earlier time stamp, although a sender's clock never goes back.
     * Three datagrams that arrive later, over a period of at least ``max_age``, are fresh relative to the confirmed

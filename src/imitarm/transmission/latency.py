@@ -25,7 +25,7 @@ STAGES = {
 }
 """Processing stages of a skeleton, in order, with the interval that each stage covers.
 
-Between two machines, the travel time of a datagram is measured relative to that of the fastest datagram.
+Between two machines, the travel time of a datagram is measured relative to the travel time of the fastest datagram.
 """
 
 _CHUNK = 1024

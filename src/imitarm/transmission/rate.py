@@ -9,7 +9,7 @@ from imitarm.validation import finite_number
 
 
 class RateLimiter:
-    """Starts control periods on a fixed schedule: at whole multiples of the period after the first start.
+    """Starts control periods on a fixed schedule, at whole multiples of the period after the first start.
 
     If a period starts late by one period or more, the missed periods are skipped and counted, and the following periods
     start on schedule. Running the missed periods later, in a burst, would move an arm faster than intended.

@@ -61,7 +61,8 @@ def listening(address: Address) -> socket.socket:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"{address[0]}:{address[1]}: cannot listen there ({error.strerror or error}); choose another port, or "
+            f"{address[0]}:{address[1]}: cannot listen at this address ({error.strerror or error}); "
+            "choose another port, or "
             "an address of this machine"
         ) from error
     return one

@@ -29,9 +29,10 @@ class BaselineRetargeter(Retargeter):
     """A baseline method; it processes its input in the same way as all other methods.
 
     The estimate of the person's arm, the engagement, the clutch and the scale are those of
-    :class:`~imitarm.retarget.retargeter.Retargeter`. The published methods leave two points open, which are the
-    same for all baselines. The robot holds its position while the person is lost, and no joint leaves its range. A
-    method that does not limit velocities itself may exceed the velocity limits; ``notes`` counts how often.
+    :class:`~imitarm.retarget.retargeter.Retargeter`. The published methods leave two points open, which this class
+    decides in the same way for all baselines. The robot holds its position while the person is lost, and no joint
+    leaves its range. A method that does not limit velocities itself may exceed the velocity limits; ``notes`` counts
+    how often.
 
     A baseline implements ``_wanted``.
 

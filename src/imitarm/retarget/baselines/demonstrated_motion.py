@@ -79,7 +79,7 @@ class DemonstratedMotion:
     def at(self, where: Array) -> DemonstratedMotion:
         """Return the motion interpolated at fractional sample numbers, shape (m,).
 
-        The closer together these numbers are, the slower is the motion.
+        The closer together these numbers are, the slower the motion becomes.
         """
         n = np.arange(len(self))
         near = tuple(self.closed[int(i)] for i in np.clip(where.astype(int), 0, len(self) - 1))
@@ -101,7 +101,7 @@ class DemonstratedMotion:
 def engagements(
     frames: Iterable[Skeleton], correspondence: Correspondence, rule: EngagementRule
 ) -> Iterator[tuple[ArmEstimate, ...]]:
-    """Yield the list of estimates, at least two, of each engagement in a recording.
+    """For each engagement in a recording, yield the list of its estimates, at least two.
 
     Args:
         frames: frames in order of time.
@@ -260,7 +260,10 @@ def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
 
 
 def blend(found: Mask, first: int, past: int, dt: float) -> Array:
-    """Return the weight of a correction in a segment, (past - first,): 1 where needed, falling to 0 within 0.2 s."""
+    """Return the weight of a correction for each sample of a segment, shape (past - first,).
+
+    The weight is 1 where the correction is needed, and falls to 0 within 0.2 s before and after that.
+    """
     at = np.arange(first, past)
     needed = at[found[first:past]]
     away = np.abs(at[:, None] - needed).min(axis=1) * dt

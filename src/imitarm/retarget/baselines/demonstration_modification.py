@@ -1,4 +1,4 @@
-"""DemonstrationModification: baseline M1, maps a person's joint angles and corrects infeasible segments.
+"""DemonstrationModification: baseline M1, which maps a person's joint angles and corrects infeasible segments.
 
 Four corrections replace the teacher's advice: slow the motion down, move the wrist closer, rotate the elbow, or repair
 key frames. Each correction changes one segment of a
@@ -82,8 +82,8 @@ class DemonstrationModification(BaselineRetargeter):
        (:class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`);
     2. :class:`~imitarm.retarget.baselines.demonstrated_motion.FeasibilityCheck` finds the infeasible segments;
     3. each infeasible segment, extended by 0.2 s on both sides, is changed by the first correction that makes it
-       feasible (slower, wrist closer, or elbow rotated); if no correction does, its key frames are repaired
-       (:class:`SegmentCorrector`);
+       feasible (slower, wrist closer, or elbow rotated); if no correction makes it feasible, the key frames of the
+       segment are repaired (:class:`SegmentCorrector`);
     4. steps 2 and 3 are repeated up to five times; samples that remain infeasible are counted and clipped to the
        joint ranges.
 
@@ -93,7 +93,7 @@ class DemonstrationModification(BaselineRetargeter):
 
     * ``"rounds"``: number of rounds of corrections;
     * ``"segments"``: number of corrected segments in all rounds; ``"slowed"``, ``"pulled_in"``, ``"elbow_rotated"`` and
-      ``"repaired"`` count them by the correction that was used;
+      ``"repaired"`` count the segments that each correction has corrected;
     * ``"missed_keys"``: number of key frames for which no feasible posture was found;
     * ``"infeasible_before"`` and ``"infeasible_after"``: number of infeasible samples before and after the corrections;
     * ``"failures"``: number of segments that remain infeasible;
@@ -218,7 +218,10 @@ class DemonstrationModification(BaselineRetargeter):
         }
 
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
-        """Append ``shown``, the shown times of the newest steps, after times for the steps in which the robot waits."""
+        """Append the times at which the person showed the newest steps.
+
+        Steps in which the robot waits before the motion get evenly spaced times, at most the first of ``shown``.
+        """
         rest = len(steps) - len(self._shown_times) - len(shown)
         begin = float(self._shown_times[-1]) if len(self._shown_times) else -self.dt
         waited = begin + self.dt * np.arange(1, rest + 1)
@@ -456,7 +459,7 @@ class SegmentCorrector:
         return motion
 
     def _corrected(self, motion: DemonstratedMotion, first: int, past: int, weight: Array) -> DemonstratedMotion:
-        """Return the motion with one segment made feasible by the first correction that can, or else repaired."""
+        """Return the motion after the first correction that makes a segment feasible, or else after a repair."""
         for name, changed, end in self._proposals(motion, first, past, weight):
             if self._check.clear(changed.joints[max(first - 1, 0) : end + 1]):
                 self.counts[name] += 1

@@ -177,7 +177,7 @@ class DelayedCurve:
 
     The lag is needed because the end of a fitted curve changes with every new frame, whereas a slightly earlier point
     is supported by frames before and after it. Frames arrive irregularly. The filter therefore advances its time in
-    control steps, and uses the frames' time stamps only to correct it.
+    control steps, and uses the frames' time stamps only to correct this time.
 
     Args:
         window: length of the time window to which the curve is fitted [s].

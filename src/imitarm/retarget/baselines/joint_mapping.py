@@ -17,9 +17,10 @@ from imitarm.validation import flag
 Array = NDArray[np.float64]
 
 _STRETCHED = ((0.0,) * 7, (0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0))
-"""Postures in which a robot arm may be stretched forward; the mapping uses the first one that is.
+"""Postures to try; the mapping uses the first of them in which the robot's arm is stretched forward.
 
-At zero, Sawyer's arm points forward. The Panda's arm points forward when its second joint is at a right angle.
+When all joint positions are zero, Sawyer's arm points forward. The Panda's arm points forward when its second joint is
+at a right angle.
 """
 _ALIGNED = 0.999  # smallest cosine between a joint's axis and the person's
 _ANY = LimbLengths(0.3, 0.26)  # where only rotations matter
@@ -31,9 +32,9 @@ class JointMapping:
 
     When a person's arm is stretched forward, its joints rotate about z, y, x, y, x, y, x
     (:mod:`imitarm.retarget.human_arm`). Sawyer's joints have the same axes when all joint positions are zero. The
-    Panda's joints have these axes, some in the opposite direction, when its second joint is at a right angle. With this
-    posture :math:`q^*`, the directions :math:`\sigma_i = \pm 1` and the person's angles :math:`\theta_i`, the mapping
-    is
+    Panda's joints have these axes, some in the opposite direction, when its second joint is at a right angle. Let
+    :math:`q^*` be the posture in which the robot's joints have these axes, :math:`\sigma_i = \pm 1` the directions of
+    its joints, and :math:`\theta_i` the person's angles. The mapping is
 
     .. math:: q_i = q^*_i + \sigma_i\,\theta_i \quad\text{(absolute)}, \qquad
               q_i = q_{i,0} + \sigma_i\,(\theta_i - \theta_{i,0}) \quad\text{(relative)},
@@ -172,7 +173,7 @@ def continued(angles: Array, before: Array) -> Array:
 
 
 def _whole_turn_inside(angles: Array, lower: Array, upper: Array) -> Array:
-    """Shift each angle beyond its limits by 360 degrees if the shifted angle is within them, shape (n,) [rad]."""
+    """Shift each angle that is beyond its limits by 360 degrees if this brings it within its limits, (n,) [rad]."""
     turned = angles - 2.0 * np.pi * np.sign(angles)
     helps = ((angles < lower) | (angles > upper)) & (turned >= lower) & (turned <= upper)
     return np.where(helps, turned, angles)

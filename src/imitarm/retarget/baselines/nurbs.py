@@ -45,9 +45,8 @@ def basis_functions(knots: Array, degree: int, u: ArrayLike) -> tuple[Indices, A
         u: parameters, shape (k,); clipped to the range of the knots.
 
     Returns:
-        Indices of the first non-zero function, shape (k,), and the values of this function and the following ones,
-        shape (k, degree +
-        1).
+        Indices of the first non-zero function, shape (k,), and the values of this and the following functions, shape
+        (k, degree + 1).
     """
     at = np.minimum(np.maximum(np.asarray(u, dtype=float), knots[degree]), knots[-degree - 1])
     span = np.searchsorted(knots[degree + 1 : -degree - 1], at, side="right") + degree
@@ -186,7 +185,7 @@ def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
 
 
 class _Problem:
-    """Data of a fit: the samples, their basis functions, and the confidence-free parts of the normal equations."""
+    """Data of a fit: samples, basis functions, and those parts of the normal equations that need no confidence."""
 
     def __init__(self, first: Indices, values: Array, points: Array, rows: Array) -> None:
         self.first, self.values, self.points, self.rows = first, values, points, rows
@@ -202,7 +201,10 @@ class _Problem:
         self.bend = _bend_band(rows, order)
 
     def normal(self, confidence: Array) -> tuple[Array, Array]:
-        """Return the lower band of R^T C R, shape (degree + 1, n), and R^T C Q, shape (n, d), with confidences C."""
+        """Return the lower band of R^T C R, shape (degree + 1, n), and R^T C Q, shape (n, d).
+
+        R contains the basis functions at the samples, C the confidences (diagonal), and Q the sample points.
+        """
         c, n, order, dim = confidence[:, None], self.n_control, self.order, self.dim
         band = np.bincount(self._cells, (c * self._products).ravel(), order * n)
         right = np.bincount(self._places, (c * self._moments).ravel(), n * dim)
@@ -213,7 +215,7 @@ class _Problem:
         return np.asarray((self.values[:, None, :] @ control[self.reached])[:, 0] - self.points)
 
     def with_weights(self, weights: Array) -> _Problem:
-        """Return the same samples for a rational curve with weights (n,)."""
+        """Return the data of the same samples for a rational curve with weights (n,)."""
         weighted = self.values * weights[self.reached]
         return _Problem(self.first, weighted / weighted.sum(axis=1, keepdims=True), self.points, self.rows)
 
@@ -427,7 +429,7 @@ def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
 
     Let :math:`W_k` be the denominator of the curve at sample k with the previous weights. The cost :math:`\sum_k
     \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is quadratic in X and w. X is
-    eliminated. If several weights w are equally good, the function returns those closest to 1.
+    eliminated. If several weights w are equally good, the function returns the weights closest to 1.
     """
     n = problem.n_control
     basis = np.zeros((len(problem.first), n))

@@ -184,7 +184,7 @@ class ThesisRetargeter(Retargeter):
     In each control step, the tool moves towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
     3.9). The length of every step is limited, because the damping would otherwise stop the arm. Joint positions and
     velocities stay within their limits. Like the thesis, the method does not handle accelerations, the elbow, obstacles
-    and tracking losses. When the person is lost, the target therefore stays where it is, and jumps when the person
+    or tracking losses. When the person is lost, the target therefore stays where it is, and jumps when the person
     returns.
 
     Args:
@@ -252,7 +252,7 @@ class ThesisRetargeter(Retargeter):
         return ArmEstimator(self.correspondence, smoothing=False, limbs="direction")
 
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
-        """Retarget a whole recording; ``smoothing="global"`` fits one curve to all of it.
+        """Retarget a whole recording; ``smoothing="global"`` fits one curve to the whole recording.
 
         Args:
             skeletons: skeletons in order of time.
