@@ -24,7 +24,7 @@ class PersonFilter(SkeletonSource):
 
     The filter follows the first person who appears, and ignores everybody else. The filter follows another person only
     after the first person has been out of view for more than ``patience`` on the source's clock. After that time, every
-    retargeter has stopped, and begins anew with the next person. A camera that tracks only one person at a time may
+    retargeter has stopped, and starts again with the next person. A camera that tracks only one person at a time may
     give the next person the same number. The filter therefore also ignores a person who appears farther away than the
     followed person can have walked.
 

@@ -99,7 +99,7 @@ class UdpSource(SkeletonSource):
     A :class:`~imitarm.transmission.datagram_filter.DatagramFilter` drops and counts datagrams that are late, damaged,
     hostile, or from another sender. A sender that is killed and started again is accepted after half a second of
     silence. The times of the restarted sender are shifted so that they continue after the gap. Every retargeter stops
-    in the gap and then begins anew.
+    during the gap and then starts again.
 
     Args:
         port: port to listen on; 0: any free port.

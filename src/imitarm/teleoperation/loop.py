@@ -96,7 +96,7 @@ class Teleoperation:
     In each period, the retargeter turns the newest skeleton into a joint velocity, the safety filter corrects this
     velocity, and :meth:`Robot.move <imitarm.robots.robot.Robot.move>` sends it to the robot. Sometimes the robot cannot
     be controlled, because it was stopped, was slowed down or does not answer. When the robot can be controlled again,
-    it is first brought to rest. The retargeter then begins anew from the arm's current position, so the arm never
+    it is first brought to rest. The retargeter then starts again from the arm's current position, so the arm never
     jumps.
 
     Args:
