@@ -208,7 +208,7 @@ def test_spikes_are_found_and_taken_as_lost(joints, by, at, width):
     spiky = [moved(s, joints, by) if i in wrong else s for i, s in enumerate(frames)]
     issue = issues(spiky)["spike"]
     assert issue.severity == "error" and issue.frame == min(at) and f"in {len(wrong)} frame" in issue.message
-    assert f"by {np.linalg.norm(by):.1f}" in issue.message
+    assert f"by at most {np.linalg.norm(by):.1f}" in issue.message
     mended, notes = repaired(SkeletonRecording(spiky))
     assert any("spike" in note for note in notes) and "spike" not in issues(mended.skeletons)
     for i, (s, good) in enumerate(zip(mended.skeletons, frames, strict=True)):

@@ -265,9 +265,9 @@ def is_motion_capture(head: bytes) -> bool:
 def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read a motion capture of an arm with :meth:`MotionCapture.load`, and add a synthetic body to the arm.
 
-    The right arm is the captured arm with its measured bone lengths, and is marked as tracked. The rest of the body,
-    which was not captured, is that of an average person who stands upright in front of a sensor, and is marked as
-    inferred.
+    The right arm is the captured arm with its measured bone lengths, and is marked as tracked. The rest of the body was
+    not captured, and is marked as inferred. The body is that of an average person who stands upright in front of a
+    sensor.
 
     Args:
         path: path of the file.

@@ -108,7 +108,7 @@ def fit_motion(
 
 
 class _Search:
-    """Finds postures with the tool's orientation at home, away from singularities and without contact."""
+    """Finds postures away from singularities and contacts, in which the tool has the same orientation as at home."""
 
     def __init__(self, arm: ArmModel, fixtures: Sequence[Obstacle]) -> None:
         self.arm, self.links, self.home = arm, SelfClearance(arm, _APART), arm.tool_pose(arm.home)

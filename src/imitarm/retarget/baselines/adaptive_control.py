@@ -36,10 +36,10 @@ _GRIP = 0.2  # [s] in which the closure follows a closing hand
 
 
 class JointPlant:
-    """A MuJoCo simulation of the robot arm that a joint controller drives, with gravity and without contacts.
+    """A MuJoCo simulation of a robot arm that a joint controller moves; it includes gravity, but no contacts.
 
     The simulation includes rotor inertia, viscous damping and dry friction of the joints. ``ArmModel`` does not include
-    these effects, so a controller that uses an ``ArmModel`` does not know them.
+    these effects, so a controller that uses an ``ArmModel`` does not account for them.
 
     Args:
         arm: arm model to simulate.

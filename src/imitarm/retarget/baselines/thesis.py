@@ -161,7 +161,10 @@ def _unit(vector: Array) -> Array:
 
 
 def _nearest_rotation(matrix: Array) -> Array:
-    """Return the rotation closest to ``matrix``, the product of the printed matrices, which is not a rotation."""
+    """Return the rotation closest to ``matrix``.
+
+    As the product of the printed matrices, ``matrix`` itself is not a rotation.
+    """
     left, values, right = np.linalg.svd(matrix)
     if values[1] < 1e-9:  # almost no direction is left
         return carried(None, None, left[:, 0])
