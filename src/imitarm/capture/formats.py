@@ -266,7 +266,7 @@ def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]
     """Read a motion capture of an arm with :meth:`MotionCapture.load`, and add a synthetic body to the arm.
 
     The right arm is the captured arm with its measured bone lengths, and is marked as tracked. The rest of the body was
-    not captured, and is marked as inferred. The body is that of an average person who stands upright in front of a
+    not captured, and is marked as inferred. The rest belongs to an average person who stands upright in front of a
     sensor.
 
     Args:
