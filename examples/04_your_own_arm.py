@@ -1,6 +1,7 @@
 """Load your own arm from a URDF or MJCF file: kinematics, inverse kinematics, gravity, and simulation.
 
-The example first writes a URDF file, so that it runs without other files. To load your own arm, replace that file.
+The example first writes a URDF file, so that it runs without other files. To load your own arm,
+load the file of that arm instead.
 """
 
 from __future__ import annotations
