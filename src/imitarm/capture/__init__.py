@@ -1,8 +1,8 @@
 """Capture: skeletons of a person, and the sources that deliver them.
 
-``SOURCES`` lists all sources by name. To add a source, write one class and register it here, or by an entry point of
-another package (group ``imitarm.sources``). The source then appears in the ``--help`` of every command that takes a
-source.
+``SOURCES`` lists all sources by name. To add a source, write one class, and register the class in ``SOURCES`` or by an
+entry point of another package (group ``imitarm.sources``). The source then appears in the ``--help`` of every command
+that takes a source.
 """
 
 from imitarm.capture.skeleton import Arm, HandState, Skeleton, SkeletonSource, Tracking

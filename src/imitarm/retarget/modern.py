@@ -49,8 +49,8 @@ class ModernRetargeter(Retargeter):
     Each control step consists of four parts (see docs/retargeting.md):
 
     1. extrapolate the estimate of the person's arm (:class:`~imitarm.retarget.arm_estimator.ArmEstimator`) from its
-       last frame with a decaying velocity, so that the wrist is at :math:`W + v\,\tau(1 - e^{-s/\tau})` after
-       s seconds, with :math:`\tau` = 50 ms;
+       last frame with a decaying velocity. After s seconds, the wrist is at :math:`W + v\,\tau(1 - e^{-s/\tau})`, with
+       :math:`\tau` = 50 ms;
     2. compute the tool's target and the twist towards it, :math:`K \log(T_d T^{-1})`, plus a fraction of the hand's
        velocity (feed-forward);
     3. solve a quadratic programme for the joint velocities. The tasks of the programme are the twist of the tool and

@@ -288,7 +288,7 @@ class Retargeter(ABC):
     # --- the same for all
 
     def _start_where_pushed(self, measured: Array) -> None:
-        """Rest at the measured posture if the arm was moved by hand while it followed nobody."""
+        """Rest at the measured posture if the arm was moved by hand while the robot followed nobody."""
         if float(np.abs(measured - self.latest.q).max()) > PUSHED:
             q = np.clip(measured, self.arm.lower, self.arm.upper)
             self.latest = RetargetStep(self.latest.time, q, np.zeros(self.arm.n_joints), state=self.latest.state)

@@ -218,7 +218,7 @@ class DemonstrationModification(BaselineRetargeter):
         }
 
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
-        """Append the times at which the person showed the newest steps.
+        """Append the times at which the person showed the newest steps to ``shown_times``.
 
         Steps in which the robot waits before the motion get evenly spaced times, at most the first of ``shown``.
         """
