@@ -206,7 +206,7 @@ class StackingOutcome:
     Attributes:
         success: whether four cubes stand in order.
         failure: one of :data:`imitarm.tasks.stack.FAILURES`; empty on success.
-        reason: reason in words.
+        reason: explanation of the outcome in words.
         stacked: number of cubes in the tower at the end.
         time: time at which the person finished, or the time limit [s].
         path_length: path length of the tool [m].

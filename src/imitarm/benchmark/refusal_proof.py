@@ -102,8 +102,7 @@ class _Cells:
     """A regular grid of equal boxes that fills a region of positions.
 
     Attributes:
-        frame: directions of the edges in rows, which are an orthonormal basis of the permitted line, plane or space,
-            (d, 3).
+        frame: unit vectors along the edges, shape (d, 3); an orthonormal basis of the permitted line, plane or space.
         size: size of a box along each edge, shape (d,) [m].
         lowest: smallest coordinates of all boxes, shape (d,) [m].
         counts: number of boxes along each edge, shape (d,).

@@ -246,7 +246,7 @@ def check_durations(motions: Sequence[ValidRows]) -> Iterator[Finding]:
     durations = np.array([motion.duration for motion in motions])
     if durations.max() > _DURATION_RATIO * durations.min():
         slow = int(np.argmax(durations))
-        message = f"takes {durations[slow]:.2f} s, but the shortest demonstration {durations.min():.2f} s"
+        message = f"takes {durations[slow]:.2f} s, but the shortest demonstration takes {durations.min():.2f} s"
         remedy = "check that both show the whole motion; align makes the durations equal"
         yield motions[slow].finding("warning", "durations", message, remedy)
 
@@ -452,7 +452,7 @@ def _outliers(motions: Sequence[ValidRows], positions: Array, rotations: Array |
             f"({motions[center].raw.source}), the others typically by "
             f"{np.degrees(np.median(np.delete(angle, center))):.0f}"
         )
-        remedy = "check it, and the order of its quaternions (wxyz or xyzw)"
+        remedy = "check this demonstration, and the order of its quaternions (wxyz or xyzw)"
         yield motions[i].finding("warning", "rotation-outlier", message, remedy)
 
 

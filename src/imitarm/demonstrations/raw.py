@@ -172,7 +172,8 @@ class RawDemonstration:
         if not generic or len(names) != arm.n_joints:
             raise InputError(
                 f"{self.source}: joints {', '.join(names)} are not those of {arm.name} "
-                f"({', '.join(arm.joint_names)}); give the arm that was recorded, or name the columns as it does"
+                f"({', '.join(arm.joint_names)}); give the arm that was recorded, or name the columns like "
+                f"the joints of this arm"
             )
         numbers = [int(match[1]) for name in names if (match := _NUMBER_AT_END.search(name))]
         if sorted(numbers) != list(range(min(numbers), min(numbers) + len(names))):

@@ -267,8 +267,8 @@ def read(
             wxyz.
         arm: arm that was recorded, with its tool; needed for files that contain only joint angles.
         task: name of the task; used if the file does not state a task.
-        repair: whether to drop rows that are not finite or not later than the previous row, with a remark in
-            ``source``.
+        repair: whether to drop rows with numbers that are not finite, and rows that are not later than the previous
+            row. The ``source`` then says how many rows were dropped.
         thin: whether to drop rows that only repeat the previous row (see :meth:`RawDemonstration.held`).
 
     Returns:

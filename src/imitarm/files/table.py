@@ -102,7 +102,7 @@ def _text_of(path: str | Path, content: bytes) -> str:
     kind = kind_of(content)
     if kind is not None:
         raise FileFormatError(
-            f"{path}: this is {kind}, not a text table; give it its right name or export it as UTF-8 CSV"
+            f"{path}: this is {kind}, not a text table; correct its file name, or export it as UTF-8 CSV"
         )
     try:
         text = content.decode("utf-8-sig")

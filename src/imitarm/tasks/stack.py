@@ -98,8 +98,8 @@ class StackTask:
     """A Sawyer with a parallel gripper at a table with four cubes of 32 mm; colours and pips show their numbers 1 to 4.
 
     Cube 1 stays in its place; cubes 2, 3 and 4 are stacked on it in this order. The task succeeds if the cubes stand in
-    the order of their numbers without support by the gripper, and each cube is centred on the cube below it to within
-    the tolerance.
+    the order of their numbers, and the gripper does not support them. Each cube must be centred on the cube below it to
+    within the tolerance.
 
     Contacts use MuJoCo's elliptic friction cones with ``impratio`` 10, so that a grasped cube does not slip out of the
     fingers. The setting ``condim`` 4 gives the finger pads torsional friction.
