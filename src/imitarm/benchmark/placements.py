@@ -127,8 +127,14 @@ def _end_clearance(skill: Skill, arm: ArmModel, obstacle: Obstacle) -> float:
     return nearest
 
 
-def run_placement(policy: str, setup: Setup, seed: int) -> PlacementResult:
+def run_placement(policy: str, setup: Setup, seed: int, max_tilt: float | None = None) -> PlacementResult:
     """Let one policy reproduce a skill in one placement.
+
+    Args:
+        policy: name in :data:`~imitarm.policies.POLICIES`.
+        setup: the skill and the arm.
+        seed: seed of the placement.
+        max_tilt: largest rotation of the tool away from the learned rotation [rad]; None: as demonstrated.
 
     Raises:
         InputError: when the skill or the arm can't be loaded.
@@ -138,7 +144,7 @@ def run_placement(policy: str, setup: Setup, seed: int) -> PlacementResult:
     scene = placement(skill, arm, seed, start)
     robot = SimulatedRobot(arm, scene=scene, q=start)
     spheres = arm.tool_spheres if skill.gmr_.has_orientation_ else [[0.0, 0.0, 0.0, arm.tool_radius]]
-    decides = POLICIES[policy].build(skill, tool_spheres=spheres, clearance=CLEARANCE)
+    decides = POLICIES[policy].build(skill, tool_spheres=spheres, clearance=CLEARANCE, arm=arm, max_tilt=max_tilt)
     began, planned = time.perf_counter(), [np.nan]
 
     def on_step(_step: object) -> None:
@@ -188,6 +194,7 @@ def run_placements(
     setups: Sequence[Setup],
     seeds: Iterable[int],
     *,
+    max_tilt: float | None = None,
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[PlacementResult]:
@@ -197,13 +204,14 @@ def run_placements(
         policies: names in :data:`~imitarm.policies.POLICIES`.
         setups: skills with their arms.
         seeds: seeds of the placements.
+        max_tilt: largest rotation of the tool away from the learned rotation [rad]; None: as demonstrated.
         jobs: processes.
         progress: function called with the number of finished placements and the total number.
 
     Raises:
         InputError: when a skill or an arm can't be loaded, or several processes are requested without joblib.
     """
-    work = [(policy, setup, seed) for setup in setups for seed in seeds for policy in policies]
+    work = [(policy, setup, seed, max_tilt) for setup in setups for seed in seeds for policy in policies]
     done: list[PlacementResult] = []
     with contextlib.ExitStack() as stack:
         results: Iterable[PlacementResult]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import math
 import shlex
 import sys
 import tempfile
@@ -122,6 +123,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_robot_options(placed)
     _add_fill(placed)
+    placed.add_argument(
+        "--max-tilt", type=float, metavar="DEG", help="largest tilt of the tool; default: as in the demonstrations"
+    )
     placed.set_defaults(benchmark=_placements)
     people = parsers.add_parser("people", help="retarget recordings of real people to simulated arms")
     people.add_argument(
@@ -248,6 +252,7 @@ def _placements(arguments: argparse.Namespace) -> int:
             arguments.policies,
             [setup],
             range(arguments.first, arguments.first + arguments.seeds),
+            max_tilt=None if arguments.max_tilt is None else math.radians(arguments.max_tilt),
             jobs=arguments.jobs,
             progress=lambda done, of: bar.update(task, completed=done, total=of),
         )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +22,10 @@ from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.policies import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Policy
 from imitarm.robots import SimulatedRobot
-from imitarm.scene import Scene, load_scene
+from imitarm.scene import Scene, load_scene, standard_fixtures
 from imitarm.skills import Skill
 from imitarm.trajectory import Demonstration
+from imitarm.validation import finite_number
 from imitarm.viewer import Report, write_report
 
 EPILOG = """\
@@ -65,6 +68,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="keep the clearance only for the tool, not for the links of the arm (for comparison)",
     )
+    avoid.add_argument(
+        "--max-tilt",
+        type=float,
+        metavar="DEG",
+        help="largest rotation of the tool away from the learned one, to make room for the arm; default: two standard "
+        "deviations of the demonstrated rotation",
+    )
     held = avoid.add_mutually_exclusive_group()
     held.add_argument("--keep-height", action="store_true", help="move the path only sideways, as on a table")
     held.add_argument("--not-down", action="store_true", help="never move the path downwards")
@@ -100,7 +110,9 @@ def run(arguments: argparse.Namespace) -> int:
     arm = load_robot(arguments)
     scene = Scene() if arguments.scene is None else load_scene(arguments.scene)
     if arguments.goal is not None:
-        scene = Scene(Pose(0.01 * np.array(arguments.goal), skill.goal_.quaternion), scene.obstacles)
+        scene = replace(scene, goal=Pose(0.01 * np.array(arguments.goal), skill.goal_.quaternion))
+    if not scene.fixtures:
+        scene = replace(scene, fixtures=standard_fixtures())
     scene.check()
     start = _start(skill, arm, arguments.start)
     if scene.goal is not None:  # said before anything moves
@@ -108,7 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
         find_posture(arm, Pose(scene.goal.position, turn))
     robot = SimulatedRobot(arm, scene=scene, control=arguments.control, q=find_posture(arm, start))
     spheres = _tool(skill, arm, arguments.tool_radius)
-    policy = _policy(arguments, skill, spheres)
+    policy = _policy(arguments, skill, arm, spheres)
     with progress_bar() as progress:
         moving = progress.add_task("reproducing", total=1.0)
         result = run_scene(
@@ -134,13 +146,19 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if report.passed else 1
 
 
-def _policy(arguments: argparse.Namespace, skill: Skill, spheres: NDArray[np.float64]) -> Policy:
+def _policy(arguments: argparse.Namespace, skill: Skill, arm: ArmModel, spheres: NDArray[np.float64]) -> Policy:
     """Return the chosen policy, created with the arguments that all policies share."""
     options: dict[str, Any] = {
         "tool_spheres": spheres,
         "clearance": 1e-3 * arguments.clearance,
         "forbidden": next((FORBIDDEN[key] for key in FORBIDDEN if getattr(arguments, key)), ()),
     }
+    if not arguments.tool_only and arguments.tool_radius is None:
+        options["arm"] = arm
+        if arguments.max_tilt is not None:
+            options["max_tilt"] = math.radians(finite_number(arguments.max_tilt, "--max-tilt", "degrees", at_least=0.0))
+    elif arguments.max_tilt is not None:
+        raise InputError("--max-tilt concerns the plan of the whole arm: leave out --tool-only and --tool-radius")
     if arguments.method is not None:
         if arguments.policy != "acfra":
             raise InputError(f"--method is an option of --policy acfra, not of {arguments.policy}; leave it out")

@@ -206,8 +206,9 @@ def show_results(report: Report) -> None:
     show_table(headings, rows, styles=styles)
     remark(
         "clearance: smallest measured distance between the arm (with tool) and any obstacle [mm]; certified: "
-        "guaranteed lower bound for the tool on the planned path [mm]; RMSE: root mean square distance to the "
-        "demonstrations [mm]; unmoved: fraction of the Gaussian components that were not moved; "
+        "guaranteed lower bound on the planned path, for the whole arm or, with --tool-only, for the tool [mm]; "
+        "RMSE: root mean square distance to the demonstrations [mm]; unmoved: fraction of the Gaussian components "
+        "that were not moved; "
         "adaptation: computing time [ms]"
     )
     if any(scene.certificate_void for scene in report.scenes):

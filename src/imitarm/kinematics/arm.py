@@ -271,6 +271,11 @@ class ArmModel(ArmKinematics):
         """Whether every moving link has a mass and an inertia, which torques and simulation need."""
         return not self._mass_faults
 
+    @property
+    def has_dynamics(self) -> bool:
+        """Whether every moving link has a mass and an inertia, which torques and simulation need."""
+        return not self._mass_faults
+
     def check_dynamics(self) -> None:
         """Check that every moving link has a mass and an inertia, which torques and simulation need.
 

@@ -30,6 +30,10 @@ class SphereCover:
         follows_last_joint: True for spheres that move rigidly with the flange, shape (m,).
         base_centers: centers of the spheres that cover the base, which never moves, shape (b, 3) [m].
         base_radii: radii of the base's spheres, shape (b,) [m].
+        joints: index of each of the arm's joints in the model, shape (n_joints,).
+        carriers: index of the body that each joint moves, shape (n_joints,).
+        slides: True for prismatic joints, shape (n_joints,).
+        moves: 1.0 where a joint moves a sphere, else 0.0, shape (m, n_joints).
     """
 
     def __init__(self, model: mujoco.MjModel, working: mujoco.MjModel, names: Sequence[str]) -> None:
@@ -60,10 +64,10 @@ class SphereCover:
         self.bodies = tuple(model.body(body).name for body in owners)
         self.radii = np.concatenate(radii)
         self.radii.setflags(write=False)
-        self._joints, self._owners = np.array([working.joint(name).id for name in names]), np.array(owners, dtype=int)
+        self.joints, self._owners = np.array([working.joint(name).id for name in names]), np.array(owners, dtype=int)
         self._centers = np.concatenate(centers)[:, :, None]
-        self._slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
-        self._any_slides = bool(self._slides.any())
+        self.slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
+        self._any_slides = bool(self.slides.any())
         moves = [[_carries(model, int(model.jnt_bodyid[joint]), body) for joint in joints] for body in owners]
         self._moves = np.array(moves, dtype=float).reshape(len(owners), 1, len(joints))
         self._moves_of_all = np.concatenate([self._moves[:, 0], np.zeros((len(self.base_radii), len(joints)))])
@@ -71,8 +75,11 @@ class SphereCover:
         self._columns = np.ascontiguousarray(self._centers[:, :, 0].T)
         rows = 3 * self._owners[:, None] + np.arange(3)
         self._picked = rows * len(owners) + np.arange(len(owners))[:, None]
+        self.moves = self._moves[:, 0]
+        self.moves.setflags(write=False)
+        self.carriers = working.jnt_bodyid[self.joints].astype(int)
         self._root = int(model.body_rootid[model.jnt_bodyid[joints[0]]])
-        self._dofs = working.jnt_dofadr[self._joints]
+        self._dofs = working.jnt_dofadr[self.joints]
         self._moved = self._moves[:, 0].copy()
         self.links = self._moves[:, 0].sum(axis=1).astype(int)
         self.follows_last_joint = self._moves[:, 0, -1] > 0.0
@@ -86,6 +93,16 @@ class SphereCover:
         turned = (data.xmat.reshape(-1, 3) @ self._columns).take(self._picked)
         turned += data.xpos.take(self._owners, axis=0)
         return np.asarray(turned)
+
+    def placed(self, rotations: Array, origins: Array) -> Array:
+        """Return the centers of the spheres for many postures, in the base frame, shape (n, m, 3) [m].
+
+        Args:
+            rotations: rotation matrices of all bodies of the model, shape (n, n_bodies, 3, 3).
+            origins: origins of all bodies in the base frame, shape (n, n_bodies, 3) [m].
+        """
+        turned = rotations[:, self._owners] @ self._centers
+        return np.asarray(turned[..., 0] + origins[:, self._owners])
 
     def speeds(self, data: mujoco.MjData, spheres: NDArray[np.int_], centers: Array, normals: Array) -> Array:
         """Return how fast each joint moves chosen spheres along chosen directions, shape (k, n_joints) [m/rad].
@@ -130,17 +147,17 @@ class SphereCover:
             centers: centers of the outer spheres, shape (k, 3) [m].
             normals: unit vectors from inner to outer, shape (k, 3).
         """
-        axes, anchors = data.xaxis[self._joints], data.xanchor[self._joints]
+        axes, anchors = data.xaxis[self.joints], data.xanchor[self.joints]
         rates = _cross(centers, normals) @ axes.T
         rates -= normals @ _cross(axes, anchors).T
         if self._any_slides:
-            rates[:, self._slides] = normals @ axes[self._slides].T
+            rates[:, self.slides] = normals @ axes[self.slides].T
         rates *= self._moves_of_all[outer] - self._moves_of_all[inner]
         return np.asarray(rates)
 
     def jacobians(self, data: mujoco.MjData) -> Array:
         """Return the Jacobians of the centers, shape (m, 3, n_joints) [m/rad]."""
-        axes, anchors = data.xaxis[self._joints].T, data.xanchor[self._joints].T
+        axes, anchors = data.xaxis[self.joints].T, data.xanchor[self.joints].T
         x, y, z = axes
         # Column j is a_j x (c - o_j). All the cross products with c at once: c times the stacked matrices [a_j]x^T.
         zero = np.zeros_like(x)
@@ -149,7 +166,7 @@ class SphereCover:
         offsets = np.stack((y * w - z * v, z * u - x * w, x * v - y * u))
         columns = (self.centers(data) @ crosses).reshape(-1, *axes.shape) - offsets
         if self._any_slides:
-            columns[:, :, self._slides] = axes[:, self._slides]
+            columns[:, :, self.slides] = axes[:, self.slides]
         return np.asarray(columns * self._moves)
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.html_table import html_table
-from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm import ArmModel, ArmState
+from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.policies.certificate import ToolAmongObstacles
 from imitarm.policies.certified import CERTIFIED
@@ -26,6 +27,7 @@ from imitarm.policies.least_detour import (
     LeastDetour,
     PathAdapter,
 )
+from imitarm.policies.whole_arm import ArmSolution, ArmTask, solve
 from imitarm.registry import Registry
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
@@ -37,6 +39,8 @@ Array = NDArray[np.float64]
 HORIZONTAL_ONLY = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))  # stay in the plane of the table: 2-D avoidance
 NOT_DOWN = ((0.0, 0.0, -1.0),)  # never into the table
 
+_JERKY = "no smoother path was found on which the whole arm is clear: its jerk is {:.0f} times that of the nominal path"
+_SAME_START = 1e-3  # [m] between a decomposed path and the tool
 
 ADAPTERS: Registry[PathAdapter] = Registry(
     "adaptation method",
@@ -90,7 +94,9 @@ class Adaptation:
         reason: which obstacle blocks the path and why it can't be avoided; empty when feasible.
         method: name of the method.
         compute_time: computing time of the whole adaptation [s].
-        joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned.
+        joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned. Between
+            two samples the joints move linearly.
+        tilt: largest rotation of the tool away from the learned rotation [rad].
     """
 
     nominal: Trajectory
@@ -114,6 +120,7 @@ class Adaptation:
     method: str
     compute_time: float
     joints: Array | None = None
+    tilt: float = 0.0
 
     @property
     def unmoved_fraction(self) -> float:
@@ -146,6 +153,7 @@ class Adaptation:
             "jerk": f"{self.jerk_ratio:.1f} times that of the nominal path",
             "jerk above the limit": self.jerk_reason,
             "joint path": "not planned" if self.joints is None else f"{self.joints.shape[1]} joints",
+            "largest tilt of the tool": f"{np.degrees(self.tilt):.1f} degrees",
             "compute time": f"{1e3 * self.compute_time:.1f} ms",
         }
         return html_table("Adaptation", rows)
@@ -164,6 +172,9 @@ def adapt(
     pinned: Sequence[float] = (),
     start: Pose | None = None,
     n_samples: int | None = None,
+    state: ArmState | None = None,
+    max_tilt: float | None = None,
+    allowance: float = 0.0,
 ) -> Adaptation:
     """Adapt the whole path of a skill to the obstacles of a scene.
 
@@ -184,12 +195,19 @@ def adapt(
         tool_radius: the tool as one sphere of this radius about its tip [m]; 0 for a point.
         tool_spheres: the tool as spheres that contain it: rows x y z r in the tool's frame, shape (m, 4) [m]. The
             spheres rotate with the tool's learned orientation.
-        arm: arm whose ``tool_spheres`` represent the tool. The links of the arm are not considered.
-        clearance: required distance from the tool to every obstacle [m].
+        arm: the arm with its tool. The path of its joints is planned, and every moving part of the arm keeps the
+            clearance. Its links stay 12 mm apart, and the motion is slowed down where the limits of the arm require it.
+        clearance: required distance from the tool, or from the whole arm, to every obstacle [m].
         forbidden: directions in which no component may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
         pinned: times [s] at which the path must not move, for example contact points.
         start: start of the motion; None: the learned start.
         n_samples: samples along the path; None: 200.
+        state: measured state of ``arm``, from whose posture the motion starts; None: a posture near ``arm.home`` with
+            the tool at the start.
+        max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]; 0 at start and goal;
+            None: two standard deviations of the demonstrated rotation, and 0 if no orientation was learned.
+        allowance: distance that is added to the clearance if a path with this larger clearance is found, because no
+            robot moves exactly as commanded [m].
 
     Returns:
         The adaptation; check ``feasible`` before executing it.
@@ -202,11 +220,44 @@ def adapt(
     adapter = adapter_named(method)
     instance(scene, Scene, "scene")
     clearance = finite_number(clearance, "clearance", "m", at_least=0.0)
+    if arm is not None:
+        instance(arm, ArmModel, "arm")
+    if state is not None:
+        begins = _start_of(arm, state, start)
+        if isinstance(skill, ComponentPath):
+            _check_start(skill, begins)
+        else:
+            start = begins
+    extra = finite_number(allowance, "allowance", "m", at_least=0.0)
     path = _decomposed(skill, scene.goal, start, pinned, n_samples)
-    spheres = _spheres(path, tool_radius, tool_spheres, arm)
+    posture: Array | None = None
+    if arm is not None:
+        posture = _first_posture(arm, path.nominal, state)
+        if path.nominal.quaternions is None:  # the tool keeps the rotation that it has at the start
+            held = np.tile(arm.tool_pose(posture).quaternion, (len(path.nominal), 1))
+            path = replace(path, nominal=Trajectory(path.nominal.times, path.nominal.positions, held))
+    limit = path.rotation_tolerance
+    if max_tilt is not None:
+        limit = np.full(len(path.nominal), finite_number(max_tilt, "max_tilt", "rad", at_least=0.0))
     allowed = AllowedDirections.without(_unit_rows(forbidden))
-    tool = ToolAmongObstacles.along(path.nominal, spheres, scene.obstacles)
-    problem = AvoidanceProblem(path, tool.clearance_of(path.nominal.positions), clearance, allowed)
+    tool = ToolAmongObstacles.along(path.nominal, _spheres(path, tool_radius, tool_spheres, arm), scene.obstacles)
+    nominal = tool.clearance_of(path.nominal.positions)
+    for more in dict.fromkeys((extra, 0.0)):
+        problem = AvoidanceProblem(path, nominal, clearance + more, allowed)
+        adaptation, detour = _of_tool(problem, scene, method, adapter, began)
+        if arm is not None and posture is not None and adapter.refuses:
+            task = ArmTask(arm, posture, scene, problem.clearance, allowed, limit, more)
+            adaptation = _of_whole_arm(adaptation, solve(task, detour), scene, problem.clearance, began)
+        if adaptation.feasible:
+            break
+    return adaptation
+
+
+def _of_tool(
+    problem: AvoidanceProblem, scene: Scene, method: str, adapter: PathAdapter, began: float
+) -> tuple[Adaptation, Detour]:
+    """Adapt the path of the tool alone."""
+    path, tool, clearance, allowed = problem.path, problem.nominal.tool, problem.clearance, problem.allowed
     detour = _detour(problem, adapter)
     jerk_ratio = 1.0
     if detour.displacement.any():
@@ -215,7 +266,7 @@ def adapt(
             least = LeastDetour(detour.path, tool, clearance, allowed, exact=True)
             detour, jerk_ratio = least.smoothed(detour)
     used = detour.path
-    return Adaptation(
+    adaptation = Adaptation(
         nominal=path.nominal,
         trajectory=path.nominal.with_positions(detour.clearance.positions),
         displacement=detour.displacement,
@@ -236,6 +287,68 @@ def adapt(
         reason="" if detour.feasible else _reason(scene, problem, detour, method, adapter),
         method=method,
         compute_time=time.perf_counter() - began,
+    )
+    return adaptation, detour
+
+
+def _start_of(arm: ArmModel | None, state: ArmState, start: Pose | None) -> Pose:
+    """Return the pose of the tool in the measured posture."""
+    instance(state, ArmState, "state")
+    if arm is None or start is not None:
+        raise InputError("adapt: state needs arm, and replaces start; give arm and state, or start")
+    return arm.tool_pose(state.q)
+
+
+def _check_start(path: ComponentPath, begins: Pose) -> None:
+    away = float(np.linalg.norm(path.nominal.positions[0] - begins.position))
+    if away > _SAME_START:
+        raise InputError(
+            f"adapt: the decomposed path starts {1e3 * away:.1f} mm from the arm's tool; decompose it with that start"
+        )
+
+
+def _first_posture(arm: ArmModel, nominal: Trajectory, state: ArmState | None) -> Array:
+    """Return the posture in which the motion starts, shape (n_joints,) [rad].
+
+    Raises:
+        UnreachableError: when the arm can't bring its tool to the start.
+    """
+    if state is not None:
+        return state.q
+    rotation = arm.tool_pose(arm.home).quaternion if nominal.quaternions is None else nominal.quaternions[0]
+    return find_posture(arm, Pose(nominal.positions[0], rotation))
+
+
+def _of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearance: float, began: float) -> Adaptation:
+    """Return the adaptation of the whole arm, from that of the tool alone."""
+    plan, timing, spent = solution.plan, solution.timing, time.perf_counter() - began
+    if plan is None or not plan.complete:
+        return replace(tool, feasible=False, reason=solution.reason, compute_time=spent)
+    used = plan.components
+    times = tool.nominal.times if timing is None else timing.times
+    jerk = used.jerk_ratio(plan.path.positions)
+    return replace(
+        tool,
+        trajectory=Trajectory(times, plan.path.positions, plan.path.quaternions),
+        displacement=plan.displacement,
+        moved=np.einsum("kd,kd->k", plan.displacement, plan.displacement) > STILL**2,
+        means=used.means,
+        covariances=used.covariances,
+        responsibilities=used.responsibilities,
+        divided=used.n_components != tool.responsibilities.shape[1] or tool.divided,
+        min_clearance=clearance + plan.clearance.room,
+        certified_clearance=clearance + plan.clearance.room,
+        validity=_validity(scene, float(times[-1]), arm=True),
+        deviation=used.deviation(plan.displacement),
+        jerk_ratio=jerk,
+        jerk_reason=""
+        if jerk <= MAX_JERK_RATIO
+        else f"the whole arm needs {jerk:.0f} times the jerk of the nominal path",
+        feasible=not solution.reason,
+        reason=solution.reason,
+        compute_time=spent,
+        joints=plan.path.joints,
+        tilt=plan.largest_tilt,
     )
 
 
@@ -309,7 +422,7 @@ def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
     return adapter.detour(problem)
 
 
-def _validity(scene: Scene, duration: float) -> str:
+def _validity(scene: Scene, duration: float, *, arm: bool = False) -> str:
     moving = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.velocity.any()]
     covers = "the tool on the planned path, but not for the links of the arm and not for tracking errors"
     rotating = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.angular_velocity.any()]

@@ -105,7 +105,7 @@ class ToolAmongObstacles:
             # Exact for a rotation at constant rate: the sagitta of the arc about the tip.
             bows = np.linalg.norm(spheres[:, :3], axis=1)[:, None] * (1.0 - np.cos(half_angle))
         offsets: list[Array | None] = []
-        solids = tuple(obstacle if not obstacle.angular_velocity.any() else _around(obstacle) for obstacle in obstacles)
+        solids = tuple(without_rotation(obstacle) for obstacle in obstacles)
         for obstacle in solids:
             if not obstacle.velocity.any():
                 offsets.append(centres)
@@ -317,8 +317,14 @@ class PathClearance:
         return distance, normal
 
 
-def _around(obstacle: Obstacle) -> Sphere:
-    """Return a sphere about an obstacle's centre that contains the obstacle in every orientation."""
+def without_rotation(obstacle: Obstacle) -> Obstacle:
+    """Return the obstacle, or, if it rotates, a sphere about its centre that contains it in every orientation.
+
+    Raises:
+        InputError: when a half-space rotates.
+    """
+    if not obstacle.angular_velocity.any():
+        return obstacle
     if isinstance(obstacle, HalfSpace):
         raise InputError(
             f"adapt: half-space {obstacle.name!r} rotates; a path among rotating half-spaces can't be certified"

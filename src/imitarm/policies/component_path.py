@@ -65,6 +65,8 @@ class ComponentPath:
         centres: index of the sample at the centre of each component, (n_components,).
         precisions: inverses of ``yields``, (n_components, 3, 3) [1/m^2].
         tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
+        rotation_tolerance: two standard deviations of the demonstrated rotation along the path, in the direction in
+            which it varies most, shape (n,) [rad]; 0 without a learned orientation.
     """
 
     nominal: Trajectory
@@ -77,6 +79,7 @@ class ComponentPath:
     centres: Index
     precisions: Array
     tolerance: Array
+    rotation_tolerance: Array
 
     @classmethod
     def of_skill(
@@ -249,9 +252,18 @@ def _learned(gmr: GMR, n_samples: int, fixed_times: tuple[float, ...]) -> Compon
         centres=centres,
         precisions=np.asarray(np.linalg.inv(yields), dtype=np.float64),
         tolerance=tolerance,
+        rotation_tolerance=_rotation_tolerance(gmr, times),
     )
     _PATHS[gmr] = (gmr.means_, key, path)
     return path
+
+
+def _rotation_tolerance(gmr: GMR, times: Array) -> Array:
+    """Return two standard deviations of the rotation at each time, shape (n,) [rad]."""
+    if not gmr.has_orientation_:
+        return np.zeros(len(times))
+    largest = np.linalg.eigvalsh(gmr.predict_orientation(times)[1])[:, -1]
+    return np.asarray(2.0 * np.sqrt(np.maximum(largest, 0.0)))
 
 
 def _sample_times(n_samples: int, fixed_times: tuple[float, ...]) -> Array:

@@ -40,7 +40,7 @@ _GAIN = 0.9  # stop when a round saves less than a tenth
 _STALLED = 2e-5  # [m] a try that raises the lowest bound by less is no progress either
 _MAX_STALLED = 4  # tries without progress, then the search gives up
 _PROGRESS = 0.9  # a try that leaves more than this fraction of what was missing is no progress
-_SMOOTHNESS = 1e-3  # weight of the squared jerk of the displacement, in units of the largest nominal jerk
+SMOOTHNESS = 1e-3  # weight of the squared jerk of the displacement, in units of the largest nominal jerk
 _SMOOTHER = (1e-1, 1e1, 1e3)  # weights tried where the path would be too jerky
 _WITHIN = 0.999  # of the stated limits is planned for
 _SOLVED = 1  # daqp's exit flag of an optimal solution
@@ -324,28 +324,9 @@ class LeastDetour:
         return best, ratio
 
     def _scale(self, moved: Index, smoothness: float | None) -> Array:
-        """Return the matrix G (m d, m d) with ``delta = G y``, so that the cost of ``delta`` is ``|y|^2``.
-
-        The cost is ``delta^T H delta``. The diagonal blocks of H contain the demonstrated precisions. If the path is
-        divided or has to be smoother, H also contains the squared jerk of the displacement.
-        """
-        axes, m, d = self.allowed.axes, len(moved), self.allowed.dimension
-        weight = (_SMOOTHNESS if self.exact else 0.0) if smoothness is None else smoothness
-        index, h = np.arange(m), np.zeros((m, d, m, d))
-        if weight == 0.0 and d == 3:
-            h[index, :, index, :] = self.path.factors[moved]
-            return h.reshape(m * d, m * d)
-        blocks = axes.T @ self.path.precisions[moved] @ axes
-        if weight == 0.0:
-            h[index, :, index, :] = np.swapaxes(np.linalg.inv(np.linalg.cholesky(blocks)), 1, 2)
-            return h.reshape(m * d, m * d)
-        h[index, :, index, :] = blocks
-        jerk = self.path.basis_jerk[:, moved] / max(self.path.nominal_jerk, 1e-9)
-        products = weight * (jerk.T @ jerk)
-        for axis in range(d):
-            h[:, axis, :, axis] += products
-        lower = np.linalg.cholesky(h.reshape(m * d, m * d))
-        return np.asarray(np.linalg.inv(lower).T)
+        """Return :func:`style_scale` of the moved components with a weight, or the default weight of this path."""
+        weight = (SMOOTHNESS if self.exact else 0.0) if smoothness is None else smoothness
+        return style_scale(self.path, self.allowed, moved, weight)
 
     def _step(
         self, moved: Index, scale: Array, here: PathClearance, held: ClosePoints, cuts: _Cuts
@@ -407,6 +388,36 @@ class LeastDetour:
         displacement[moved] = self.allowed.enforced((scale @ y).reshape(-1, d))
         displacement[np.einsum("kd,kd->k", displacement, displacement) < STILL**2] = 0.0
         return displacement, float(y @ y)
+
+
+def style_scale(path: ComponentPath, allowed: AllowedDirections, moved: Index, smoothness: float) -> Array:
+    """Return the matrix G (m d, m d) with ``delta = G y``, so that the cost of ``delta`` is ``|y|^2``.
+
+    The cost is ``delta^T H delta`` with the demonstrated precisions on the diagonal blocks of H and the squared jerk of
+    the displacement.
+
+    Args:
+        path: the path and its components.
+        allowed: directions in which components may move; ``delta`` has d coordinates in its axes for each component.
+        moved: indices of the m components that may move.
+        smoothness: weight of the squared jerk, in units of the largest nominal jerk.
+    """
+    axes, m, d = allowed.axes, len(moved), allowed.dimension
+    index, h = np.arange(m), np.zeros((m, d, m, d))
+    if smoothness == 0.0 and d == 3:
+        h[index, :, index, :] = path.factors[moved]
+        return h.reshape(m * d, m * d)
+    blocks = axes.T @ path.precisions[moved] @ axes
+    if smoothness == 0.0:
+        h[index, :, index, :] = np.swapaxes(np.linalg.inv(np.linalg.cholesky(blocks)), 1, 2)
+        return h.reshape(m * d, m * d)
+    h[index, :, index, :] = blocks
+    jerk = path.basis_jerk[:, moved] / max(path.nominal_jerk, 1e-9)
+    products = smoothness * (jerk.T @ jerk)
+    for axis in range(d):
+        h[:, axis, :, axis] += products
+    lower = np.linalg.cholesky(h.reshape(m * d, m * d))
+    return np.asarray(np.linalg.inv(lower).T)
 
 
 @dataclass(frozen=True, eq=False)

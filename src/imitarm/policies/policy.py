@@ -6,6 +6,7 @@ A policy observes an arm and its scene, and returns a command. ACFRA (adaptive c
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.command import Command, Status
 from imitarm.errors import InfeasibleError, InputError
-from imitarm.kinematics.arm import ArmState
+from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply
 from imitarm.policies.adaptation import Adaptation, adapt, adapter_named
 from imitarm.policies.component_path import ComponentPath
@@ -27,7 +28,10 @@ from imitarm.validation import finite_array, finite_number, instance
 
 Array = NDArray[np.float64]
 
+_OF_THE_ARM = ("arm", "max_tilt")  # options that a policy need not have
 _LEAST_PATIENCE = 5e-3  # [m] no robot follows more closely than this at all times
+_ALLOWANCE, _ALLOWANCE_OF_ARM = 2e-3, 5e-3  # [m] usual margin of a plan for the tool, for the whole arm
+_SAME_START = 1e-4  # [m, rad] the joints are planned from exactly where the arm is
 _SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learned one is the learned one
 _STANDS = 0.05  # speed of the phase below which the motion is said to wait
 _DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
@@ -71,6 +75,7 @@ class Policy(ABC):
         tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: its tip.
         clearance: required distance of the tool to every obstacle [m].
         forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
+        arm: the arm that will move, for policies that plan its joints; None: not known.
 
     Attributes:
         plan: plan to draw in a report, an :class:`~imitarm.policies.Adaptation`; None if the policy has no plan.
@@ -85,7 +90,9 @@ class Policy(ABC):
         tool_spheres: ArrayLike | None = None,
         clearance: float = 0.02,
         forbidden: ArrayLike = (),
+        arm: ArmModel | None = None,
     ) -> None:
+        self.arm = None if arm is None else instance(arm, ArmModel, "Policy: arm")
         self.skill = instance(skill, Skill, "Policy: skill")
         self.tool_spheres = (
             None if tool_spheres is None else finite_array(tool_spheres, (None, 4), "Policy: tool_spheres", "m")
@@ -97,15 +104,21 @@ class Policy(ABC):
     def build(cls, skill: Skill, **options: Any) -> Self:
         """Return a policy for the command line and the benchmark, with the constructor's common arguments.
 
+        Options about the arm are left out if the constructor does not take them.
+
         Raises:
-            InputError: when the constructor does not take these arguments.
+            InputError: when the constructor does not take the other arguments.
         """
+        parameters = inspect.signature(cls).parameters.values()
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            known = {parameter.name for parameter in parameters}
+            options = {name: value for name, value in options.items() if name in known or name not in _OF_THE_ARM}
         try:
             return cls(skill, **options)
         except TypeError as error:
             raise InputError(
-                f"{cls.__name__}: can't be built with the arguments {', '.join(options)}: {error}; change its "
-                "constructor so that it takes the arguments of Policy's constructor"
+                f"{cls.__name__}: can't be built with the arguments {', '.join(options)}: {error}; let its "
+                f"constructor take the arguments of Policy's constructor"
             ) from error
 
     @abstractmethod
@@ -154,10 +167,15 @@ class ACFRA(Policy):
         clearance: required distance of the tool to every obstacle [m].
         forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
         pinned: times at which the path must not move [s].
+        arm: the arm with its tool. The policy then plans the joints of the whole arm and follows them, and
+            ``tool_radius`` and ``tool_spheres`` are not used. None: only the path of the tool is planned.
+        max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]; see
+            :func:`~imitarm.policies.adapt`.
         gain: K [1/s].
         patience: e_0, the position error at which the phase stops [m]; None: the clearance, at least 5 mm.
         arrival: distance to the end of the path at which the motion counts as arrived [m].
-        allowance: margin added to the clearance in planning, if possible, because a robot has tracking errors [m].
+        allowance: margin added to the clearance in planning, if possible, because a robot has tracking errors [m]; None:
+            2 mm for a plan of the tool, 5 mm for a plan of the whole arm.
 
     Attributes:
         adaptation: result of the last ``reset``.
@@ -173,23 +191,28 @@ class ACFRA(Policy):
         clearance: float = 0.02,
         forbidden: ArrayLike = (),
         pinned: Sequence[float] = (),
+        arm: ArmModel | None = None,
+        max_tilt: float | None = None,
         gain: float = 8.0,
         patience: float | None = None,
         arrival: float = 0.003,
-        allowance: float = 0.002,
+        allowance: float | None = None,
     ) -> None:
-        super().__init__(skill, tool_spheres=tool_spheres, clearance=clearance, forbidden=forbidden)
+        super().__init__(skill, tool_spheres=tool_spheres, clearance=clearance, forbidden=forbidden, arm=arm)
         self._refuses = adapter_named(method).refuses
-        self._options = {
-            "method": method,
-            "tool_radius": tool_radius,
-            "tool_spheres": tool_spheres,
-            "forbidden": forbidden,
-        }
+        self._whole_arm = arm is not None and self._refuses
+        self._options: dict[str, Any] = {"method": method, "forbidden": forbidden}
+        if self._whole_arm:
+            self._options |= {"arm": arm, "max_tilt": max_tilt}
+        else:
+            self._options |= {"tool_radius": tool_radius, "tool_spheres": tool_spheres}
         self._path = ComponentPath.of_skill(skill, pinned=pinned)
         self._gain = finite_number(gain, "ACFRA: gain", "1/s", above=0.0)
         self._arrival = finite_number(arrival, "ACFRA: arrival", "m", above=0.0)
-        self._allowance = finite_number(allowance, "ACFRA: allowance", "m", at_least=0.0)
+        usual = _ALLOWANCE_OF_ARM if self._whole_arm else _ALLOWANCE
+        self._allowance = finite_number(
+            usual if allowance is None else allowance, "ACFRA: allowance", "m", at_least=0.0
+        )
         self._patience = max(self.clearance, _LEAST_PATIENCE)
         if patience is not None:
             self._patience = finite_number(patience, "ACFRA: patience", "m", above=0.0)
@@ -205,8 +228,9 @@ class ACFRA(Policy):
         away = observation.tool_to_base.error_to(self.skill.start_)
         if not self.skill.gmr_.has_orientation_:
             away = away[:3]
-        start = observation.tool_to_base if np.linalg.norm(away) > _SAME_PLACE else None
-        self.adaptation = self._adapted(observation.scene.now(observation.time), start)
+        same = np.linalg.norm(away) <= (_SAME_START if self._whole_arm else _SAME_PLACE)
+        start = None if same else observation.tool_to_base
+        self.adaptation = self._adapted(observation.scene.now(observation.time), start, observation.state)
         if not self.adaptation.feasible and self._refuses:
             raise InfeasibleError(self.adaptation.reason)
         path = self.adaptation.trajectory
@@ -216,21 +240,25 @@ class ACFRA(Policy):
             step = quaternion_multiply(path.quaternions[1:], quaternion_conjugate(path.quaternions[:-1]))
             rotation[:-1] = quaternion_log(step) / np.diff(path.times)[:, None]
         self._twists = np.concatenate([velocity, rotation], axis=1)
+        joints = self.adaptation.joints
+        self._joint_velocities = None if joints is None else np.gradient(joints, path.times, axis=0)
         self._displaced = np.linalg.norm(path.positions - self.adaptation.nominal.positions, axis=1)
         self._hold = observation.tool_to_base
         self._began = observation.time
         self._phase, self._void = 0.0, ""
 
-    def _adapted(self, scene: Scene, start: Pose | None) -> Adaptation:
-        """Plan with the allowance if that is feasible, otherwise without it."""
-        plan, path = None, self._path.between(self.skill, start, scene.goal)
-        for allowance in sorted({self._allowance if self._refuses else 0.0, 0.0}, reverse=True):
-            clearance = self.clearance + allowance
-            plan = adapt(path, scene, clearance=clearance, **self._options)  # type: ignore[arg-type]
-            if plan.feasible:
-                break
-        assert plan is not None
-        return plan
+    def _adapted(self, scene: Scene, start: Pose | None, state: ArmState) -> Adaptation:
+        """Return the adapted path, from a start (None: the learned one)."""
+        path = self._path.between(self.skill, start, scene.goal)
+        allowance = self._allowance if self._refuses else 0.0
+        return adapt(
+            path,
+            scene,
+            clearance=self.clearance,
+            allowance=allowance,
+            state=state if self._whole_arm else None,
+            **self._options,
+        )
 
     @property
     def plan(self) -> Adaptation | None:
@@ -266,28 +294,42 @@ class ACFRA(Policy):
         if self._void:
             return Command(np.zeros(6), progress=self._phase / end, status=Status.BRAKING, reason=self._void)
         speed = 1.0 if on_schedule else max(0.0, 1.0 - (lag / self._patience) ** 2)
-        forward = np.array([np.interp(self._phase, path.times, column) for column in self._twists.T])
+        phase = self._phase
+        forward = _at(phase, path.times, self._twists)
         if self._phase >= end:
             speed = 0.0
         elif not on_schedule:
             self._phase = min(self._phase + speed * dt, end)
-        return self._command(speed * forward + self._gain * error, speed, lag, end)
+        joints = self._joint_command(observation.state.q, phase, speed)
+        return self._command(speed * forward + self._gain * error, joints, speed, lag, end)
 
-    def _command(self, twist: Array, speed: float, lag: float, end: float) -> Command:
+    def _joint_command(self, q: Array, phase: float, speed: float) -> Array | None:
+        """Return the joint velocity that follows the planned joints; None when only the tool was planned."""
+        assert self.adaptation is not None
+        joints, times = self.adaptation.joints, self.adaptation.trajectory.times
+        if joints is None or self._joint_velocities is None:
+            return None
+        forward = _at(phase, times, self._joint_velocities)
+        return np.asarray(speed * forward + self._gain * (_at(phase, times, joints) - q))
+
+    def _command(self, twist: Array, joints: Array | None, speed: float, lag: float, end: float) -> Command:
         assert self.adaptation is not None
         progress = self._phase / end
         if (speed < _STANDS and self._phase < end) or (self._phase >= end and lag > self._arrival):
             what = "behind its path" if self._phase < end else "from the end of its path"
             reason = f"the tool is {1e3 * lag:.0f} mm {what}"
-            return Command(twist, progress=progress, status=Status.WAITING, reason=reason)
+            return Command(twist, joints, progress=progress, status=Status.WAITING, reason=reason)
         displaced = float(np.interp(self._phase, self.adaptation.trajectory.times, self._displaced))
         if displaced > _DISPLACED:
             reason = f"the path is displaced by {1e3 * displaced:.0f} mm here because of an obstacle"
-            return Command(twist, progress=progress, status=Status.AVOIDING, reason=reason)
-        return Command(twist, progress=progress)
+            return Command(twist, joints, progress=progress, status=Status.AVOIDING, reason=reason)
+        return Command(twist, joints, progress=progress)
 
     def _target(self, path: Trajectory) -> Pose:
         """Return the desired pose at the current phase; without a learned orientation, the tool's rotation is kept."""
+        assert self.adaptation is not None
+        if self.adaptation.joints is not None and self.arm is not None:  # between samples the joints move linearly
+            return self.arm.tool_pose(_at(self._phase, path.times, self.adaptation.joints))
         positions, quaternions = path.at([self._phase])
         return Pose(positions[0], self._hold.quaternion if quaternions is None else quaternions[0])
 
@@ -298,3 +340,8 @@ class ACFRA(Policy):
         path = self.adaptation.trajectory
         away = np.linalg.norm(observation.tool_to_base.position - path.positions[-1])
         return self._phase >= path.times[-1] and bool(away < self._arrival)
+
+
+def _at(time: float, times: Array, values: Array) -> Array:
+    """Return the rows of values (n, m) at times (n,), interpolated linearly at one time, shape (m,)."""
+    return np.array([np.interp(time, times, column) for column in values.T])

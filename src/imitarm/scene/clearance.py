@@ -161,7 +161,7 @@ class SelfClearance:
         self._n_rows, self._gain = n_rows, gain
         cover = arm.cover
         centers, radii = self._centers(arm.home), np.concatenate([cover.radii, cover.base_radii])
-        links = np.concatenate([cover.links, np.zeros(len(cover.base_radii), dtype=int)])
+        links = self.links = np.concatenate([cover.links, np.zeros(len(cover.base_radii), dtype=int)])
         meet = meeting_links(arm)
         sums = radii[:, None] + radii
         apart = np.linalg.norm(centers[:, None] - centers, axis=2) - sums
@@ -169,10 +169,10 @@ class SelfClearance:
         outer, inner = np.nonzero(meet[links[:, None], links] & (apart >= clearance))
         pair_of_links = links[outer] * (arm.n_joints + 1) + links[inner]
         order = np.argsort(pair_of_links, kind="stable")
-        self._outer, self._inner = outer[order], inner[order]
-        self._flat = self._outer * len(radii) + self._inner  # in the matrix of all distances
-        self._sums = sums[self._outer, self._inner]
-        self._coarse_sums = self._sums.astype(np.float32)
+        self.outer, self.inner = outer[order], inner[order]
+        self._flat = self.outer * len(radii) + self.inner  # in the matrix of all distances
+        self.sums = sums[self.outer, self.inner]
+        self._coarse_sums = self.sums.astype(np.float32)
         self._starts = np.flatnonzero(np.diff(pair_of_links[order], prepend=-1))
         ends = [*self._starts.tolist(), len(order)][1:]
         self._groups = [slice(a, b) for a, b in zip(self._starts.tolist(), ends, strict=True)]
@@ -185,7 +185,7 @@ class SelfClearance:
     @property
     def n_pairs(self) -> int:
         """Number of pairs of spheres that are checked."""
-        return len(self._sums)
+        return len(self.sums)
 
     def distance(self, q: ArrayLike) -> float:
         """Return the smallest distance of all checked pairs of spheres [m]; negative when two overlap.
@@ -199,7 +199,7 @@ class SelfClearance:
         if not self.n_pairs:
             return math.inf
         centers = self._centers(q)
-        return float((np.linalg.norm(centers[self._outer] - centers[self._inner], axis=1) - self._sums).min())
+        return float((np.linalg.norm(centers[self.outer] - centers[self.inner], axis=1) - self.sums).min())
 
     def nearest(self, q: ArrayLike) -> tuple[Indices, Array]:
         """Return the pairs of spheres that have a row, nearest first.
@@ -267,11 +267,11 @@ class SelfClearance:
                 close = close[np.argpartition(coarse[close], _MOST)[:_MOST]]
             chosen = np.array(sorted({*close.tolist(), *best}), dtype=np.intp)
             chosen = chosen.take(coarse.take(chosen).argsort())
-        outer, inner = self._outer.take(chosen), self._inner.take(chosen)
+        outer, inner = self.outer.take(chosen), self.inner.take(chosen)
         outer_centers = centers.take(outer, axis=0)
         between = outer_centers - centers.take(inner, axis=0)
         lengths = np.sqrt((between * between).sum(axis=1))
-        return outer, inner, outer_centers, between / lengths[:, None], lengths - self._sums.take(chosen)
+        return outer, inner, outer_centers, between / lengths[:, None], lengths - self.sums.take(chosen)
 
     def _coarse_distances(self, centers: Array) -> NDArray[np.float32]:
         """Return the distances of all checked pairs in single precision, which suffices for finding near pairs."""

@@ -1,0 +1,415 @@
+r"""Proof that a whole arm keeps its clearance on a joint path, between the samples too.
+
+Between two samples every joint moves linearly, and the centre c of a sphere of the arm moves on an arc. On the whole
+segment the centre stays within
+
+.. math:: e = \tfrac18 \sum_{i,j} |\Delta q_i|\,|\Delta q_j|\,R_{\max(i,j)}
+
+of the straight line between its two positions. :math:`R_j` is the largest distance of the centre from the axis of joint
+j (1 for a prismatic joint), because the second derivative of c with respect to the joints i and j has at most the norm
+:math:`R_{\max(i,j)}`. The signed distance to a convex obstacle is a convex function of the point, so the tangents at
+the two ends bound it on the line, and on the arc it is smaller by at most e. Where this bound is too low, the segment
+is divided into halves, which makes e four times smaller.
+
+The same holds for two links of the arm. In the frame of the inner link, only the joints between the two links move the
+outer one, and the distance from a fixed point is a convex function too.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_path import ArmPath
+from imitarm.policies.certificate import crossing_of_tangents, without_rotation
+from imitarm.scene.clearance import SelfClearance
+from imitarm.scene.edged import HalfSpace
+from imitarm.scene.obstacle import Obstacle
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+SELF = -1
+"""Stands for the index of an obstacle where two links of the arm are meant."""
+_REACH = 0.1  # [m] beyond the clearance: pairs that are farther apart at both ends of a segment are not bounded
+_MOST_HALVINGS = 8  # of a segment
+_CONTACT = 1e-3  # [m] a part may come nearer to a fixture by this than it is where contact is meant
+_TINY = 1e-9  # [m] a joint that moves a sphere has at least this distance from it
+
+
+@dataclass(frozen=True)
+class ArmClearance:
+    """The smallest clearance of an arm on a joint path, and where it is.
+
+    Attributes:
+        room: distance minus required clearance [m]. If it is not negative, it is a guaranteed lower bound on the whole
+            path. If it is negative, it is the value at one point of the path, and other points may be worse.
+        obstacle: index of the obstacle; ``SELF`` for two links.
+        sphere: index of the sphere of the arm; for two links, the sphere of the outer link.
+        other: index of the sphere of the inner link; -1 for an obstacle.
+        sample: index of the sample at or before the point.
+    """
+
+    room: float
+    obstacle: int
+    sphere: int
+    other: int
+    sample: int
+
+
+@dataclass(frozen=True, eq=False)
+class Gaps:
+    """Pairs of a sphere of the arm and an obstacle, or of two spheres of the arm, that are near each other.
+
+    Attributes:
+        path: the arm at the samples.
+        obstacle: index of the obstacle; ``SELF`` for two spheres of the arm, shape (k,).
+        sample: index of the sample of the path, shape (k,).
+        sphere: index of the sphere; for two spheres, of the outer one, shape (k,).
+        other: index of the inner one of two spheres; -1 for an obstacle, shape (k,).
+        first: number of joints that move both spheres and so do not change their distance; 0 for an obstacle, (k,).
+        room: distance minus required clearance, shape (k,) [m].
+        normal: unit vector along which the sphere moves away fastest, in the base frame, shape (k, 3).
+        drift: change of the distance with time, caused by the motion of the obstacle, shape (k,) [m/s].
+    """
+
+    path: ArmPath
+    obstacle: Index
+    sample: Index
+    sphere: Index
+    other: Index
+    first: Index
+    room: Array
+    normal: Array
+    drift: Array
+
+    @classmethod
+    def joined(cls, path: ArmPath, parts: Sequence[Gaps]) -> Gaps:
+        """Return all pairs of several parts."""
+        none, empty = np.zeros(0, dtype=np.intp), np.zeros(0)
+        parts = [cls(path, none, none, none, none, none, empty, np.zeros((0, 3)), empty), *parts]
+        names = [name for name in cls.__dataclass_fields__ if name != "path"]
+        return cls(path, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+    def __len__(self) -> int:
+        return len(self.room)
+
+    def rates(self, chosen: Index) -> Array:
+        """Return the change of the distance of chosen pairs with each joint, shape (m, n_joints) [m/rad]."""
+        rates = self.path.sphere_speeds(self.sample[chosen], self.sphere[chosen], self.normal[chosen])
+        return rates * (np.arange(rates.shape[1]) >= self.first[chosen, None])
+
+
+class ArmAmongObstacles:
+    """An arm, the obstacles and fixtures that it must not approach, and its links, which must stay apart.
+
+    Args:
+        arm: the arm with its tool.
+        obstacles: convex obstacles at time 0, which move at their velocities. A rotating obstacle is replaced by a
+            sphere about its centre that contains it.
+        clearance: required distance from every moving part of the arm to every obstacle [m].
+        fixtures: objects on which the arm stands or works, such as a table. A part of the arm may come as near to a
+            fixture as it is in one of the postures ``contacts`` or at home; otherwise it keeps the clearance.
+        contacts: postures in which parts of the arm may be near fixtures, shape (k, n_joints) [rad].
+        own: the links that must stay apart, and their required clearance; None: not checked.
+
+    Attributes:
+        n_obstacles: number of obstacles; fixtures have indices from there on.
+    """
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        obstacles: Sequence[Obstacle],
+        clearance: float,
+        *,
+        fixtures: Sequence[Obstacle] = (),
+        contacts: Array | None = None,
+        own: SelfClearance | None = None,
+    ) -> None:
+        self.arm, self.clearance, self.n_obstacles, self.own = arm, clearance, len(obstacles), own
+        self._pairs: list[_Pairs] = [_ToObstacle(arm, i, o, clearance) for i, o in enumerate(obstacles)]
+        if fixtures:
+            postures = arm.home[None] if contacts is None else np.concatenate([arm.home[None], contacts])
+            centers = ArmPath.of(arm, postures).centers
+            for i, fixture in enumerate(fixtures, len(obstacles)):
+                away = fixture.distances_at(centers, gradient=False)[0] - arm.cover.radii - _CONTACT
+                self._pairs.append(_ToObstacle(arm, i, fixture, np.minimum(away.min(axis=0), clearance)))
+        if own is not None and own.n_pairs:
+            self._pairs.append(_ToLink(arm, own))
+
+    def gaps(self, path: ArmPath, times: Array, reach: float) -> Gaps:
+        """Return all pairs that are nearer than the required clearance plus ``reach``, at the samples.
+
+        Args:
+            path: the arm at n samples.
+            times: time of each sample [s], shape (n,).
+            reach: [m].
+        """
+        return Gaps.joined(path, [pairs.gaps(path, times, reach) for pairs in self._pairs])
+
+    def clearance_at(self, path: ArmPath, times: Array, reach: float) -> ArmClearance:
+        """Return the smallest clearance at the samples of a path; ``reach`` [m] if it is larger than that.
+
+        Args:
+            path: the arm at n samples.
+            times: time of each sample [s], shape (n,).
+            reach: [m].
+        """
+        gaps = self.gaps(path, times, reach)
+        if not len(gaps):
+            return ArmClearance(reach, 0, -1, -1, 0)
+        i = int(np.argmin(gaps.room))
+        place = (gaps.obstacle[i], gaps.sphere[i], gaps.other[i], gaps.sample[i])
+        return ArmClearance(float(gaps.room[i]), *map(int, place))
+
+    def clearance_of(self, path: ArmPath, times: Array) -> ArmClearance:
+        """Bound the clearance on a whole joint path, on which the joints move linearly between the samples.
+
+        Args:
+            path: the arm at n samples.
+            times: time of each sample [s], shape (n,).
+        """
+        fine, times, origin, travel = _finer(path, times)
+        fastest = max((float(np.linalg.norm(pairs.velocity)) for pairs in self._pairs), default=0.0)
+        # Pairs that are not near at the ends of a segment cannot come nearer on it than this.
+        farthest = travel + fastest * float(np.diff(times).max(initial=0.0))
+        lowest = ArmClearance(_REACH - 0.5 * farthest, 0, -1, -1, 0)
+        for pairs in self._pairs:
+            lowest = min(lowest, pairs.bound(fine, times), key=lambda found: found.room)
+            if lowest.room < 0.0:
+                break
+        return replace(lowest, sample=int(origin[lowest.sample]))
+
+
+def _finer(path: ArmPath, times: Array) -> tuple[ArmPath, Array, Index, float]:
+    """Divide segments on which a sphere could move farther than ``_REACH``.
+
+    Returns:
+        The path, its times, the sample of the given path at or before each of its samples, and the longest distance
+        that a sphere moves on a segment [m].
+    """
+    away = np.linalg.norm(path.centers[:, :, None] - path.anchors[:, None], axis=3).max(axis=1, initial=0.0)
+    away[:, path.arm.cover.slides] = 1.0
+    steps = np.abs(np.diff(path.joints, axis=0))
+    whole = np.maximum(away[:-1], away[1:])
+    whole += 0.5 * (steps * whole).sum(axis=1, keepdims=True)  # an axis may come closer or move away meanwhile
+    travel = (steps * whole).sum(axis=1)
+    parts = np.maximum(np.ceil(travel / _REACH), 1.0)
+    n = len(path)
+    if parts.max(initial=1.0) == 1.0:
+        return path, times, np.arange(n), float(travel.max(initial=0.0))
+    places = np.concatenate([i + np.arange(k) / k for i, k in enumerate(parts.astype(int).tolist())] + [[n - 1.0]])
+    joints = np.stack([np.interp(places, np.arange(n), column) for column in path.joints.T], axis=1)
+    finer = ArmPath.of(path.arm, joints)
+    return finer, np.interp(places, np.arange(n), times), places.astype(np.intp), float((travel / parts).max())
+
+
+class _Pairs(ABC):
+    """Pairs of one sphere of the arm with one obstacle, or with spheres of other links.
+
+    Attributes:
+        arm: the arm.
+        obstacle: index of the obstacle, or ``SELF``.
+        sphere: sphere of each pair; of two spheres the outer one, shape (n_pairs,).
+        other: inner sphere of each pair, or -1, shape (n_pairs,).
+        first: number of joints, counted from the base, that do not change the distance of each pair, shape (n_pairs,).
+        moves: whether a joint changes the distance of each pair, shape (n_pairs, n_joints).
+        velocity: of the obstacle, shape (3,) [m/s].
+    """
+
+    velocity: Array = np.zeros(3)
+    arm: ArmModel
+    obstacle: int
+    sphere: Index
+    other: Index
+    first: Index
+    moves: Mask
+
+    @abstractmethod
+    def near(self, path: ArmPath, times: Array, reach: float) -> Mask:
+        """Return which pairs may be nearer than the clearance plus ``reach`` at each sample, shape (n, n_pairs)."""
+
+    @abstractmethod
+    def points(self, path: ArmPath, sample: Index, pair: Index, times: Array) -> Array:
+        """Return where spheres are, relative to the obstacle or in the frame of the inner link, shape (k, 3) [m]."""
+
+    @abstractmethod
+    def measured(self, points: Array, pair: Index) -> tuple[Array, Array]:
+        """Return distance minus required clearance (k,) [m] of such points, and its gradient (k, 3)."""
+
+    def gaps(self, path: ArmPath, times: Array, reach: float) -> Gaps:
+        sample, pair = np.nonzero(self.near(path, times, reach))
+        room, normal = self.measured(self.points(path, sample, pair, times[sample]), pair)
+        kept = np.flatnonzero(room < reach)
+        sample, pair, room, normal = sample[kept], pair[kept], room[kept], normal[kept]
+        normals = self.in_base(path, sample, pair, normal)
+        obstacle, drift = np.full(len(kept), self.obstacle), -(normal @ self.velocity)
+        return Gaps(path, obstacle, sample, self.sphere[pair], self.other[pair], self.first[pair], room, normals, drift)
+
+    def in_base(self, path: ArmPath, sample: Index, pair: Index, normals: Array) -> Array:
+        """Return gradients in the base frame."""
+        return normals
+
+    def bound(self, path: ArmPath, times: Array) -> ArmClearance:
+        """Bound the clearance of these pairs on the whole path."""
+        near = self.near(path, times, _REACH)
+        segment, pair = np.nonzero(near[:-1] | near[1:])
+        if not len(segment):
+            return ArmClearance(_REACH, self.obstacle, -1, -1, 0)
+        room, where = _lowest(self, path, times, segment, pair)
+        place = pair[where]
+        return ArmClearance(room, self.obstacle, int(self.sphere[place]), int(self.other[place]), int(segment[where]))
+
+
+class _ToObstacle(_Pairs):
+    """Every sphere of the arm with one obstacle."""
+
+    def __init__(self, arm: ArmModel, index: int, obstacle: Obstacle, clearance: Array | float) -> None:
+        self.arm, self.obstacle, n = arm, index, len(arm.cover.radii)
+        self._solid = without_rotation(obstacle)
+        self.velocity = self._solid.velocity
+        self.sphere, self.other, self.first = np.arange(n), np.full(n, -1), np.zeros(n, dtype=np.intp)
+        self.moves = arm.cover.moves > 0.0
+        self._kept_off = arm.cover.radii + clearance  # [m] least distance of a centre
+        self._flat = isinstance(self._solid, HalfSpace)
+        if not self._flat:
+            low, high = self._solid.bounds()
+            self._middle, self._size = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+
+    def near(self, path: ArmPath, times: Array, reach: float) -> Mask:
+        centers = path.centers - times[:, None, None] * self.velocity
+        limit = self._kept_off + reach
+        if self._flat:
+            return np.asarray(self._solid.distances_at(centers, gradient=False)[0] < limit)
+        away = centers - self._middle
+        return np.asarray(np.einsum("nmi,nmi->nm", away, away) < np.maximum(limit + self._size, 0.0) ** 2)
+
+    def points(self, path: ArmPath, sample: Index, pair: Index, times: Array) -> Array:
+        return np.asarray(path.centers[sample, self.sphere[pair]] - times[:, None] * self.velocity)
+
+    def measured(self, points: Array, pair: Index) -> tuple[Array, Array]:
+        distance, normal = self._solid.distances_at(points, gradient=True)
+        return distance - self._kept_off[pair], normal
+
+
+class _ToLink(_Pairs):
+    """The pairs of spheres of two links of the arm that :class:`SelfClearance` checks."""
+
+    def __init__(self, arm: ArmModel, own: SelfClearance) -> None:
+        self.arm, self.obstacle, self._own = arm, SELF, own
+        self.sphere, self.other = own.outer, own.inner
+        self.first = own.links[own.inner]
+        self.moves = (arm.cover.moves[own.outer] > 0.0) & (np.arange(arm.n_joints) >= self.first[:, None])
+
+    def near(self, path: ArmPath, times: Array, reach: float) -> Mask:
+        base = np.broadcast_to(self.arm.cover.base_centers, (len(path), *self.arm.cover.base_centers.shape))
+        columns = np.moveaxis(np.concatenate([path.centers, base], axis=1), 2, 0).astype(np.float32)
+        away = np.take(columns, self.sphere, axis=2)
+        away -= np.take(columns, self.other, axis=2)
+        limit = (self._own.sums + self._own.clearance + reach).astype(np.float32) + np.float32(1e-4)
+        return np.asarray(np.einsum("inp,inp->np", away, away) < limit * limit)
+
+    def points(self, path: ArmPath, sample: Index, pair: Index, times: Array) -> Array:
+        inner, m = self.other[pair], path.centers.shape[1]
+        of_base = inner >= m
+        origin = path.centers[sample, np.where(of_base, 0, inner)]
+        if of_base.any():
+            origin[of_base] = self.arm.cover.base_centers[inner[of_base] - m]
+        away = path.centers[sample, self.sphere[pair]] - origin
+        return np.einsum("kji,kj->ki", path.rotations[sample, self.first[pair]], away)
+
+    def measured(self, points: Array, pair: Index) -> tuple[Array, Array]:
+        length = np.sqrt(np.einsum("ki,ki->k", points, points))
+        normal = points / np.maximum(length, 1e-12)[:, None]
+        return length - self._own.sums[pair] - self._own.clearance, normal
+
+    def in_base(self, path: ArmPath, sample: Index, pair: Index, normals: Array) -> Array:
+        return np.einsum("kij,kj->ki", path.rotations[sample, self.first[pair]], normals)
+
+
+@dataclass(eq=False)
+class _Ends:
+    """One end of each of k segments: joints, time, the point of each pair with its room and gradient, and its radii."""
+
+    joints: Array
+    times: Array
+    points: Array
+    room: Array
+    normal: Array
+    radii: Array
+
+    @classmethod
+    def of(cls, pairs: _Pairs, path: ArmPath, times: Array, sample: Index, pair: Index) -> _Ends:
+        points = pairs.points(path, sample, pair, times)
+        radii = np.maximum(path.sphere_radii(sample, pairs.sphere[pair]), _TINY) * pairs.moves[pair]
+        return cls(path.joints[sample], times, points, *pairs.measured(points, pair), radii)
+
+    def take(self, chosen: Index) -> _Ends:
+        return _Ends(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+    def __add__(self, other: _Ends) -> _Ends:
+        names = self.__dataclass_fields__
+        return _Ends(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+
+
+def _lowest(pairs: _Pairs, path: ArmPath, times: Array, segment: Index, pair: Index) -> tuple[float, int]:
+    """Return the lowest bound over segments of pairs, and the number of the segment; a value when it is negative."""
+    start = _Ends.of(pairs, path, times[segment], segment, pair)
+    end = _Ends.of(pairs, path, times[segment + 1], segment + 1, pair)
+    at = int(np.argmin(np.minimum(start.room, end.room)))
+    if min(start.room[at], end.room[at]) < 0.0:
+        return float(min(start.room[at], end.room[at])), at
+    of, lowest, where = np.arange(len(segment)), np.inf, 0
+    for halvings in range(_MOST_HALVINGS + 1):
+        bounds = _bounds(start, end)
+        rest = np.flatnonzero(bounds < 0.0) if halvings < _MOST_HALVINGS else np.zeros(0, dtype=np.intp)
+        settled = bounds.copy()
+        settled[rest] = np.inf
+        at = int(np.argmin(settled))
+        if settled[at] < lowest:
+            lowest, where = float(settled[at]), int(of[at])
+        if not len(rest):
+            break
+        start, end, of = start.take(rest), end.take(rest), of[rest]
+        postures, row = np.unique(0.5 * (start.joints + end.joints), axis=0, return_inverse=True)
+        middle = _Ends.of(
+            pairs, ArmPath.of(pairs.arm, postures), 0.5 * (start.times + end.times), row.reshape(-1), pair[of]
+        )
+        at = int(np.argmin(middle.room))
+        if middle.room[at] < 0.0:
+            return float(middle.room[at]), int(of[at])
+        start, end, of = start + middle, middle + end, np.tile(of, 2)
+    return lowest, where
+
+
+def _bounds(start: _Ends, end: _Ends) -> Array:
+    """Bound distance minus required clearance from below on each segment, shape (k,) [m]."""
+    step = end.points - start.points
+    a = np.einsum("kd,kd->k", start.normal, step)
+    b = np.einsum("kd,kd->k", end.normal, step)
+    low = crossing_of_tangents(start.room, a, end.room, b, 1.0)[0]
+    return low - bows(np.abs(end.joints - start.joints), np.maximum(start.radii, end.radii))
+
+
+def bows(steps: Array, radii: Array) -> Array:
+    """Return how far arcs leave the straight lines between their ends at most, shape (k,) [m].
+
+    Args:
+        steps: absolute motion of each joint, shape (k, n_joints) [rad].
+        radii: distance from the axis of each joint, the larger of the two ends; 0 for joints that do not move the
+            point, shape (k, n_joints) [m].
+    """
+    steps = np.where(radii > 0.0, steps, 0.0)
+    whole, farther = radii.copy(), np.zeros(len(steps))
+    for j in range(steps.shape[1] - 1, -1, -1):  # between the ends the distance may be larger by half of the motion
+        whole[:, j] += 0.5 * farther
+        farther += steps[:, j] * whole[:, j]
+    before = np.cumsum(steps, axis=1) - steps
+    return np.asarray(0.125 * np.einsum("kj,kj->k", whole * steps, steps + 2.0 * before))

@@ -1,0 +1,388 @@
+r"""A joint path on which the whole arm keeps its clearance, close to a given displacement of the learned path.
+
+Three sets of numbers describe the motion: the displacements :math:`\Delta` of the components of the learned path, a
+rotation of the tool away from the learned rotation (the *tilt* :math:`\tau`), and the self-motion :math:`\psi`, which
+moves the arm but not its tool. Each is multiplied by smooth functions of time :math:`B`. Around a joint path q(t), a
+small change of these numbers moves the joints by
+
+.. math:: \delta q(t) = J^+(t) \begin{bmatrix} B_\Delta(t)\,\delta\Delta \\ B_\tau(t)\,\delta\tau \end{bmatrix}
+          + N(t)\,B_\psi(t)\,\delta\psi
+
+with the right inverse :math:`J^+` of the tool's Jacobian and a basis N of its null space. Every distance between a part
+of the arm and an obstacle then changes linearly. Each round solves a quadratic program: the smallest displacement and
+tilt for which all linearised distances reach the required clearance and the joints stay within their limits. Inverse
+kinematics then brings the tool exactly to its poses, and the next round begins from there, until the distances suffice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, make_interp_spline
+
+from imitarm.kinematics.arm_path import ArmPath, right_inverses, self_motions
+from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply
+from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles, ArmClearance, Gaps
+from imitarm.policies.component_path import STILL, ComponentPath
+from imitarm.policies.least_detour import SMOOTHNESS, UNBOUNDED, AllowedDirections, style_scale
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_STRIDE = 4  # the rounds look at every fourth sample, the last ones at all
+_ROUNDS = 24
+_FINAL_ROUNDS = 10  # with all samples
+_PATIENCE = 7  # rounds without progress, then this attempt is given up
+_PROGRESS = 1e-3  # [m] progress of the smallest distance that counts
+_TILTS, _SELF_MOTIONS = 8, 10  # knots of the splines
+_TILT_SIGMA = 0.15  # [rad] a tilt of this size costs as much as a displacement by one demonstrated sigma
+_REACH = 0.06  # [m] pairs farther apart than the clearance and this have no row
+_NEAR = 0.01  # [m] every pair nearer than the clearance and this has a row; of the others, the nearest of each link
+_MARGIN = 5e-4  # [m] the rows ask for this much more, because distances are not linear
+_LONGEST_STEP = 0.5  # [rad] of a joint in one round
+_NEAR_LIMIT, _LIMIT_MARGIN = 0.3, 0.01  # [rad] from a joint's limit: it has a row there; it stays this far away
+_FAST = 0.7  # times its limit: a joint that is faster has a row that keeps it within the limit, if possible
+_CALM, _CALMING = 1.05, 4  # speed that is fast enough; rounds in which a clear plan is made slower
+_SLACK_SCALE = 1e-3  # [m] of missing clearance costs as much as one demonstrated sigma, where rows contradict
+_MOST_ROWS = 500
+_SOLVED = 1  # daqp's exit flag of an optimal solution
+_ACCURATE = 1e-5  # [m, rad] error of the tool's pose that is accepted
+
+
+@dataclass(frozen=True, eq=False)
+class ArmPlan:
+    """A joint path for a displaced and tilted path of the tool.
+
+    Attributes:
+        components: the path whose components were moved.
+        displacement: displacement of each component's mean, shape (n_components, 3) [m].
+        tilt: coefficients of the tool's rotation away from the learned rotation, shape (n_tilts, 3) [rad].
+        path: the arm at the samples.
+        clearance: the smallest clearance and where it is. On a path with all samples it is proven when it is not
+            negative.
+        complete: whether ``path`` has all samples of the component path.
+        cost: squared size of displacement and tilt, in demonstrated standard deviations.
+        largest_tilt: largest rotation of the tool away from the learned rotation [rad].
+        speed: largest speed of a joint at the learned times, divided by the joint's limit.
+    """
+
+    components: ComponentPath
+    displacement: Array
+    tilt: Array
+    path: ArmPath
+    clearance: ArmClearance
+    complete: bool
+    cost: float
+    largest_tilt: float
+    speed: float
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the whole arm keeps its clearance on the whole path."""
+        return self.complete and self.clearance.room >= 0.0
+
+
+def splines(times: Array, n_knots: int, *, last: bool) -> Array:
+    """Return cubic B-splines in time that are 0 at the start, shape (n, n_splines).
+
+    Args:
+        times: n increasing times [s].
+        n_knots: evenly spaced knots between the first and the last time.
+        last: whether to include the last spline, without which all are 0 at the end too.
+    """
+    inner = np.linspace(times[0], times[-1], n_knots)
+    knots = np.concatenate([[times[0]] * 3, inner, [times[-1]] * 3])
+    basis = BSpline.design_matrix(times, knots, 3).toarray()
+    return np.asarray(basis[:, 1:] if last else basis[:, 1:-1])
+
+
+class ArmPlanner:
+    """Plans joint paths for one component path among one set of obstacles.
+
+    Args:
+        around: the arm, its obstacles and the required clearances.
+        components: the path of the tool and its components.
+        quaternions: learned rotations of the tool at the samples, tool_to_base, shape (n, 4).
+        max_tilt: largest rotation away from the learned rotation at each sample, shape (n,) [rad].
+        allowed: directions in which components may move.
+
+    Attributes:
+        coarse: samples at which a plan begins, shape (k,).
+        clock: time at which the arm is at each sample, for obstacles that move, shape (n,) [s]; at first the times of
+            the learned motion.
+    """
+
+    def __init__(
+        self,
+        around: ArmAmongObstacles,
+        components: ComponentPath,
+        quaternions: Array,
+        max_tilt: Array,
+        allowed: AllowedDirections,
+    ) -> None:
+        self.around, self.arm, self.components = around, around.arm, components
+        self.quaternions, self.max_tilt, self.allowed = quaternions, max_tilt, allowed
+        self.times = components.nominal.times
+        self.clock = self.times
+        n = len(self.times)
+        self.coarse = np.unique(np.append(np.arange(0, n, _STRIDE), n - 1))
+        self._tilts = splines(self.times, _TILTS, last=False)
+        self._selves = splines(self.times, _SELF_MOTIONS, last=True)
+        self._scale = style_scale(components, allowed, np.arange(components.n_components), SMOOTHNESS)
+
+    @property
+    def n_tilts(self) -> int:
+        """Number of rows of a tilt's coefficients."""
+        return self._tilts.shape[1]
+
+    def poses(self, displacement: Array, tilt: Array, samples: Index) -> tuple[Array, Array]:
+        """Return the poses of the tool at samples: positions (k, 3) [m] and quaternions (k, 4)."""
+        positions = self.components.nominal.positions[samples] + self.components.basis[samples] @ displacement
+        rotation = quaternion_exp(self._tilts[samples] @ tilt)
+        return positions, quaternion_multiply(rotation, self.quaternions[samples])
+
+    def tilts(self, tilt: Array) -> Array:
+        """Return the rotation of the tool away from the learned one at each sample, shape (n, 3) [rad]."""
+        return np.asarray(self._tilts @ tilt)
+
+    def plan(self, displacement: Array, joints: Array, tilt: Array | None = None) -> ArmPlan | None:
+        """Improve a displacement and a joint path until the whole arm keeps its clearance.
+
+        Args:
+            displacement: of each component's mean, from which to start, shape (n_components, 3) [m].
+            joints: joint path at ``coarse``, from which to start, shape (k, n_joints) [rad].
+            tilt: coefficients from which to start, shape (n_tilts, 3) [rad]; None: no tilt.
+
+        Returns:
+            A feasible plan, or the best attempt; None when the arm can't follow the tool's path.
+        """
+        tilt = np.zeros((self.n_tilts, 3)) if tilt is None else tilt
+        state = self._closed(joints, displacement, tilt, self.coarse)
+        if state is None:
+            return None
+        best = self._improved(state, displacement, tilt, self.coarse, _ROUNDS)
+        if best.clearance.room < 0.0:
+            return best
+        samples = np.arange(len(self.times))
+        spline = make_interp_spline(self.times[self.coarse], best.path.joints, 3)
+        state = self._closed(spline(self.times), best.displacement, best.tilt, samples)
+        if state is None:
+            return best
+        return self._improved(state, best.displacement, best.tilt, samples, _FINAL_ROUNDS)
+
+    def _closed(self, joints: Array, displacement: Array, tilt: Array, samples: Index) -> ArmPath | None:
+        """Return the arm with its tool exactly at the poses; None when they are out of reach."""
+        path, error = ArmPath.of(self.arm, joints).moved_to(*self.poses(displacement, tilt, samples))
+        return path if error < _ACCURATE else None
+
+    def _improved(self, path: ArmPath, displacement: Array, tilt: Array, samples: Index, rounds: int) -> ArmPlan:
+        """Return the first plan that keeps all clearances at the samples (on the whole path, if these are all)."""
+        best: ArmPlan | None = None
+        since, margin, calmed = 0, _MARGIN, 0
+        for _ in range(rounds + 1):
+            plan = self._evaluated(path, displacement, tilt, samples)
+            since = 0 if best is None or plan.clearance.room > best.clearance.room + _PROGRESS else since + 1
+            if best is None or _rank(plan) > _rank(best):
+                best = plan
+            if plan.clearance.room >= 0.0:
+                calmed += 1
+            if (plan.clearance.room >= 0.0 and (plan.speed <= _CALM or calmed > _CALMING)) or since > _PATIENCE:
+                break
+            gaps = self.around.gaps(path, self.clock[samples], _REACH)
+            if plan.complete and plan.clearance.room < 0.0 and gaps.room.min(initial=1.0) >= 0.0:
+                margin += _MARGIN - plan.clearance.room  # only between the samples the arm is too near
+            step = self._step(path, gaps, displacement, tilt, samples, margin)
+            moved = None if step is None else self._moved(path, displacement, tilt, samples, *step)
+            if moved is None:
+                break
+            path, displacement, tilt = moved
+        assert best is not None
+        return best
+
+    def _evaluated(self, path: ArmPath, displacement: Array, tilt: Array, samples: Index) -> ArmPlan:
+        """Return a plan with its lowest clearance: on the whole path if all samples are there, else at the samples."""
+        complete = len(samples) == len(self.times)
+        beyond = np.minimum(path.joints - self.arm.lower, self.arm.upper - path.joints)
+        sample, joint = np.unravel_index(int(np.argmin(beyond)), beyond.shape)
+        if complete:
+            lowest = self.around.clearance_of(path, self.clock)
+        else:
+            lowest = self.around.clearance_at(path, self.clock[samples], _REACH)
+            lowest = replace(lowest, sample=int(samples[lowest.sample]))
+        if beyond[sample, joint] < min(lowest.room, 0.0):
+            lowest = ArmClearance(float(beyond[sample, joint]), JOINT_LIMIT, int(joint), -1, int(samples[sample]))
+        turned = float(np.linalg.norm(self._tilts @ tilt, axis=1).max())
+        cost = self._cost(displacement, tilt)
+        speed = float((np.abs(np.diff(path.joints, axis=0)) / self._longest_steps(samples)).max(initial=0.0))
+        return ArmPlan(self.components, displacement, tilt, path, lowest, complete, cost, turned, speed)
+
+    def _longest_steps(self, samples: Index) -> Array:
+        """Return the largest step of each joint to the next sample at the learned times, (k - 1, n_joints) [rad]."""
+        return np.asarray(np.diff(self.times[samples])[:, None] * self.arm.max_velocity)
+
+    def _cost(self, displacement: Array, tilt: Array) -> float:
+        style = np.einsum("kd,kde,ke->", displacement, self.components.precisions, displacement)
+        return float(style + np.sum((tilt / _TILT_SIGMA) ** 2))
+
+    def _moved(
+        self, path: ArmPath, displacement: Array, tilt: Array, samples: Index, new: Array, turned: Array, change: Array
+    ) -> tuple[ArmPath, Array, Array] | None:
+        """Take a step, shortened until the arm can follow; None when it can't."""
+        fraction = min(1.0, _LONGEST_STEP / max(float(np.abs(change).max()), 1e-9))
+        for _ in range(4):
+            there = displacement + fraction * (new - displacement), tilt + fraction * (turned - tilt)
+            state = self._closed(path.joints + fraction * change, *there, samples)
+            if state is not None:
+                return state, *there
+            fraction *= 0.5
+        return None
+
+    def _step(
+        self, path: ArmPath, gaps: Gaps, displacement: Array, tilt: Array, samples: Index, margin: float
+    ) -> tuple[Array, Array, Array] | None:
+        """Solve one quadratic program.
+
+        Returns:
+            The new displacement (n_components, 3) [m] and tilt (n_tilts, 3) [rad], and the change of the joints at the
+            samples (k, n_joints) [rad]; None when there is no solution.
+        """
+        jacobians = path.tool_jacobians()
+        local = _Local(self, samples, right_inverses(jacobians), self_motions(jacobians))
+        now = np.concatenate([displacement.ravel(), tilt.ravel(), np.zeros(local.n_self)])
+        chosen = _chosen(gaps)
+        rows = local.rows(gaps.sample[chosen], gaps.rates(chosen))
+        parts, lower = [rows], [margin - gaps.room[chosen] + rows @ now]
+        for sign, away in ((1.0, path.joints - self.arm.lower), (-1.0, self.arm.upper - path.joints)):
+            at, joint = np.nonzero(away < _NEAR_LIMIT)
+            rows = local.rows(at, sign * np.eye(path.joints.shape[1])[joint])
+            parts.append(rows)
+            lower.append(_LIMIT_MARGIN - away[at, joint] + rows @ now)
+        steps, longest = np.diff(path.joints, axis=0), self._longest_steps(samples)
+        at, joint = np.nonzero(np.abs(steps) > _FAST * longest)
+        outward = -np.sign(steps[at, joint])[:, None] * np.eye(path.joints.shape[1])[joint]
+        rows = local.rows(at + 1, outward) - local.rows(at, outward)
+        parts.append(rows)
+        lower.append(np.abs(steps[at, joint]) - longest[at, joint] + rows @ now)
+        soft = len(lower[0]), sum(map(len, lower))
+        rows, low = self._limits(local.n_self, tilt)
+        matrix, bounds = np.concatenate([*parts, rows]), np.concatenate([*lower, low])
+        y = _least(local.scaled(matrix, self._scale), bounds, soft)
+        if y is None:
+            return None
+        new, turned, selves = local.unscaled(y, self._scale, self.allowed)
+        twist = np.concatenate(
+            [self.components.basis[samples] @ (new - displacement), self._tilts[samples] @ (turned - tilt)], axis=1
+        )
+        change = np.einsum("nji,ni->nj", local.inverse, twist)
+        change += np.einsum("nje,ne->nj", local.null, self._selves[samples] @ selves)
+        return new, turned, change
+
+    def _limits(self, n_self: int, tilt: Array) -> tuple[Array, Array]:
+        """Return rows that keep the tilt within its limit, and the displacements out of forbidden directions."""
+        n_moved, n_tilts = 3 * self.components.n_components, self.n_tilts
+        at = self.coarse
+        limit, now = self.max_tilt[at], self._tilts[at] @ tilt
+        length = np.linalg.norm(now, axis=1)
+        beyond = length > 0.8 * limit
+        directions = [np.tile(sign * axis, (len(at), 1)) for axis in np.eye(3) for sign in (1.0, -1.0)]
+        directions.append(np.where(beyond[:, None], now / np.maximum(length, 1e-9)[:, None], 0.0))
+        rows, low = [], []
+        for direction in directions:
+            part = np.zeros((len(at), n_moved + 3 * n_tilts + n_self))
+            turning = self._tilts[at][:, :, None] * direction[:, None, :]
+            part[:, n_moved : n_moved + 3 * n_tilts] = -turning.reshape(len(at), -1)
+            rows.append(part)
+            low.append(-limit)
+        for forbidden in self.allowed.forbidden:
+            part = np.zeros((self.components.n_components, n_moved + 3 * n_tilts + n_self))
+            part[:, :n_moved] = np.kron(np.eye(self.components.n_components), -forbidden)
+            rows.append(part)
+            low.append(np.zeros(len(part)))
+        return np.concatenate(rows), np.concatenate(low)
+
+
+JOINT_LIMIT = SELF - 1
+"""Stands for the index of an obstacle where a limit of a joint is meant; ``sphere`` is then the joint."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Local:
+    """How the numbers of a plan move the joints at chosen samples, to first order."""
+
+    planner: ArmPlanner
+    samples: Index
+    inverse: Array
+    null: Array
+
+    @property
+    def n_self(self) -> int:
+        return self.planner._selves.shape[1] * self.null.shape[2]
+
+    def rows(self, at: Index, rates: Array) -> Array:
+        """Return rows for quantities that change at ``rates`` (r, n_joints) with the joints at the samples ``at``."""
+        planner, sample = self.planner, self.samples[at]
+        of_tool = np.einsum("rj,rji->ri", rates, self.inverse[at])
+        of_self = np.einsum("rj,rje->re", rates, self.null[at])
+        parts = (
+            (planner.components.basis, of_tool[:, :3]),
+            (planner._tilts, of_tool[:, 3:]),
+            (planner._selves, of_self),
+        )
+        columns = [
+            (basis[sample][:, :, None] * own[:, None, :]).reshape(len(at), basis.shape[1] * own.shape[1])
+            for basis, own in parts
+        ]
+        return np.concatenate(columns, axis=1)
+
+    def scaled(self, matrix: Array, scale: Array) -> Array:
+        """Return rows for unit costs; ``scale`` is that of the displacements in the allowed axes."""
+        k, axes = self.planner.components.n_components, self.planner.allowed.axes
+        moved = (matrix[:, : 3 * k].reshape(-1, k, 3) @ axes).reshape(len(matrix), -1) @ scale
+        n_tilts = 3 * self.planner.n_tilts
+        tilted = _TILT_SIGMA * matrix[:, 3 * k : 3 * k + n_tilts]
+        return np.concatenate([moved, tilted, matrix[:, 3 * k + n_tilts :]], axis=1)
+
+    def unscaled(self, y: Array, scale: Array, allowed: AllowedDirections) -> tuple[Array, Array, Array]:
+        """Return displacement, tilt and self-motion for a solution."""
+        n, n_tilts = scale.shape[1], 3 * self.planner.n_tilts
+        moved = allowed.enforced((scale @ y[:n]).reshape(-1, allowed.dimension))
+        moved[np.einsum("kd,kd->k", moved, moved) < STILL**2] = 0.0
+        tilt = (_TILT_SIGMA * y[n : n + n_tilts]).reshape(-1, 3)
+        return moved, tilt, y[n + n_tilts :].reshape(self.planner._selves.shape[1], -1)
+
+
+def _rank(plan: ArmPlan) -> tuple[float, float]:
+    """Return a key by which plans are compared: those that are clear by their speed, the others by their clearance."""
+    return min(plan.clearance.room, 0.0), -max(plan.speed, _CALM)
+
+
+def _chosen(gaps: Gaps) -> Index:
+    """Return the pairs that get a row: all that are near, and of the others the nearest of each link."""
+    links = gaps.path.arm.cover.links
+    kinds = np.stack([gaps.obstacle, gaps.sample, links[gaps.sphere], gaps.first])
+    order = np.lexsort((gaps.room, *kinds))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = (np.diff(kinds[:, order], axis=1) != 0).any(axis=0)
+    chosen = np.union1d(order[first], np.flatnonzero(gaps.room < _NEAR))
+    if len(chosen) > _MOST_ROWS:
+        chosen = chosen[np.argpartition(gaps.room[chosen], _MOST_ROWS)[:_MOST_ROWS]]
+    return chosen
+
+
+def _least(rows: Array, lower: Array, soft: tuple[int, int]) -> Array | None:
+    """Return the smallest y with ``rows @ y >= lower``, shape (n,); None when there is none.
+
+    Where the rows contradict each other, the first ``soft[0]`` rows (clearances) are relaxed by one common distance, as
+    small as possible. If that is not enough, the first ``soft[1]`` rows (also limits of joints) are relaxed.
+    """
+    n, upper = rows.shape[1], np.full(len(rows), UNBOUNDED)
+    y, _, flag, _ = daqp.solve(np.eye(n), np.zeros(n), np.ascontiguousarray(rows), upper, lower)
+    for relaxed in soft:
+        if flag == _SOLVED:
+            return np.asarray(y[:n])
+        slack = np.where(np.arange(len(rows)) < relaxed, _SLACK_SCALE, 0.0)[:, None]
+        y, _, flag, _ = daqp.solve(np.eye(n + 1), np.zeros(n + 1), np.hstack([rows, slack]), upper, lower)
+    return np.asarray(y[:n]) if flag == _SOLVED else None

@@ -1,0 +1,124 @@
+r"""Execution times for a joint path, within the limits of velocity, acceleration and torque, from rest to rest.
+
+Along a path q(s) with the path parameter s and the speed :math:`\dot s`, all limits are linear in :math:`b = \dot s^2`
+and :math:`a = \ddot s`:
+
+.. math:: |q'| \sqrt b \le \dot q_{max}, \qquad |q' a + q'' b| \le \ddot q_{max}, \qquad
+          |M q'\,a + (M q'' + C(q, q') q')\,b + g| \le \tau_{max}
+
+A pass from the end to the start finds the largest b at each sample from which the rest of the path can still be
+executed; a pass from the start then takes the largest a at each sample (Pham and Pham, "A new approach to time-optimal
+path parameterization based on reachability analysis", IEEE T-RO 34(3), 2018).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.kinematics.arm import ArmModel
+
+Array = NDArray[np.float64]
+
+_VELOCITY, _ACCELERATION, _TORQUE = 0.95, 0.9, 0.9  # fractions of the limits that are used
+_HALVINGS = 40
+_NO_EFFECT = 1e-9  # a coefficient smaller than this does not limit a
+_SLOWEST = 1e-6  # squared speed below which the path counts as blocked
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """Execution times of a path.
+
+    Attributes:
+        times: time of each sample, from 0, shape (n,) [s].
+        blocked: index of the first sample at which a limit does not allow any motion; -1 if there is none.
+        joint: the joint of this limit; -1 if there is none.
+    """
+
+    times: Array
+    blocked: int = -1
+    joint: int = -1
+
+
+def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array) -> Timing:
+    """Return the shortest execution times of a path within the limits of an arm, from rest to rest.
+
+    Args:
+        arm: the arm with its tool.
+        joints: joint positions at the samples, shape (n, n_joints) [rad].
+        parameters: path parameter s of each sample, increasing, shape (n,) [s]. At speed 1 it is the time.
+        fastest: largest speed of s at each sample, shape (n,).
+    """
+    first = np.gradient(joints, parameters, axis=0)
+    second = np.gradient(first, parameters, axis=0)
+    of_a, of_b, bound = _limits(arm, joints, first, second)
+    static = bound.min(axis=1)
+    if static.min() < 0.0:  # the weight of the arm alone exceeds a torque
+        sample = int(np.flatnonzero(static < 0.0)[0])
+        return Timing(np.array(parameters - parameters[0]), sample, int(np.argmin(bound[sample])) % arm.n_joints)
+    with np.errstate(divide="ignore"):
+        most = (_VELOCITY * arm.max_velocity / np.abs(first)).min(axis=1)
+    most = np.minimum(most, fastest) ** 2
+    step = 2.0 * np.diff(parameters)
+    n = len(joints)
+    reachable = np.zeros(n)
+    for i in range(n - 2, -1, -1):
+        reachable[i] = _largest(of_a[i], of_b[i], bound[i], float(most[i]), float(step[i]), float(reachable[i + 1]))
+    b = np.zeros(n)
+    for i in range(n - 1):
+        high = _interval(of_a[i], of_b[i], bound[i], float(b[i]))[1]
+        b[i + 1] = min(max(b[i] + high * step[i], 0.0), reachable[i + 1])
+    speeds = np.sqrt(b)
+    means = 0.5 * (speeds[1:] + speeds[:-1])
+    slow = np.flatnonzero(means <= _SLOWEST)
+    if len(slow):
+        return Timing(np.array(parameters - parameters[0]), int(slow[0]), -1)
+    return Timing(np.concatenate([[0.0], np.cumsum(np.diff(parameters) / means)]))
+
+
+def _limits(arm: ArmModel, joints: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
+    """Return coefficients of ``of_a * a + of_b * b <= bound`` at each sample, each of shape (n, m)."""
+    of_a, of_b, room = [first], [second], [np.broadcast_to(_ACCELERATION * arm.max_acceleration, first.shape)]
+    upper, lower = list(room), list(room)
+    if np.isfinite(arm.max_torque).any() and arm.has_dynamics:
+        zero = np.zeros(arm.n_joints)
+        weight = np.array([arm.inverse_dynamics(q, zero, zero) for q in joints])
+        of_a.append(np.array([arm.inverse_dynamics(q, zero, d) for q, d in zip(joints, first, strict=True)]) - weight)
+        moved = [arm.inverse_dynamics(q, d, dd) for q, d, dd in zip(joints, first, second, strict=True)]
+        of_b.append(np.array(moved) - weight)
+        upper.append(_TORQUE * arm.max_torque - weight)
+        lower.append(_TORQUE * arm.max_torque + weight)
+    a, b = np.concatenate(of_a, axis=1), np.concatenate(of_b, axis=1)
+    bound = np.concatenate([*upper, *lower], axis=1)
+    a, b = np.concatenate([a, -a], axis=1), np.concatenate([b, -b], axis=1)
+    return a, b, np.where(np.isfinite(bound), bound, 1e12)
+
+
+def _interval(of_a: Array, of_b: Array, bound: Array, b: float) -> tuple[float, float]:
+    """Return the smallest and the largest a that the limits allow at ``b``."""
+    room = bound - of_b * b
+    up, down = of_a > _NO_EFFECT, of_a < -_NO_EFFECT
+    if (room[~(up | down)] < 0.0).any():
+        return 1.0, -1.0
+    high = float((room[up] / of_a[up]).min(initial=1e9))
+    low = float((room[down] / of_a[down]).max(initial=-1e9))
+    return low, high
+
+
+def _largest(of_a: Array, of_b: Array, bound: Array, most: float, step: float, after: float) -> float:
+    """Return the largest b, at most ``most``, from which some a leads to a next b between 0 and ``after``."""
+
+    def works(b: float) -> bool:
+        low, high = _interval(of_a, of_b, bound, b)
+        return max(low, -b / step) <= min(high, (after - b) / step)
+
+    if works(most):
+        return most
+    low, high = 0.0, most
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if works(middle) else (low, middle)
+    return low

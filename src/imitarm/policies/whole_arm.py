@@ -1,0 +1,320 @@
+"""Search for a joint path on which the whole arm keeps its clearance, in the demonstrated manner, or a refusal.
+
+The repairs are tried in an order in which each keeps more of the demonstrated motion than the next:
+
+1. the tool's own detour, with the self-motion of the arm and the allowed tilt of the tool;
+2. another posture of the arm at the goal;
+3. narrower components, which can bend the path more sharply;
+4. the path on another side of the obstacle, or farther away from it.
+
+If none succeeds, the answer names the link, the obstacle and the time of the best attempt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import UnreachableError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import find_posture
+from imitarm.kinematics.arm_path import ArmPath, track
+from imitarm.kinematics.pose import Pose
+from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles, ArmClearance
+from imitarm.policies.arm_planner import JOINT_LIMIT, ArmPlan, ArmPlanner
+from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.least_detour import AllowedDirections, Detour
+from imitarm.policies.retiming import Timing, retimed
+from imitarm.scene.clearance import SelfClearance
+from imitarm.scene.scene import Scene
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+SELF_CLEARANCE = 0.012  # [m] planned between links
+_FILTER_SELF, _FILTER_MARGIN = 0.01, 1e-3  # [m] that the safety filter keeps between links; that it adds to a clearance
+_APPROACH_RATE, _SELF_RATE = 5.4, 4.5  # [1/s] distances shrink no faster than this times what is left; the filter: 6, 5
+_REACH = 0.15  # [m] pairs farther apart than the clearance and this do not slow the motion
+_SLOWEST = 1e-3  # [m/s] closing speed that is always allowed, so that the motion goes on
+_RETIMINGS = 4  # among moving obstacles
+_GOAL_POSTURES = 24  # tried at the goal
+_AHEAD = 0.05  # of the duration: a place this close to the goal is the goal
+_SIDES = 8  # directions tried across the path
+_AWAY = (0.1, 0.2)  # [m] by which the path is moved to another side
+_MOST_SIDES = 5  # that are followed up
+_LEVER = 0.05  # squared influence of the components; a place with less is not moved
+
+
+@dataclass(frozen=True, eq=False)
+class ArmSolution:
+    """The result of the search.
+
+    Attributes:
+        plan: the plan, or the best attempt; None when the arm can't follow the path at all.
+        timing: execution times; None unless a plan is feasible.
+        reason: why there is no plan; empty if there is one.
+    """
+
+    plan: ArmPlan | None
+    timing: Timing | None
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class ArmTask:
+    """What the arm has to do.
+
+    Attributes:
+        arm: the arm with its tool.
+        start: posture at the start, shape (n_joints,) [rad].
+        scene: obstacles at time 0, and fixtures.
+        clearance: required distance from every moving part of the arm to every obstacle [m].
+        allowed: directions in which components may move.
+        max_tilt: largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad].
+        allowance: part of the clearance that the safety filter does not ask for [m].
+    """
+
+    arm: ArmModel
+    start: Array
+    scene: Scene
+    clearance: float
+    allowed: AllowedDirections
+    max_tilt: Array
+    allowance: float
+
+
+def solve(task: ArmTask, detour: Detour) -> ArmSolution:
+    """Find a joint path for a skill's path.
+
+    Args:
+        task: the arm and its surroundings.
+        detour: the detour of the tool alone, feasible or not.
+    """
+    search = _Search(task, detour)
+    if search.start.room < 0.0:
+        return ArmSolution(None, None, f"at the start {search.named(search.start)}: move the obstacle or the arm")
+    best: ArmPlan | None = None
+    for planner, displacement, joints in search.attempts():
+        plan = planner.plan(displacement, joints)
+        if plan is None:
+            continue
+        if plan.feasible:
+            timed = search.timed(planner, plan)
+            if timed is not None:
+                plan, timing = timed
+                return ArmSolution(plan, timing, search.overloaded(timing))
+        best = plan if best is None or _rank(plan) > _rank(best) else best
+        search.failed(planner, plan)
+    return ArmSolution(best, None, search.refusal(best))
+
+
+def _rank(plan: ArmPlan) -> tuple[bool, float]:
+    return plan.complete, plan.clearance.room
+
+
+class _Search:
+    """The attempts of one search, and what was learned from those that failed."""
+
+    def __init__(self, task: ArmTask, detour: Detour) -> None:
+        self.task, self.detour = task, detour
+        self._components = detour.path
+        nominal = self._components.nominal
+        self._times = nominal.times
+        start = task.arm.tool_pose(task.start)
+        learned = nominal.quaternions
+        self._quaternions = np.tile(start.quaternion, (len(nominal), 1)) if learned is None else learned
+        fixtures = task.scene.fixtures
+        contacts = self._tracked(nominal.positions, None)[::4] if fixtures else None
+        own = links_apart(task.arm)
+        self._around = ArmAmongObstacles(
+            task.arm, task.scene.obstacles, task.clearance, fixtures=fixtures, contacts=contacts, own=own
+        )
+        self.start = self._around.clearance_at(ArmPath.of(task.arm, task.start[None]), np.zeros(1), _REACH)
+        self._moving = any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
+        self._first: ArmClearance | None = None
+        self._worst: ArmClearance | None = None
+        self._goals: list[Array] | None = None
+
+    def attempts(self) -> Iterator[tuple[ArmPlanner, Array, Array]]:
+        """Yield a planner, a displacement and a joint path to begin with, in the order of the repairs."""
+        learned, detour = self._planner(self._components), self.detour.displacement
+        joints = self._followed(learned, detour, None)
+        first = ArmPath.of(self.task.arm, joints)
+        self._first = self._around.clearance_at(first, learned.clock[learned.coarse], _REACH)
+        self._first = replace(self._first, sample=int(learned.coarse[self._first.sample]))
+        yield learned, detour, joints
+        self._goals = self._goal_postures()
+        if not self._goals:
+            return
+        if self._at_goal():
+            for goal in self._goals:
+                yield learned, detour, self._followed(learned, detour, goal)
+            if self._at_goal():
+                return
+        narrow = self._planner(self._components.divided)
+        away = learned.components.basis @ detour
+        same: Array = np.asarray(np.linalg.lstsq(narrow.components.basis, away, rcond=1e-6)[0], dtype=np.float64)
+        yield narrow, same, self._followed(narrow, same, None)
+        for planner in (learned, narrow):
+            for displacement, joints in self._sides(planner):
+                yield planner, displacement, joints
+
+    def failed(self, planner: ArmPlanner, plan: ArmPlan) -> None:
+        """Remember where an attempt failed."""
+        if self._worst is None or plan.clearance.room > self._worst.room:
+            self._worst = plan.clearance
+
+    def _at_goal(self) -> bool:
+        worst = self._worst
+        last = len(self._times) - 1
+        return worst is not None and worst.obstacle != JOINT_LIMIT and worst.sample >= (1.0 - _AHEAD) * last
+
+    def _planner(self, components: ComponentPath) -> ArmPlanner:
+        return ArmPlanner(self._around, components, self._quaternions, self.task.max_tilt, self.task.allowed)
+
+    def _followed(self, planner: ArmPlanner, displacement: Array, goal: Array | None) -> Array:
+        tilt = np.zeros((planner.n_tilts, 3))
+        return track(self.task.arm, self.task.start, *planner.poses(displacement, tilt, planner.coarse), goal)
+
+    def _tracked(self, positions: Array, goal: Array | None) -> Array:
+        return track(self.task.arm, self.task.start, positions, self._quaternions, goal)
+
+    def _goal_postures(self) -> list[Array]:
+        """Return postures with the tool at the goal in which the whole arm is clear, different from each other."""
+        arm, path = self.task.arm, self._components.nominal
+        goal = Pose(path.positions[-1], self._quaternions[-1])
+        random = np.random.default_rng(0)
+        low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
+        found: list[Array] = []
+        end = np.array([self._times[-1]])
+        for _ in range(_GOAL_POSTURES):
+            try:
+                q = find_posture(arm, goal, q0=random.uniform(low, high), restarts=0)
+            except UnreachableError:
+                continue
+            gaps = self._around.gaps(ArmPath.of(arm, q[None]), end, 0.0)
+            if not len(gaps.room) and all(np.abs(q - other).max() > 0.3 for other in found):
+                found.append(q)
+        return sorted(found, key=lambda q: float(np.abs(q - self.task.start).max()))[:3]
+
+    def _sides(self, planner: ArmPlanner) -> list[tuple[Array, Array]]:
+        """Return displacements that lead the tool past the worst place on other sides, with their joint paths.
+
+        The most promising ones are those on which the arm violates its clearances least.
+        """
+        worst = self._worst
+        if worst is None or not self.task.allowed.dimension:
+            return []
+        path, at = planner.components, worst.sample
+        lever = float((path.basis[at] ** 2).sum())
+        if lever < _LEVER:
+            return []
+        positions = path.nominal.positions
+        tangent = positions[min(at + 2, len(positions) - 1)] - positions[max(at - 2, 0)]
+        tangent = tangent / max(float(np.linalg.norm(tangent)), 1e-9)
+        across = np.linalg.svd(tangent[None])[2][1:]
+        angles = np.arange(_SIDES) * (2.0 * np.pi / _SIDES)
+        ring = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ across
+        found: list[tuple[float, int, Array, Array]] = []
+        for distance in _AWAY:
+            for direction in self.task.allowed.unit_directions(ring):
+                displacement = (distance / lever * path.basis[at])[:, None] * direction
+                joints = self._followed(planner, displacement, None)
+                arm = ArmPath.of(self.task.arm, joints)
+                gaps = self._around.gaps(arm, self._times[planner.coarse], 0.0)
+                found.append((float(-gaps.room.sum()), len(found), displacement, joints))
+        return [(displacement, joints) for _, _, displacement, joints in sorted(found)[:_MOST_SIDES]]
+
+    def timed(self, planner: ArmPlanner, plan: ArmPlan) -> tuple[ArmPlan, Timing] | None:
+        """Return a plan with execution times within the limits of the arm and of the safety filter.
+
+        Among moving obstacles, other times change what is near. The plan is then made again for the new times, until it
+        keeps its clearance at the times at which it is executed; None if that does not succeed.
+        """
+        for _ in range(_RETIMINGS):
+            timing = self._timing(plan, planner.clock)
+            if timing.blocked >= 0 or not self._moving:
+                return plan, timing
+            planner.clock = timing.times
+            clearance = self._around.clearance_of(plan.path, timing.times)
+            if clearance.room >= 0.0:
+                return replace(plan, clearance=clearance), timing
+            again = planner.plan(plan.displacement, plan.path.joints[planner.coarse], plan.tilt)
+            if again is None or not again.feasible:
+                return None
+            plan = again
+        return None
+
+    def _timing(self, plan: ArmPlan, clock: Array) -> Timing:
+        path, times = plan.path, self._times
+        gaps = self._around.gaps(path, clock, _REACH)
+        speed = np.linalg.norm(np.gradient(path.centers, times, axis=0), axis=2)
+        own = gaps.obstacle == SELF
+        margin = np.where(own, SELF_CLEARANCE - _FILTER_SELF, max(self.task.allowance - _FILTER_MARGIN, 0.0))
+        rate = np.where(own, _SELF_RATE, _APPROACH_RATE)
+        allowed = np.maximum(rate * (np.maximum(gaps.room, 0.0) + margin) + gaps.drift, _SLOWEST)
+        # A distance shrinks at most as fast as the sphere moves; that of two spheres at most twice as fast.
+        closing = np.flatnonzero(allowed < 2.0 * speed[gaps.sample, gaps.sphere])
+        velocity = np.gradient(path.joints, times, axis=0)[gaps.sample[closing]]
+        approach = np.maximum(-np.einsum("kj,kj->k", gaps.rates(closing), velocity), 1e-9)
+        fastest = np.ones(len(path))
+        np.minimum.at(fastest, gaps.sample[closing], allowed[closing] / approach)
+        return retimed(self.task.arm, path.joints, times, fastest)
+
+    def named(self, found: ArmClearance) -> str:
+        """Return which part of the arm is how near to what."""
+        arm = self.task.arm
+        if found.obstacle == JOINT_LIMIT:
+            return f"joint {arm.joint_names[found.sphere]} would exceed its limit by {-found.room:.2f} rad"
+        link = arm.cover.bodies[found.sphere]
+        if found.obstacle == SELF:
+            bodies = arm.cover.bodies
+            other = bodies[found.other] if found.other < len(bodies) else "the base"
+            left = 1e3 * (found.room + SELF_CLEARANCE)
+            return f"{link} is {left:.0f} mm from {other} ({1e3 * SELF_CLEARANCE:.0f} mm required)"
+        left, scene = 1e3 * (found.room + self.task.clearance), self.task.scene
+        n = len(scene.obstacles)
+        if found.obstacle < n:
+            name = scene.name_of(found.obstacle)
+        else:
+            fixture = scene.fixtures[found.obstacle - n]
+            name = fixture.name or fixture.kind
+        return f"{link} is {left:.0f} mm from {name} ({1e3 * self.task.clearance:.0f} mm required)"
+
+    def refusal(self, best: ArmPlan | None) -> str:
+        """Return why no plan was found."""
+        if best is None:
+            return f"{self.task.arm.name} can't bring its tool along the path: move the path nearer to the arm"
+        first = "" if self._first is None else f"along the tool's path {self._placed(self._first)}; "
+        if self._goals is not None and not self._goals:
+            return (
+                f"no posture was found in which the tool is at the goal and the whole arm is clear "
+                f"({self.named(best.clearance)} in the best one): move the obstacle or the goal"
+            )
+        return (
+            f"no path of the whole arm was found: {first}in the best attempt {self._placed(best.clearance)}; move the "
+            "obstacle, allow a larger tilt of the tool (max_tilt), or ask for less clearance"
+        )
+
+    def _placed(self, found: ArmClearance) -> str:
+        return f"{self.named(found)} at {self._times[min(found.sample, len(self._times) - 1)]:.2f} s"
+
+    def overloaded(self, timing: Timing) -> str:
+        """Return why a plan can't be executed at any speed; empty if it can."""
+        if timing.blocked < 0:
+            return ""
+        joint = f"joint {self.task.arm.joint_names[timing.joint]}" if timing.joint >= 0 else "a joint"
+        return (
+            f"the weight of the arm needs more torque than {joint} has, at {self._times[timing.blocked]:.2f} s: move "
+            "the path nearer to the arm, or use a lighter tool"
+        )
+
+
+@lru_cache(maxsize=16)
+def links_apart(arm: ArmModel) -> SelfClearance:
+    """Return the self-clearance that is planned for an arm."""
+    return SelfClearance(arm, SELF_CLEARANCE)

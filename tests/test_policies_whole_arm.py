@@ -1,0 +1,192 @@
+"""The whole arm: planned, certified, executed as planned, or refused with the link, the obstacle and the time."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from imitarm import (
+    ACFRA,
+    ArmModel,
+    InfeasibleError,
+    InputError,
+    Pose,
+    Scene,
+    SimulatedRobot,
+    Skill,
+    Sphere,
+    find_posture,
+)
+from imitarm.benchmark.placements import placement
+from imitarm.control_loop import reproduce
+from imitarm.demonstrations import align, read
+from imitarm.kinematics.arm import ArmState
+from imitarm.kinematics.pose import quaternion_conjugate, quaternion_log, quaternion_multiply
+from imitarm.policies import adapt
+from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.policy import Observation
+from imitarm.safety import SafetyFilter
+from imitarm.scene import HalfSpace
+
+ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
+ZEROS = np.zeros(7)
+TILT = np.deg2rad(30.0)
+
+
+@lru_cache
+def pouring(folder: Path) -> Skill:
+    return Skill(8).fit(align(read(folder / "panda_kinesthetic" / "pouring.npy", units="cm", duration=10.0)))
+
+
+@lru_cache
+def prepared(folder: Path, name: str):
+    skill, arm = pouring(folder), ARMS[name]
+    rotation = skill.start_.quaternion if skill.gmr_.has_orientation_ else arm.tool_pose(arm.home).quaternion
+    return skill, arm, find_posture(arm, Pose(skill.start_.position, rotation))
+
+
+def at_rest(q) -> ArmState:
+    return ArmState(np.asarray(q), ZEROS, ZEROS, 0.0)
+
+
+def planned(folder, name, seed, **options):
+    skill, arm, start = prepared(folder, name)
+    scene = placement(skill, arm, seed, start)
+    return scene, adapt(skill, scene, arm=arm, state=at_rest(start), **({"max_tilt": TILT} | options))
+
+
+def measured_clearance(arm, scene, joints) -> float:
+    """The smallest distance of the simulator's exact shapes at four postures of each segment."""
+    robot = SimulatedRobot(arm, scene=scene, q=joints[0])
+    addresses = [robot.model.joint(joint).qposadr[0] for joint in arm.joint_names]
+    lowest = np.inf
+    for a, b in pairwise(joints):
+        for fraction in np.linspace(0.0, 1.0, 4, endpoint=False):
+            robot.data.qpos[addresses] = a + fraction * (b - a)
+            mujoco.mj_kinematics(robot.model, robot.data)
+            lowest = min(lowest, robot.clearance())
+    return lowest
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("seed", range(6))
+def test_a_plan_keeps_the_clearance_by_the_geometry_of_the_simulator(real_data, name, seed):
+    skill, arm, start = prepared(real_data, name)
+    scene, plan = planned(real_data, name, seed)
+    if not plan.feasible:
+        pytest.fail(f"refused: {plan.reason}")
+    assert plan.certified_clearance >= 0.02
+    assert measured_clearance(arm, scene, plan.joints) >= plan.certified_clearance - 1e-6
+    np.testing.assert_allclose(plan.joints[0], start, atol=1e-5)
+    assert (plan.joints >= arm.lower).all()
+    assert (plan.joints <= arm.upper).all()
+    assert plan.tilt <= TILT + np.deg2rad(1.0)
+    assert plan.trajectory.duration <= 1.5 * skill.duration_
+    for i in (0, 57, 120, -1):  # the trajectory is that of the joints
+        pose = arm.tool_pose(plan.joints[i])
+        np.testing.assert_allclose(plan.trajectory.positions[i], pose.position, atol=1e-6)
+    goal = arm.tool_pose(plan.joints[-1])
+    np.testing.assert_allclose(goal.position, skill.goal_.position, atol=1e-4)
+
+
+@pytest.mark.parametrize(("name", "seed"), [("sawyer", 1), ("panda", 3), ("panda", 7)])
+def test_what_is_planned_is_executed_and_arrives(real_data, name, seed):
+    skill, arm, start = prepared(real_data, name)
+    scene = placement(skill, arm, seed, start)
+    robot = SimulatedRobot(arm, scene=scene, q=start)
+    policy = ACFRA(skill, arm=arm, max_tilt=TILT)
+    off = []
+
+    def on_step(step):
+        plan = policy.adaptation
+        times = plan.trajectory.times
+        target = np.array([np.interp(policy.phase, times, column) for column in plan.joints.T])
+        off.append(np.abs(step.state.q - target).max())
+
+    safety = SafetyFilter(arm, clearance=0.02)
+    done = reproduce(policy, robot, scene.at, safety=safety, timeout=1.6 * skill.duration_, on_step=on_step)
+    assert done.success, done.reason
+    assert done.min_clearance >= 0.02
+    assert not robot.contacts
+    assert np.median(off) < 0.01
+
+
+def test_tilt_zero_keeps_the_learned_rotation(real_data):
+    _, plan = planned(real_data, "sawyer", 0, max_tilt=0.0)
+    assert plan.feasible
+    shown = plan.nominal.quaternions
+    apart = quaternion_log(quaternion_multiply(plan.trajectory.quaternions, quaternion_conjugate(shown)))
+    assert np.linalg.norm(apart, axis=1).max() < 1e-4
+
+
+def test_without_obstacles_the_learned_path_is_followed(real_data):
+    skill, arm, start = prepared(real_data, "panda")
+    plan = adapt(skill, Scene(), arm=arm, state=at_rest(start))
+    assert plan.feasible
+    assert not plan.moved.any()
+    np.testing.assert_allclose(plan.trajectory.positions, plan.nominal.positions, atol=2e-6)
+
+
+def test_a_blocked_goal_is_refused_before_anything_moves_with_the_link(real_data):
+    skill, arm, start = prepared(real_data, "sawyer")
+    goal = Pose(skill.generate().positions[-1], skill.generate().quaternions[-1])
+    tool = goal.apply(arm.tool_spheres[:, :3])
+    back = goal.apply([0.0, 0.0, -1.0]) - goal.position  # from the tip towards the wrist
+    away = 0.1
+    while (np.linalg.norm(tool - goal.position - away * back, axis=1) - arm.tool_spheres[:, 3]).min() < 0.13:
+        away += 0.01
+    scene = Scene(None, [Sphere(goal.position + away * back, 0.1, name="jug")])  # clear of the tool, not of the wrist
+    plan = adapt(skill, scene, arm=arm, state=at_rest(start), max_tilt=TILT)
+    assert not plan.feasible
+    assert re.search(r'no posture .* goal .*right_l\d is .* mm from sphere "jug" \(20 mm required\)', plan.reason)
+    robot = SimulatedRobot(arm, scene=scene, q=start)
+    with pytest.raises(InfeasibleError, match="jug"):
+        ACFRA(skill, arm=arm, max_tilt=TILT).reset(Observation(0.0, robot.state(), arm.tool_pose(start), scene))
+
+
+def test_an_arm_that_starts_too_near_is_refused(real_data):
+    skill, arm, start = prepared(real_data, "panda")
+    elbow = arm.collision_spheres(start)[0][arm.cover.links == 4].mean(axis=0)
+    plan = adapt(skill, Scene(None, [Sphere(elbow, 0.05, name="post")]), arm=arm, state=at_rest(start))
+    assert not plan.feasible
+    assert plan.reason.startswith("at the start")
+    assert "post" in plan.reason
+
+
+def test_a_table_is_kept_off_by_the_links_and_not_by_the_tool_that_works_on_it(real_data):
+    skill, arm, start = prepared(real_data, "sawyer")
+    lowest = skill.generate().positions[:, 2].min()
+    tool = float(arm.tool_spheres[:, 3].max())
+    table = HalfSpace([0.0, 0.0, lowest - tool - 0.03], name="table")
+    plan = adapt(skill, Scene(None, (), 0.0, (table,)), arm=arm, state=at_rest(start), max_tilt=TILT)
+    assert plan.feasible, plan.reason
+
+
+def test_a_moving_obstacle_is_certified_on_schedule_for_the_whole_arm(real_data):
+    skill, arm, start = prepared(real_data, "sawyer")
+    middle = skill.generate().positions[100]
+    time = 0.5 * skill.duration_
+    velocity = np.array([0.03, 0.0, 0.0])
+    ball = Sphere(middle - time * velocity + [0.0, 0.0, 0.05], 0.03, velocity=velocity, name="ball")
+    plan = adapt(skill, Scene(None, [ball]), arm=arm, state=at_rest(start), max_tilt=TILT)
+    assert plan.feasible, plan.reason
+    assert plan.only_on_schedule
+    for q, t in zip(plan.joints, plan.trajectory.times, strict=True):
+        centers, radii = arm.collision_spheres(q)
+        assert (ball.after(t).signed_distance(centers) - radii).min() >= 0.02 - 1e-9
+
+
+def test_arguments_that_do_not_go_together_are_refused(real_data):
+    skill, arm, start = prepared(real_data, "sawyer")
+    with pytest.raises(InputError, match="state needs arm"):
+        adapt(skill, Scene(), tool_radius=0.01, state=at_rest(start))
+    with pytest.raises(InputError, match="max_tilt"):
+        adapt(skill, Scene(), arm=arm, state=at_rest(start), max_tilt=-1.0)
+    with pytest.raises(InputError, match="decompose it with that start"):
+        adapt(ComponentPath.of_skill(skill), Scene(), arm=arm, state=at_rest(start + 0.1))
