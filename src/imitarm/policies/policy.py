@@ -174,8 +174,8 @@ class ACFRA(Policy):
         gain: K [1/s].
         patience: e_0, the position error at which the phase stops [m]; None: the clearance, at least 5 mm.
         arrival: distance to the end of the path at which the motion counts as arrived [m].
-        allowance: margin added to the clearance in planning, if possible, because a robot has tracking errors [m]; None:
-            2 mm for a plan of the tool, 5 mm for a plan of the whole arm.
+        allowance: margin added to the clearance in planning, if possible, because a robot has tracking errors [m];
+            None: 2 mm for a plan of the tool, 5 mm for a plan of the whole arm.
 
     Attributes:
         adaptation: result of the last ``reset``.
