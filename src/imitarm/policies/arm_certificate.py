@@ -150,7 +150,7 @@ class ArmAmongObstacles:
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: [m].
+            reach: largest room of the pairs that are returned [m].
         """
         return Gaps.joined(path, [pairs.gaps(path, times, reach) for pairs in self._pairs])
 
@@ -160,7 +160,7 @@ class ArmAmongObstacles:
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: [m].
+            reach: largest room of the pairs that are returned [m].
         """
         gaps = self.gaps(path, times, reach)
         if not len(gaps):
@@ -221,7 +221,7 @@ class _Pairs(ABC):
         other: inner sphere of each pair, or -1, shape (n_pairs,).
         first: number of joints, counted from the base, that do not change the distance of each pair, shape (n_pairs,).
         moves: whether a joint changes the distance of each pair, shape (n_pairs, n_joints).
-        velocity: of the obstacle, shape (3,) [m/s].
+        velocity: velocity of the obstacle, shape (3,) [m/s].
     """
 
     velocity: Array = np.zeros(3)

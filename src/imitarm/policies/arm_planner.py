@@ -152,7 +152,7 @@ class ArmPlanner:
         """Improve a displacement and a joint path until the whole arm keeps its clearance.
 
         Args:
-            displacement: of each component's mean, from which to start, shape (n_components, 3) [m].
+            displacement: displacement of each component's mean, from which to start, shape (n_components, 3) [m].
             joints: joint path at ``coarse``, from which to start, shape (k, n_joints) [rad].
             tilt: coefficients from which to start, shape (n_tilts, 3) [rad]; None: no tilt.
 
