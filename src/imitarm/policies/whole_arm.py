@@ -12,6 +12,7 @@ If none succeeds, the answer names the link, the obstacle and the time of the be
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from imitarm.errors import UnreachableError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import find_posture
-from imitarm.kinematics.arm_path import ArmPath, track
+from imitarm.kinematics.arm_path import ArmPath, self_motions, track
 from imitarm.kinematics.pose import Pose
 from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles, ArmClearance
 from imitarm.policies.arm_planner import JOINT_LIMIT, ArmPlan, ArmPlanner
@@ -42,6 +43,9 @@ _REACH = 0.15  # [m] pairs farther apart than the clearance and this do not slow
 _SLOWEST = 1e-3  # [m/s] closing speed that is always allowed, so that the motion goes on
 _RETIMINGS = 4  # among moving obstacles
 _GOAL_POSTURES = 24  # tried at the goal
+_SWEEP, _SWEEP_STEPS = 0.15, 24  # [rad] of self-motion in one step of the search for a clear posture; steps
+_REACHED = 1e-5  # [m, rad] error of a posture at the goal that is accepted
+_DIFFERENT, _MOST_GOALS = 0.3, 3  # [rad] two postures differ by this; how many are followed up
 _AHEAD = 0.05  # of the duration: a place this close to the goal is the goal
 _SIDES = 8  # directions tried across the path
 _AWAY = (0.1, 0.2)  # [m] by which the path is moved to another side
@@ -136,6 +140,7 @@ class _Search:
         self.start = self._around.clearance_at(ArmPath.of(task.arm, task.start[None]), np.zeros(1), _REACH)
         self._moving = any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
         self._first: ArmClearance | None = None
+        self._goal: ArmClearance | None = None
         self._worst: ArmClearance | None = None
         self._goals: list[Array] | None = None
 
@@ -184,22 +189,51 @@ class _Search:
         return track(self.task.arm, self.task.start, positions, self._quaternions, goal)
 
     def _goal_postures(self) -> list[Array]:
-        """Return postures with the tool at the goal in which the whole arm is clear, different from each other."""
+        """Return postures with the tool at the goal in which the whole arm is clear, different from each other.
+
+        Inverse kinematics from random starts finds postures at the goal; each is then changed by its self-motion.
+        """
         arm, path = self.task.arm, self._components.nominal
         goal = Pose(path.positions[-1], self._quaternions[-1])
         random = np.random.default_rng(0)
         low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
-        found: list[Array] = []
-        end = np.array([self._times[-1]])
+        starts: list[Array] = []
         for _ in range(_GOAL_POSTURES):
-            try:
-                q = find_posture(arm, goal, q0=random.uniform(low, high), restarts=0)
-            except UnreachableError:
-                continue
-            gaps = self._around.gaps(ArmPath.of(arm, q[None]), end, 0.0)
-            if not len(gaps.room) and all(np.abs(q - other).max() > 0.3 for other in found):
+            with contextlib.suppress(UnreachableError):
+                starts.append(find_posture(arm, goal, q0=random.uniform(low, high), restarts=0))
+        found: list[Array] = []
+        for q in self._swept(np.array(starts), goal) if starts else ():
+            if all(np.abs(q - other).max() > _DIFFERENT for other in found):
                 found.append(q)
-        return sorted(found, key=lambda q: float(np.abs(q - self.task.start).max()))[:3]
+        return sorted(found, key=lambda q: float(np.abs(q - self.task.start).max()))[:_MOST_GOALS]
+
+    def _swept(self, starts: Array, goal: Pose) -> Iterator[Array]:
+        """Yield clear postures along the self-motions through postures (k, n_joints), the nearest to them first."""
+        arm, k = self.task.arm, len(starts)
+        times = np.full(k, self._times[-1])
+        poses = np.tile(goal.position, (k, 1)), np.tile(goal.quaternion, (k, 1))
+        paths = [ArmPath.of(arm, starts)] * 2
+        null = self_motions(paths[0].tool_jacobians())
+        headings = [sign * null[:, :, :1].sum(axis=2) for sign in (1.0, -1.0)]
+        for step in range(_SWEEP_STEPS + 1):
+            for path in paths[: 2 if step else 1]:
+                usable = np.abs(path.errors_to(*poses)).max(axis=1) < _REACHED
+                usable &= ((path.joints >= arm.lower) & (path.joints <= arm.upper)).all(axis=1)
+                gaps = self._around.gaps(path, times, 0.0)
+                room = np.zeros(k)
+                np.minimum.at(room, gaps.sample, gaps.room)
+                yield from path.joints[usable & (room == 0.0)]
+                best = int(np.argmax(np.where(usable, room, -np.inf)))
+                if usable[best] and (self._goal is None or room[best] > self._goal.room):
+                    one = ArmPath.of(arm, path.joints[best][None])
+                    found = self._around.clearance_at(one, times[:1], _REACH)
+                    self._goal = replace(found, sample=len(self._times) - 1)
+            if not null.shape[2]:
+                return
+            for i, path in enumerate(paths):
+                paths[i], _ = ArmPath.of(arm, path.joints + _SWEEP * headings[i]).moved_to(*poses)
+                now = self_motions(paths[i].tool_jacobians())[:, :, 0]
+                headings[i] = now * np.where(np.einsum("kj,kj->k", now, headings[i]) < 0.0, -1.0, 1.0)[:, None]
 
     def _sides(self, planner: ArmPlanner) -> list[tuple[Array, Array]]:
         """Return displacements that lead the tool past the worst place on other sides, with their joint paths.
@@ -291,9 +325,10 @@ class _Search:
             return f"{self.task.arm.name} can't bring its tool along the path: move the path nearer to the arm"
         first = "" if self._first is None else f"along the tool's path {self._placed(self._first)}; "
         if self._goals is not None and not self._goals:
+            nearest = "" if self._goal is None else f" (in the best one, {self.named(self._goal)})"
             return (
-                f"no posture was found in which the tool is at the goal and the whole arm is clear "
-                f"({self.named(best.clearance)} in the best one): move the obstacle or the goal"
+                f"no posture was found in which the tool is at the goal and the whole arm is clear{nearest}: move the "
+                "obstacle or the goal"
             )
         return (
             f"no path of the whole arm was found: {first}in the best attempt {self._placed(best.clearance)}; move the "
