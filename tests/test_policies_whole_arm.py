@@ -45,8 +45,14 @@ def pouring(folder: Path) -> Skill:
 
 
 @lru_cache
-def prepared(folder: Path, name: str):
-    skill, arm = pouring(folder), ARMS[name]
+def shelf(folder: Path) -> Skill:
+    recording = folder / "panda_kinesthetic" / "bottle2shelf.npy"
+    return Skill(10).fit(align(read(recording, units="cm", duration=10.0)))
+
+
+@lru_cache
+def prepared(folder: Path, name: str, learned=pouring):
+    skill, arm = learned(folder), ARMS[name]
     rotation = skill.start_.quaternion if skill.gmr_.has_orientation_ else arm.tool_pose(arm.home).quaternion
     return skill, arm, find_posture(arm, Pose(skill.start_.position, rotation))
 
@@ -115,6 +121,28 @@ def test_what_is_planned_is_executed_and_arrives(real_data, name, seed):
     assert done.min_clearance >= 0.02
     assert not robot.contacts
     assert np.median(off) < 0.01
+
+
+def test_a_goal_that_only_another_start_posture_reaches_is_approached_first(real_data):
+    skill, arm, start = prepared(real_data, "sawyer", shelf)
+    approached = 0
+    for seed in (203, 204, 208):
+        scene = placement(skill, arm, seed, start)
+        plan = adapt(skill, scene, arm=arm, state=at_rest(start), max_tilt=TILT)
+        if plan.approach is None:
+            continue
+        approached += 1
+        np.testing.assert_allclose(plan.approach.joints[0], start, atol=1e-9)
+        np.testing.assert_allclose(plan.approach.joints[-1], plan.joints[0], atol=1e-9)
+        assert (np.diff(plan.approach.times) > 0.0).all()
+        assert measured_clearance(arm, scene, plan.approach.joints) >= 0.02
+        if approached == 1:
+            robot = SimulatedRobot(arm, scene=scene, q=start)
+            safety, timeout = SafetyFilter(arm, clearance=0.02), plan.approach.times[-1] + 1.6 * skill.duration_
+            done = reproduce(ACFRA(skill, arm=arm, max_tilt=TILT), robot, scene.at, safety=safety, timeout=timeout)
+            assert done.success, done.reason
+            assert done.min_clearance >= 0.02
+    assert approached > 0
 
 
 def test_tilt_zero_keeps_the_learned_rotation(real_data):

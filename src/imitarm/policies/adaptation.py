@@ -27,7 +27,7 @@ from imitarm.policies.least_detour import (
     LeastDetour,
     PathAdapter,
 )
-from imitarm.policies.whole_arm import ArmSolution, ArmTask, solve
+from imitarm.policies.whole_arm import Approach, ArmSolution, ArmTask, solve
 from imitarm.registry import Registry
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
@@ -97,6 +97,8 @@ class Adaptation:
         joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned. Between
             two samples the joints move linearly.
         tilt: largest rotation of the tool away from the learned rotation [rad].
+        approach: motion of the joints to the first posture of ``joints``, which is executed first; None if the arm is
+            there already.
     """
 
     nominal: Trajectory
@@ -121,6 +123,7 @@ class Adaptation:
     compute_time: float
     joints: Array | None = None
     tilt: float = 0.0
+    approach: Approach | None = None
 
     @property
     def unmoved_fraction(self) -> float:
@@ -154,6 +157,7 @@ class Adaptation:
             "jerk above the limit": self.jerk_reason,
             "joint path": "not planned" if self.joints is None else f"{self.joints.shape[1]} joints",
             "largest tilt of the tool": f"{np.degrees(self.tilt):.1f} degrees",
+            "motion to the first posture": "none" if self.approach is None else f"{self.approach.times[-1]:.1f} s",
             "compute time": f"{1e3 * self.compute_time:.1f} ms",
         }
         return html_table("Adaptation", rows)
@@ -349,6 +353,7 @@ def _of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearan
         compute_time=spent,
         joints=plan.path.joints,
         tilt=plan.largest_tilt,
+        approach=solution.approach,
     )
 
 

@@ -85,18 +85,19 @@ class ArmPlan:
         return self.complete and self.clearance.room >= 0.0
 
 
-def splines(times: Array, n_knots: int, *, last: bool) -> Array:
-    """Return cubic B-splines in time that are 0 at the start, shape (n, n_splines).
+def splines(times: Array, n_knots: int, *, first: bool, last: bool) -> Array:
+    """Return cubic B-splines in time, shape (n, n_splines).
 
     Args:
         times: n increasing times [s].
         n_knots: evenly spaced knots between the first and the last time.
-        last: whether to include the last spline, without which all are 0 at the end too.
+        first: whether to include the first spline; without it, all are 0 at the start.
+        last: whether to include the last spline; without it, all are 0 at the end.
     """
     inner = np.linspace(times[0], times[-1], n_knots)
     knots = np.concatenate([[times[0]] * 3, inner, [times[-1]] * 3])
     basis = BSpline.design_matrix(times, knots, 3).toarray()
-    return np.asarray(basis[:, 1:] if last else basis[:, 1:-1])
+    return np.asarray(basis[:, 0 if first else 1 : None if last else -1])
 
 
 class ArmPlanner:
@@ -108,6 +109,7 @@ class ArmPlanner:
         quaternions: learned rotations of the tool at the samples, tool_to_base, shape (n, 4).
         max_tilt: largest rotation away from the learned rotation at each sample, shape (n,) [rad].
         allowed: directions in which components may move.
+        free_start: whether the self-motion may change the posture at the start.
 
     Attributes:
         coarse: samples at which a plan begins, shape (k,).
@@ -122,15 +124,17 @@ class ArmPlanner:
         quaternions: Array,
         max_tilt: Array,
         allowed: AllowedDirections,
+        *,
+        free_start: bool = False,
     ) -> None:
-        self.around, self.arm, self.components = around, around.arm, components
+        self.around, self.arm, self.components, self.free_start = around, around.arm, components, free_start
         self.quaternions, self.max_tilt, self.allowed = quaternions, max_tilt, allowed
         self.times = components.nominal.times
         self.clock = self.times
         n = len(self.times)
         self.coarse = np.unique(np.append(np.arange(0, n, _STRIDE), n - 1))
-        self._tilts = splines(self.times, _TILTS, last=False)
-        self._selves = splines(self.times, _SELF_MOTIONS, last=True)
+        self._tilts = splines(self.times, _TILTS, first=False, last=False)
+        self._selves = splines(self.times, _SELF_MOTIONS, first=free_start, last=True)
         self._scale = style_scale(components, allowed, np.arange(components.n_components), SMOOTHNESS)
 
     @property

@@ -233,16 +233,17 @@ class ACFRA(Policy):
         self.adaptation = self._adapted(observation.scene.now(observation.time), start, observation.state)
         if not self.adaptation.feasible and self._refuses:
             raise InfeasibleError(self.adaptation.reason)
-        path = self.adaptation.trajectory
+        self._path_to_follow, self._joints = path, joints = _with_approach(self.adaptation, self.arm)
         velocity = np.gradient(path.positions, path.times, axis=0)
         rotation = np.zeros((len(path), 3))
         if path.quaternions is not None:
             step = quaternion_multiply(path.quaternions[1:], quaternion_conjugate(path.quaternions[:-1]))
             rotation[:-1] = quaternion_log(step) / np.diff(path.times)[:, None]
         self._twists = np.concatenate([velocity, rotation], axis=1)
-        joints = self.adaptation.joints
         self._joint_velocities = None if joints is None else np.gradient(joints, path.times, axis=0)
-        self._displaced = np.linalg.norm(path.positions - self.adaptation.nominal.positions, axis=1)
+        planned = self.adaptation.trajectory.positions
+        displaced = np.linalg.norm(planned - self.adaptation.nominal.positions, axis=1)
+        self._displaced = np.concatenate([np.zeros(len(path) - len(displaced)), displaced])
         self._hold = observation.tool_to_base
         self._began = observation.time
         self._phase, self._void = 0.0, ""
@@ -278,7 +279,7 @@ class ACFRA(Policy):
         """
         if self.adaptation is None:
             raise InputError("ACFRA.step: call reset(observation) first")
-        path = self.adaptation.trajectory
+        path = self._path_to_follow
         end = float(path.times[-1])
         on_schedule = self.adaptation.only_on_schedule
         if on_schedule:
@@ -305,8 +306,7 @@ class ACFRA(Policy):
 
     def _joint_command(self, q: Array, phase: float, speed: float) -> Array | None:
         """Return the joint velocity that follows the planned joints; None when only the tool was planned."""
-        assert self.adaptation is not None
-        joints, times = self.adaptation.joints, self.adaptation.trajectory.times
+        joints, times = self._joints, self._path_to_follow.times
         if joints is None or self._joint_velocities is None:
             return None
         forward = _at(phase, times, self._joint_velocities)
@@ -319,7 +319,7 @@ class ACFRA(Policy):
             what = "behind its path" if self._phase < end else "from the end of its path"
             reason = f"the tool is {1e3 * lag:.0f} mm {what}"
             return Command(twist, joints, progress=progress, status=Status.WAITING, reason=reason)
-        displaced = float(np.interp(self._phase, self.adaptation.trajectory.times, self._displaced))
+        displaced = float(np.interp(self._phase, self._path_to_follow.times, self._displaced))
         if displaced > _DISPLACED:
             reason = f"the path is displaced by {1e3 * displaced:.0f} mm here because of an obstacle"
             return Command(twist, joints, progress=progress, status=Status.AVOIDING, reason=reason)
@@ -327,9 +327,8 @@ class ACFRA(Policy):
 
     def _target(self, path: Trajectory) -> Pose:
         """Return the desired pose at the current phase; without a learned orientation, the tool's rotation is kept."""
-        assert self.adaptation is not None
-        if self.adaptation.joints is not None and self.arm is not None:  # between samples the joints move linearly
-            return self.arm.tool_pose(_at(self._phase, path.times, self.adaptation.joints))
+        if self._joints is not None and self.arm is not None:  # between samples the joints move linearly
+            return self.arm.tool_pose(_at(self._phase, path.times, self._joints))
         positions, quaternions = path.at([self._phase])
         return Pose(positions[0], self._hold.quaternion if quaternions is None else quaternions[0])
 
@@ -337,7 +336,7 @@ class ACFRA(Policy):
         """Return whether the end of the path is reached within ``arrival``."""
         if self.adaptation is None or self._void:
             return False
-        path = self.adaptation.trajectory
+        path = self._path_to_follow
         away = np.linalg.norm(observation.tool_to_base.position - path.positions[-1])
         return self._phase >= path.times[-1] and bool(away < self._arrival)
 
@@ -345,3 +344,17 @@ class ACFRA(Policy):
 def _at(time: float, times: Array, values: Array) -> Array:
     """Return the rows of values (n, m) at times (n,), interpolated linearly at one time, shape (m,)."""
     return np.array([np.interp(time, times, column) for column in values.T])
+
+
+def _with_approach(plan: Adaptation, arm: ArmModel | None) -> tuple[Trajectory, Array | None]:
+    """Return the tool's path and the joints (n, n_joints) of the whole motion, which begins with the approach."""
+    path, joints, approach = plan.trajectory, plan.joints, plan.approach
+    if approach is None or joints is None or arm is None:
+        return path, joints
+    positions, quaternions = arm.tool_path(approach.joints[:-1])  # its last posture is the first one of the plan
+    whole = Trajectory(
+        np.concatenate([approach.times[:-1], approach.times[-1] + path.times]),
+        np.concatenate([positions, path.positions]),
+        None if path.quaternions is None else np.concatenate([quaternions, path.quaternions]),
+    )
+    return whole, np.concatenate([approach.joints[:-1], joints])

@@ -5,7 +5,8 @@ The repairs are tried in an order in which each keeps more of the demonstrated m
 1. the tool's own detour, with the self-motion of the arm and the allowed tilt of the tool;
 2. another posture of the arm at the goal;
 3. narrower components, which can bend the path more sharply;
-4. the path on another side of the obstacle, or farther away from it.
+4. the path on another side of the obstacle, or farther away from it;
+5. another posture at the start, if the arm can reach it by a clear motion before the motion of the skill begins.
 
 If none succeeds, the answer names the link, the obstacle and the time of the best attempt.
 """
@@ -16,6 +17,7 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +46,8 @@ _SLOWEST = 1e-3  # [m/s] closing speed that is always allowed, so that the motio
 _RETIMINGS = 4  # among moving obstacles
 _GOAL_POSTURES = 24  # tried at the goal
 _SWEEP, _SWEEP_STEPS = 0.15, 24  # [rad] of self-motion in one step of the search for a clear posture; steps
+_VIAS, _VIA_SPREAD = 60, 0.6  # random via postures of an approach; their standard deviation [rad]
+_LEG_STEP, _LEG_SPEED = 0.05, 0.4  # [rad] between samples of an approach; fraction of the largest speed
 _REACHED = 1e-5  # [m, rad] error of a posture at the goal that is accepted
 _DIFFERENT, _MOST_GOALS = 0.3, 3  # [rad] two postures differ by this; how many are followed up
 _AHEAD = 0.05  # of the duration: a place this close to the goal is the goal
@@ -61,11 +65,26 @@ class ArmSolution:
         plan: the plan, or the best attempt; None when the arm can't follow the path at all.
         timing: execution times; None unless a plan is feasible.
         reason: why there is no plan; empty if there is one.
+        approach: motion from the posture of the task to the start of the plan; None if the plan starts there.
     """
 
     plan: ArmPlan | None
     timing: Timing | None
     reason: str
+    approach: Approach | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """A motion of the joints before the motion of the skill begins, clear like the plan itself.
+
+    Attributes:
+        joints: joint positions, shape (m, n_joints) [rad]; between two samples the joints move linearly.
+        times: times from 0, shape (m,) [s].
+    """
+
+    joints: Array
+    times: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +126,12 @@ def solve(task: ArmTask, detour: Detour) -> ArmSolution:
         if plan is None:
             continue
         if plan.feasible:
-            timed = search.timed(planner, plan)
+            approach = search.approach(plan.path.joints[0]) if planner.free_start else None
+            timed = search.timed(planner, plan) if approach is not None or not planner.free_start else None
             if timed is not None:
                 plan, timing = timed
-                return ArmSolution(plan, timing, search.overloaded(timing))
+                return ArmSolution(plan, timing, search.overloaded(timing), approach)
+            continue
         best = plan if best is None or _rank(plan) > _rank(best) else best
         search.failed(planner, plan)
     return ArmSolution(best, None, search.refusal(best))
@@ -159,6 +180,7 @@ class _Search:
             for goal in self._goals:
                 yield learned, detour, self._followed(learned, detour, goal)
             if self._at_goal():
+                yield from self._other_starts(detour)
                 return
         narrow = self._planner(self._components.divided)
         away = learned.components.basis @ detour
@@ -167,6 +189,51 @@ class _Search:
         for planner in (learned, narrow):
             for displacement, joints in self._sides(planner):
                 yield planner, displacement, joints
+        yield from self._other_starts(detour)
+
+    def _other_starts(self, displacement: Array) -> Iterator[tuple[ArmPlanner, Array, Array]]:
+        """Yield joint paths that end in a clear posture at the goal, and so may start in another posture."""
+        if self._moving:  # there is no time for an approach
+            return
+        planner = self._planner(self._components, free_start=True)
+        positions, quaternions = planner.poses(displacement, np.zeros((planner.n_tilts, 3)), planner.coarse)
+        for goal in self._goals or []:
+            joints = track(self.task.arm, goal, positions[::-1], quaternions[::-1])[::-1]
+            yield planner, displacement, joints
+
+    def approach(self, end: Array) -> Approach | None:
+        """Return a clear motion from the posture of the task to another posture; None if none was found.
+
+        The motion is straight in joint space, or straight to a via posture and from there to the end.
+        """
+        arm, start = self.task.arm, self.task.start
+        random = np.random.default_rng(1)
+        middle = 0.5 * (start + end)
+        vias = [None, arm.home, *(middle + _VIA_SPREAD * random.normal(size=(_VIAS, arm.n_joints)))]
+        for via in vias:
+            corners = [start, end] if via is None else [start, np.clip(via, arm.lower, arm.upper), end]
+            legs = [self._leg(a, b) for a, b in pairwise(corners)]
+            if all(self._around.clearance_of(leg, np.zeros(len(leg))).room >= 0.0 for leg in legs):
+                return self._timed_legs(legs)
+        return None
+
+    def _leg(self, start: Array, end: Array) -> ArmPath:
+        n = 2 + int(np.abs(end - start).max() / _LEG_STEP)
+        return ArmPath.of(self.task.arm, np.linspace(start, end, n + 10))
+
+    def _timed_legs(self, legs: list[ArmPath]) -> Approach | None:
+        """Return legs with execution times; the arm rests between two legs."""
+        joints, times, now = [self.task.start[None]], [np.zeros(1)], 0.0
+        for leg in legs:
+            whole = np.abs(leg.joints[-1] - leg.joints[0]) / (_LEG_SPEED * self.task.arm.max_velocity)
+            parameters = np.linspace(0.0, max(float(whole.max()), 0.1), len(leg))
+            timing = self._timing(leg, parameters, np.zeros(len(leg)))
+            if timing.blocked >= 0:
+                return None
+            joints.append(leg.joints[1:])
+            times.append(now + timing.times[1:])
+            now = float(times[-1][-1])
+        return Approach(np.concatenate(joints), np.concatenate(times))
 
     def failed(self, planner: ArmPlanner, plan: ArmPlan) -> None:
         """Remember where an attempt failed."""
@@ -178,8 +245,9 @@ class _Search:
         last = len(self._times) - 1
         return worst is not None and worst.obstacle != JOINT_LIMIT and worst.sample >= (1.0 - _AHEAD) * last
 
-    def _planner(self, components: ComponentPath) -> ArmPlanner:
-        return ArmPlanner(self._around, components, self._quaternions, self.task.max_tilt, self.task.allowed)
+    def _planner(self, components: ComponentPath, *, free_start: bool = False) -> ArmPlanner:
+        tilt, allowed = self.task.max_tilt, self.task.allowed
+        return ArmPlanner(self._around, components, self._quaternions, tilt, allowed, free_start=free_start)
 
     def _followed(self, planner: ArmPlanner, displacement: Array, goal: Array | None) -> Array:
         tilt = np.zeros((planner.n_tilts, 3))
@@ -270,7 +338,7 @@ class _Search:
         keeps its clearance at the times at which it is executed; None if that does not succeed.
         """
         for _ in range(_RETIMINGS):
-            timing = self._timing(plan, planner.clock)
+            timing = self._timing(plan.path, self._times, planner.clock)
             if timing.blocked >= 0 or not self._moving:
                 return plan, timing
             planner.clock = timing.times
@@ -283,8 +351,8 @@ class _Search:
             plan = again
         return None
 
-    def _timing(self, plan: ArmPlan, clock: Array) -> Timing:
-        path, times = plan.path, self._times
+    def _timing(self, path: ArmPath, times: Array, clock: Array) -> Timing:
+        """Return the times of a path with the parameters ``times``, among obstacles as they are at ``clock``."""
         gaps = self._around.gaps(path, clock, _REACH)
         speed = np.linalg.norm(np.gradient(path.centers, times, axis=0), axis=2)
         own = gaps.obstacle == SELF
