@@ -1,4 +1,4 @@
-"""ArmPath: an arm in every posture of a joint path, as arrays; and a joint path for poses of the tool."""
+"""ArmPath: the kinematics of an arm along a joint path, as arrays; track: a joint path for given poses of the tool."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class ArmPath:
         centers: centres of the spheres that cover the moving links and the tool (``ArmModel.cover``), in the base
             frame, shape (n, m, 3) [m].
         axes: unit vectors along the axes of the joints in the base frame, shape (n, n_joints, 3).
-        anchors: a point on each axis, shape (n, n_joints, 3) [m].
-        rotations: rotation matrices link_to_base; the base comes first, then the link that each joint moves, shape (n,
+        anchors: a point on the axis of each joint in the base frame, shape (n, n_joints, 3) [m].
+        rotations: rotation matrices link_to_base of the base, then of the link that each joint moves, shape (n,
             n_joints + 1, 3, 3).
     """
 
@@ -98,7 +98,7 @@ class ArmPath:
         return jacobians
 
     def sphere_speeds(self, sample: Index, sphere: Index, directions: Array) -> Array:
-        """Return how fast each joint moves spheres along directions, shape (k, n_joints) [m/rad].
+        """Return the speed of spheres along directions for each joint moving at unit speed, (k, n_joints) [m/rad].
 
         Args:
             sample: index of the posture, shape (k,).
@@ -116,7 +116,8 @@ class ArmPath:
     def sphere_radii(self, sample: Index, sphere: Index) -> Array:
         """Return the distance of spheres' centres from the axis of each joint, shape (k, n_joints) [m].
 
-        1 for a prismatic joint, which moves every point by the same amount. Joints that do not move the sphere have 0.
+        The value is 1 for a prismatic joint, which moves every point by the same amount, and 0 for a joint that does
+        not move the sphere.
 
         Args:
             sample: index of the posture, shape (k,).
@@ -131,7 +132,7 @@ class ArmPath:
         return radii * self.arm.cover.moves[sphere]
 
     def errors_to(self, positions: Array, quaternions: Array) -> Array:
-        """Return the twists over unit time that bring the tool to poses, shape (n, 6) [m, rad].
+        """Return the displacement and the rotation vector from the tool to each given pose, shape (n, 6) [m, rad].
 
         Args:
             positions: shape (n, 3) [m].
@@ -141,14 +142,14 @@ class ArmPath:
         return np.concatenate([positions - self.positions, rotation], axis=1)
 
     def moved_to(self, positions: Array, quaternions: Array) -> tuple[ArmPath, float]:
-        """Bring the tool to poses, in all postures at once, by Newton's method with the least joint motion.
+        """Move the joints of all postures so that the tool reaches given poses, with the least joint motion (Newton).
 
         Args:
             positions: shape (n, 3) [m].
             quaternions: tool_to_base, shape (n, 4).
 
         Returns:
-            The path, and the largest remaining error of a coordinate of a pose [m, rad].
+            The moved path, and the largest remaining error over all coordinates of all poses [m, rad].
         """
         path = self
         for step in range(_NEWTON_STEPS + 1):
@@ -172,7 +173,7 @@ def right_inverses(jacobians: Array) -> Array:
 def self_motions(jacobians: Array) -> Array:
     """Return orthonormal joint motions that do not move the tool, shape (n, n_joints, n_joints - 6).
 
-    Their signs and order change as little as possible from one posture to the next.
+    The signs and the order of these motions change as little as possible from one posture to the next.
 
     Args:
         jacobians: Jacobians of the tool in consecutive postures, shape (n, 6, n_joints).
@@ -193,22 +194,22 @@ def self_motions(jacobians: Array) -> Array:
 
 
 def _null_vectors(jacobians: Array) -> Array:
-    """Return the unit vector that each Jacobian (n, 6, 7) maps to zero, shape (n, 7): the last right singular one."""
+    """Return the unit vectors (n, 7) that the Jacobians (n, 6, 7) map to zero: the last right singular vectors."""
     return np.asarray(np.linalg.svd(jacobians)[2][:, 6])
 
 
 def track(arm: ArmModel, start: Array, positions: Array, quaternions: Array, drift: Array | None = None) -> Array:
-    """Follow poses of the tool one after the other, each from the posture before, with the least joint motion.
+    """Return joint positions for successive poses of the tool, each with the least motion from the previous posture.
 
     Args:
         arm: the arm with its tool.
-        start: posture from which to start, shape (n_joints,) [rad].
+        start: posture before the first pose, shape (n_joints,) [rad].
         positions: shape (n, 3) [m].
         quaternions: tool_to_base, shape (n, 4).
-        drift: posture at the end towards which the self-motion leads, shape (n_joints,) [rad]; None: no self-motion.
+        drift: posture that the self-motion approaches at the last pose, shape (n_joints,) [rad]; None: no self-motion.
 
     Returns:
-        Shape (n, n_joints) [rad]. Where a pose is out of reach, the posture is the nearest that was found.
+        Shape (n, n_joints) [rad]. If a pose is out of reach, its posture is the nearest one that was found.
     """
     site = arm.site("tool")
     joints, q = np.empty((len(positions), arm.n_joints)), np.array(start, dtype=float)

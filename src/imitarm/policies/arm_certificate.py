@@ -1,18 +1,18 @@
 r"""Proof that a whole arm keeps its clearance on a joint path, between the samples too.
 
-Between two samples every joint moves linearly, and the centre c of a sphere of the arm moves on an arc. On the whole
-segment the centre stays within
+Between two samples every joint moves linearly, and the centre c of a sphere of the arm moves on an arc. The distance of
+this arc from the straight line between its two ends is at most
 
 .. math:: e = \tfrac18 \sum_{i,j} |\Delta q_i|\,|\Delta q_j|\,R_{\max(i,j)}
 
-of the straight line between its two positions. :math:`R_j` is the largest distance of the centre from the axis of joint
-j (1 for a prismatic joint), because the second derivative of c with respect to the joints i and j has at most the norm
+Here :math:`R_j` is the largest distance of the centre from the axis of joint j (1 for a prismatic joint). The bound
+holds because the second derivative of c with respect to the joints i and j has at most the norm
 :math:`R_{\max(i,j)}`. The signed distance to a convex obstacle is a convex function of the point, so the tangents at
-the two ends bound it on the line, and on the arc it is smaller by at most e. Where this bound is too low, the segment
-is divided into halves, which makes e four times smaller.
+the two ends bound the distance on the line from below. On the arc, the distance is smaller by at most e. Where this
+bound is too low, the segment is divided into halves, which makes e four times smaller.
 
-The same holds for two links of the arm. In the frame of the inner link, only the joints between the two links move the
-outer one, and the distance from a fixed point is a convex function too.
+The same proof holds for two links of the arm. In the frame of the inner link, only the joints between the two links
+move the outer link, and the distance from a fixed point is a convex function too.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 SELF = -1
-"""Stands for the index of an obstacle where two links of the arm are meant."""
+"""Replaces the index of an obstacle if the distance is between two links of the arm."""
 _REACH = 0.1  # [m] beyond the clearance: pairs that are farther apart at both ends of a segment are not bounded
 _MOST_HALVINGS = 8  # of a segment
 _CONTACT = 1e-3  # [m] a part may come nearer to a fixture by this than it is where contact is meant
@@ -48,12 +48,12 @@ class ArmClearance:
     """The smallest clearance of an arm on a joint path, and where it is.
 
     Attributes:
-        room: distance minus required clearance [m]. If it is not negative, it is a guaranteed lower bound on the whole
-            path. If it is negative, it is the value at one point of the path, and other points may be worse.
+        room: distance minus required clearance [m]. A value of at least 0 is a guaranteed lower bound on the whole
+            path. A negative value was measured at one point of the path, and other points may be worse.
         obstacle: index of the obstacle; ``SELF`` for two links.
         sphere: index of the sphere of the arm; for two links, the sphere of the outer link.
         other: index of the sphere of the inner link; -1 for an obstacle.
-        sample: index of the sample at or before the point.
+        sample: index of the sample at or before the point with this clearance.
     """
 
     room: float
@@ -71,9 +71,10 @@ class Gaps:
         path: the arm at the samples.
         obstacle: index of the obstacle; ``SELF`` for two spheres of the arm, shape (k,).
         sample: index of the sample of the path, shape (k,).
-        sphere: index of the sphere; for two spheres, of the outer one, shape (k,).
-        other: index of the inner one of two spheres; -1 for an obstacle, shape (k,).
-        first: number of joints that move both spheres and so do not change their distance; 0 for an obstacle, (k,).
+        sphere: index of the sphere; for two spheres, index of the outer sphere, shape (k,).
+        other: index of the inner sphere for two spheres; -1 for an obstacle, shape (k,).
+        first: number of joints that move both spheres and therefore do not change their distance, shape (k,); 0 for an
+            obstacle.
         room: distance minus required clearance, shape (k,) [m].
         normal: unit vector along which the sphere moves away fastest, in the base frame, shape (k, 3).
         drift: change of the distance with time, caused by the motion of the obstacle, shape (k,) [m/s].
@@ -91,7 +92,7 @@ class Gaps:
 
     @classmethod
     def joined(cls, path: ArmPath, parts: Sequence[Gaps]) -> Gaps:
-        """Return all pairs of several parts."""
+        """Return the pairs of all ``parts`` as one object."""
         none, empty = np.zeros(0, dtype=np.intp), np.zeros(0)
         parts = [cls(path, none, none, none, none, none, empty, np.zeros((0, 3)), empty), *parts]
         names = [name for name in cls.__dataclass_fields__ if name != "path"]
@@ -101,7 +102,7 @@ class Gaps:
         return len(self.room)
 
     def rates(self, chosen: Index) -> Array:
-        """Return the change of the distance of chosen pairs with each joint, shape (m, n_joints) [m/rad]."""
+        """Return the derivative of each chosen pair's distance by each joint, shape (m, n_joints) [m/rad]."""
         rates = self.path.sphere_speeds(self.sample[chosen], self.sphere[chosen], self.normal[chosen])
         return rates * (np.arange(rates.shape[1]) >= self.first[chosen, None])
 
@@ -117,10 +118,10 @@ class ArmAmongObstacles:
         fixtures: objects on which the arm stands or works, such as a table. A part of the arm may come as near to a
             fixture as it is in one of the postures ``contacts`` or at home; otherwise it keeps the clearance.
         contacts: postures in which parts of the arm may be near fixtures, shape (k, n_joints) [rad].
-        own: the links that must stay apart, and their required clearance; None: not checked.
+        own: the links that must stay apart, and their required clearance; None: links are not checked.
 
     Attributes:
-        n_obstacles: number of obstacles; fixtures have indices from there on.
+        n_obstacles: number of obstacles, which is also the index of the first fixture.
     """
 
     def __init__(
@@ -155,7 +156,7 @@ class ArmAmongObstacles:
         return Gaps.joined(path, [pairs.gaps(path, times, reach) for pairs in self._pairs])
 
     def clearance_at(self, path: ArmPath, times: Array, reach: float) -> ArmClearance:
-        """Return the smallest clearance at the samples of a path; ``reach`` [m] if it is larger than that.
+        """Return the smallest clearance at the samples of a path; a room above ``reach`` is returned as ``reach``.
 
         Args:
             path: the arm at n samples.
@@ -192,8 +193,8 @@ def _finer(path: ArmPath, times: Array) -> tuple[ArmPath, Array, Index, float]:
     """Divide segments on which a sphere could move farther than ``_REACH``.
 
     Returns:
-        The path, its times, the sample of the given path at or before each of its samples, and the longest distance
-        that a sphere moves on a segment [m].
+        The divided path, the time of each of its samples, the index of the sample of ``path`` at or before each of its
+        samples, and the longest distance that a sphere moves on a segment [m].
     """
     away = np.linalg.norm(path.centers[:, :, None] - path.anchors[:, None], axis=3).max(axis=1, initial=0.0)
     away[:, path.arm.cover.slides] = 1.0
@@ -217,10 +218,10 @@ class _Pairs(ABC):
     Attributes:
         arm: the arm.
         obstacle: index of the obstacle, or ``SELF``.
-        sphere: sphere of each pair; of two spheres the outer one, shape (n_pairs,).
-        other: inner sphere of each pair, or -1, shape (n_pairs,).
+        sphere: index of the sphere of each pair; for two spheres, index of the outer sphere, shape (n_pairs,).
+        other: index of the inner sphere of each pair; -1 for an obstacle, shape (n_pairs,).
         first: number of joints, counted from the base, that do not change the distance of each pair, shape (n_pairs,).
-        moves: whether a joint changes the distance of each pair, shape (n_pairs, n_joints).
+        moves: whether each joint changes the distance of each pair, shape (n_pairs, n_joints).
         velocity: velocity of the obstacle, shape (3,) [m/s].
     """
 
@@ -238,11 +239,11 @@ class _Pairs(ABC):
 
     @abstractmethod
     def points(self, path: ArmPath, sample: Index, pair: Index, times: Array) -> Array:
-        """Return where spheres are, relative to the obstacle or in the frame of the inner link, shape (k, 3) [m]."""
+        """Return the spheres' centres relative to the obstacle, or to the inner sphere in its frame, (k, 3) [m]."""
 
     @abstractmethod
     def measured(self, points: Array, pair: Index) -> tuple[Array, Array]:
-        """Return distance minus required clearance (k,) [m] of such points, and its gradient (k, 3)."""
+        """Return distance minus required clearance (k,) [m] for results of ``points``, and its gradient (k, 3)."""
 
     def gaps(self, path: ArmPath, times: Array, reach: float) -> Gaps:
         sample, pair = np.nonzero(self.near(path, times, reach))
@@ -254,7 +255,7 @@ class _Pairs(ABC):
         return Gaps(path, obstacle, sample, self.sphere[pair], self.other[pair], self.first[pair], room, normals, drift)
 
     def in_base(self, path: ArmPath, sample: Index, pair: Index, normals: Array) -> Array:
-        """Return gradients in the base frame."""
+        """Return the gradients ``normals``, converted to the base frame."""
         return normals
 
     def bound(self, path: ArmPath, times: Array) -> ArmClearance:
@@ -269,7 +270,7 @@ class _Pairs(ABC):
 
 
 class _ToObstacle(_Pairs):
-    """Every sphere of the arm with one obstacle."""
+    """The pairs of one obstacle with every sphere of the arm."""
 
     def __init__(self, arm: ArmModel, index: int, obstacle: Obstacle, clearance: Array | float) -> None:
         self.arm, self.obstacle, n = arm, index, len(arm.cover.radii)
@@ -336,7 +337,7 @@ class _ToLink(_Pairs):
 
 @dataclass(eq=False)
 class _Ends:
-    """One end of each of k segments: joints, time, the point of each pair with its room and gradient, and its radii."""
+    """The first or last points of k segments: joints, times, points, room, gradients, and distances from the axes."""
 
     joints: Array
     times: Array
@@ -360,7 +361,7 @@ class _Ends:
 
 
 def _lowest(pairs: _Pairs, path: ArmPath, times: Array, segment: Index, pair: Index) -> tuple[float, int]:
-    """Return the lowest bound over segments of pairs, and the number of the segment; a value when it is negative."""
+    """Return the lowest bound over segments, or a measured value if one is negative, and the index of the segment."""
     start = _Ends.of(pairs, path, times[segment], segment, pair)
     end = _Ends.of(pairs, path, times[segment + 1], segment + 1, pair)
     at = int(np.argmin(np.minimum(start.room, end.room)))
@@ -399,12 +400,12 @@ def _bounds(start: _Ends, end: _Ends) -> Array:
 
 
 def bows(steps: Array, radii: Array) -> Array:
-    """Return how far arcs leave the straight lines between their ends at most, shape (k,) [m].
+    """Return a bound of the distance of each arc from the straight line between its ends, shape (k,) [m].
 
     Args:
         steps: absolute motion of each joint, shape (k, n_joints) [rad].
-        radii: distance from the axis of each joint, the larger of the two ends; 0 for joints that do not move the
-            point, shape (k, n_joints) [m].
+        radii: distance of the point from the axis of each joint, at the end where this distance is larger; 0 for joints
+            that do not move the point, shape (k, n_joints) [m].
     """
     steps = np.where(radii > 0.0, steps, 0.0)
     whole, farther = radii.copy(), np.zeros(len(steps))

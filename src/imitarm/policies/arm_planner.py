@@ -2,16 +2,17 @@ r"""A joint path on which the whole arm keeps its clearance, close to a given di
 
 Three sets of numbers describe the motion: the displacements :math:`\Delta` of the components of the learned path, a
 rotation of the tool away from the learned rotation (the *tilt* :math:`\tau`), and the self-motion :math:`\psi`, which
-moves the arm but not its tool. Each is multiplied by smooth functions of time :math:`B`. Around a joint path q(t), a
-small change of these numbers moves the joints by
+moves the arm but not its tool. Each set is multiplied by smooth functions of time :math:`B`. Near a joint path q(t), a
+small change of these numbers changes the joint positions by :math:`\delta q`:
 
 .. math:: \delta q(t) = J^+(t) \begin{bmatrix} B_\Delta(t)\,\delta\Delta \\ B_\tau(t)\,\delta\tau \end{bmatrix}
           + N(t)\,B_\psi(t)\,\delta\psi
 
-with the right inverse :math:`J^+` of the tool's Jacobian and a basis N of its null space. Every distance between a part
-of the arm and an obstacle then changes linearly. Each round solves a quadratic program: the smallest displacement and
-tilt for which all linearised distances reach the required clearance and the joints stay within their limits. Inverse
-kinematics then brings the tool exactly to its poses, and the next round begins from there, until the distances suffice.
+Here :math:`J^+` is the right inverse of the tool's Jacobian, and N is a basis of its null space. To first order, every
+distance between a part of the arm and an obstacle changes linearly. In each round, a quadratic program finds the
+smallest displacement and tilt for which all linearised distances reach the required clearance and the joints stay
+within their limits. Inverse kinematics then brings the tool exactly to its poses. The next round begins with this joint
+path; the rounds end when all distances reach the required clearance.
 """
 
 from __future__ import annotations
@@ -57,16 +58,16 @@ class ArmPlan:
     """A joint path for a displaced and tilted path of the tool.
 
     Attributes:
-        components: the path whose components were moved.
+        components: the learned path and its components, before they were displaced.
         displacement: displacement of each component's mean, shape (n_components, 3) [m].
         tilt: coefficients of the tool's rotation away from the learned rotation, shape (n_tilts, 3) [rad].
         path: the arm at the samples.
-        clearance: the smallest clearance and where it is. On a path with all samples it is proven when it is not
-            negative.
+        clearance: the smallest clearance and its place. If ``complete``, a clearance that is not negative is certified
+            for the whole path.
         complete: whether ``path`` has all samples of the component path.
         cost: squared size of displacement and tilt, in demonstrated standard deviations.
         largest_tilt: largest rotation of the tool away from the learned rotation [rad].
-        speed: largest speed of a joint at the learned times, divided by the joint's limit.
+        speed: largest joint speed, as a fraction of the joint's limit, if the path is executed at the learned times.
     """
 
     components: ComponentPath
@@ -91,8 +92,8 @@ def splines(times: Array, n_knots: int, *, first: bool, last: bool) -> Array:
     Args:
         times: n increasing times [s].
         n_knots: evenly spaced knots between the first and the last time.
-        first: whether to include the first spline; without it, all are 0 at the start.
-        last: whether to include the last spline; without it, all are 0 at the end.
+        first: whether to include the first spline; without it, all splines are 0 at the start.
+        last: whether to include the last spline; without it, all splines are 0 at the end.
     """
     inner = np.linspace(times[0], times[-1], n_knots)
     knots = np.concatenate([[times[0]] * 3, inner, [times[-1]] * 3])
@@ -112,9 +113,9 @@ class ArmPlanner:
         free_start: whether the self-motion may change the posture at the start.
 
     Attributes:
-        coarse: samples at which a plan begins, shape (k,).
-        clock: time at which the arm is at each sample, for obstacles that move, shape (n,) [s]; at first the times of
-            the learned motion.
+        coarse: indices of the few samples that are planned first, before all samples, shape (k,).
+        clock: time at which the arm reaches each sample, used for moving obstacles, shape (n,) [s]; initially the times
+            of the learned motion.
     """
 
     def __init__(
@@ -139,7 +140,7 @@ class ArmPlanner:
 
     @property
     def n_tilts(self) -> int:
-        """Number of rows of a tilt's coefficients."""
+        """Number of splines that describe the tilt, which is the number of rows of its coefficients."""
         return self._tilts.shape[1]
 
     def poses(self, displacement: Array, tilt: Array, samples: Index) -> tuple[Array, Array]:
@@ -156,9 +157,9 @@ class ArmPlanner:
         """Improve a displacement and a joint path until the whole arm keeps its clearance.
 
         Args:
-            displacement: displacement of each component's mean, from which to start, shape (n_components, 3) [m].
-            joints: joint path at ``coarse``, from which to start, shape (k, n_joints) [rad].
-            tilt: coefficients from which to start, shape (n_tilts, 3) [rad]; None: no tilt.
+            displacement: initial displacement of each component's mean, shape (n_components, 3) [m].
+            joints: initial joint positions at the samples ``coarse``, shape (k, n_joints) [rad].
+            tilt: initial coefficients of the tilt, shape (n_tilts, 3) [rad]; None: no tilt.
 
         Returns:
             A feasible plan, or the best attempt; None when the arm can't follow the tool's path.
@@ -178,12 +179,12 @@ class ArmPlanner:
         return self._improved(state, best.displacement, best.tilt, samples, _FINAL_ROUNDS)
 
     def _closed(self, joints: Array, displacement: Array, tilt: Array, samples: Index) -> ArmPath | None:
-        """Return the arm with its tool exactly at the poses; None when they are out of reach."""
+        """Return the joint path that moves the tool exactly to its poses; None when a pose is out of reach."""
         path, error = ArmPath.of(self.arm, joints).moved_to(*self.poses(displacement, tilt, samples))
         return path if error < _ACCURATE else None
 
     def _improved(self, path: ArmPath, displacement: Array, tilt: Array, samples: Index, rounds: int) -> ArmPlan:
-        """Return the first plan that keeps all clearances at the samples (on the whole path, if these are all)."""
+        """Return the first plan that keeps all clearances (see :meth:`_evaluated`), or else the best attempt."""
         best: ArmPlan | None = None
         since, margin, calmed = 0, _MARGIN, 0
         for _ in range(rounds + 1):
@@ -207,7 +208,7 @@ class ArmPlanner:
         return best
 
     def _evaluated(self, path: ArmPath, displacement: Array, tilt: Array, samples: Index) -> ArmPlan:
-        """Return a plan with its lowest clearance: on the whole path if all samples are there, else at the samples."""
+        """Return a plan with its smallest clearance at the samples; if these are all samples, also between them."""
         complete = len(samples) == len(self.times)
         beyond = np.minimum(path.joints - self.arm.lower, self.arm.upper - path.joints)
         sample, joint = np.unravel_index(int(np.argmin(beyond)), beyond.shape)
@@ -224,7 +225,7 @@ class ArmPlanner:
         return ArmPlan(self.components, displacement, tilt, path, lowest, complete, cost, turned, speed)
 
     def _longest_steps(self, samples: Index) -> Array:
-        """Return the largest step of each joint to the next sample at the learned times, (k - 1, n_joints) [rad]."""
+        """Return how far each joint can move from sample to sample at the learned times, (k - 1, n_joints) [rad]."""
         return np.asarray(np.diff(self.times[samples])[:, None] * self.arm.max_velocity)
 
     def _cost(self, displacement: Array, tilt: Array) -> float:
@@ -234,7 +235,7 @@ class ArmPlanner:
     def _moved(
         self, path: ArmPath, displacement: Array, tilt: Array, samples: Index, new: Array, turned: Array, change: Array
     ) -> tuple[ArmPath, Array, Array] | None:
-        """Take a step, shortened until the arm can follow; None when it can't."""
+        """Take a step, and halve it up to three times until the arm can follow; None if the arm still can't follow."""
         fraction = min(1.0, _LONGEST_STEP / max(float(np.abs(change).max()), 1e-9))
         for _ in range(4):
             there = displacement + fraction * (new - displacement), tilt + fraction * (turned - tilt)
@@ -309,12 +310,12 @@ class ArmPlanner:
 
 
 JOINT_LIMIT = SELF - 1
-"""Stands for the index of an obstacle where a limit of a joint is meant; ``sphere`` is then the joint."""
+"""Replaces the index of an obstacle if the limit of a joint is violated; ``sphere`` is then the index of the joint."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Local:
-    """How the numbers of a plan move the joints at chosen samples, to first order."""
+    """Linear model of how displacement, tilt and self-motion change the joint positions at chosen samples."""
 
     planner: ArmPlanner
     samples: Index
@@ -326,7 +327,7 @@ class _Local:
         return self.planner._selves.shape[1] * self.null.shape[2]
 
     def rows(self, at: Index, rates: Array) -> Array:
-        """Return rows for quantities that change at ``rates`` (r, n_joints) with the joints at the samples ``at``."""
+        """Return one row per quantity; ``rates`` (r, n_joints) are its derivatives by the joints at sample ``at``."""
         planner, sample = self.planner, self.samples[at]
         of_tool = np.einsum("rj,rji->ri", rates, self.inverse[at])
         of_self = np.einsum("rj,rje->re", rates, self.null[at])
@@ -342,7 +343,7 @@ class _Local:
         return np.concatenate(columns, axis=1)
 
     def scaled(self, matrix: Array, scale: Array) -> Array:
-        """Return rows for unit costs; ``scale`` is that of the displacements in the allowed axes."""
+        """Return the rows for variables with unit cost; ``scale`` converts displacements along the allowed axes."""
         k, axes = self.planner.components.n_components, self.planner.allowed.axes
         moved = (matrix[:, : 3 * k].reshape(-1, k, 3) @ axes).reshape(len(matrix), -1) @ scale
         n_tilts = 3 * self.planner.n_tilts
@@ -359,12 +360,12 @@ class _Local:
 
 
 def _rank(plan: ArmPlan) -> tuple[float, float]:
-    """Return a key by which plans are compared: those that are clear by their speed, the others by their clearance."""
+    """Return a key for comparing plans: plans with enough clearance by their speed, all others by their clearance."""
     return min(plan.clearance.room, 0.0), -max(plan.speed, _CALM)
 
 
 def _chosen(gaps: Gaps) -> Index:
-    """Return the pairs that get a row: all that are near, and of the others the nearest of each link."""
+    """Return the pairs that get a row in the quadratic program: all near pairs, and the nearest pair of each link."""
     links = gaps.path.arm.cover.links
     kinds = np.stack([gaps.obstacle, gaps.sample, links[gaps.sphere], gaps.first])
     order = np.lexsort((gaps.room, *kinds))

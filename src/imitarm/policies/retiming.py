@@ -1,4 +1,4 @@
-r"""Execution times for a joint path, within the limits of velocity, acceleration and torque, from rest to rest.
+r"""Execution times for a joint path, from rest to rest, within the limits of velocity, acceleration and torque.
 
 Along a path q(s) with the path parameter s and the speed :math:`\dot s`, all limits are linear in :math:`b = \dot s^2`
 and :math:`a = \ddot s`:
@@ -6,9 +6,10 @@ and :math:`a = \ddot s`:
 .. math:: |q'| \sqrt b \le \dot q_{max}, \qquad |q' a + q'' b| \le \ddot q_{max}, \qquad
           |M q'\,a + (M q'' + C(q, q') q')\,b + g| \le \tau_{max}
 
-A pass from the end to the start finds the largest b at each sample from which the rest of the path can still be
-executed; a pass from the start then takes the largest a at each sample (Pham and Pham, "A new approach to time-optimal
-path parameterization based on reachability analysis", IEEE T-RO 34(3), 2018).
+A first pass, from the end to the start, finds for each sample the largest b with which the rest of the path can still
+be executed. A second pass, from the start to the end, takes the largest possible a at each sample. The method is that
+of Pham and Pham, "A new approach to time-optimal path parameterization based on reachability analysis", IEEE T-RO
+34(3), 2018.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ class Timing:
 
     Attributes:
         times: time of each sample, from 0, shape (n,) [s].
-        blocked: index of the first sample at which a limit does not allow any motion; -1 if there is none.
-        joint: the joint of this limit; -1 if there is none.
+        blocked: index of the first sample at which a limit does not allow any motion; -1 if there is no such sample.
+        joint: index of the joint whose torque limit does not allow any motion; -1 if there is no such joint.
     """
 
     times: Array
@@ -49,8 +50,8 @@ def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array) -> 
     Args:
         arm: the arm with its tool.
         joints: joint positions at the samples, shape (n, n_joints) [rad].
-        parameters: path parameter s of each sample, increasing, shape (n,) [s]. At speed 1 it is the time.
-        fastest: largest speed of s at each sample, shape (n,).
+        parameters: path parameter s of each sample, increasing, shape (n,) [s]. At a speed of 1, s is the time.
+        fastest: largest allowed speed of s at each sample, shape (n,).
     """
     first = np.gradient(joints, parameters, axis=0)
     second = np.gradient(first, parameters, axis=0)
@@ -80,7 +81,7 @@ def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array) -> 
 
 
 def _limits(arm: ArmModel, joints: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
-    """Return coefficients of ``of_a * a + of_b * b <= bound`` at each sample, each of shape (n, m)."""
+    """Return the coefficients of m limits ``of_a * a + of_b * b <= bound`` at each sample, each of shape (n, m)."""
     of_a, of_b, room = [first], [second], [np.broadcast_to(_ACCELERATION * arm.max_acceleration, first.shape)]
     upper, lower = list(room), list(room)
     if np.isfinite(arm.max_torque).any() and arm.has_dynamics:
@@ -109,7 +110,7 @@ def _interval(of_a: Array, of_b: Array, bound: Array, b: float) -> tuple[float, 
 
 
 def _largest(of_a: Array, of_b: Array, bound: Array, most: float, step: float, after: float) -> float:
-    """Return the largest b, at most ``most``, from which some a leads to a next b between 0 and ``after``."""
+    """Return the largest b up to ``most`` for which an allowed a leads to a b in [0, ``after``] at the next sample."""
 
     def works(b: float) -> bool:
         low, high = _interval(of_a, of_b, bound, b)

@@ -1,14 +1,14 @@
-"""Search for a joint path on which the whole arm keeps its clearance, in the demonstrated manner, or a refusal.
+"""Search for a joint path on which the whole arm keeps its clearance, as close to the demonstration as possible.
 
-The repairs are tried in an order in which each keeps more of the demonstrated motion than the next:
+The search makes the following attempts in turn. Each attempt keeps more of the demonstrated motion than the next one:
 
-1. the tool's own detour, with the self-motion of the arm and the allowed tilt of the tool;
+1. the detour planned for the tool alone, with the self-motion of the arm and the allowed tilt of the tool;
 2. another posture of the arm at the goal;
 3. narrower components, which can bend the path more sharply;
 4. the path on another side of the obstacle, or farther away from it;
 5. another posture at the start, if the arm can reach it by a clear motion before the motion of the skill begins.
 
-If none succeeds, the answer names the link, the obstacle and the time of the best attempt.
+If no attempt succeeds, the reason names the link and the obstacle that are too close in the best attempt, and the time.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ _LEVER = 0.05  # squared influence of the components; a place with less is not m
 
 @dataclass(frozen=True, eq=False)
 class ArmSolution:
-    """The result of the search.
+    """The result of the search for a joint path.
 
     Attributes:
         plan: the plan, or the best attempt; None when the arm can't follow the path at all.
-        timing: execution times; None unless a plan is feasible.
+        timing: execution times of the plan; None if no plan is feasible.
         reason: why there is no plan; empty if there is one.
-        approach: motion from the posture of the task to the start of the plan; None if the plan starts there.
+        approach: motion from the task's start posture to the plan's first posture; None if the two are the same.
     """
 
     plan: ArmPlan | None
@@ -89,7 +89,7 @@ class Approach:
 
 @dataclass(frozen=True, eq=False)
 class ArmTask:
-    """What the arm has to do.
+    """The input of the search: the arm, its surroundings, and the limits that the plan must keep.
 
     Attributes:
         arm: the arm with its tool.
@@ -98,7 +98,7 @@ class ArmTask:
         clearance: required distance from every moving part of the arm to every obstacle [m].
         allowed: directions in which components may move.
         max_tilt: largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad].
-        allowance: part of the clearance that the safety filter does not ask for [m].
+        allowance: ``clearance`` minus the clearance that the safety filter keeps [m].
     """
 
     arm: ArmModel
@@ -111,7 +111,7 @@ class ArmTask:
 
 
 def solve(task: ArmTask, detour: Detour) -> ArmSolution:
-    """Find a joint path for a skill's path.
+    """Find a joint path that moves the tool along a skill's path and around the obstacles.
 
     Args:
         task: the arm and its surroundings.
@@ -119,7 +119,7 @@ def solve(task: ArmTask, detour: Detour) -> ArmSolution:
     """
     search = _Search(task, detour)
     if search.start.room < 0.0:
-        return ArmSolution(None, None, f"at the start {search.named(search.start)}: move the obstacle or the arm")
+        return ArmSolution(None, None, f"at the start, {search.named(search.start)}: move the obstacle or the arm")
     best: ArmPlan | None = None
     for planner, displacement, joints in search.attempts():
         plan = planner.plan(displacement, joints)
@@ -142,7 +142,7 @@ def _rank(plan: ArmPlan) -> tuple[bool, float]:
 
 
 class _Search:
-    """The attempts of one search, and what was learned from those that failed."""
+    """The attempts of one search, and the places where the failed attempts came too close."""
 
     def __init__(self, task: ArmTask, detour: Detour) -> None:
         self.task, self.detour = task, detour
@@ -166,7 +166,7 @@ class _Search:
         self._goals: list[Array] | None = None
 
     def attempts(self) -> Iterator[tuple[ArmPlanner, Array, Array]]:
-        """Yield a planner, a displacement and a joint path to begin with, in the order of the repairs."""
+        """Yield the planner, displacement and joint path with which each attempt begins, in the order given above."""
         learned, detour = self._planner(self._components), self.detour.displacement
         joints = self._followed(learned, detour, None)
         first = ArmPath.of(self.task.arm, joints)
@@ -192,7 +192,7 @@ class _Search:
         yield from self._other_starts(detour)
 
     def _other_starts(self, displacement: Array) -> Iterator[tuple[ArmPlanner, Array, Array]]:
-        """Yield joint paths that end in a clear posture at the goal, and so may start in another posture."""
+        """Yield first guesses for a joint path that ends in a clear posture and may start in another posture."""
         if self._moving:  # there is no time for an approach
             return
         planner = self._planner(self._components, free_start=True)
@@ -222,7 +222,7 @@ class _Search:
         return ArmPath.of(self.task.arm, np.linspace(start, end, n + 10))
 
     def _timed_legs(self, legs: list[ArmPath]) -> Approach | None:
-        """Return legs with execution times; the arm rests between two legs."""
+        """Return the motion along the legs with its execution times; the arm rests between two legs."""
         joints, times, now = [self.task.start[None]], [np.zeros(1)], 0.0
         for leg in legs:
             whole = np.abs(leg.joints[-1] - leg.joints[0]) / (_LEG_SPEED * self.task.arm.max_velocity)
@@ -257,9 +257,9 @@ class _Search:
         return track(self.task.arm, self.task.start, positions, self._quaternions, goal)
 
     def _goal_postures(self) -> list[Array]:
-        """Return postures with the tool at the goal in which the whole arm is clear, different from each other.
+        """Return distinct postures in which the tool is at the goal and the whole arm is clear.
 
-        Inverse kinematics from random starts finds postures at the goal; each is then changed by its self-motion.
+        Inverse kinematics from random starts finds postures at the goal. Self-motion then changes each posture.
         """
         arm, path = self.task.arm, self._components.nominal
         goal = Pose(path.positions[-1], self._quaternions[-1])
@@ -276,7 +276,7 @@ class _Search:
         return sorted(found, key=lambda q: float(np.abs(q - self.task.start).max()))[:_MOST_GOALS]
 
     def _swept(self, starts: Array, goal: Pose) -> Iterator[Array]:
-        """Yield clear postures along the self-motions through postures (k, n_joints), the nearest to them first."""
+        """Yield clear postures along the self-motions through ``starts`` (k, n_joints), the nearest postures first."""
         arm, k = self.task.arm, len(starts)
         times = np.full(k, self._times[-1])
         poses = np.tile(goal.position, (k, 1)), np.tile(goal.quaternion, (k, 1))
@@ -304,9 +304,9 @@ class _Search:
                 headings[i] = now * np.where(np.einsum("kj,kj->k", now, headings[i]) < 0.0, -1.0, 1.0)[:, None]
 
     def _sides(self, planner: ArmPlanner) -> list[tuple[Array, Array]]:
-        """Return displacements that lead the tool past the worst place on other sides, with their joint paths.
+        """Return displacements that lead the tool past the worst place on other sides, each with its joint path.
 
-        The most promising ones are those on which the arm violates its clearances least.
+        Of all displacements, those that violate the required clearances least are returned.
         """
         worst = self._worst
         if worst is None or not self.task.allowed.dimension:
@@ -334,8 +334,8 @@ class _Search:
     def timed(self, planner: ArmPlanner, plan: ArmPlan) -> tuple[ArmPlan, Timing] | None:
         """Return a plan with execution times within the limits of the arm and of the safety filter.
 
-        Among moving obstacles, other times change what is near. The plan is then made again for the new times, until it
-        keeps its clearance at the times at which it is executed; None if that does not succeed.
+        New execution times change the distances to moving obstacles. The plan is then repeated for the new times, until
+        it keeps its clearance at the times at which it is executed. If this does not succeed, the result is None.
         """
         for _ in range(_RETIMINGS):
             timing = self._timing(plan.path, self._times, planner.clock)
@@ -368,7 +368,7 @@ class _Search:
         return retimed(self.task.arm, path.joints, times, fastest)
 
     def named(self, found: ArmClearance) -> str:
-        """Return which part of the arm is how near to what."""
+        """Return a text that names the two objects that are too close and their distance, or a joint at its limit."""
         arm = self.task.arm
         if found.obstacle == JOINT_LIMIT:
             return f"joint {arm.joint_names[found.sphere]} would exceed its limit by {-found.room:.2f} rad"
@@ -390,8 +390,8 @@ class _Search:
     def refusal(self, best: ArmPlan | None) -> str:
         """Return why no plan was found."""
         if best is None:
-            return f"{self.task.arm.name} can't bring its tool along the path: move the path nearer to the arm"
-        first = "" if self._first is None else f"along the tool's path {self._placed(self._first)}; "
+            return f"{self.task.arm.name} can't move its tool along the path: move the path nearer to the arm"
+        first = "" if self._first is None else f"on the path planned for the tool alone, {self._placed(self._first)}; "
         if self._goals is not None and not self._goals:
             nearest = "" if self._goal is None else f" (in the best one, {self.named(self._goal)})"
             return (
@@ -399,8 +399,9 @@ class _Search:
                 "obstacle or the goal"
             )
         return (
-            f"no path of the whole arm was found: {first}in the best attempt {self._placed(best.clearance)}; move the "
-            "obstacle, allow a larger tilt of the tool (max_tilt), or ask for less clearance"
+            "no joint path was found on which the whole arm keeps its clearance "
+            f"({first}in the best attempt, {self._placed(best.clearance)}): move the obstacle, "
+            "allow a larger tilt of the tool (max_tilt), or require a smaller clearance"
         )
 
     def _placed(self, found: ArmClearance) -> str:
@@ -412,12 +413,12 @@ class _Search:
             return ""
         joint = f"joint {self.task.arm.joint_names[timing.joint]}" if timing.joint >= 0 else "a joint"
         return (
-            f"the weight of the arm needs more torque than {joint} has, at {self._times[timing.blocked]:.2f} s: move "
-            "the path nearer to the arm, or use a lighter tool"
+            f"at {self._times[timing.blocked]:.2f} s, {joint} has too little torque to hold the weight of the arm: "
+            "move the path nearer to the arm, or use a lighter tool"
         )
 
 
 @lru_cache(maxsize=16)
 def links_apart(arm: ArmModel) -> SelfClearance:
-    """Return the self-clearance that is planned for an arm."""
+    """Return the clearance between links that a plan keeps for this arm."""
     return SelfClearance(arm, SELF_CLEARANCE)
