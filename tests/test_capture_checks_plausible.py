@@ -293,4 +293,4 @@ def test_nobody_is_told_to_record_again_when_only_the_unit_is_wrong(tmp_path, sc
 def test_a_repeated_time_stamp_is_not_said_to_go_back():
     frames = skeletons(60)
     frames[30] = changed(frames[30], time=frames[29].time)
-    assert "it is the same" in issues(frames)["time-backwards"].message
+    assert "time stamp is the same" in issues(frames)["time-backwards"].message

@@ -106,8 +106,8 @@ def test_a_file_cut_between_two_rows_knows_how_many_there_were(saved):
         ("# version: 1", "# version: 2", "version '2'.*update imitarm"),
         ("spine_base_x", "spine_bass_x", "columns"),
         ("\n0.0,0,", "\nnan,0,", "line 10: the time is not a finite number"),
-        ("\n0.0,0,", "\n0.0,0.5,", "line 10: the person is not a whole number"),
-        ("\n0.0,0,", "\n0.0,nan,", "line 10: the person is not a whole number"),
+        ("\n0.0,0,", "\n0.0,0.5,", "line 10: the person number is not a whole number"),
+        ("\n0.0,0,", "\n0.0,nan,", "line 10: the person number is not a whole number"),
         ("\n0.0,0,2,", "\n0.0,0,7,", "line 10: a hand's state"),
         (",2\n", ",9\n", "line 10: a tracking state"),
         (",2\n", ",1.5\n", "line 10: a tracking state"),
@@ -132,7 +132,7 @@ def test_a_joint_at_infinity_is_lost_and_is_said(saved):
     assert skeleton.tracking[10] == skeleton.tracking[11] == Tracking.LOST and not skeleton.arm("right").seen
     (finding,) = recording.issues
     assert finding.code == "far-joint" and finding.frame == 2
-    assert "2 joints in 1 frames" in finding.message and "wrist_right in line 12" in finding.message
+    assert "2 joint positions in 1 frames" in finding.message and "wrist_right in line 12" in finding.message
 
 
 # --- Kinect SDK tables

@@ -21,6 +21,6 @@ SOURCES: Registry[type[SkeletonSource]] = Registry(
         "azure": "imitarm.capture.kinect:AzureKinectSource",
     },
 )
-"""All sources by name. A user selects one as ``NAME`` or ``NAME:ARGUMENT``; a file is selected by its name alone."""
+"""All sources by name. A user selects a source as ``NAME`` or ``NAME:ARGUMENT``, and a file by its name alone."""
 
 __all__ = ["SOURCES", "Arm", "HandState", "Skeleton", "SkeletonSource", "Tracking"]

@@ -79,22 +79,21 @@ _SHAPE = (len(JOINTS), 3)
 class SkeletonCamera:
     r"""A simulated skeleton camera with the errors of a real camera.
 
-    The page docs/capture.md describes how these errors were measured.
+    The page docs/capture.md describes how the errors of real cameras were measured.
 
     A joint at position x is measured at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma``
-    on each axis across the line of sight, and ``1.4 sigma`` along the line of sight. For finger tips and thumbs, both
-    standard deviations are 1.5 times as large. The slow error is a Matern process of order 3/2 over a variable u that
-    combines the time t and the path length :math:`|dx|` of the joint,
+    on each axis across the line of sight, and ``1.4 sigma`` along the line of sight. For finger tips and thumbs, the
+    standard deviations of the slow error are 1.5 times as large. The slow error is a Matern process of order 3/2 over a
+    variable u that combines the time t and the path length :math:`|dx|` of the joint,
 
     .. math:: du = dt / 5\,\mathrm{s} + |dx| / 8\,\mathrm{cm}, \qquad
               \mathrm{E}\,[c(0)\,c(u)] = \sigma^2 (1 + u)\,e^{-u},
 
-    The slow error depends on the path length, as in recordings of a Kinect v2. In these recordings, the length of a
-    bone hardly changes while the arm is at rest, but changes by 1 to 2 cm while the joint moves by 10 to 20 cm. The
-    matrix ``M`` correlates the errors of neighbouring joints, so that the length of the forearm varies less than the
-    length of the upper arm. The white noise ``n`` grows with the joint's speed. With ``sigma`` of 12 mm, the standard
-    deviation of ``n`` for elbow and wrist is 0.2 mm at rest plus 5 mm per m/s. The bias ``b`` is a constant error of
-    the elbow's depth.
+    The slow error depends on the path length because, in recordings of a Kinect v2, the length of a bone hardly changes
+    while the arm is at rest, but changes by 1 to 2 cm while a joint moves by 10 to 20 cm. The matrix ``M`` correlates
+    the errors of neighbouring joints, so that the length of the forearm varies less than the length of the upper arm.
+    The white noise ``n`` grows with the joint's speed. With ``sigma`` of 12 mm, the standard deviation of ``n`` for
+    elbow and wrist is 0.2 mm at rest plus 5 mm per m/s. The bias ``b`` is a constant error of the elbow's depth.
 
     * Timing: frames arrive at ``rate`` with ``jitter``. 3 % of the intervals between frames are twice the usual length,
       and 1 % of the frames show nobody.

@@ -224,9 +224,10 @@ def _times(view: _View) -> Iterator[RecordingIssue]:
     steps = np.diff(view.times)
     if (steps <= 0.0).any():
         i = int(np.argmax(steps <= 0.0)) + 1
-        message = f"in {int((steps <= 0.0).sum())} frames, the time stamp is not later than in the previous frame; "
-        back = 1e3 * float(-steps.min())
-        message += f"it goes back by up to {back:.0f} ms" if back > 0.0 else "it is the same"
+        count, back = int((steps <= 0.0).sum()), 1e3 * float(-steps.min())
+        message = f"in {count} frames, the time stamp is the same as in the previous frame"
+        if back > 0.0:
+            message = f"in {count} frames, the time stamp is up to {back:.0f} ms earlier than in the previous frame"
         yield view.issue("error", "time-backwards", message, "repair drops these frames", i)
     if len(view.times) < _FEW:
         yield view.issue("error", "few-frames", f"{len(view.times)} frames only", "record for longer")
@@ -240,11 +241,15 @@ def _rate(view: _View) -> Iterator[RecordingIssue]:
     if rate > PLAUSIBLE_RATE[1]:
         speed = view.hand_speed
         quick = speed > _QUICK_HAND
-        message += ", more than a skeleton camera delivers"
-        message += f"; the hands move at up to {speed:.1f} m/s" if quick else ""
+        message = f"{rate:.1f} frames per second are more than a skeleton camera delivers"
+        if quick:
+            message = f"{message}; at this frame rate, the hands move at up to {speed:.1f} m/s"
         yield view.issue("error" if quick else "warning", "frame-rate", message, view.unit_remedy())
     elif rate < _LOW_RATE[1]:
-        message += "; a robot that follows this recording would brake between two frames"
+        message = (
+            f"{rate:.1f} frames per second are too few: "
+            "a robot that follows this recording would brake between two frames"
+        )
         fits = time_unit_that_fits(rate, view.time_unit) is not None
         remedy = view.unit_remedy() if fits else "use a faster camera or computer; 30 frames per second are usual"
         yield view.issue("error", "frame-rate", message, remedy)
@@ -276,8 +281,10 @@ def _gaps(view: _View) -> Iterator[RecordingIssue]:
     if long.any():
         i = int(np.argmax(steps))
         stops = int((steps > _STOP).sum())
-        message = f"{int(long.sum())} gaps between frames, the longest {steps[i]:.2f} s; {stops} of them are longer "
-        message += f"than {_STOP:g} s, after which a robot stops"
+        message = (
+            f"{int(long.sum())} gaps between frames, the longest {steps[i]:.2f} s; "
+            f"{stops} of the gaps are longer than {_STOP:g} s, the time after which a robot stops"
+        )
         yield view.issue("warning", "gap", message, "cut the recording there with trim, or record again", i)
 
 
@@ -290,7 +297,11 @@ def _frozen(view: _View) -> Iterator[RecordingIssue]:
         if lasting:
             longest, first = max(lasting)
             message = f"the positions of the {what} are exactly the same for {longest:.2f} s"
-            message += f", and at {len(lasting) - 1} other times" if len(lasting) > 1 else ""
+            if len(lasting) > 1:
+                message = (
+                    f"in {len(lasting)} periods, the positions of the {what} are exactly the same; "
+                    f"the longest period lasts {longest:.2f} s"
+                )
             remedy = "repair drops these frames, which leaves a gap; record again if you need the motion in the gap"
             yield view.issue("error" if longest > _STOP else "warning", "frozen", message, remedy, first)
             return
@@ -309,8 +320,10 @@ def _spikes(view: _View) -> Iterator[RecordingIssue]:
     if spikes.any():
         frames = np.flatnonzero(spikes.any(axis=1))
         i, joint = divmod(int(np.argmax(size)), len(joints))
-        message = f"spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints jump away and "
-        message += f"back, by at most {size[i, joint]:.2f} m ({JOINTS[joints[joint]]})"
+        message = (
+            f"spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints jump away and "
+            f"back, by at most {size[i, joint]:.2f} m ({JOINTS[joints[joint]]})"
+        )
         remedy = "repair marks these joints as lost in these frames"
         severity = _severity_of(joints, spikes)
         yield view.issue(severity, "spike", message, remedy, int(view.later[frames[0]]))
@@ -326,8 +339,11 @@ def _jumps(view: _View) -> Iterator[RecordingIssue]:
         size = np.where(jump, step[:, joints], 0.0)
         i, joint = divmod(int(np.argmax(size)), len(joints))
         count = int(jump.any(axis=1).sum())
-        message = f"{count} jump{'' if count == 1 else 's'} without return, the largest of {size[i, joint]:.2f} m from "
-        message += f"one frame to the next ({JOINTS[joints[joint]]}, {speed[i, joints[joint]]:.0f} m/s)"
+        message = (
+            f"{count} jump{'' if count == 1 else 's'} after which the joint does not return; the largest is "
+            f"{size[i, joint]:.2f} m from one frame to the next "
+            f"({JOINTS[joints[joint]]}, {speed[i, joints[joint]]:.0f} m/s)"
+        )
         remedy = "cut the recording there with trim, or record again"
         first = int(np.argmax(jump.any(axis=1))) + 1
         yield view.issue("warning", "jump", message, remedy, int(view.later[first]))
@@ -365,8 +381,10 @@ def _arm(view: _View) -> Iterator[RecordingIssue]:
 def _hand(view: _View) -> Iterator[RecordingIssue]:
     lost = view.confidence[:, [2, 4, 5]].min(axis=1) < 1.0
     if lost.mean() > _HAND_LOST:
-        message = f"wrist, hand tip and thumb are not all tracked in {100 * lost.mean():.0f} % of the frames; the tool "
-        message += "will not rotate with the hand in these frames"
+        message = (
+            f"wrist, hand tip and thumb are not all tracked in {100 * lost.mean():.0f} % of the frames; "
+            "in these frames, the tool will not rotate with the hand"
+        )
         yield view.issue("note", "hand-lost", message, "use orientation 'fixed', or spread the thumb while recording")
 
 
@@ -395,7 +413,9 @@ def _limbs(view: _View) -> Iterator[RecordingIssue]:
 def _sides(view: _View) -> Iterator[RecordingIssue]:
     if view.swapped:
         message = f"left and right are swapped in {len(view.swapped)} frames"
-        yield view.issue("warning", "sides-swapped", message, "repair swaps them back", view.swapped[0])
+        yield view.issue(
+            "warning", "sides-swapped", message, "repair swaps left and right back in these frames", view.swapped[0]
+        )
     if view.other_axes is not None:
         return
     across = view.positions[:, JOINT["shoulder_right"], 0] - view.positions[:, JOINT["shoulder_left"], 0]
@@ -403,9 +423,9 @@ def _sides(view: _View) -> Iterator[RecordingIssue]:
     turned = seen & (across < 0.0)
     if seen.any() and turned.sum() > max(_TURNED * seen.sum(), len(view.swapped)):
         message = (
-            f"the left shoulder is where the right one should be in {100 * turned.sum() / seen.sum():.0f} % of the "
+            f"in {100 * turned.sum() / seen.sum():.0f} % of the frames, the left shoulder is where the right shoulder "
+            "should be: the person faces away from the sensor, or the image is mirrored"
         )
-        message += "frames: the person faces away from the sensor, or the image is mirrored"
         yield view.issue(
             "warning", "turned-away", message, "face the sensor, and do not mirror the image", int(np.argmax(turned))
         )

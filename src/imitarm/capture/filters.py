@@ -23,10 +23,10 @@ class PersonFilter(SkeletonSource):
     """Selects one person from a source that may deliver several persons.
 
     The filter follows the first person who appears, and ignores everybody else. The filter follows another person only
-    after the first person has been out of view for more than ``patience`` on the source's clock. After that time, every
-    retargeter has stopped, and starts again with the next person. A camera that tracks only one person at a time may
-    give the next person the same number. The filter therefore also ignores a person who appears farther away than the
-    followed person can have walked.
+    after the first person has been out of view for more than ``patience`` on the source's clock. When the filter
+    selects another person, every retargeter has already stopped, and starts again with the new person. A camera that
+    tracks only one person at a time may give two successive persons the same number. The filter therefore also ignores
+    a person who appears at a position that the followed person cannot have reached by walking.
 
     Args:
         source: the source to filter.
@@ -152,14 +152,16 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     Let :math:`l, r` be the positions of a left and a right joint, and :math:`l', r'` their positions in the previous
     frame, a time t earlier.
 
-    Left and right are swapped back if this shortens the motion by more than the limbs can have moved in this time:
+    Left and right are swapped back if the swap shortens the motion since the previous frame by more than the limbs can
+    have moved in the time t, which gives the inequality
 
     .. math:: \sum_j |l_j - l'_j| + |r_j - r'_j| > \sum_j |l_j - r'_j| + |r_j - l'_j| + n\,\max(0.15, v t)
 
-    summed over the n pairs of joints that are visible in both frames. First, the inequality for shoulders and hips (v =
-    0.5 m/s) decides whether the whole body is swapped back. Then, the inequality for the hands, with or without the
-    elbows (v = 4 m/s), decides whether only the arms are swapped back. Hands that touch are too close to each other to
-    satisfy the inequality, so they are not swapped. If one joint of a pair is lost, only the other joint is used.
+    The sums run over the n pairs of joints that are visible in both frames. The inequality is first evaluated for
+    shoulders and hips, with v = 0.5 m/s; if it holds, the whole body is swapped back. The inequality is then evaluated
+    for the hands with and without the elbows, with v = 4 m/s; if it holds, only the arms are swapped back. Hands that
+    touch are too close to each other to satisfy the inequality, so they are not swapped. If one joint of a pair is
+    lost, only the other joint is used.
 
     Args:
         skeleton: skeleton as the camera reports it.

@@ -149,7 +149,8 @@ def _persons(table: Table, content: bytes) -> list[int]:
     """Return the person numbers as integers, because the Kinect SDK's body numbers are too large for a float."""
     lines = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n")
     fields = [lines[line - 1].split(b",")[1].strip() for line in table.lines]
-    _refuse(table, np.array([_WHOLE.fullmatch(field) is None for field in fields]), "the person is not a whole number")
+    bad = np.array([_WHOLE.fullmatch(field) is None for field in fields])
+    _refuse(table, bad, "the person number is not a whole number")
     return [int(field) for field in fields]
 
 
@@ -239,7 +240,7 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
         return []
     frame = int(np.argmax(far.any(axis=1)))
     message = (
-        f"{int(far.sum())} joints in {int(far.any(axis=1).sum())} frames are not finite or more than "
+        f"{int(far.sum())} joint positions in {int(far.any(axis=1).sum())} frames are not finite or more than "
         f"{FARTHEST:.0f} m away; the first is {JOINTS[int(np.argmax(far[frame]))]} in line {int(table.lines[frame])}; "
         "these joints count as lost"
     )
@@ -265,9 +266,9 @@ def is_motion_capture(head: bytes) -> bool:
 def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read a motion capture of an arm with :meth:`MotionCapture.load`, and add a synthetic body to the arm.
 
-    The right arm is the captured arm with its measured bone lengths, and is marked as tracked. The rest of the body was
-    not captured, and is marked as inferred. The rest belongs to an average person who stands upright in front of a
-    sensor.
+    The right arm is the captured arm with its measured bone lengths, and is marked as tracked. The rest of the body,
+    which was not captured, is that of an average person who stands upright in front of a sensor. This synthetic part of
+    the body is marked as inferred.
 
     Args:
         path: path of the file.

@@ -27,7 +27,7 @@ _LONGEST_WAIT = 0.5  # [s] for one call of the driver, so that Ctrl-C is noticed
 
 
 class BodyCamera(SkeletonSource):
-    """A camera whose driver delivers frames of all bodies in view.
+    """A camera whose driver delivers, in each frame, all bodies in view.
 
     Attributes:
         name: name for messages.
@@ -127,9 +127,9 @@ _V2_START = 10.0  # [s] within which the first frame must come: a cold camera ta
 class KinectV2Source(BodyCamera):
     """Skeletons of all persons in front of a Kinect v2, with the states of their hands.
 
-    The SDK defines the coordinate frame and the joints; they are those of :class:`~imitarm.capture.skeleton.Skeleton`.
-    A hand state is used only when the SDK reports high confidence in it; otherwise the state is unknown. Times are on
-    the sensor's clock.
+    The coordinate frame and the joints of the SDK are those of :class:`~imitarm.capture.skeleton.Skeleton`. A hand
+    state is used only when the SDK reports high confidence in it; otherwise the state is unknown. Times are on the
+    sensor's clock.
 
     This class was written from the documentation of `kinect-next` 3.0 and has not been tested with a real camera.
 
@@ -257,7 +257,7 @@ class AzureKinectSource(BodyCamera):
         self._tracker = self._call_driver("start body tracking", driver.start_body_tracker)
 
     def _call_driver(self, what: str, call: Callable[[], Any]) -> Any:
-        """Call the driver, and raise an error where it would print a message and end the program."""
+        """Call the driver; where the driver would print a message and end the program, raise an error instead."""
         said = io.StringIO()
         try:
             with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
@@ -290,7 +290,7 @@ class AzureKinectSource(BodyCamera):
             result = self._k4abt.k4abt_tracker_enqueue_capture(self._tracker.handle(), capture, wait)
         finally:
             self._k4a.k4a_capture_release(capture)
-        self._pending = self._came(result, "hand an image to body tracking")
+        self._pending = self._came(result, "pass an image to body tracking")
         return self._pending
 
     def _came(self, result: int, what: str) -> bool:

@@ -295,7 +295,7 @@ class MediaPipeSource(SkeletonSource):
         return None
 
     def _due(self, time: float, until: float) -> bool:
-        """Wait until a skeleton is due in real time; return False if this time is later than ``until``."""
+        """Wait until a skeleton is due in real time, but not longer than ``until``; return whether it is due."""
         if not self._realtime:
             return True
         if self._began == -np.inf:

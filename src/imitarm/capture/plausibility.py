@@ -48,9 +48,8 @@ def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
         rate: frame rate that results if the time stamps are in ``unit`` [Hz].
         unit: length of the unit in which the time stamps were read [s].
 
-    Returns:
-        The name of the unit, and the factor by which the times must be multiplied. The
-        result is None when no other unit gives a plausible frame rate.
+    Returns: The name of the unit, and the factor by which the times that were read must be multiplied; None when no
+        unit other than ``unit`` gives a plausible frame rate.
     """
     low, high = PLAUSIBLE_RATE
     fits = [
@@ -70,7 +69,7 @@ def length_unit_that_fits(limb: float) -> str | None:
     """Return the unit of length in which a limb has a plausible length; None when no unit fits.
 
     Args:
-        limb: length of an upper arm or a forearm as read from a file; it is not plausible in metres.
+        limb: length of an upper arm or a forearm, as read from a file, that is not plausible in metres.
     """
     low, high = PLAUSIBLE_LIMB
     fits = [name for name, unit in _LENGTH_UNITS.items() if low <= limb * unit <= high]
@@ -126,7 +125,7 @@ def _mean(points: Array) -> Array:
 
 
 def _median(points: Array) -> Array:
-    """Return the median over the frames that contain no nan, shape (3,); nan when all frames contain nan."""
+    """Return the median position over the frames in which it is known, shape (3,); nan if it is never known."""
     known = points[np.isfinite(points).all(axis=1)]
     return np.median(known, axis=0) if len(known) else np.full(3, np.nan)
 
@@ -162,8 +161,7 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
         positions: shape (n, 25, 3) [m].
         spikes: whether each joint is in a spike, shape (n, 25).
 
-    Returns:
-        The speed; nan when neither hand is visible at 10 or more positions.
+    Returns: The speed; nan when fewer than 10 speeds can be computed for each hand.
     """
     speeds = []
     for wrist in (JOINT[f"wrist_{side}"] for side in SIDES):

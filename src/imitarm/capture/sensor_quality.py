@@ -233,7 +233,7 @@ def wrist_difference(one: SkeletonRecording, other: SkeletonRecording) -> float:
 def _describe(recording: SkeletonRecording, images: int, seconds: float, swaps: int) -> str:
     lines = [
         f"{recording.name}: {images} images, {len(recording)} with a person, {images / seconds:.0f} images per second, "
-        f"left and right swapped back in {swaps}"
+        f"left and right swapped back in {swaps} images"
     ]
     noise = measure_noise(recording.skeletons).in_motion if len(recording) >= _LEAST_COMMON else None
     for side in SIDES:

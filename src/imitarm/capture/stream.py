@@ -83,8 +83,8 @@ class Arrival(NamedTuple):
 
     Attributes:
         waited: time between exposure and sending [s].
-        queued: time between sending and receiving [s]. If another machine sent the skeleton, the shortest such time of
-            the last one to two minutes is subtracted.
+        queued: time between sending and receiving [s]; for a sender on another machine, relative to the shortest time
+            of the last one to two minutes.
         received_ns: time of receiving, on this machine's clock [ns].
     """
 
@@ -98,8 +98,8 @@ class UdpSource(SkeletonSource):
 
     A :class:`~imitarm.transmission.datagram_filter.DatagramFilter` drops and counts datagrams that are late, damaged,
     hostile, or from another sender. A sender that is killed and started again is accepted after half a second of
-    silence. The times of the restarted sender are shifted so that they continue after the gap. Every retargeter stops
-    during the gap and then starts again.
+    silence. The time stamps of the restarted sender are shifted so that they continue those from before the restart.
+    Every retargeter stops while the sender is silent, and then starts again.
 
     Args:
         port: port to listen on; 0: any free port.

@@ -349,7 +349,8 @@ def fit_sensor_to_base(sensor: ArrayLike, base: ArrayLike, weights: ArrayLike | 
     spread = _spread(b)
     rms = float(np.sqrt(np.mean(residuals**2)))
     if rms > _USABLE:
-        raise InputError(_misfit(k, b, c, rms))
+        error = f"sensor calibration: the average error is {100 * rms:.0f} cm"
+        raise InputError(f"{error}; {_misfit(k, b, c, rms)}")
     sigma = math.sqrt(float(np.sum(residuals**2)) / max(3 * len(k) - 6, 1))
     lever = math.sqrt(len(k) * float(spread[1] ** 2 + spread[2] ** 2))
     return SensorFit(
@@ -422,17 +423,12 @@ def _suspect(k: Array, b: Array, c: Array, rms: float) -> int | None:
 
 def _misfit(k: Array, b: Array, c: Array, rms: float) -> str:
     """Return the most likely reason why no rigid motion maps one set of points to the other."""
-    text = f"sensor calibration: the average error is {100 * rms:.0f} cm; "
     ratio = float(np.linalg.norm(b - b.mean(axis=0)) / np.linalg.norm(k - k.mean(axis=0)))
     if _rms(k * [-1.0, 1.0, 1.0], b, c) < 0.5 * rms:
-        return text + "one of the frames is mirrored: reverse the sensor's x axis (is its image mirrored?)"
+        return "one of the frames is mirrored: reverse the sensor's x axis (is its image mirrored?)"
     if not 0.67 < ratio < 1.5 and _rms(ratio * k, b, c) < 0.5 * rms:
-        return (
-            text + f"the robot's points are {ratio:.3g} times as far apart as the sensor's points: give both in metres"
-        )
+        return f"the robot's points are {ratio:.3g} times as far apart as the sensor's points: give both in metres"
     suspect = _suspect(k, b, c, rms)
     if suspect is not None:
-        return text + f"point {suspect + 1} does not fit the others: touch it again, or leave it out"
-    return (
-        text + "the points of sensor and robot are not the same points in the same order: touch them again one by one"
-    )
+        return f"point {suspect + 1} does not fit the others: touch it again, or leave it out"
+    return "the points of sensor and robot are not the same points in the same order: touch them again one by one"

@@ -66,7 +66,7 @@ class Correspondence:
         object.__setattr__(self, "scale", scale)
 
     def engage(self, wrist: ArrayLike, hand: Array, tool_to_base: Pose) -> Clutch:
-        """Return the clutch of an engagement that begins at these poses.
+        """Return the clutch of an engagement that begins with the given poses of hand and tool.
 
         Args:
             wrist: wrist position in the base frame, shape (3,) [m].
@@ -82,9 +82,9 @@ class Clutch:
 
     Attributes:
         correspondence: correspondence between the person's arm and the robot's.
-        wrist: wrist position in the base frame at that time, shape (3,) [m].
-        hand: hand rotation in the base frame at that time, quaternion wxyz, shape (4,).
-        home: pose of the tool in the base frame at that time.
+        wrist: wrist position in the base frame when the robot began to follow, shape (3,) [m].
+        hand: hand rotation in the base frame when the robot began to follow, quaternion wxyz, shape (4,).
+        home: pose of the tool in the base frame when the robot began to follow.
     """
 
     correspondence: Correspondence

@@ -75,11 +75,13 @@ class EngagementRule:
 class Engagement:
     """Decides, in each control period, whether the robot follows the person.
 
-    ::
+    The state changes as follows:
 
-        WAITING --(seen for 0.5 s)--> FOLLOWING --(lost)--> COASTING --> HOLDING --> STOPPED --> WAITING
-                                          ^                    |            |
-                                          +------(seen again)--+------------+
+    * From ``WAITING`` to ``FOLLOWING``: the camera has seen the arm for 0.5 s.
+    * From ``FOLLOWING`` to ``COASTING``, ``HOLDING`` and ``STOPPED``, one after another: the arm stays lost.
+    * From ``COASTING`` or ``HOLDING`` back to ``FOLLOWING``: the camera sees the arm again.
+    * From ``STOPPED`` to ``WAITING``: the robot is at rest, and the camera sees the arm again.
+
 
     Args:
         correspondence: correspondence between the person's arm and the robot's.

@@ -124,7 +124,7 @@ class _Search:
         return float(np.linalg.norm(self._tips - self._tips.mean(axis=0), axis=1).max())
 
     def centres(self) -> Iterator[tuple[Array, Array]]:
-        """Yield positions (3,) [m] for the motion's middle, nearest to home first, each with a posture close to it."""
+        """Yield positions (3,) [m] for the middle of the motion, nearest to home first, each with a posture near it."""
         for shift in _NEAR_HOME:
             yield self.home.position + shift, self.arm.home
         if self._far is None:  # the same for all scales
@@ -132,7 +132,7 @@ class _Search:
         yield from self._far
 
     def start(self, centre: Array, near: Array, begin: Array, outermost: Array) -> Array | None:
-        """Return a posture in which the motion can begin, shape (n_joints,); None if part of it is out of reach.
+        """Return a start posture of the motion, shape (n_joints,); None if part of the motion is out of reach.
 
         Args:
             centre: centre of the motion, shape (3,) [m].

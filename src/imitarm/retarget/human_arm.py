@@ -53,8 +53,8 @@ def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike,
         d: distance along the previous z axis [m].
         a: distance along the new x axis [m].
         alpha: angle about the new x axis [rad].
-        as_printed: whether to use the second row of the matrix as printed in the thesis, with sin instead of cos. The
-            rotational part of the transform is then no rotation.
+        as_printed: whether to use the second row of the matrix as printed in the thesis, with sin instead of cos, so
+            that the rotational part of the transform is not a rotation.
 
     Returns:
         shape (..., 4, 4).
@@ -82,7 +82,7 @@ def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: boo
     Args:
         angles: joint angles, shape (7,) [rad].
         lengths: lengths of this person.
-        as_printed: whether to use the matrices as printed in the thesis; their rotational parts are then no rotations.
+        as_printed: whether to use the matrices as printed in the thesis, whose rotational parts are not rotations.
 
     Returns:
         The transforms of frames 0 to 7, shape (8, 4, 4); frame 0 is the shoulder's frame.
@@ -232,7 +232,8 @@ def carried(rotation: Array | None, before: Array | None, after: Array) -> Array
         after: unit vector along the forearm now, shape (3,).
 
     Returns:
-        shape (3, 3): ``rotation``, rotated by the smallest rotation that takes ``before`` to ``after``.
+        The new rotation of the hand, shape (3, 3): ``rotation`` after the smallest rotation that takes ``before`` to
+            ``after``.
     """
     if rotation is None or before is None:
         side = _cross(np.array([0.0, 0.0, 1.0]), after)

@@ -139,14 +139,14 @@ def correct_limbs(
 def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds: int = 3) -> Array:
     r"""Move shoulder, elbow and wrist as little as possible so that the bones have their true lengths.
 
-    The function minimises the sum of the squared displacements, weighted by the confidences :math:`c_j`. The result is
-    the most likely arm if every point is measured with an error.
+    The function minimises the sum of the squared displacements, weighted by the confidences :math:`c_j`. If the
+    measurement errors of the points are independent and Gaussian, the result is the most likely posture of the arm.
 
     .. math:: \min \sum_j c_j |x_j - \tilde x_j|^2 \quad\text{s.t.}\quad |E - S| = L_U,\; |W - E| = L_F
 
-    A few Gauss-Newton steps solve this problem. Each step solves a 2 x 2 system of equations for the Lagrange
-    multipliers. :func:`correct_limbs` is the special case in which the shoulder is assumed to be exact and only the
-    directions of the bones are used. The special case transfers the errors of shoulder and elbow to the wrist.
+    A few Gauss-Newton steps solve this minimisation problem. Each step solves a 2 x 2 system of equations for the
+    Lagrange multipliers. :func:`correct_limbs` is the special case in which the shoulder is assumed to be exact and
+    only the directions of the bones are used, so the errors of shoulder and elbow are transferred to the wrist.
 
     Args:
         points: shoulder, elbow, wrist, shape (3, 3) [m].

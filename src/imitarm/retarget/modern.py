@@ -53,16 +53,16 @@ class ModernRetargeter(Retargeter):
        :math:`\tau` = 50 ms;
     2. compute the tool's target and the twist towards it, :math:`K \log(T_d T^{-1})`, plus a fraction of the hand's
        velocity (feed-forward);
-    3. solve a quadratic programme for the joint velocities. The tasks of the programme are the twist of the tool and
-       the elbow's SEW angle (shoulder-elbow-wrist). The constraints of the programme are the joint limits of position,
-       velocity and acceleration, the distances of the links to each other and to the scene, and bounds that keep elbow
-       and wrist away from their singularities. While the robot follows nobody, it is at rest;
+    3. solve a quadratic programme for the joint velocities. The quadratic programme has two tasks: the twist of the
+       tool and the elbow's SEW angle (shoulder-elbow-wrist). The constraints of the programme are the joint limits of
+       position, velocity and acceleration, the distances of the links to each other and to the scene, and bounds that
+       keep elbow and wrist away from their singularities. While the robot follows nobody, it is at rest;
     4. limit the jerk of the joints (:class:`JerkLimiter`) and check all limits again. If something blocks the arm, the
        arm does not push harder, and the target stays near the blocked tool.
 
-    From the time when the robot begins to follow, its desired elbow angle changes by as much as the person's elbow
-    angle: :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of the elbow task decreases when the camera sees
-    the person's elbow poorly, and when the person's or the robot's arm is nearly straight.
+    Since the robot began to follow, its desired elbow angle :math:`\psi_d` has changed by as much as the person's elbow
+    angle :math:`\psi_h`, so :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of the elbow task decreases when
+    the camera sees the person's elbow poorly, and when the person's or the robot's arm is nearly straight.
 
     When the camera loses the person, the robot continues along the extrapolated motion for 0.1 s, then holds its
     target, and stops 0.3 s after the loss. Once the person has been seen again for half a second, the motion restarts
@@ -76,9 +76,9 @@ class ModernRetargeter(Retargeter):
         gain: gain K of the twist towards the target [1/s].
         lead: fraction of the hand's velocity that is fed forward, 0 to 1.
         rotation_length: position error [m] that counts as much as a rotation error of one radian about the base's x, y
-            and z axes; used when the joints can't achieve both position and rotation. None: 0.1 m when the tool rotates
-            with the hand, because a camera measures this rotation poorly; 0.3 m when the tool keeps its rotation; when
-            the tool stays upright, 0.2 m about x and y (tilt) and 0.05 m about z.
+            and z axes; used when the joints can't achieve both position and rotation. None: a value that depends on the
+            orientation of the correspondence. It is 0.1 m for ``"hand"``, because a camera measures the hand's rotation
+            poorly; 0.3 m for ``"fixed"``; and for ``"upright"`` 0.2 m about x and y (tilt) and 0.05 m about z.
         elbow: weight of the elbow task relative to the tool's task [m^2]; 0: the elbow is free.
         clearance: required distance between the arm and the obstacles [m].
         own_clearance: required distance between the arm's own links [m]; None: not checked.
@@ -259,7 +259,7 @@ class ModernRetargeter(Retargeter):
 
 
 class JerkLimiter:
-    r"""Follows a reference of the joints with limited position, velocity, acceleration and jerk.
+    r"""Makes the joints follow a reference, and limits their position, velocity, acceleration and jerk.
 
     The limiter is a critically damped follower with feed-forward, whose acceleration is :math:`a_d = \omega^2 (q_r - q)
     + 2\omega (v_r - v)` for a reference with position :math:`q_r` and velocity :math:`v_r`. The acceleration is clipped
@@ -272,13 +272,14 @@ class JerkLimiter:
 
     If D' is negative, the bound is :math:`2 D'/dt` instead.
 
-    A joint that satisfies this bound once can satisfy it in all later steps by braking with a_max. Near a position
-    limit, clipping to this velocity may exceed the jerk limit, but the limits of position, velocity and acceleration
-    are always kept.
+    A joint whose velocity is at most :math:`v_b` in one step can keep to this bound in all later steps by braking with
+    a_max. Near a position limit, clipping the velocity to :math:`v_b` may exceed the jerk limit, but the limits of
+    position, velocity and acceleration are always kept.
 
     A blocked arm falls behind its commands, and its drives push harder as the error grows. The command of a joint
     therefore brakes when it is ahead of the measured position by more than half of ``max_lead``, as if ``max_lead``
-    were an additional position limit. The command may exceed this limit by the braking distance.
+    were an additional position limit. While the command brakes, it may exceed half of ``max_lead`` by the braking
+    distance.
 
     Args:
         arm: arm model that provides the joint limits.
@@ -286,9 +287,9 @@ class JerkLimiter:
         frequency: natural frequency omega of the follower [rad/s]; must be well below 1/dt.
         rise_time: shortest time in which the acceleration rises from 0 to a_max [s]; the jerk limit is j = a_max /
             rise_time.
-        max_lead: largest distance by which a command may be ahead of the measured position [rad]. Half of this value
-            must exceed the distance that a joint moves at full speed within the robot's delay; otherwise, the limit
-            slows the joints down.
+        max_lead: largest distance by which a command may be ahead of the measured position [rad]. Half of ``max_lead``
+            must exceed the distance that a joint moves at full speed within the robot's delay; otherwise, the joints
+            are slowed down.
 
     Raises:
         InputError: when a number is out of range.

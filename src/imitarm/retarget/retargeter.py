@@ -76,7 +76,7 @@ class Retargeter(ABC):
 
     :meth:`start` defines the posture in which the robot begins at rest. :meth:`step` is then called once per control
     period ``dt`` with the skeleton that arrived since the last call, or None. Cameras deliver 30 frames per second, but
-    a robot takes 100 commands per second, so most calls get None.
+    a robot takes 100 commands per second, so most calls receive None instead of a skeleton.
 
     Every control step has four parts, which are the same for all methods:
 
@@ -281,7 +281,7 @@ class Retargeter(ABC):
     def _velocity_at(self, before: Array, after: Array) -> Array:
         """Return the joint velocities at the end of this period, shape (n_joints,) [rad/s].
 
-        The default is the mean velocity over the period.
+        The default implementation returns the mean velocity over the period.
         """
         return (after - before) / self.dt
 

@@ -41,10 +41,10 @@ class OneEuro:
     .. math:: \hat x \leftarrow \hat x + \alpha(f_c)\,(x - \hat x), \qquad f_c = f_{min} + \beta\,|\hat{\dot x}|
 
     The speed is the norm of the whole velocity vector, so the filter acts equally in all directions. The velocity is
-    computed from the difference of two successive measured values. The original filter uses the difference between a
-    measured value and the previous smoothed value. During steady motion, the difference of the original filter contains
-    the filter's own lag and is too large, so predictions from the velocity would be wrong. The weight :math:`\alpha` of
-    a value is multiplied by the value's confidence.
+    computed from the difference of two successive measured values. The original filter instead uses the difference
+    between a measured value and the previous smoothed value. During steady motion, smoothed values lag behind measured
+    values, so this difference would give a velocity that is too large for predictions. The weight :math:`\alpha` of a
+    value is multiplied by the value's confidence.
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].
@@ -217,16 +217,16 @@ class TrackingOffsets:
     r"""Compensates for the jumps that occur when a joint changes between tracked and inferred.
 
     When a joint is hidden, a camera infers its position. The error of the inferred position is several times larger
-    than the error of the tracked position. The jump from the last tracked to the first inferred position is mostly due
-    to this change of the error, as is the jump back to the first tracked position. Therefore, when a joint becomes
-    inferred, an offset o from the measured position :math:`\tilde x` is chosen so that the motion continues,
+    than the error of the tracked position. When the tracking state changes, the measured position jumps, mostly because
+    of the error of the inferred position. Therefore, when a joint becomes inferred, an offset o from the measured
+    position :math:`\tilde x` is chosen so that the motion continues,
 
     .. math:: o = x_p + v\,\Delta t - \tilde x, \qquad x = \tilde x + o
 
     where x is the compensated position, :math:`x_p` the previous compensated position, v the velocity and :math:`\Delta
-    t` the time step. While the joint is inferred, the offset is constant, so only the changes of the measured position
-    have an effect. When the joint is tracked again, a new offset is chosen in the same way. While the joint is tracked,
-    the offset decays with time and with the distance :math:`|\Delta x|` that the joint moves,
+    t` the time step. While the joint is inferred, the offset is constant, so the compensated position changes by as
+    much as the measured position. When the joint is tracked again, a new offset is chosen in the same way. While the
+    joint is tracked, the offset decays with time and with the distance :math:`|\Delta x|` that the joint moves,
 
     .. math:: o \leftarrow o\,\exp(-\Delta t / T - |\Delta x| / L).
 

@@ -28,8 +28,8 @@ _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 def now_ns() -> int:
     """Return the current time [ns] of a monotonic clock that all processes of this machine share.
 
-    If the operating system allows it, the clock keeps running while the machine is suspended. If the clock stopped,
-    every datagram that this machine sends after a suspension would look delayed to its receiver.
+    If the operating system allows it, the clock keeps running while the machine is suspended. If the clock stopped
+    during a suspension, every datagram that the machine sends afterwards would look delayed to its receiver.
     """
     return time.clock_gettime_ns(_CLOCK) if _CLOCK is not None else time.monotonic_ns()
 

@@ -73,9 +73,9 @@ class ClockOffsetEstimator:
 
     * Two datagrams that arrive later have an earlier time stamp, although a sender's clock never goes back.
     * Three datagrams that arrive later, over a period of at least ``max_age``, are fresh relative to the confirmed
-      minimum, and three datagrams had supported this minimum before the sample arrived. The second rule applies only
-      while at most four samples are unconfirmed, because a larger number of unconfirmed samples comes from a queue of
-      delayed datagrams.
+      minimum, and three datagrams had supported this minimum before the sample arrived. The rejection by three
+      datagrams applies only while at most four samples are unconfirmed, because a larger number of unconfirmed samples
+      comes from a queue of delayed datagrams.
 
     Args:
         max_age: longest accepted delay [ns].
@@ -97,7 +97,7 @@ class ClockOffsetEstimator:
     def too_early(self, offset: int, sent: int, now: int) -> bool:
         """Return whether a time stamp lies more than ``10 * max_age`` in the future.
 
-        The sample of such a datagram is used only if the next datagram has a still later time stamp.
+        The sample of a datagram from the future is used only if the next datagram has a still later time stamp.
 
         Args:
             offset: time of receiving minus time stamp [ns].
@@ -144,7 +144,7 @@ class ClockOffsetEstimator:
             self._confirmed[0] = min(self._confirmed[0], self._unconfirmed.pop().offset)
 
     def _reject_false(self, sent: int, now: int, *, fresh: bool) -> None:
-        """Count a datagram as evidence against the unconfirmed samples, and drop those that are proved false."""
+        """Count a datagram as evidence against the unconfirmed samples, and drop the samples that are proved false."""
         few, kept = len(self._unconfirmed) <= _MAX_REJECTED, []
         for one in self._unconfirmed:
             one.contradictions += sent < one.sent
@@ -279,7 +279,7 @@ class DatagramFilter:
         return ""
 
     def _wrong_order(self, header: Header, offset: int, now: int) -> str:
-        """Return why the datagram cannot follow the last accepted datagram; empty if it can."""
+        """Return the reason why the datagram cannot follow the last accepted datagram; an empty text if it can."""
         if self._last_sequence is None:
             return ""
         step = (header.sequence - self._last_sequence) & _MASK

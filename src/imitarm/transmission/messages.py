@@ -101,7 +101,7 @@ class JointCommand:
     Attributes:
         mode: kind of command.
         q: commanded joint positions, shape (n_joints,) [rad]; at most 16 joints.
-        velocity: joint velocities with which the arm should pass these positions, shape (n_joints,) [rad/s].
+        velocity: joint velocities with which the arm should pass the positions ``q``, shape (n_joints,) [rad/s].
         arm: fingerprint of the arm model for which the command was computed.
         challenge: for ENABLE, the challenge number that the stopped robot sent; otherwise 0.
         opening: commanded opening of the gripper [m], at most 1 m; None: leave it unchanged.

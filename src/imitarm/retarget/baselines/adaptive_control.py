@@ -38,8 +38,8 @@ _GRIP = 0.2  # [s] in which the closure follows a closing hand
 class JointPlant:
     """A MuJoCo simulation of a robot arm that a joint controller moves; it includes gravity, but no contacts.
 
-    The simulation includes rotor inertia, viscous damping and dry friction of the joints. ``ArmModel`` does not include
-    these effects, so a controller that uses an ``ArmModel`` does not account for them.
+    The simulation includes rotor inertia, viscous damping and dry friction of the joints. ``ArmModel`` includes neither
+    rotor inertia nor friction, so a controller that uses an ``ArmModel`` does not account for them.
 
     Args:
         arm: arm model to simulate.
@@ -197,7 +197,7 @@ class AdaptiveLaw:
         return Torques(torque, np.clip(torque, -self.arm.max_torque, self.arm.max_torque))
 
     def _coriolis(self, q: Array, velocity: Array, along: Array) -> Array:
-        """Return the product of C(q, velocity) and ``along``, shape (n_joints,) [N m]."""
+        """Return the product of the matrix C(q, velocity) and the vector ``along``, shape (n_joints,) [N m]."""
         rest = np.zeros_like(q)
         gravity = self.arm.gravity_torque(q)
 

@@ -79,7 +79,7 @@ class DemonstratedMotion:
     def at(self, where: Array) -> DemonstratedMotion:
         """Return the motion interpolated at fractional sample numbers, shape (m,).
 
-        The closer together these numbers are, the slower the motion becomes.
+        The closer together the sample numbers are, the slower the motion becomes.
         """
         n = np.arange(len(self))
         near = tuple(self.closed[int(i)] for i in np.clip(where.astype(int), 0, len(self) - 1))
@@ -101,7 +101,7 @@ class DemonstratedMotion:
 def engagements(
     frames: Iterable[Skeleton], correspondence: Correspondence, rule: EngagementRule
 ) -> Iterator[tuple[ArmEstimate, ...]]:
-    """For each engagement in a recording, yield the list of its estimates, at least two.
+    """For each engagement in a recording, yield the estimates of the arm (at least two).
 
     Args:
         frames: frames in order of time.
@@ -185,11 +185,11 @@ class FeasibilityCheck:
             )
 
     def reasons(self, joints: Array) -> dict[str, Mask]:
-        """Return, for each condition, which samples of joints (n, n_joints) [rad] violate it, shape (n,) bool."""
+        """For each condition, return a mask (n,) of the samples in ``joints`` (n, n_joints) [rad] that violate it."""
         return {"speed": self.too_fast(joints), **self.postures(joints)}
 
     def anywhere(self, joints: Array) -> Mask:
-        """Return which samples of joints (n, n_joints) [rad] violate any condition, shape (n,) bool."""
+        """Return a mask (n,) of the samples in ``joints`` (n, n_joints) [rad] that violate any condition."""
         return np.asarray(np.any(list(self.reasons(joints).values()), axis=0))
 
     def too_fast(self, joints: Array) -> Mask:
@@ -205,7 +205,7 @@ class FeasibilityCheck:
         return np.asarray(np.abs(np.diff(joints, axis=0)) / (self.dt * self.arm.max_velocity))
 
     def postures(self, joints: Array) -> dict[str, Mask]:
-        """Return, for each condition on a single posture, which samples violate it, shape (n,) bool."""
+        """For each condition on a single posture, return a mask (n,) of the samples that violate it."""
         jacobians = np.array([self.arm.tool_jacobian(q) for q in joints]).reshape(-1, 6, self.arm.n_joints)
         found: dict[str, Mask] = {
             "limits": self.outside(joints),
@@ -238,10 +238,10 @@ class FeasibilityCheck:
 def stretch(joints: Array) -> Array:
     r"""Return the stretch of a person's arm, shape (n,), for joint positions of the robot (n, n_joints) [rad].
 
-    The stretch is the distance from shoulder to wrist divided by the length of the straight arm. For a person's arm
-    at these joint angles, with upper arm and forearm of equal length, the stretch is :math:`|\cos(q_3/2)|`. (Sawyer's
-    upper arm and forearm are 0.412 and 0.411 m long.) The distance from shoulder to wrist of the robot itself is not
-    used. Because of the offsets between the links, this distance is largest when the elbow is bent.
+    The stretch is the distance from shoulder to wrist divided by the length of the straight arm. For a person's arm at
+    these joint angles, with upper arm and forearm of equal length, the stretch is :math:`|\cos(q_3/2)|`. Sawyer's upper
+    arm and forearm have almost equal lengths (0.412 and 0.411 m). The distance from the robot's own shoulder to its
+    wrist is not used, because the offsets between the links make this distance largest when the elbow is bent.
     """
     return np.asarray(np.abs(np.cos(0.5 * joints[:, ELBOW])))
 
@@ -262,7 +262,7 @@ def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
 def blend(found: Mask, first: int, past: int, dt: float) -> Array:
     """Return the weight of a correction for each sample of a segment, shape (past - first,).
 
-    The weight is 1 where the correction is needed, and falls to 0 within 0.2 s before and after that.
+    The weight is 1 at the samples that need the correction, and falls to 0 within 0.2 s before and after them.
     """
     at = np.arange(first, past)
     needed = at[found[first:past]]

@@ -73,8 +73,8 @@ class DemonstrationModification(BaselineRetargeter):
 
     The method combines two published ideas. Argall's advice operators correct a segment of an execution according to a
     teacher's advice. Mueller et al. 2018 annotate constraints and replace key frames that violate them. The paper that
-    the thesis cites is about policies of a mobile robot. We therefore designed corrections for an arm, and a program
-    that replaces the teacher.
+    the thesis cites is about policies of a mobile robot. We therefore designed corrections for an arm, which a program
+    selects instead of a teacher.
 
     The method is offline. :meth:`run` processes the whole recording in four steps:
 
@@ -171,7 +171,7 @@ class DemonstrationModification(BaselineRetargeter):
         """Retarget a whole recording and correct the motion; ``notes`` counts the changes.
 
         If the motion is slowed down, the result is longer than the recording; ``shown_times`` contains the time at
-        which the person showed each sample. The targets are slowed down together with the motion. The other corrections
+        which the person showed each sample. Slowing the motion down also slows its targets down; the other corrections
         do not change the targets.
 
         Args:
@@ -220,7 +220,8 @@ class DemonstrationModification(BaselineRetargeter):
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
         """Append the times at which the person showed the newest steps to ``shown_times``.
 
-        Steps in which the robot waits before the motion get evenly spaced times, at most the first of ``shown``.
+        While the robot waits before the motion, the appended times are evenly spaced, but never later than the first
+        time in ``shown``.
         """
         rest = len(steps) - len(self._shown_times) - len(shown)
         begin = float(self._shown_times[-1]) if len(self._shown_times) else -self.dt
@@ -261,7 +262,7 @@ class DemonstrationModification(BaselineRetargeter):
 def slowed(
     motion: DemonstratedMotion, first: int, past: int, weight: Array, factor: float
 ) -> tuple[DemonstratedMotion, int]:
-    r"""Slow a segment of a motion down: each sample takes :math:`1 + w\,(s - 1)` times as long.
+    r"""Slow down a segment of a motion: each sample takes :math:`1 + w\,(s - 1)` times as long.
 
     Args:
         motion: motion whose joints have been mapped to the robot.
@@ -284,9 +285,10 @@ def slowed(
 def pull(points: Array, joints: Array) -> Array:
     r"""Return the factor :math:`\kappa` by which to shorten the distance from shoulder to wrist, shape (n,).
 
-    With this factor, the stretch is at most 78/80. If the elbow angles of robot and person are equal, :math:`\kappa =
-    \frac{78}{80} L / |W - S|`, where L is the length of the straight arm. In a relative mapping, the two elbow angles
-    can differ. The person's elbow is then bent further by the angle that the robot's elbow needs to reach this stretch.
+    The factor limits the stretch of the robot's arm to 78/80. If the elbow angles of robot and person are equal,
+    :math:`\kappa = \frac{78}{80} L / |W - S|`, where L is the length of the straight arm. In a relative mapping, the
+    elbow angles of robot and person can differ. The person's elbow is then bent further by the angle by which the
+    robot's elbow must bend to reach a stretch of 78/80.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
@@ -309,7 +311,7 @@ def pulled_in(points: Array, kappa: Array) -> Array:
         kappa: factor :math:`\kappa` of each sample, at most 1, shape (n,).
 
     Returns:
-        shape (n, 3, 3) [m]; the bones keep their lengths.
+        The changed points, shape (n, 3, 3) [m]; the bones keep their lengths.
     """
     s, e, w = np.moveaxis(points, 1, 0)
     upper, fore = _length(e - s), _length(w - e)
@@ -334,7 +336,7 @@ def elbow_rotated(points: Array, angle: Array) -> Array:
         angle: angle of rotation of each sample, shape (n,) [rad].
 
     Returns:
-        shape (n, 3, 3) [m]; the bones keep their lengths.
+        The changed points, shape (n, 3, 3) [m]; the bones keep their lengths.
     """
     s, e, w = np.moveaxis(points, 1, 0)
     axis = (w - s) / np.maximum(_length(w - s), 1e-9)[:, None]
@@ -356,10 +358,10 @@ def repaired(
 ) -> tuple[Array, int]:
     r"""Repair the key frames of a segment (after Mueller et al. 2018), and interpolate between them by a cubic spline.
 
-    A segment has five key frames. A key frame that is already feasible is kept. For every other key frame, a normal
+    A segment has five key frames. A key frame that is already feasible is kept. For each infeasible key frame, a normal
     distribution :math:`N(\mu_k, \Sigma_k)` is fitted to the joint positions around it, and up to 500 random postures
-    are drawn from this distribution until one is feasible. If none is feasible, the key frame becomes :math:`\mu_k`,
-    clipped to the joint ranges.
+    are drawn from this distribution until one is feasible. If none of the postures is feasible, the key frame becomes
+    :math:`\mu_k`, clipped to the joint ranges.
 
     Args:
         joints: joint positions of the whole motion, shape (n, n_joints) [rad].
@@ -488,7 +490,7 @@ class SegmentCorrector:
     def _mapped(
         self, name: str, motion: DemonstratedMotion, first: int, past: int
     ) -> Iterator[tuple[str, DemonstratedMotion, int]]:
-        """Map the joints of a segment again, and yield the motion if every tenth sample of the segment is feasible."""
+        """Map the joints of a segment again; yield the motion only if every tenth sample of the segment is feasible."""
         before = motion.joints[max(first - 1, 0)]
         self._mapping.resume(before)
         for i in range(first, past, _STRIDE):

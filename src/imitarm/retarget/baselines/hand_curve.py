@@ -33,8 +33,8 @@ _RESTART = 0.25  # [s] a source whose clock jumps by more has restarted
 class RotationCurve:
     r"""A smooth curve of rotations, :math:`R(t) = R_0 \exp(c(t))`, where c is a :class:`NURBS` of rotation vectors.
 
-    Roll, pitch and yaw wrap around and have singularities. Rotation vectors relative to a mean rotation have neither
-    problem for angles below 360 degrees.
+    Roll, pitch and yaw wrap around and have singularities. Rotation vectors relative to a mean rotation neither wrap
+    around nor have singularities for angles below 360 degrees.
 
     Attributes:
         reference: reference rotation :math:`R_0`, quaternion wxyz, shape (4,).

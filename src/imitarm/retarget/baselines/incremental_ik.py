@@ -31,9 +31,9 @@ class IncrementalIK(BaselineRetargeter):
 
     where :math:`\Delta x_d` is the displacement of the target since the last frame, and e the error relative to the
     target of the last frame. The displacement is spread evenly over the control steps of one frame. The pseudo-inverse
-    is not damped. Without damping, even the smallest singular value is inverted, so the displacement grows without
-    bound near the edge of the workspace. Each joint is then limited to its velocity limit and to its range. These
-    limits change the direction of the tool's motion. In ``notes``, ``"capped_steps"`` counts the control steps in which
+    is not damped. Without damping, even the smallest singular value is inverted, so the joint displacement grows
+    without bound near the edge of the workspace. Each joint is then limited to its velocity limit and to its range,
+    which changes the direction of the tool's motion. In ``notes``, ``"capped_steps"`` counts the control steps in which
     a velocity limit was active, and ``"caps"`` counts the limited joints in all of these steps.
 
     The movement primitives of the cited paper are left out. Movement primitives belong to the learned skill and can be

@@ -31,20 +31,21 @@ class JointMapping:
     r"""Maps the seven angles of a person's arm to seven robot joints with the same order of axes.
 
     When a person's arm is stretched forward, its joints rotate about z, y, x, y, x, y, x
-    (:mod:`imitarm.retarget.human_arm`). Sawyer's joints have the same axes when all joint positions are zero. The
-    Panda's joints have these axes, some in the opposite direction, when its second joint is at a right angle. Let
-    :math:`q^*` be the posture in which the robot's joints have these axes, :math:`\sigma_i = \pm 1` the directions of
-    its joints, and :math:`\theta_i` the person's angles. The mapping is
+    (:mod:`imitarm.retarget.human_arm`). Sawyer's joints have the same axes as a person's arm when all joint positions
+    are zero. The Panda's joints have the axes of a person's arm, some in the opposite direction, when the Panda's
+    second joint is at a right angle. Let :math:`q^*` be the posture in which the robot's joints have the axes of a
+    person's arm, :math:`\sigma_i = \pm 1` the directions of its joints, and :math:`\theta_i` the person's angles. The
+    mapping is
 
     .. math:: q_i = q^*_i + \sigma_i\,\theta_i \quad\text{(absolute)}, \qquad
               q_i = q_{i,0} + \sigma_i\,(\theta_i - \theta_{i,0}) \quad\text{(relative)},
 
     where :math:`q_{i,0}` and :math:`\theta_{i,0}` are the joint positions of robot and person when the robot began to
-    follow the person. The two equations determine only the first four joints (shoulder and elbow). The last three
-    joints are computed in closed form from the desired rotation of the tool. The desired rotation is the hand's
-    rotation if the mapping is absolute and the orientation of the correspondence is ``"hand"``; otherwise, it is the
-    rotation of the clutch's target. Like every mapping of joints, this mapping does not use link lengths, so the tool
-    and the hand are at different positions.
+    follow the person. The equations of both mappings determine only the first four joints (shoulder and elbow). The
+    last three joints are computed in closed form from the desired rotation of the tool. The tool's desired rotation is
+    the hand's rotation if the mapping is absolute and the orientation of the correspondence is ``"hand"``; otherwise,
+    it is the rotation of the clutch's target. Like every mapping of joints, this mapping does not use link lengths, so
+    the tool and the hand are at different positions.
 
     The angles are continuous from frame to frame, without jumps by 360 degrees. An angle that is undefined keeps its
     value.
@@ -75,7 +76,10 @@ class JointMapping:
         self._origin: tuple[Array, Array] | None = None  # robot's joints and person's angles when engaged
 
     def resume(self, q: Array) -> None:
-        """Continue at joint positions ``q`` (7,) [rad] with the same reference, to map a part of a motion again."""
+        """Continue at joint positions ``q``, shape (7,) [rad], to map a part of a motion again.
+
+        A relative mapping keeps the joint positions at which the robot began to follow the person.
+        """
         self._q = np.array(q, dtype=float)
         if self._origin is not None:
             q0, theta0 = self._from
@@ -96,7 +100,7 @@ class JointMapping:
 
     @property
     def _from(self) -> tuple[Array, Array]:
-        """The last joint positions of the robot, and the person's angles that correspond to them."""
+        """The joint positions of robot and person from which the mapping measures the changes of the angles."""
         if self.relative and self._origin is not None:
             return self._origin
         return self.zero, np.zeros(7)
@@ -168,12 +172,12 @@ class Approach:
 
 
 def continued(angles: Array, before: Array) -> Array:
-    """Add multiples of 360 degrees so that each angle is as close as possible to the previous one, (n,) [rad]."""
+    """Add multiples of 360 degrees to angles (n,) [rad], so that each is as close as possible to its previous value."""
     return np.asarray(before + (angles - before + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def _whole_turn_inside(angles: Array, lower: Array, upper: Array) -> Array:
-    """Shift each angle that is beyond its limits by 360 degrees if this brings it within its limits, (n,) [rad]."""
+    """Shift an angle beyond its limits by 360 degrees if it is then within its limits; all angles (n,) [rad]."""
     turned = angles - 2.0 * np.pi * np.sign(angles)
     helps = ((angles < lower) | (angles > upper)) & (turned >= lower) & (turned <= upper)
     return np.where(helps, turned, angles)

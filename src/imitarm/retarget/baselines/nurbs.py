@@ -36,11 +36,11 @@ def basis_functions(knots: Array, degree: int, u: ArrayLike) -> tuple[Indices, A
         + \frac{u_{i+p+1} - u}{u_{i+p+1} - u_{i+1}} N_{i+1,p-1}(u)
 
     where 0/0 = 0. The last knot span includes its right end, so that the last function is 1 at the end of the curve. At
-    every ``u``, only p + 1 functions are non-zero. The recursion computes only these functions, and for them no divisor
-    is zero.
+    every ``u``, only p + 1 functions are non-zero. The recursion computes only the non-zero functions, for which no
+    divisor is zero.
 
     Args:
-        knots: knots, non-decreasing, the first and the last repeated degree + 1 times, shape (m,).
+        knots: non-decreasing knots, shape (m,); the first and the last knot each occur degree + 1 times.
         degree: degree p of the curve.
         u: parameters, shape (k,); clipped to the range of the knots.
 
@@ -185,7 +185,7 @@ def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
 
 
 class _Problem:
-    """Data of a fit: samples, basis functions, and those parts of the normal equations that need no confidence."""
+    """Data of a fit: samples, basis functions, and the parts of the normal equations without confidences."""
 
     def __init__(self, first: Indices, values: Array, points: Array, rows: Array) -> None:
         self.first, self.values, self.points, self.rows = first, values, points, rows
@@ -255,7 +255,7 @@ def fit_nurbs(
         robust: whether to reduce the weight of samples that are farther than 2.5 sigma from the curve (Huber weights),
             in three passes.
         rational: whether to fit the weights w too, which are then between 0.2 and 5 with mean 1; otherwise, all weights
-            are 1. Fitted weights are needed only for exact arcs.
+            are 1. Fitted weights are needed only for exact circular arcs.
 
     Raises:
         InputError: when shapes do not match, times do not increase, fewer than p + 1 samples have a confidence above 0,
@@ -332,7 +332,7 @@ def _check_options(smoothing: Smoothing, sigma: float | None) -> None:
 def bends(knots: Array, degree: int) -> Array:
     r"""Return the second differences D of the control points, shape (n - 2, 3); row j acts on points j, j+1, j+2.
 
-    Each control point corresponds to a parameter, the mean of p knots :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`.
+    Each control point corresponds to the parameter :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`, the mean of p knots.
     The parameters :math:`g_j` are denser near the ends of the curve. Near the ends, plain differences :math:`P_{j+1} -
     2 P_j + P_{j-1}` would not vanish for a straight uniform motion, so a fit would slow this motion down. The second
     differences are therefore divided differences,
@@ -429,7 +429,7 @@ def _rational_weights(problem: _Problem, confidence: Array, mu: float) -> Array:
 
     Let :math:`W_k` be the denominator of the curve at sample k with the previous weights. The cost :math:`\sum_k
     \frac{c_k}{W_k^2} |\sum_i N_i X_i - Q_k \sum_i N_i w_i|^2` with :math:`X_i = w_i P_i` is quadratic in X and w. X is
-    eliminated. If several weights w are equally good, the function returns the weights closest to 1.
+    eliminated. If the cost has several minima, the function returns the weights closest to 1.
     """
     n = problem.n_control
     basis = np.zeros((len(problem.first), n))

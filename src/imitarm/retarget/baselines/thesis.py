@@ -163,7 +163,7 @@ def _unit(vector: Array) -> Array:
 def _nearest_rotation(matrix: Array) -> Array:
     """Return the rotation closest to ``matrix``.
 
-    As the product of the printed matrices, ``matrix`` itself is not a rotation.
+    ``matrix`` is a product of matrices as printed in the thesis, and therefore is not a rotation itself.
     """
     left, values, right = np.linalg.svd(matrix)
     if values[1] < 1e-9:  # almost no direction is left
@@ -185,10 +185,10 @@ class ThesisRetargeter(Retargeter):
        :class:`~imitarm.retarget.baselines.hand_curve.DelayedCurve`).
 
     In each control step, the tool moves towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
-    3.9). The length of every step is limited, because the damping would otherwise stop the arm. Joint positions and
-    velocities stay within their limits. Like the thesis, the method does not handle accelerations, the elbow, obstacles
-    or tracking losses. When the person is lost, the target therefore stays where it is, and jumps when the person
-    returns.
+    3.9). The length of every step is limited, because the damping of a long step would stop the arm. Joint positions
+    and velocities stay within their limits. Like the thesis, the method does not handle accelerations, the elbow,
+    obstacles or tracking losses. When the person is lost, the target therefore stays where it is, and jumps when the
+    person returns.
 
     Args:
         arm: the robot's arm with its tool.
@@ -197,8 +197,8 @@ class ThesisRetargeter(Retargeter):
         scene: ignored.
         small_angle: None: damping as in Eq 3.9; ``"thesis"``: damping with the small-angle term that the thesis prints
             after Eq 3.9.
-        as_printed: names of the misprints in :data:`PRINTED` to reproduce; True: all misprints. The arm stays within
-            its limits in any case.
+        as_printed: names of the misprints in :data:`PRINTED` to reproduce; True: all misprints. With any of the
+            misprints, the arm stays within its limits.
         smoothing: ``"live"``: a curve is fitted to the last 0.6 s; ``"global"``: :meth:`run` fits one curve to the
             whole recording, without lag, but :meth:`step` uses a live curve; None: no curve.
         lag: time by which the evaluated point of the live curve lies in the past [s].
