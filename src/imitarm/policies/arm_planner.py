@@ -27,8 +27,8 @@ from scipy.interpolate import BSpline, make_interp_spline
 from imitarm.kinematics.arm_path import ArmPath, right_inverses, self_motions
 from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply
 from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles, ArmClearance, Gaps
-from imitarm.policies.component_path import STILL, ComponentPath
-from imitarm.policies.least_detour import SMOOTHNESS, UNBOUNDED, AllowedDirections, style_scale
+from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.least_detour import UNBOUNDED, AllowedDirections, style_scale
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -47,6 +47,7 @@ _LONGEST_STEP = 0.5  # [rad] of a joint in one round
 _NEAR_LIMIT, _LIMIT_MARGIN = 0.3, 0.01  # [rad] from a joint's limit: it has a row there; it stays this far away
 _FAST = 0.7  # times its limit: a joint that is faster has a row that keeps it within the limit, if possible
 _CALM, _CALMING = 1.05, 4  # speed that is fast enough; rounds in which a clear plan is made slower
+_NEGLIGIBLE = 2e-4  # [m] a component that would move less than this stays exactly where it is
 _SLACK_SCALE = 1e-3  # [m] of missing clearance costs as much as one demonstrated sigma, where rows contradict
 _MOST_ROWS = 500
 _SOLVED = 1  # daqp's exit flag of an optimal solution
@@ -110,6 +111,7 @@ class ArmPlanner:
         quaternions: learned rotations of the tool at the samples, tool_to_base, shape (n, 4).
         max_tilt: largest rotation away from the learned rotation at each sample, shape (n,) [rad].
         allowed: directions in which components may move.
+        smoothness: weight of the squared jerk of the displacement (see ``style_scale``).
         free_start: whether the self-motion may change the posture at the start.
 
     Attributes:
@@ -126,6 +128,7 @@ class ArmPlanner:
         max_tilt: Array,
         allowed: AllowedDirections,
         *,
+        smoothness: float = 0.0,
         free_start: bool = False,
     ) -> None:
         self.around, self.arm, self.components, self.free_start = around, around.arm, components, free_start
@@ -136,7 +139,7 @@ class ArmPlanner:
         self.coarse = np.unique(np.append(np.arange(0, n, _STRIDE), n - 1))
         self._tilts = splines(self.times, _TILTS, first=False, last=False)
         self._selves = splines(self.times, _SELF_MOTIONS, first=free_start, last=True)
-        self._scale = style_scale(components, allowed, np.arange(components.n_components), SMOOTHNESS)
+        self._scale = style_scale(components, allowed, np.arange(components.n_components), smoothness)
 
     @property
     def n_tilts(self) -> int:
@@ -354,7 +357,7 @@ class _Local:
         """Return displacement, tilt and self-motion for a solution."""
         n, n_tilts = scale.shape[1], 3 * self.planner.n_tilts
         moved = allowed.enforced((scale @ y[:n]).reshape(-1, allowed.dimension))
-        moved[np.einsum("kd,kd->k", moved, moved) < STILL**2] = 0.0
+        moved[np.einsum("kd,kd->k", moved, moved) < _NEGLIGIBLE**2] = 0.0
         tilt = (_TILT_SIGMA * y[n : n + n_tilts]).reshape(-1, 3)
         return moved, tilt, y[n + n_tilts :].reshape(self.planner._selves.shape[1], -1)
 

@@ -30,7 +30,7 @@ from imitarm.kinematics.pose import Pose
 from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles, ArmClearance
 from imitarm.policies.arm_planner import JOINT_LIMIT, ArmPlan, ArmPlanner
 from imitarm.policies.component_path import ComponentPath
-from imitarm.policies.least_detour import AllowedDirections, Detour
+from imitarm.policies.least_detour import SMOOTHNESS, AllowedDirections, Detour
 from imitarm.policies.retiming import Timing, retimed
 from imitarm.scene.clearance import SelfClearance
 from imitarm.scene.scene import Scene
@@ -182,7 +182,7 @@ class _Search:
             if self._at_goal():
                 yield from self._other_starts(detour)
                 return
-        narrow = self._planner(self._components.divided)
+        narrow = self._planner(self._components.divided, smoothness=SMOOTHNESS)
         away = learned.components.basis @ detour
         same: Array = np.asarray(np.linalg.lstsq(narrow.components.basis, away, rcond=1e-6)[0], dtype=np.float64)
         yield narrow, same, self._followed(narrow, same, None)
@@ -245,9 +245,16 @@ class _Search:
         last = len(self._times) - 1
         return worst is not None and worst.obstacle != JOINT_LIMIT and worst.sample >= (1.0 - _AHEAD) * last
 
-    def _planner(self, components: ComponentPath, *, free_start: bool = False) -> ArmPlanner:
-        tilt, allowed = self.task.max_tilt, self.task.allowed
-        return ArmPlanner(self._around, components, self._quaternions, tilt, allowed, free_start=free_start)
+    def _planner(self, components: ComponentPath, *, smoothness: float = 0.0, free_start: bool = False) -> ArmPlanner:
+        return ArmPlanner(
+            self._around,
+            components,
+            self._quaternions,
+            self.task.max_tilt,
+            self.task.allowed,
+            smoothness=smoothness,
+            free_start=free_start,
+        )
 
     def _followed(self, planner: ArmPlanner, displacement: Array, goal: Array | None) -> Array:
         tilt = np.zeros((planner.n_tilts, 3))
