@@ -50,7 +50,12 @@ def test_a_recording_becomes_a_demonstration_within_the_limits(shown, tmp_path, 
     out = tmp_path / "demo.csv"
     assert run(shown, "--out", out, "--task", "reach") == 0
     printed = capsys.readouterr().out
-    for words in ("following", "tool to its own target, RMS [mm]", "beyond a limit of acceleration", f"wrote {out}"):
+    for words in (
+        "following",
+        "RMS distance of the tool to its own target [mm]",
+        "a joint exceeds an acceleration limit",
+        f"wrote {out}",
+    ):
         assert words in printed
     demo = Demonstration.load(out)
     assert demo.task == "reach" and demo.joint_names == ARM.joint_names
@@ -108,8 +113,8 @@ def test_all_methods_side_by_side(shown, tmp_path, capsys, monkeypatch):
 def test_a_made_up_person_is_a_source_and_is_measured_against_the_truth(tmp_path, capsys):
     assert run("synthetic:1", "--seconds", 4, "--robot", "panda") == 0
     printed = capsys.readouterr()
-    assert "tool to the true hand, RMS" in printed.out and "on panda" in printed.out
-    row = next(line for line in printed.out.splitlines() if "tool to the true hand, RMS" in line)
+    assert "RMS distance of the tool to the true hand" in printed.out and "on panda" in printed.out
+    row = next(line for line in printed.out.splitlines() if "RMS distance of the tool to the true hand" in line)
     assert float(row.split("│")[2]) < 120.0
 
 
@@ -136,7 +141,7 @@ def test_with_fit_a_motion_that_is_too_large_is_made_smaller(shown, tmp_path, ca
     assert "instead of 6.00, so that the whole motion is within reach" in printed.err
     assert "slowed to 20 % of its speed" in printed.err
     assert Demonstration.load(tmp_path / "a.csv").trajectory.duration > 20.0
-    row = next(line for line in printed.out.splitlines() if "tool to its own target" in line)
+    row = next(line for line in printed.out.splitlines() if "RMS distance of the tool to its own target" in line)
     assert float(row.split("│")[2]) < 40.0
 
 

@@ -74,8 +74,8 @@ def test_a_recording_leads_a_simulated_robot(person, tmp_path, capfd):
     for part in (
         "the source has ended",
         "following",
-        "largest use of the limits",
-        "no safe motion was found in 0 steps",
+        "highest values relative to the limits",
+        "no safe motion was found",
         "median [ms]",
         "total",
         "wrote",

@@ -89,6 +89,6 @@ def test_a_row_that_is_broken_is_named(tmp_path, sawyer):
     lines = (tmp_path / "a.csv").read_text().splitlines()
     lines[4] = lines[4].replace(lines[4].split(",")[2], "nan")
     (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
-    with pytest.raises(FileFormatError, match="line 5 holds a number that is not finite"):
+    with pytest.raises(FileFormatError, match="line 5: the row holds a number that is not finite"):
         read(tmp_path / "a.csv", arm=sawyer)
     assert len(read(tmp_path / "a.csv", arm=sawyer, repair=True)[0]) == 79

@@ -101,9 +101,12 @@ def test_options_that_can_not_be(tmp_path, options, error, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t[[0, 1, 3, 2, 4, 5]], r"line 5 is not later than the previous row; fix .*repair=True"),
-        (lambda t: np.where(np.arange(6)[:, None] == 2, np.nan, t), "line 4 holds a number that is not finite"),
-        (lambda t: t * [1, np.inf, 1, 1], "line 2 holds a number that is not finite"),
+        (lambda t: t[[0, 1, 3, 2, 4, 5]], r"line 5: the time is not later than in the previous row; fix .*repair=True"),
+        (
+            lambda t: np.where(np.arange(6)[:, None] == 2, np.nan, t),
+            "line 4: the row holds a number that is not finite",
+        ),
+        (lambda t: t * [1, np.inf, 1, 1], "line 2: the row holds a number that is not finite"),
         (lambda t: t * [1, 1e9, 1, 1], r"line 2: no robot reaches the position"),
         (lambda t: t[:1], "1 rows|of 1 rows"),
     ],

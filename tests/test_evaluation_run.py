@@ -26,7 +26,7 @@ GOOD = TargetTracking("modern", 0.01, 0.0, 0.0, 0.03, 1, 0.95, 0)
         (
             {},
             True,
-            "modern: follows its target, 10 mm from it (RMS), farther than 5 cm for 0 % of the time; the "
+            "modern: follows its target (RMS distance 10 mm, farther than 5 cm for 0 % of the time); the "
             "person controlled the robot for",
         ),
         ({"rms": FAR}, True, "follows"),

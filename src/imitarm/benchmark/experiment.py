@@ -138,7 +138,7 @@ class Experiment:
 
     @property
     def plan(self) -> Plan:
-        """Definition of the recording to follow; for the live task, of a stacking recording with the same seeds."""
+        """Definition of the recording to follow; the live task has a stacking recording with the same seeds."""
         kind = "stacking" if self.task == LIVE else self.task
         return Plan(kind, self.seed, self.repeat, self.seconds, self.sigma, self.data)
 
@@ -263,7 +263,7 @@ def run_stacking(
 
 
 def camera_maker(sigma: float | None) -> Callable[[int], SkeletonCamera]:
-    """Return a function that makes a camera with realistic errors from a seed; ``sigma`` [m] as in Experiment."""
+    """Return a function that makes a camera from a seed; the camera has realistic errors of ``sigma`` [m]."""
     return SkeletonCamera.from_seed if sigma is None else partial(SkeletonCamera, sigma=sigma)
 
 

@@ -238,7 +238,7 @@ def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> R
         seed: number of the scene.
         path: nominal path, shape (n, 3) [m].
         duration: duration of the path [s].
-        rotates: whether the skill rotates the tool; only then may the tool have spheres away from the tip.
+        rotates: whether the skill rotates the tool. If False, the tool has no spheres away from the tip.
     """
     rng = np.random.default_rng([31, seed])
     family = RANDOM_FAMILIES[int(rng.choice(len(RANDOM_FAMILIES), p=[0.1, 0.1, 0.3, 0.12, 0.06, 0.06, 0.16, 0.1]))]

@@ -46,7 +46,7 @@ def _compared(results: Results, tasks: Sequence[str]) -> Iterator[tuple[Figure, 
     """Yield one comparison of ``modern`` for each measure and each other method.
 
     Each comparison consists of the measure, the name of the other method, the difference (``modern`` minus the other
-    method), and the p-value after Holm's correction for the number of methods in this measure.
+    method), and the p-value after Holm's correction for the number of other methods.
     """
     baselines = [name for name in results.methods if name != OURS and results.of(name, tasks)]
     if not results.of(OURS, tasks):
@@ -211,7 +211,7 @@ def verdict(comparisons: Sequence[Comparison], sign: float) -> str:
     """Return whether a claim holds in comparison with every baseline: "yes", "no" or "not shown".
 
     A difference counts if its interval excludes zero and its p-value, corrected for the number of baselines, is below
-    0.05. With only two persons, p can't be that small, so no claim can be confirmed.
+    0.05. With only two persons, p is never below 0.05, so no claim can be confirmed.
 
     Args:
         comparisons: comparison of the evaluated method with each baseline (method minus baseline).
@@ -228,7 +228,7 @@ def verdict(comparisons: Sequence[Comparison], sign: float) -> str:
 
 
 def _against(pairs: Sequence[tuple[str, Values, Values]], sign: float) -> Verdict:
-    """Compare Me with baselines; each entry holds a baseline's name, the values of Me, and the baseline's values."""
+    """Compare Me with baselines; ``pairs`` holds each baseline's name, the values of Me, and the baseline's values."""
     found = [(name, compare(ours, theirs)) for name, ours, theirs in pairs]
     texts = [
         f"{METHODS[name].title} {100 * c.relative:+.0f} %" if math.isfinite(c.relative) else f"{METHODS[name].title} –"

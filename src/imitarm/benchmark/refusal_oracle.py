@@ -80,7 +80,13 @@ def answer(question: Question) -> Answer:
 def is_solved(
     question: Question, axes: Array | None = None, grids_to_search: Sequence[tuple[float, float]] | None = None
 ) -> bool:
-    """Return whether a path is found and verified, with the given grids (reach and cell size [m]) or by default all."""
+    """Return whether a path is found and verified.
+
+    Args:
+        question: the scene and the path.
+        axes: orthonormal basis of the permitted displacements, shape (d, 3); None: from the question.
+        grids_to_search: reach and cell size [m] of each grid to search; None: all grids.
+    """
     axes = question.axes() if axes is None else axes
     if separation(question, question.nominal.times, question.nominal.positions) >= -1e-9:
         return True
@@ -159,7 +165,11 @@ def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Arr
 def _advanced(
     cost: Array, middle: tuple[int, ...], away: Array, longest: float, from_fixed: bool, to_fixed: bool
 ) -> Array:
-    """Return the costs of cells in the next layer; displacements stay in their cell, except next to a fixed time."""
+    """Return the cost of each cell in the next layer, reached from the previous layer.
+
+    The path keeps its cell from layer to layer. Only next to a fixed time, the path moves from the undisplaced position
+    to a cell, or back.
+    """
     if from_fixed and not to_fixed:
         return np.where(away <= longest, cost[middle] + _CHANGE_COST * away, np.inf)
     if to_fixed and not from_fixed:
@@ -193,7 +203,12 @@ def _layer(
     from_fixed: bool,
     to_fixed: bool,
 ) -> tuple[list[tuple[Array, Array]], list[Bools], Bools, Bools]:
-    """Return for one layer: distances and gradients, free moves along axes and from the layer before, free cells."""
+    """Return what the search must know about one layer.
+
+    Returns:
+        Distances and gradients at the cell centres, one pair for each obstacle and sphere; for each axis, whether the
+        move to the next cell is free; whether the move from the previous layer is free; whether each cell is free.
+    """
     shape = (side,) * d
     free, ahead = np.ones(shape, dtype=bool), np.ones(shape, dtype=bool)
     sides = [np.ones(shape, dtype=bool) for _ in range(d)]
@@ -242,8 +257,8 @@ def _keeps(need: float, f0: Array, f1: Array, slope0: Array, slope1: Array, step
     """Return whether the distance to an obstacle is proven to be at least ``need`` [m] along a step.
 
     The distance changes by at most the length of the step. If the distance at one end exceeds ``need`` by more than
-    this length, the whole step keeps the distance. If the distance at one end is below ``need``, the step does not keep
-    the distance. Only the other cases need :func:`_tangent_bound`.
+    the length of the step, the whole step keeps the distance. If the distance at one end is below ``need``, the step
+    does not keep the distance. In all other cases, :func:`_tangent_bound` decides.
 
     Args:
         need: required distance [m].
@@ -316,7 +331,7 @@ def _neighbours(
 
 
 def _fits(question: Question, axes: Array, chain: tuple[Array, Array]) -> bool:
-    """Return whether sums of components or of hat functions can follow a chain with the required clearance."""
+    """Return whether a sum of components, or of hat functions, can follow a chain and keep the required clearance."""
     times = question.nominal.times
     wanted = np.stack([np.interp(times, chain[0], column) for column in chain[1].T], axis=1)
     return any(
@@ -325,7 +340,10 @@ def _fits(question: Question, axes: Array, chain: tuple[Array, Array]) -> bool:
 
 
 def _hats(question: Question, every: int) -> Array:
-    """Return m hat functions of time (n, m), with a peak at every ``every``-th sample and near fixed times."""
+    """Return the values of m hat functions at the n samples, shape (n, m).
+
+    The hat functions have their peaks at every ``every``-th sample and near fixed times.
+    """
     times, n = question.nominal.times, len(question.nominal)
     fixed = [int(np.argmin(np.abs(times - time))) for time in question.fixed_times]
     peaks = set(range(0, n, every)) | {n - 1}
@@ -378,9 +396,9 @@ def _fit(question: Question, axes: Array, basis: Array, wanted: Array) -> bool:
 def _tangent_rows(
     question: Question, axes: Array, basis: Array, tip: Array, relative: Array, here: Array, extra: Array
 ) -> tuple[Array, Array]:
-    """Return linear constraints, rows (r, m d) and lower bounds (r,): the tangents of all small distances to obstacles.
+    """Return r linear constraints that keep the distances to obstacles: rows (r, m d) and lower bounds (r,).
 
-    The tangents are taken at ``tip + here``.
+    Each constraint is the tangent of one small distance at the path ``tip + here``.
     """
     times = question.nominal.times
     j, s = extra[:, 0].astype(int), extra[:, 1:2]
@@ -408,7 +426,8 @@ def _close_points(question: Question, times: Array, tip: Array, relative: Array,
     """Return the r places at which the path comes too close to an obstacle, shape (r, 2).
 
     On each segment between samples, 49 points are examined. If any point is too close, the closest point of the segment
-    is returned, as the index of the segment's first sample and the fraction of the segment before the point.
+    is returned. Each place is a pair: the index of the segment's first sample, and the fraction of the segment before
+    the point.
     """
     found = []
     fractions = np.linspace(0.02, 0.98, 49)[:, None, None]

@@ -114,7 +114,11 @@ class _Cells:
     counts: tuple[int, ...]
 
     def window(self, centre: Array) -> tuple[tuple[int, int], ...]:
-        """Return the range of boxes (first index, end index) along each edge within the largest displacement."""
+        """Return the boxes within the largest displacement from ``centre`` (3,) [m].
+
+        Returns:
+            The first index and the index after the last along each edge.
+        """
         low = np.floor((self.frame @ centre - MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         high = np.ceil((self.frame @ centre + MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         return tuple((max(a, 0), min(b, n)) for a, b, n in zip(low, high, self.counts, strict=True))
@@ -124,8 +128,8 @@ class _Cells:
     ) -> tuple[tuple[int, int], ...] | None:
         """Return the part of a window whose boxes fit into the bounding box of an inflated obstacle.
 
-        Every other box has a corner that, after moving by ``shift`` (3,) [m], is farther than ``need`` [m] from the
-        obstacle.
+        The boxes are moved by ``shift`` (3,) [m], and the obstacle is inflated by ``need`` [m]. Every other box has a
+        corner outside the inflated obstacle.
 
         Returns:
             The first index and the index after the last along each edge; None when no box fits.
@@ -141,7 +145,7 @@ class _Cells:
         return tuple(part)
 
     def corners(self, window: tuple[tuple[int, int], ...], centre: Array) -> Array:
-        """Return the corners (n_0 + 1, ..., 3) [m] of the boxes in a window, in the plane through ``centre``."""
+        """Return the corners of a window's boxes, in the plane through ``centre`` (3,); shape (n_0 + 1, ..., 3) [m]."""
         ticks = [
             low + size * np.arange(a, b + 1) for (a, b), low, size in zip(window, self.lowest, self.size, strict=True)
         ]
@@ -180,7 +184,7 @@ def _extent(obstacle: Obstacle, direction: Array) -> float:
 
 
 def _aligned(rotation: Array, axes: Array) -> Array:
-    """Return an orthonormal basis of the span of ``axes`` (d, 3), aligned with the rows of a rotation matrix."""
+    """Return an orthonormal basis (d, 3) of the space that ``axes`` (d, 3) span, aligned with ``rotation`` (3, 3)."""
     d = len(axes)
     inside = rotation @ axes.T @ axes
     first = inside[int(np.argmax(np.linalg.norm(inside, axis=1)))]
@@ -201,9 +205,9 @@ def is_impossible(question: Question, cells: _Cells) -> bool:
     """Return whether there is provably no path, because a flood fill of possibly free boxes can't reach the goal.
 
     A box is blocked if all of its corners are inside the same inflated obstacle. The corners suffice, because the
-    obstacle is convex. Boxes are fixed in space, so the motion of the tip does not matter. The obstacles are made
-    smaller to allow for all other motion. The other motion is that out of the permitted plane, that of spheres away
-    from the tip, and that of the obstacles.
+    obstacle is convex. Boxes are fixed in space, so the motion of the tip in the permitted plane does not matter. To
+    allow for three other motions, the obstacles are made smaller: the tip moves out of the permitted plane, spheres
+    move relative to the tip, and obstacles move.
     """
     d = len(cells.frame)
     moving = any(obstacle.velocity.any() for obstacle in question.obstacles)
@@ -253,7 +257,7 @@ def is_impossible(question: Question, cells: _Cells) -> bool:
 
 
 def _touching(cells: _Cells, window: tuple[tuple[int, int], ...], point: Array) -> Bools:
-    """Return for each box of a window whether it touches a point."""
+    """Return for each box of a window whether the box contains ``point`` (3,) [m] or touches it."""
     at = (cells.frame @ point - cells.lowest) / cells.size
     lines = [
         (np.arange(a, b) - 1e-9 <= x) & (x <= np.arange(a, b) + 1.0 + 1e-9)
@@ -266,7 +270,7 @@ def _touching(cells: _Cells, window: tuple[tuple[int, int], ...], point: Array) 
 
 
 def _shifted(values: Bools, old: tuple[tuple[int, int], ...], new: tuple[tuple[int, int], ...]) -> Bools:
-    """Return the values of boxes for another window of the grid; boxes outside the old window get False."""
+    """Copy the values of the boxes from window ``old`` to window ``new``; boxes outside the old window get False."""
     answer = np.zeros([b - a for a, b in new], dtype=bool)
     low = [max(a, c) for (a, _), (c, _) in zip(old, new, strict=True)]
     high = [min(b, e) for (_, b), (_, e) in zip(old, new, strict=True)]
@@ -284,7 +288,10 @@ def _inside(question: Question, start: float, end: float) -> Array:
 def _leftover_motion(
     question: Question, cells: _Cells, times: Array, tip: Array, relative: Array, middle: int
 ) -> Array:
-    """Return the longest relative displacement of spheres and obstacles from a sample, (n_obstacles, m) [m]."""
+    """Return how far each of m spheres moves relative to each obstacle, shape (n_obstacles, m) [m].
+
+    Displacements are measured from the sample ``middle``. Motion of the tip in the permitted plane does not count.
+    """
     out_of_plane = tip - tip @ cells.frame.T @ cells.frame
     bow = np.linalg.norm(question.spheres[:, :3], axis=1) * 1e-3 * bool(np.abs(np.diff(relative, axis=1)).max() > 0.0)
     answer = np.empty((len(question.obstacles), len(question.spheres)))
@@ -324,7 +331,7 @@ def _maybe_free(
 def _permitted(
     question: Question, cells: _Cells, window: tuple[tuple[int, int], ...], times: Array, tip: Array
 ) -> Bools:
-    """Return for each box whether displacements into it have a permitted direction at some time of an interval."""
+    """Return for each box whether the path may be displaced into the box at some time of an interval."""
     answer = np.ones([b - a for a, b in window], dtype=bool)
     corners: Array | None = None
     for f in question.forbidden:

@@ -36,11 +36,11 @@ class Place:
 
     Attributes:
         document: path of the Markdown document.
-        benchmark: name of the benchmark; its tables are between the lines ``<!-- imitarm benchmark NAME -->`` and
-            ``<!-- end -->``.
+        benchmark: name of the benchmark. In the document, its tables stand between two comment lines: one that names
+            the benchmark (:attr:`begin`), and :data:`END`.
 
     Raises:
-        InputError: when the document can't be read, or does not contain these two lines once each, in this order.
+        InputError: when the document can't be read, or does not contain the two comment lines once each, in this order.
     """
 
     document: Path
@@ -69,7 +69,7 @@ class Place:
         write_text(self.document, f"{head}{self.begin}\n{said}\n\n{body}\n{END}\n{tail}")
 
     def _parts(self) -> tuple[str, str]:
-        """Return the document before and after the tables."""
+        """Return two parts of the document: the text before the tables, and the text after them."""
         try:
             text = self.document.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:

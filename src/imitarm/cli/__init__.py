@@ -85,7 +85,7 @@ def _explained(error: BaseException) -> tuple[str, int]:
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     """Build the parser.
 
-    Only the subcommand named in ``words`` gets its arguments, so that the others are not imported.
+    Only the subcommand named in ``words`` gets its arguments, so that the modules of other commands are not imported.
     """
     parser = argparse.ArgumentParser(
         prog="imitarm",

@@ -78,10 +78,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     sensor.add_argument(
         "pairs", nargs="?", metavar="PAIRS", help=f"table of points in both frames: {', '.join(_PAIRS)} [m]"
     )
-    add_source(sensor, "--source", "guided: measure the hand with this source; ")
-    sensor.add_argument("--points", metavar="FILE", help="guided: points in the robot's base frame, x y z [m]")
+    add_source(sensor, "--source", "guided calibration: source that measures the hand; ")
     sensor.add_argument(
-        "--seconds", type=float, default=1.0, metavar="S", help="guided: measuring time for each point; default: 1"
+        "--points", metavar="FILE", help="guided calibration: file of points, x y z in the base frame [m]"
+    )
+    sensor.add_argument(
+        "--seconds",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="guided calibration: duration for each point; default: 1",
     )
     clutch = kinds.add_parser("clutch", help="choose scale and orientation; asks for values that are not given")
     add_robot_options(clutch)
@@ -259,7 +265,7 @@ def _clutch(arguments: argparse.Namespace, before: Calibration) -> Calibration:
     show_table(
         ["clutch", ""],
         [
-            ("scale", f"{scale:.2f}: 10 cm of the hand are {10 * scale:.1f} cm of the tool"),
+            ("scale", f"{scale:.2f}: when the hand moves 10 cm, the tool moves {10 * scale:.1f} cm"),
             ("orientation", _ORIENTATIONS[orientation]),
         ],
     )
@@ -322,7 +328,7 @@ def touched_points(
         only: index of the single point to touch, from 0; None: all points.
 
     Returns:
-        For the index of each point that was not skipped: position of the hand in the sensor's frame, shape (3,) [m].
+        Positions of the hand in the sensor's frame, shape (3,) [m], by index of the point; skipped points are missing.
 
     Raises:
         InputError: when the user gives up, the source has ended, or fewer than four points were measured.

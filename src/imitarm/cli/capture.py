@@ -106,8 +106,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _tell_sent(sender: SkeletonSender, address: str) -> None:
     """Print how many skeletons were sent."""
-    unheard = f"; {sender.failed} more were sent, but no program received them" if sender.failed else ""
-    remark(f"sent {sender.sent} skeletons to {address}{unheard}")
+    remark(f"sent {sender.sent} skeletons to {address}")
+    if sender.failed:
+        remark(f"sent {sender.failed} more skeletons to {address}, but no program received them")
 
 
 def _check_options(arguments: argparse.Namespace) -> None:

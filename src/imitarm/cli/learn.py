@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not quality.faithful:
         problem = f"the skill does not reproduce the motion: {quality.problem}"
         if not arguments.allow_errors:
-            raise TaskFailedError(f"nothing written: {problem}; --allow-errors writes it anyway")
+            raise TaskFailedError(f"no skill was written: {problem}; to write it anyway, use --allow-errors")
         remark(f"warning: {problem}")
     skill.save(arguments.out)
     say(f"wrote {arguments.out}")

@@ -47,9 +47,9 @@ def check_outputs(
                 raise InputError(f"{named}: is also the file of {name} and would be overwritten; name another file")
         taken.append((option, path))
         if path.exists() and not force and not (option == PAGE and _is_page(path)):
-            what = " and is not an HTML page" if option == PAGE else ""
-            remedy = "" if force is None else ", or replace it with --force"
-            raise InputError(f"{named}: already exists{what}; name another file{remedy}")
+            what = "already exists and is not an HTML page" if option == PAGE else "already exists"
+            remedy = "name another file" if force is None else "name another file, or replace it with --force"
+            raise InputError(f"{named}: {what}; {remedy}")
 
 
 def same_place(one: Path, other: Path) -> bool:

@@ -90,7 +90,7 @@ def gather(
             end.
         what: text of the progress bar, for example ``"capturing"``.
         live: whether the source runs until it is stopped.
-        total: expected duration for the progress bar if ``seconds`` is None [s]; None if unknown.
+        total: expected duration of the source [s], for the progress bar; unused if ``seconds`` is given; None: unknown.
         on_skeleton: function called with each skeleton.
 
     Returns:

@@ -98,7 +98,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     follow.add_argument(
         "--orientation",
         choices=get_args(Orientation),
-        help="how the tool rotates: with the hand, about the vertical, or not; default: as calibrated, else upright",
+        help="rotation of the tool: like the hand, only about the vertical axis, or none; default: as calibrated, else "
+        "upright",
     )
     follow.add_argument(
         "--fit",
@@ -278,9 +279,9 @@ def _demonstration(made: Retargeting, task: str, source: str, whole: bool) -> De
     return Demonstration(trajectory, joints, task, source, made.arm.joint_names)
 
 
-TARGET_RMS = "tool to its own target, RMS"
-TARGET_FAR = f"farther than {1e2 * FAR:.0f} cm from its own target"
-TARGET_LAG = "lag behind its own target"
+TARGET_RMS = "RMS distance of the tool to its own target"
+TARGET_FAR = f"tool farther than {1e2 * FAR:.0f} cm from its own target"
+TARGET_LAG = "lag of the tool behind its own target"
 _TILES = (TARGET_RMS, TARGET_FAR, TARGET_LAG)  # the measures that matter most
 _DEGREES = 180.0 / np.pi
 
@@ -296,13 +297,13 @@ def _measures(evaluation: RunEvaluation) -> list[Measure]:
         Measure(TARGET_RMS, 1e3 * m.target_rms, "mm", 1, "less"),
         Measure(TARGET_FAR, 1e2 * tracking.far_fraction, "% of the time", 1, "less"),
         Measure(TARGET_LAG, 1e3 * evaluation.target_lag, "ms", 0, "less"),
-        Measure(f"tool to the {hand}, RMS", 1e3 * m.tool_rms, "mm", 1, "less"),
-        Measure("tool to the hand after removing the lag, RMS", 1e3 * m.tool_rms_without_lag, "mm", 1, "less"),
-        Measure(f"lag behind the {hand}", 1e3 * evaluation.hand_lag, "ms", 0),
-        Measure("upper arm's direction, RMS error", _DEGREES * m.elbow_direction_rms, "°", 1, "less"),
-        Measure("beyond a limit of position", m.position_violations, "frames", 0, "less", fault=True),
-        Measure("beyond a limit of velocity", m.velocity_violations, "frames", 0, "less", fault=True),
-        Measure("beyond a limit of acceleration", m.acceleration_violations, "frames", 0, "less", fault=True),
+        Measure(f"RMS distance of the tool to the {hand}", 1e3 * m.tool_rms, "mm", 1, "less"),
+        Measure("RMS distance of the tool to the hand, without lag", 1e3 * m.tool_rms_without_lag, "mm", 1, "less"),
+        Measure(f"lag of the tool behind the {hand}", 1e3 * evaluation.hand_lag, "ms", 0),
+        Measure("RMS error of the upper arm's direction", _DEGREES * m.elbow_direction_rms, "°", 1, "less"),
+        Measure("a joint exceeds a position limit", m.position_violations, "frames", 0, "less", fault=True),
+        Measure("a joint exceeds a velocity limit", m.velocity_violations, "frames", 0, "less", fault=True),
+        Measure("a joint exceeds an acceleration limit", m.acceleration_violations, "frames", 0, "less", fault=True),
         Measure("highest velocity", 100.0 * m.velocity_ratio, "% of the limit", 0, "less"),
         Measure("highest acceleration", 100.0 * m.acceleration_ratio, "% of the limit", 0, "less"),
         Measure("jerk of the joints, RMS", m.joint_jerk_rms, "rad/s³", 0, "less"),
@@ -393,7 +394,7 @@ def suggestion(
     tries.append(f"--scale {0.5 * correspondence.scale:.2g} (smaller)")
     if mine / _OTHER_MOVES_MORE <= other <= _OTHER_MOVES_MORE * mine:
         tries.append(f"--side {side} (if the person demonstrates with the other arm)")
-    return "the tool did not follow its target: try " + ", ".join(tries)
+    return f"the tool did not follow its target: try {', '.join(tries)}"
 
 
 def _wrist_motion(skeletons: Sequence[Skeleton], side: str) -> float:

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print one arm, or the list of all.
+    """Print one arm, or the list of all arms.
 
     Raises:
         InputError: if the robot can't be loaded, or two robots are named.

@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--control",
         choices=("position", "torque"),
         default="position",
-        help="control of the simulated drives; default: position",
+        help="control mode of the simulated drives; default: position",
     )
     network = parser.add_argument_group("network")
     network.add_argument(

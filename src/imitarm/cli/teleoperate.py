@@ -204,11 +204,9 @@ def _show(arguments: argparse.Namespace, summary: Summary, robot: Robot, stream:
         ("skeletons", str(summary.skeletons)),
         ("states", states),
         ("commands changed to keep a limit", clamped),
-        (
-            "commands changed to keep a clearance",
-            f"in {summary.filtered} steps; no safe motion was found in {summary.unsafe} steps",
-        ),
-        ("largest use of the limits", limits),
+        ("commands changed to keep a clearance", f"in {summary.filtered} steps"),
+        ("no safe motion was found", f"in {summary.unsafe} steps"),
+        ("highest values relative to the limits", limits),
     ]
     received = [("skeletons", stream.datagram_filter.dropped)] if stream is not None else []
     if isinstance(robot, UdpRobot):

@@ -5,13 +5,13 @@ in another. The mean at equal times would smear such a bend, because averaging c
 Alignment changes the time at which a demonstration reaches each point of its path, but never the path.
 
 Dynamic time warping within a band finds the matching points. For two motions ``a``, ``b`` of n samples, the cheapest
-monotone path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` obeys
+monotone path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` follows from a recursion:
 
     D(i, j) = c(i, j) + min(D(i-1, j-1) + c(i, j), D(i-1, j) + p, D(i, j-1) + p)
 
-(Sakoe and Chiba 1978, symmetric form, in which a diagonal step counts twice). D(i, j) is the cost of the cheapest path
-from (0, 0) to (i, j). The price ``p`` of a step that is not diagonal keeps noise from distorting time, and the band
-limits |i - j|. The code computes all cells of one anti-diagonal together, for all pairs of motions.
+This is the symmetric form of Sakoe and Chiba (1978), in which a diagonal step counts twice. D(i, j) is the cost of the
+cheapest path from (0, 0) to (i, j). The price ``p`` of a step that is not diagonal keeps noise from distorting time,
+and the band limits |i - j|. The code computes all cells of one anti-diagonal together, for all pairs of motions.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class Alignment:
             [s].
         kept_rows: first and last row of each demonstration that were kept, shape (n_demonstrations, 2).
         durations: duration of each trimmed demonstration before alignment [s], shape (n_demonstrations,).
-        warps: for each sample of the aligned motion, the fraction of the demonstration's own trimmed duration at which
-            the demonstration reached the same point; 0 to 1, strictly increasing, shape (n_demonstrations, n).
+        warps: time of each aligned sample in the trimmed demonstration, as a fraction of the duration of the trimmed
+            demonstration; 0 to 1, strictly increasing, shape (n_demonstrations, n).
         method: ``"dtw"`` or ``"resample"``.
     """
 
@@ -108,8 +108,8 @@ def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Meth
         method: ``"dtw"`` or ``"resample"``.
 
     Returns:
-        Demonstrations with the same ``n`` times. The ``source`` of each one states which rows of the recording were
-        kept.
+        Demonstrations with the same ``n`` times. The ``source`` of each demonstration states which rows of the
+        recording were kept.
 
     Raises:
         InputError: when the list is empty, ``n`` is below 10, a demonstration does not move, or only some have
@@ -199,8 +199,8 @@ def moving_rows(times: Array, positions: Array, quaternions: Array | None = None
     The first row is found in two steps: find the row at which the tool is first more than 0.5 mm away from its start,
     then go back to the last row that is within 0.1 mm of the start. The last row is found in the same way, from the end
     backwards. A margin of 0.1 s is kept on both sides. Speed is not used, so a slow motion is never mistaken for rest.
-    With noisy samples, both distances are raised to at least 4 standard deviations of the averaged noise. Rotation
-    without displacement counts as motion.
+    With noisy samples, the limits 0.5 mm and 0.1 mm are raised to at least 4 standard deviations of the averaged noise.
+    Rotation without displacement counts as motion.
 
     Args:
         times: strictly increasing, shape (n,) [s].

@@ -25,23 +25,24 @@ COUNTS = "2 (x y), 3 (x y z), 7 (x y z and quaternion), or 4 or 8 with the time 
 
 _UNIT_WORDS = {
     "length": {
-        **{"m": "m metre metres meter meters", "cm": "cm centimetre centimetres centimeter centimeters"},
-        **{"mm": "mm millimetre millimetres millimeter millimeters", "in": "in inch inches", "ft": "ft foot feet"},
+        **{"m": "m/metre/metres/meter/meters", "cm": "cm/centimetre/centimetres/centimeter/centimeters"},
+        **{"mm": "mm/millimetre/millimetres/millimeter/millimeters", "in": "in/inch/inches", "ft": "ft/foot/feet"},
     },
     "time": {
-        **{"s": "s sec secs second seconds", "ms": "ms msec msecs millis millisec millisecond milliseconds"},
+        **{"s": "s/sec/secs/second/seconds", "ms": "ms/msec/msecs/millis/millisec/millisecond/milliseconds"},
         **{
-            "us": "us usec usecs micros microsec microsecond microseconds",
-            "min": "min minute minutes",
-            "h": "h hr hour hours",
+            "us": "us/usec/usecs/micros/microsec/microsecond/microseconds",
+            "min": "min/minute/minutes",
+            "h": "h/hr/hour/hours",
         },
-        "ns": "ns nsec nsecs nanos nanosec nanosecs nanosecond nanoseconds",
+        "ns": "ns/nsec/nsecs/nanos/nanosec/nanosecs/nanosecond/nanoseconds",
     },
-    "angle": {"rad": "rad rads radian radians", "deg": "deg degs degree degrees ° º"},
-    "rotation": {"1": "1 -"},  # a quaternion has no unit
+    "angle": {"rad": "rad/rads/radian/radians", "deg": "deg/degs/degree/degrees/°/º"},
+    "rotation": {"1": "1/-"},  # a quaternion has no unit
 }
 UNITS = {
-    kind: {word: unit for unit, words in units.items() for word in words.split()} for kind, units in _UNIT_WORDS.items()
+    kind: {word: unit for unit, words in units.items() for word in words.split("/")}
+    for kind, units in _UNIT_WORDS.items()
 }
 UNITS["rotation"][""] = "1"  # EuRoC writes ``q_RS_w []``
 _KINDS = {"t": "time", **dict.fromkeys("xyz", "length"), "joint": "angle"}

@@ -127,8 +127,10 @@ def check_gaps(motion: ValidRows) -> Iterator[Finding]:
         longest = int(gaps[np.argmax(steps[gaps])])
         moved = float(np.linalg.norm(motion.positions[longest + 1] - motion.positions[longest]))
         count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
-        message = f"{count} of {steps[longest]:.3g} s (usual step {np.median(steps):.3g} s), "
-        message += f"in which the tool moved {1e3 * moved:.0f} mm"
+        message = (
+            f"{count} of {steps[longest]:.3g} s (usual step {np.median(steps):.3g} s), in which the tool moved "
+            f"{1e3 * moved:.0f} mm"
+        )
         remedy = "record again, or accept a straight line across the gap"
         yield motion.finding("warning", "gap", message, remedy, longest + 1)
 
@@ -189,7 +191,8 @@ def check_units(motion: ValidRows) -> Iterator[Finding]:
     if distance.max() > _FAR:
         row = int(np.argmax(distance))
         fits = [
-            f'units="{name}" (the motion is then {extent * metres:.3g} m large, {distance[row] * metres:.3g} m away)'
+            f'units="{name}" (the motion then extends over {extent * metres:.3g} m and is up to '
+            f"{distance[row] * metres:.3g} m from the base)"
             for name, metres in LENGTH_UNITS.items()
             if distance[row] * metres <= _FAR and (extent * metres >= _TINY or extent < _NO_MOTION)
         ]
@@ -198,7 +201,7 @@ def check_units(motion: ValidRows) -> Iterator[Finding]:
             "error", "units", f"{distance[row]:.4g} m from the base: the unit is probably not the metre", remedy, row
         )
     elif _NO_MOTION < extent < _TINY and motion.quaternions is None:
-        message = f"the whole motion is {1e3 * extent:.2g} mm large"
+        message = f"the whole motion extends over only {1e3 * extent:.2g} mm"
         yield motion.finding("warning", "units", message, "check the unit: are the numbers in metres?")
 
 
@@ -259,9 +262,9 @@ def check_plane(motions: Sequence[ValidRows]) -> Iterator[Finding]:
     flat = deviations < _FLAT
     if flat.any() and deviations[0] > _FLAT:
         normal = directions[-1] * np.sign(directions[-1][np.argmax(np.abs(directions[-1]))])
-        shape = "in a plane, normal" if flat.sum() == 1 else "on a straight line, across"
         vector = " ".join(f"{x:.2f}" for x in normal + 0.0)
-        message = f"all motions lie {shape} ({vector}), within {1e3 * deviations[flat].max():.2g} mm"
+        shape = "plane with the normal" if flat.sum() == 1 else "straight line perpendicular to"
+        message = f"all motions lie within {1e3 * deviations[flat].max():.2g} mm of a {shape} ({vector})"
         yield Finding(
             "note", "planar", message, remedy="none needed: the skill keeps the position in that direction constant"
         )
@@ -344,8 +347,10 @@ def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: 
             if len(whole) and 2 * short[i].sum() >= m - 1:
                 done = nearest[i, whole[0]] / (n - 1)
                 percent = 100.0 * (done if verb == "stops" else 1.0 - done)
-                message = f"{verb} at {percent:.0f} % of the path of {motions[whole[0]].name}, "
-                message += f"{scale.factor * apart[i, whole[0]]:.0f} {scale.unit} from its {end}"
+                message = (
+                    f"{verb} at {percent:.0f} % of the path of {motions[whole[0]].name}, which is "
+                    f"{scale.factor * apart[i, whole[0]]:.0f} {scale.unit} from the {end} of that path"
+                )
                 yield i, message, "incomplete", "leave it out, or record the whole motion again"
 
 
@@ -372,9 +377,12 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
         if apart.max() > _OPPOSED:
             odd = int(np.argmax(apart.sum(axis=1)))
             name, degrees = motions[int(np.argmax(apart[odd]))].name, np.degrees(apart[odd].max())
-            message = f"its rotation is up to {degrees:.0f} degrees from that of {name} at the same phase: their mean"
+            message = (
+                f"its rotation differs by up to {degrees:.0f} degrees from the rotation of {name} at the same phase, "
+                "so the mean of both rotations would be meaningless"
+            )
             remedy = "check how the tool was held and the order of the quaternions (wxyz or xyzw), or leave it out"
-            yield motions[odd].finding("error", "two-rotations", f"{message} would be meaningless", remedy)
+            yield motions[odd].finding("error", "two-rotations", message, remedy)
         else:
             kinds.append(("two-rotations", "warning", "rotations", apart, _ROTATIONS_APART, np.degrees(1.0), "degrees"))
     for code, severity, what, distance, floor, factor, unit in kinds:
@@ -407,7 +415,7 @@ def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | N
 
     The result is a mask (m,) that selects one group, and the gap between the two groups. The gap is the longest link of
     the minimum spanning tree. There are two groups only if the gap exceeds ``floor`` and is several times as long as
-    the second longest link, which means that demonstrations within a group are much closer together.
+    the second longest link. In that case, demonstrations within a group are much closer together than the groups.
     """
     m = len(distance)
     nearest, inside, links = distance[0].copy(), np.arange(m) == 0, []
@@ -439,18 +447,17 @@ def _outliers(motions: Sequence[ValidRows], positions: Array, rotations: Array |
         usual = float(np.median(np.delete(distance[center], center)))
         message = (
             f"is {1e3 * distance[center, i]:.0f} mm from the most typical demonstration "
-            f"({motions[center].raw.source}), "
+            f"({motions[center].raw.source}), but the typical distance is {1e3 * usual:.0f} mm"
         )
-        message += f"the others typically {1e3 * usual:.0f} mm"
         yield motions[i].finding("warning", "outlier", message, "check it; leave it out if it shows another motion")
     if rotations is None:
         return
     angle = _angles(rotations, rotations[center]).mean(axis=1)
     for i in _unlike(angle, center, _OUTLIER_ANGLE):
-        message = f"is rotated by {np.degrees(angle[i]):.0f} degrees from the most typical demonstration "
-        message += (
-            f"({motions[center].raw.source}), the others typically by "
-            f"{np.degrees(np.median(np.delete(angle, center))):.0f}"
+        message = (
+            f"is rotated by {np.degrees(angle[i]):.0f} degrees from the most typical demonstration "
+            f"({motions[center].raw.source}), but the typical angle is "
+            f"{np.degrees(np.median(np.delete(angle, center))):.0f} degrees"
         )
         remedy = "check this demonstration, and the order of its quaternions (wxyz or xyzw)"
         yield motions[i].finding("warning", "rotation-outlier", message, remedy)

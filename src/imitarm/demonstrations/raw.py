@@ -51,7 +51,7 @@ class Finding:
         source: name of the demonstration concerned; empty when the finding concerns all demonstrations.
         row: index of the first sample concerned, from 0; None when the finding concerns the whole motion.
         line: line number of the sample ``row`` in the text file, from 1; None when the file is not text.
-        remedy: action that fixes the fault. Options are written as arguments of ``read``, for example ``units="mm"``.
+        remedy: action that fixes the fault. Options of ``read`` are written as in Python, for example ``units="mm"``.
     """
 
     severity: Severity
@@ -258,9 +258,13 @@ class RawDemonstration:
         bad = invalid | late
         if bad.any() and not repair:
             row = int(np.flatnonzero(bad)[0])
-            what = "holds a number that is not finite" if invalid[row] else "is not later than the previous row"
+            what = (
+                "the row holds a number that is not finite"
+                if invalid[row]
+                else "the time is not later than in the previous row"
+            )
             raise FileFormatError(
-                f"{raw.where(row)} {what}; fix the file, or read it with repair=True to drop such rows"
+                f"{raw.where(row)}: {what}; fix the file, or read it with repair=True to drop such rows"
             )
         keep = np.flatnonzero(~bad)
         if len(keep) < max(2, (1.0 - _MAX_DROPPED) * len(raw)):

@@ -268,7 +268,7 @@ def read(
         arm: arm that was recorded, with its tool; needed for files that contain only joint angles.
         task: name of the task; used if the file does not state a task.
         repair: whether to drop rows with numbers that are not finite, and rows that are not later than the previous
-            row. The ``source`` then says how many rows were dropped.
+            row. The ``source`` of the demonstration states how many rows were dropped.
         thin: whether to drop rows that only repeat the previous row (see :meth:`RawDemonstration.held`).
 
     Returns:
@@ -303,8 +303,8 @@ def known_formats() -> str:
 def _reader_of(path: str) -> Reader:
     """Return the reader that recognises the content of a file; the suffix of the file's name must not contradict it.
 
-    Readers of other packages are tried first, because the built-in text table reader accepts any text. Next come the
-    built-in readers that know the suffix.
+    Readers of other packages are tried first, because the built-in text table reader accepts any text. The built-in
+    readers that know the suffix are tried next, and the other built-in readers last.
     """
     content = read_bytes(path)
     suffix, head = Path(path).suffix.lower(), content[:_HEAD]

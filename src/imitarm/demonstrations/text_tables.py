@@ -158,7 +158,10 @@ def _looks_like_names(words: Sequence[str]) -> bool:
 
 
 def _run_of_names(words: Sequence[str], width: int) -> tuple[str, ...] | None:
-    """Return ``width`` consecutive words of a remark that are its only known column names; None if there are none."""
+    """Return the column names in a remark: ``width`` consecutive words that are known names.
+
+    None if the remark holds no such sequence of words, or more than one.
+    """
     known = [bool(column_of(word).what) for word in words]
     starts = [i for i, here in enumerate(known) if here and (i == 0 or not known[i - 1])]
     runs = [words[i : i + next((k for k, here in enumerate(known[i:]) if not here), len(words))] for i in starts]

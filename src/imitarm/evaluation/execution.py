@@ -22,12 +22,12 @@ CATCH_UP = 5.0  # [1/s] fraction of the remaining error to the commanded positio
 def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
     r"""Return how an arm that keeps its limits would move when it follows commanded positions, (n, n_joints) [rad].
 
-    In each control period, the velocity of the arm is computed from the commanded velocity and a correction towards the
-    commanded position:
+    In each control period, the velocity of the arm is the commanded velocity plus a correction towards the commanded
+    position (``clip``: see below):
 
     .. math:: \dot q_k = \mathrm{clip}\left((q^c_{k+1} - q^c_k) / dt + 5\,\mathrm{s}^{-1}\,(q^c_k - q_k)\right)
 
-    The function clip limits the velocity to the box of velocities from which all limits of position, velocity and
+    The function ``clip`` limits the velocity to the box of velocities from which all limits of position, velocity and
     acceleration can still be kept (:class:`~imitarm.kinematics.limits.JointLimits`). Commands within the limits are
     executed unchanged.
 

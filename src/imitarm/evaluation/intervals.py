@@ -82,8 +82,8 @@ def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) ->
     r"""Return the percentile bootstrap interval of a mean.
 
     Resampled means of n samples scatter too little: their standard deviation is too small by the factor
-    :math:`\sqrt{(n-1)/n}`. The deviations of the resampled means are therefore divided by this factor. Without this
-    correction, a "95 %" interval of ten samples would cover only 90 %.
+    :math:`\sqrt{(n-1)/n}`. Therefore the deviation of each resampled mean from the mean is divided by
+    :math:`\sqrt{(n-1)/n}`. Without this division, a "95 %" interval of ten samples would cover only 90 %.
 
     Args:
         samples: shape (n,).
@@ -141,15 +141,16 @@ def rate_interval(outcomes: Values) -> Interval:
 
     The interval is the Wilson interval for :math:`N / D` trials instead of N, because the trials of one person are
     similar (Rao and Scott, Biometrics 1992). :math:`D = 1 + (m - 1) \rho` is the design effect of m trials per person.
-    :math:`\rho` is the correlation between trials of one person. The correlation is estimated from the differences
-    between the persons' rates, as far as they exceed differences by chance. The estimate from a few persons is poor, so
-    it is averaged with a prior correlation of 0.3, which has the weight of two persons. If all trials had the same
-    result, or if there is only one person, the correlation is 0.3. N / D lies between the number of persons and N.
+    :math:`\rho` is the correlation between trials of one person. The correlation is estimated from how much more the
+    persons' success rates differ than they would by chance. The estimate from a few persons is poor, so it is averaged
+    with a prior correlation of 0.3, which has the weight of two persons. If all trials had the same result, or if there
+    is only one person, the correlation is set to 0.3. :math:`N / D` lies between the number of persons and N.
 
-    When only one person fails, the persons seem to differ. When another person fails as well, the persons seem to be
-    alike. One more failure could therefore narrow the interval. To prevent such narrowing, the function also computes
-    the interval of every result that is at least as good in each trial, and takes the lowest of the lower ends.
-    Likewise, the function takes the highest upper end of all results that are at least as bad in each trial.
+    A result with one more failure could have a narrower interval: if only one person failed, the persons seem to
+    differ; if a second person failed as well, the persons seem to be alike. To prevent such narrowing, the function
+    also computes the interval of every result that is at least as good in each trial, and returns the lowest of these
+    lower ends. In the same way, the returned upper end is the highest upper end of all results that are at least as bad
+    in each trial.
 
     Args:
         outcomes: outcome of each trial, 1 for success, 0 for failure.
@@ -167,11 +168,12 @@ def rate_interval(outcomes: Values) -> Interval:
 
 
 def _lower_end(rates: Array, each: float, step: int) -> float:
-    """Return the lowest lower end of the intervals of all results in which every person has at least the given rate.
+    """Return the lower end of the interval of a success rate.
 
-    Among results with the same mean, the lower end is lowest where the persons differ most. In such a result, the best
-    person becomes perfect before another person improves (the result majorises all others). Therefore only results of
-    this kind need to be examined.
+    The function computes the interval of every result in which each person has at least the given rate, and returns the
+    lowest of the lower ends. Among results with the same mean, the lower end is lowest where the persons differ most.
+    The persons differ most if the best person becomes perfect before another person improves (this result majorises all
+    others). Therefore only such results are examined.
 
     Args:
         rates: success rate of each person, shape (n,).

@@ -141,9 +141,9 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
     Args:
         run: run of the method.
         correspondence: correspondence between person and robot, the input of the method.
-        true: the person's true arm at the times of the run. If the method slows the motion down, the arm is taken at
-            the corresponding earlier times. None if the true arm is unknown, as with a real camera; the measures that
-            need it are then nan.
+        true: the person's true arm, one sample for each time of the run. If the method slows the motion down, each
+            sample shows the arm at the earlier time that the robot reproduces. None if the true arm is unknown, as with
+            a real camera; measures that need the true arm are then nan.
 
     Raises:
         InputError: when the run is shorter than 4 control periods or a joint position is not finite.

@@ -150,9 +150,9 @@ def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
     .. math:: -\int_0^{\omega_c} \sqrt{\left(\tfrac{1}{\omega_c}\right)^2
               + \left(\tfrac{d\hat V}{d\omega}\right)^2}\, d\omega, \qquad \hat V = |V(\omega)| / |V(0)|
 
-    where :math:`\omega_c` is the largest frequency up to 20 Hz at which :math:`\hat V` exceeds 0.05 (SPARC:
-    Balasubramanian et al., J. NeuroEng. Rehabil. 2015). The value also depends on the number of movements in a
-    recording, so compare only motions of the same recording.
+    Here, :math:`\omega_c` is the largest frequency up to 20 Hz at which :math:`\hat V` exceeds 0.05. The measure is
+    called SPARC (Balasubramanian et al., Journal of NeuroEngineering and Rehabilitation, 2015). The value also depends
+    on the number of movements in a recording, so compare only motions of the same recording.
 
     Args:
         speed: speed of a point, shape (n,) [m/s].

@@ -33,9 +33,8 @@ class TargetTracking:
 
     The tool tracked the target if three conditions hold: the robot was engaged for at least half of the time, the RMS
     distance was at most :data:`FAR`, and the tool was farther away than :data:`FAR` for at most :data:`FAR_FRACTION` of
-    the time with a target. The two limits FAR and FAR_FRACTION were chosen for two reasons. First, a gripper within 5
-    cm of its target is still at the object that it should grasp. Second, the normal lag of the method ``modern``
-    exceeds neither limit.
+    the time with a target. FAR is 5 cm, because a gripper within 5 cm of its target is still at the object that it
+    should grasp. The normal lag of the method ``modern`` exceeds neither FAR nor FAR_FRACTION.
 
     Attributes:
         title: title of the method.
@@ -110,7 +109,7 @@ class TargetTracking:
         far = f"farther than {1e2 * FAR:.0f} cm for {_percent(self.far_fraction)} of the time"
         led = f"the person controlled the robot for {_percent(self.engaged_fraction)} of the time"
         mostly = "" if self.mostly_engaged else "nobody controlled the robot for most of the time: "
-        return f"{self.title}: {mostly}{word}, {1e3 * self.rms:.0f} mm from it (RMS), {far}; {led}; {limits}"
+        return f"{self.title}: {mostly}{word} (RMS distance {1e3 * self.rms:.0f} mm, {far}); {led}; {limits}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,7 @@ class TrueArm:
             truth: the person's skeleton over time; called in the order of the times.
             times: times of a run, shape (n,) [s].
             correspondence: correspondence with the side of the arm and the pose of the sensor.
-            start: time on the person's clock at time 0 of the run; this is the time of the first skeleton [s].
+            start: reading of the person's clock at time 0 of the run, when the first skeleton was measured [s].
         """
         t = np.asarray(times, dtype=float)
         return cls.from_points(
@@ -162,15 +162,15 @@ def reference_positions(
 
     .. math:: p(t) = p_{home} + \rho\,(W(t - lag) - W(t_e))
 
-    where :math:`W` is the position of the true wrist, :math:`\rho` the scale, :math:`t_e` the time at which the
-    engagement began, and :math:`p_{home}` the position of the tool at that time.
+    Here, :math:`W` is the position of the true wrist, :math:`\rho` is the scale, :math:`t_e` is the time at which the
+    engagement began, and :math:`p_{home}` is the position of the tool at the time :math:`t_e`.
 
     Args:
         true: the person's arm, in the axes of the base.
         tool: positions of the tool, shape (n, 3) [m].
         periods: the engaged frames.
         scale: rho.
-        lag: time by which the tool may be late [s].
+        lag: time by which the tool lags behind the wrist [s].
 
     Returns:
         shape (n, 3) [m]; undefined in frames that are not engaged.
@@ -211,8 +211,9 @@ def rms(errors: ArrayLike) -> float:
 def best_lag(true: TrueArm, tool: Array, periods: EngagementPeriods, scale: float) -> tuple[float, float]:
     """Return the constant lag that explains the tool's motion best [s], and the RMS error after removing this lag [m].
 
-    Lags from -0.1 to 0.8 s are tried. A parabola through the lag with the smallest error and its two neighbours gives
-    the minimum. The lag and the error are nan if no frame is engaged. The lag is also nan if the hand did not move.
+    Lags from -0.1 to 0.8 s are tried. The best lag is the minimum of a parabola through three points: the lag with the
+    smallest error and its two neighbours. The lag and the error are nan if no frame is engaged. The lag is also nan if
+    the hand did not move.
     """
     engaged = periods.engaged
     if not engaged.any():

@@ -72,9 +72,10 @@ class PartFile:
         Calling this method again does nothing.
 
         Args:
-            take: function that is called with the path ``part``. The function may create ``PATH`` from that file, and
-                returns whether it renamed the file. If it returns False, ``part`` is removed. If it returns True,
-                nothing is removed, because a new file called ``PATH.part`` would belong to another recorder.
+            take: function that is called with the path ``part``. The function may create ``PATH`` from ``PATH.part``,
+                and returns whether ``PATH.part`` was renamed. If ``take`` returns False, ``PATH.part`` is removed. If
+                ``take`` returns True, no file is removed, because a new file called ``PATH.part`` would belong to
+                another recorder.
             begin: text that replaces the ``begin`` given to the constructor; both must have the same length.
 
         Raises:

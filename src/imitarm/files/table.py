@@ -50,8 +50,8 @@ class Table:
         path: path of the file as given by the caller.
         remarks: the ``key: value`` remarks before the numbers, keys in lower case.
         names: column names, from a separate row or from the last remark before the numbers that has one word for each
-            column. Units from a row of units are added in brackets (``x [mm]``). None when the file has no column
-            names.
+            column. Units from a row of units are added in brackets (``x [mm]``). The value None means that the file has
+            no column names.
         values: the numbers, shape (n, columns). The caller must check for nan and inf.
         lines: line number of each row in the file, from 1, shape (n,).
         ends_in_newline: False when the last line may have been cut off.
@@ -188,7 +188,7 @@ def _with_decimal_points(path: str | Path, body: Sequence[tuple[int, str]], sepa
     first = commas[0]
     points = next((field for field in fields if "." in field and _number(field.replace(",", "")) is not None), None)
     if points is not None or all(_THOUSANDS.fullmatch(field) for field in commas):
-        why = f", and {points!r} has a decimal point" if points else ""
+        why = f" ({points!r} has a decimal point)" if points else ""
         raise FileFormatError(
             f"{path}, line {fields[first]}: {first!r} has a decimal comma or a comma between thousands{why}; write all "
             "numbers with decimal points and without other commas"

@@ -1,7 +1,8 @@
 r"""SimulatedOperator: a simulated person who stacks cubes with a teleoperated robot and watches gripper and cubes.
 
-The simulated person closes the loop around a retargeter. The operator sees gripper and cubes with delay and noise, and
-reacts with a motion of the hand. The operator does not know the retargeter between hand and gripper.
+Because the person reacts to the robot, person and retargeter form a closed loop. The operator sees gripper and cubes
+with delay and noise, and reacts with a motion of the hand. The operator does not know the retargeter between hand and
+gripper.
 """
 
 from __future__ import annotations
@@ -272,7 +273,10 @@ class StackPlan:
         return float(np.hypot(*(self._tool - goal)[:2]))
 
     def _above(self, place: Array, height: float, away: float) -> Array:
-        """Return a goal above ``place``; while the gripper is low and far away, a goal straight above the gripper."""
+        """Return the next goal of a motion to the point above ``place`` at ``height`` [m].
+
+        If the gripper is low and far away, the goal is straight above the gripper. Otherwise, the goal is that point.
+        """
         if self._tool[2] < height - 0.03 and away > 0.03:
             return np.array([self._tool[0], self._tool[1], height])
         return np.array([place[0], place[1], height])
@@ -351,11 +355,11 @@ class SimulatedOperator:
     a low speed v near a contact. Tremor is added by :class:`~imitarm.capture.person.Person`.
 
     *Eye.* About 7 times per second, the person reacts to an :class:`OperatorView` that is ``delay`` old. The observed
-    positions have a bias, and noise of about a millimetre. The person expects the gripper at the observed position plus
-    the displacement that the hand has commanded since the time of the view: :math:`\hat p = p(t-\delta) +
-    \rho\,(h_{end} - h(t-\delta-\lambda))`. In this equation, :math:`\delta` is ``delay``, and :math:`\rho` and
-    :math:`\lambda` are the scale and the lag that the person expects. The next sub-movement is :math:`d =
-    g\,(p_{goal}-\hat p)/\rho`. The gain g is below 1 over short distances and 1 over long distances.
+    positions have a bias, and noise of about a millimetre. The person extrapolates the observed position by the
+    displacement that the hand has commanded since the time of the view, and so expects the gripper at :math:`\hat p =
+    p(t-\delta) + \rho\,(h_{end} - h(t-\delta-\lambda))`. In this equation, :math:`\delta` is ``delay``, and
+    :math:`\rho` and :math:`\lambda` are the scale and the lag that the person expects. The next sub-movement of the
+    hand is :math:`d = g\,(p_{goal}-\hat p)/\rho`. The gain g is below 1 over short distances and 1 over long distances.
 
     *Plan.* :class:`StackPlan` chooses the goals. The hand closes or opens when the gripper looks aligned to within the
     person's tolerance, which grows as the person becomes impatient. If the gripper misses or loses a cube, or a cube

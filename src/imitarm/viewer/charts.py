@@ -240,7 +240,8 @@ def small_multiples(name: str, description: str, unit: str, times: Array, curves
 class _Panel:
     """A small chart in a figure of many.
 
-    All charts share one pair of axes in inches, because separate axes for each joint would take ten times longer.
+    All charts share one pair of axes in inches, because drawing separate axes for each joint
+    would take ten times longer.
     """
 
     left: float

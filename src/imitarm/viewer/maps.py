@@ -50,7 +50,7 @@ class View:
 
     @property
     def leftwards(self) -> bool:
-        """Whether the horizontal coordinate increases to the left, as y does seen from above with x pointing up."""
+        """Whether the horizontal coordinate increases to the left, as y does if x points up."""
         return (self.across, self.up) == (1, 0)
 
     @classmethod
@@ -79,8 +79,8 @@ def drawn_map(
         corners: lower and upper corner of the area that must be visible, shape (2, 2) [m].
         legend_rows: number of rows of the legend.
         note: text added to the title.
-        stretched: whether a flat map may be stretched vertically; the title then states the factor. If False, both axes
-            have the same scale.
+        stretched: whether a flat map may be stretched vertically; the title then states the factor. If
+            ``stretched`` is False, both axes have the same scale.
     """
     span = np.maximum(corners[1] - corners[0], 1e-3)
     width = _WIDTH - 0.72
@@ -113,7 +113,7 @@ def corners_of(points: Array, margin: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """A grid of points on a map: coordinates ``across`` (columns,) and ``up`` (rows,) [m] of the axes of ``view``."""
+    """A grid of points on a map: horizontal coordinates ``across`` (columns,) and vertical ``up`` (rows,) [m]."""
 
     view: View
     across: Array
@@ -130,7 +130,8 @@ class Grid:
         """Return the distance from each grid point to an obstacle, the smallest over ``depths`` (rows, columns) [m].
 
         ``depths`` are coordinates along the line of sight. With one depth, the line of distance 0 outlines the
-        cross-section of the obstacle. With many depths, it outlines the projection of the obstacle.
+        cross-section of the obstacle. With many depths, the line of distance 0 outlines
+        the projection of the obstacle.
         """
         points = np.empty((len(depths), len(self.up), len(self.across), 3))
         points[..., self.view.across] = self.across

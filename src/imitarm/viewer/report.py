@@ -274,7 +274,7 @@ def _tool(scene: SceneResult) -> str:
     if reach == 0.0:
         return "a point"
     many = "one sphere" if len(spheres) == 1 else f"{len(spheres)} spheres"
-    return f"{many}, within {number(MM * reach, 0, 'mm')} of the tool centre point"
+    return f"{many}, no point of which is farther than {number(MM * reach, 0, 'mm')} from the tool centre point"
 
 
 def _learning_figures(learning: LearningSummary) -> Iterator[Figure]:

@@ -323,7 +323,7 @@ def _figures(run: Retargeting, key: str) -> Iterator[Figure]:
             retarget_charts.elbow(run, points, name=f"{key}-elbow"),
             "Direction of the upper arm",
             "Robot and person start in different postures, so compare how the two directions change, not their "
-            "values. Upwards, 90° is straight up; to the left, 90° is straight to the left.",
+            "values. An upward angle of 90° means straight up; a leftward angle of 90° means straight left.",
         )
 
 
