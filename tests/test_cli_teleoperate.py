@@ -74,7 +74,7 @@ def test_a_recording_leads_a_simulated_robot(person, tmp_path, capfd):
     for part in (
         "the source has ended",
         "following",
-        "highest values relative to the limits",
+        "highest velocity and acceleration",
         "no safe motion was found",
         "median [ms]",
         "total",

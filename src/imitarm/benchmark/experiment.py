@@ -263,7 +263,7 @@ def run_stacking(
 
 
 def camera_maker(sigma: float | None) -> Callable[[int], SkeletonCamera]:
-    """Return a function that makes a camera from a seed; the camera has realistic errors of ``sigma`` [m]."""
+    """Return a function that makes a camera from a seed; ``sigma`` [m]: its measuring error; None: set by the seed."""
     return SkeletonCamera.from_seed if sigma is None else partial(SkeletonCamera, sigma=sigma)
 
 

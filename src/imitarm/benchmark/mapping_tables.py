@@ -282,9 +282,10 @@ def success_table(results: Results) -> Table:
         rows.append((METHODS[name].title, *rate, *cells, why))
     columns = ("method", "stacked>", "95 % [%]>", *(f"{figure.title}>" for figure in LOOP), "failures")
     note = (
-        "The interval of the success rate is Wilson's, with an effective number of trials. The more the persons differ, "
-        "the smaller is the effective number of trials. One more failure never raises the lower end of the interval. "
-        "Time, path and torque are means over persons (95 % interval) and include only the trials that succeeded. "
+        "The interval of the success rate is Wilson's, with an effective number of trials. The more the persons "
+        "differ, the smaller is the effective number of trials. One more failure never raises the lower end of the "
+        "interval. Time, path and torque are means over persons (95 % interval) and include only the trials that "
+        "succeeded. "
         f"{persons_note(results)}"
     )
     return Table("Four cubes stacked, closed loop", columns, tuple(rows), note)

@@ -205,9 +205,9 @@ def is_impossible(question: Question, cells: _Cells) -> bool:
     """Return whether there is provably no path, because a flood fill of possibly free boxes can't reach the goal.
 
     A box is blocked if all of its corners are inside the same inflated obstacle. The corners suffice, because the
-    obstacle is convex. Boxes are fixed in space, so the motion of the tip in the permitted plane does not matter. To
-    allow for three other motions, the obstacles are made smaller: the tip moves out of the permitted plane, spheres
-    move relative to the tip, and obstacles move.
+    obstacle is convex. Boxes are fixed in space, so the motion of the tip in the permitted plane does not matter. The
+    obstacles are made smaller, because the tip may move out of the permitted plane, spheres may move relative to the
+    tip, and obstacles may move.
     """
     d = len(cells.frame)
     moving = any(obstacle.velocity.any() for obstacle in question.obstacles)

@@ -37,7 +37,7 @@ class Place:
     Attributes:
         document: path of the Markdown document.
         benchmark: name of the benchmark. In the document, its tables stand between two comment lines: one that names
-            the benchmark (:attr:`begin`), and :data:`END`.
+            the benchmark (:attr:`begin`), and the line :data:`END`.
 
     Raises:
         InputError: when the document can't be read, or does not contain the two comment lines once each, in this order.

@@ -197,7 +197,7 @@ def _show(arguments: argparse.Namespace, summary: Summary, robot: Robot, stream:
     counts[_INTERRUPTED] = summary.interrupted
     states = ", ".join(f"{name} {100 * n / max(summary.steps, 1):.0f} %" for name, n in counts.most_common() if n)
     clamped = ", ".join(f"{name} in {n} steps" for name, n in sorted(summary.clamped.items())) or "none"
-    limits = f"velocity {100 * summary.speed:.0f} %, acceleration {100 * summary.acceleration:.0f} %"
+    limits = f"{100 * summary.speed:.0f} % and {100 * summary.acceleration:.0f} % of the limits"
     rows = [
         ("ended", summary.reason),
         ("duration", f"{summary.duration:.2f} s, {summary.steps} steps, {summary.overruns} missed"),
@@ -206,7 +206,7 @@ def _show(arguments: argparse.Namespace, summary: Summary, robot: Robot, stream:
         ("commands changed to keep a limit", clamped),
         ("commands changed to keep a clearance", f"in {summary.filtered} steps"),
         ("no safe motion was found", f"in {summary.unsafe} steps"),
-        ("highest values relative to the limits", limits),
+        ("highest velocity and acceleration", limits),
     ]
     received = [("skeletons", stream.datagram_filter.dropped)] if stream is not None else []
     if isinstance(robot, UdpRobot):

@@ -263,8 +263,11 @@ def check_plane(motions: Sequence[ValidRows]) -> Iterator[Finding]:
     if flat.any() and deviations[0] > _FLAT:
         normal = directions[-1] * np.sign(directions[-1][np.argmax(np.abs(directions[-1]))])
         vector = " ".join(f"{x:.2f}" for x in normal + 0.0)
-        shape = "plane with the normal" if flat.sum() == 1 else "straight line perpendicular to"
-        message = f"all motions lie within {1e3 * deviations[flat].max():.2g} mm of a {shape} ({vector})"
+        within = f"{1e3 * deviations[flat].max():.2g} mm"
+        if flat.sum() == 1:
+            message = f"all motions lie within {within} of a plane with the normal ({vector})"
+        else:
+            message = f"all motions lie within {within} of a straight line that is perpendicular to ({vector})"
         yield Finding(
             "note", "planar", message, remedy="none needed: the skill keeps the position in that direction constant"
         )

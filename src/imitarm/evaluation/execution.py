@@ -23,7 +23,7 @@ def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
     r"""Return how an arm that keeps its limits would move when it follows commanded positions, (n, n_joints) [rad].
 
     In each control period, the velocity of the arm is the commanded velocity plus a correction towards the commanded
-    position (``clip``: see below):
+    position (``clip`` is explained below):
 
     .. math:: \dot q_k = \mathrm{clip}\left((q^c_{k+1} - q^c_k) / dt + 5\,\mathrm{s}^{-1}\,(q^c_k - q_k)\right)
 

@@ -173,7 +173,7 @@ def _lower_end(rates: Array, each: float, step: int) -> float:
     The function computes the interval of every result in which each person has at least the given rate, and returns the
     lowest of the lower ends. Among results with the same mean, the lower end is lowest where the persons differ most.
     The persons differ most if the best person becomes perfect before another person improves (this result majorises all
-    others). Therefore only such results are examined.
+    others). Therefore only results in which the best persons are perfect are examined.
 
     Args:
         rates: success rate of each person, shape (n,).

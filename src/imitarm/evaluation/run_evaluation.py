@@ -34,7 +34,7 @@ class TargetTracking:
     The tool tracked the target if three conditions hold: the robot was engaged for at least half of the time, the RMS
     distance was at most :data:`FAR`, and the tool was farther away than :data:`FAR` for at most :data:`FAR_FRACTION` of
     the time with a target. FAR is 5 cm, because a gripper within 5 cm of its target is still at the object that it
-    should grasp. The normal lag of the method ``modern`` exceeds neither FAR nor FAR_FRACTION.
+    should grasp. The method ``modern``, with its normal lag, exceeds neither FAR nor FAR_FRACTION.
 
     Attributes:
         title: title of the method.

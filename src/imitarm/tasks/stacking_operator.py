@@ -275,7 +275,8 @@ class StackPlan:
     def _above(self, place: Array, height: float, away: float) -> Array:
         """Return the next goal of a motion to the point above ``place`` at ``height`` [m].
 
-        If the gripper is low and far away, the goal is straight above the gripper. Otherwise, the goal is that point.
+        If the gripper is low and far away, the goal is straight above the gripper. Otherwise, the goal is
+        the point above ``place``.
         """
         if self._tool[2] < height - 0.03 and away > 0.03:
             return np.array([self._tool[0], self._tool[1], height])

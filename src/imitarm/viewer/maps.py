@@ -113,7 +113,7 @@ def corners_of(points: Array, margin: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """A grid of points on a map: horizontal coordinates ``across`` (columns,) and vertical ``up`` (rows,) [m]."""
+    """A grid of points on a map: horizontal ``across`` (columns,) and vertical ``up`` (rows,) coordinates [m]."""
 
     view: View
     across: Array
