@@ -82,7 +82,7 @@ def test_real_recordings_in_the_wrong_unit(real_data):
     units = [finding for finding in findings if finding.code == "units"]
     assert len(units) == 9
     assert {f.severity for f in units} == {"error"}
-    assert all('units="cm" (the motion is then 0.' in f.remedy for f in units)
+    assert all('units="cm" (the motion then extends over 0.' in f.remedy for f in units)
 
 
 def test_real_recordings_with_a_stranger_among_them(real_data):
@@ -481,7 +481,7 @@ def test_motions_on_a_line():
         one.with_trajectory(Trajectory(one.trajectory.times, one.trajectory.positions * [1, 0, 0]), None)
         for one in motions(4)
     ]
-    assert "on a straight line" in find("planar", lint(line)).message
+    assert "of a straight line" in find("planar", lint(line)).message
 
 
 def test_an_outlier_in_position():
