@@ -36,8 +36,8 @@ class Command:
         twist: twist of the tool in the base frame, linear velocity first, shape (6,) [m/s, rad/s].
         joint_velocity: velocity of the joints, shape (n_joints,) [rad/s]; if given, it replaces the twist, for example
             along a planned joint path. None: the inverse kinematics computes the joint velocity from the twist.
-        posture: joint positions towards which the arm drifts in the null space of the twist, shape (n_joints,) [rad];
-            None: no preference.
+        posture: joint positions towards which the arm drifts in the null space of the twist, shape (n_joints,) [rad],
+            or None without a preference.
         elbow: SEW (shoulder-elbow-wrist) angle to which the elbow rotates in the null space of the twist [rad]; None:
             no preference.
         progress: completed fraction of the motion, 0 to 1; nan if unknown.

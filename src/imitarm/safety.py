@@ -46,12 +46,12 @@ class SafetyStep:
 class SafetyFilter:
     r"""Converts commands to joint velocities that keep the arm's limits and its clearances.
 
-    Each step solves one quadratic program (:class:`~imitarm.kinematics.ik.IKSolver`): it finds the joint velocity
-    closest to the command that
+    Each step finds the joint velocity that is closest to the command and meets two conditions, by one quadratic program
+    (:class:`~imitarm.kinematics.ik.IKSolver`):
 
-    * always stays inside the position, velocity and acceleration limits of the joints;
-    * lets no part of the arm approach an obstacle faster than :class:`~imitarm.scene.clearance.ClearanceLimit` allows,
-      and lets no link approach another link faster than :class:`~imitarm.scene.clearance.SelfClearance` allows.
+    * The velocity always stays inside the position, velocity and acceleration limits of the joints.
+    * No part of the arm approaches an obstacle faster than :class:`~imitarm.scene.clearance.ClearanceLimit` allows, and
+      no link approaches another link faster than :class:`~imitarm.scene.clearance.SelfClearance` allows.
 
     If these clearance inequalities contradict the joint limits, no safe motion exists. The velocity then violates the
     inequalities as little as possible, which moves the arm away from objects that are too close, and ``safe`` is False.

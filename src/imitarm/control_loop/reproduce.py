@@ -78,12 +78,13 @@ def reproduce(
             robot is stopped and the exception is raised again.
 
     Returns:
-        The measured motion from rest to rest. ``success`` means that the motion finished in time, touched nothing, and
-        kept the clearance that the filter requires. ``details`` holds the commanded ``"twists"`` (n, 6) and several
-        counts. ``"clamped"`` says how often each limit changed a command. ``"filtered"`` is the number of steps in
-        which the filter changed a command to keep a clearance, and ``"unsafe"`` the number of steps without a safe
-        motion. ``"statuses"`` is the number of steps with each status of the policy. The entries of the robot's
-        :meth:`~imitarm.robots.robot.Robot.report` are added.
+        The measured motion from rest to rest. Its attribute ``success`` means that the motion finished in time, touched
+        nothing, and kept the clearance that the filter requires. Its ``details`` contain the commanded ``"twists"``
+        (n, 6) and several counts. The count ``"clamped"`` says how often each limit changed a command. The count
+        ``"filtered"`` is the number of steps in which the filter changed a command to keep a clearance, and
+        ``"unsafe"`` is the number of steps without a safe motion. The count ``"statuses"`` is the number of steps with
+        each status of the policy. The details also contain the entries of the robot's
+        :meth:`~imitarm.robots.robot.Robot.report`.
 
     Raises:
         InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not return a Command.

@@ -420,10 +420,10 @@ def complete_home(
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return a position for every joint of ``model``, and notes on the choice.
 
-    A joint in ``given`` has the position that is given. A tool's fingers are open, other joints that do not belong to
-    the arm are in the middle of their ranges, and coupled joints follow their leader. The arm's own joints are also in
-    the middle of their ranges if that posture is not singular and its links are at least 20 mm apart. Otherwise the
-    function chooses the best of many postures.
+    A joint in ``given`` has the position that ``given`` contains. A tool's fingers are open, other joints that do not
+    belong to the arm are in the middle of their ranges, and coupled joints follow their leader. The arm's own joints
+    are also in the middle of their ranges if that posture is not singular and its links are at least 20 mm apart.
+    Otherwise the function chooses the best of many postures.
     """
     home: dict[str, float] = {}
     for index in range(model.njnt):

@@ -55,16 +55,17 @@ class IKStep:
 class IKSolver:
     r"""Inverse kinematics of one arm for a control loop; arguments that do not change are checked once.
 
-    ``"qp"`` minimises, over the joint velocity v inside every :class:`~imitarm.kinematics.limits.Box`,
+    The method ``"qp"`` minimises the following cost over the joint velocity v inside every
+    :class:`~imitarm.kinematics.limits.Box`:
 
     .. math:: \sum_i \tfrac12 |J_i v - t_i|^2 + \tfrac{\mu}2 |v|^2 + \tfrac{w_a}2 |v - v_p|^2
               + \sum_j \tfrac{c_j}2 \max(0, b_j - A_j v)^2 / |A_j|^2
 
-    Here, each task has a Jacobian :math:`J_i` and a target :math:`t_i`. The previous velocity is :math:`v_p`. The rows
-    :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite price are hard
-    constraints, which are kept whenever the boxes allow it. If the boxes do not allow it, the sum of the squared
-    violations, in rad/s along each row, is minimised first, and the tasks have second priority. The other methods
-    accept one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one
+    Here, each task has a Jacobian :math:`J_i` and a target :math:`t_i`, and :math:`v_p` is the joint velocity of the
+    previous step. The rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite
+    price are hard constraints, which are kept whenever the boxes allow it. If the boxes do not allow it, the sum of the
+    squared violations, in rad/s along each row, is minimised first, and the tasks have second priority. The other
+    methods accept one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one
     :class:`~imitarm.kinematics.tasks.PostureTask`, and no limits except boxes. These methods are the following:
 
     * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9), computes :math:`v = J^T (J J^T+\lambda^2)^{-1} t` in

@@ -135,8 +135,8 @@ class SphereCover:
 
         A joint that moves both spheres does not change their distance. Let n be the unit vector from the inner to the
         outer sphere, and c the center of the outer sphere. Let a be the axis of a joint that moves only the outer
-        sphere, and o a point on the axis. Per radian, this joint changes the distance by ``n.(a x (c - o)) = a.(c x n)
-        - n.(a x o)``.
+        sphere, and o a point on the axis. Per radian, this joint changes the distance by
+        ``n.(a x (c - o)) = a.(c x n) - n.(a x o)``.
 
         Args:
             data: the kinematics of a posture.

@@ -208,8 +208,9 @@ def adapt(
         n_samples: samples along the path; None: 200.
         state: measured state of ``arm``, from whose posture the motion starts; None: a posture near ``arm.home`` with
             the tool at the start.
-        max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]; 0 at start and goal;
-            None: two standard deviations of the demonstrated rotation, and 0 if no orientation was learned.
+        max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]. At start and goal, this
+            rotation is always 0. The default is two standard deviations of the demonstrated rotation, and 0 if no
+            orientation was learned.
         allowance: distance that is added to the clearance if a path with this larger clearance is found, because no
             robot moves exactly as commanded [m].
 
@@ -324,7 +325,7 @@ def _first_posture(arm: ArmModel, nominal: Trajectory, state: ArmState | None) -
 
 
 def _of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearance: float, began: float) -> Adaptation:
-    """Return the adaptation of the whole arm, from that of the tool alone."""
+    """Return the adaptation of the whole arm, given the adaptation of the tool alone."""
     plan, timing, spent = solution.plan, solution.timing, time.perf_counter() - began
     if plan is None or not plan.complete:
         return replace(tool, feasible=False, reason=solution.reason, compute_time=spent)
@@ -429,15 +430,17 @@ def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
 
 def _validity(scene: Scene, duration: float, *, arm: bool = False) -> str:
     moving = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.velocity.any()]
-    covers = "the tool on the planned path, but not for the links of the arm and not for tracking errors"
+    covers = "it covers the tool on the planned path, but neither the links of the arm nor tracking errors"
+    if arm:
+        covers = "it covers every moving part of the arm on the planned joint path, but no tracking errors"
     rotating = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.angular_velocity.any()]
     if rotating:
-        covers += f"; {' and '.join(rotating)} may rotate in any way about the centre"
+        covers += f"; {' and '.join(rotating)} may rotate in any way about the obstacle's centre"
     if not moving:
-        return f"while the obstacles stand still, for {covers}"
+        return f"the guarantee holds while the obstacles stand still; {covers}"
     return (
-        f"only from 0 to {duration:.2f} s, while the motion is on time and {' and '.join(moving)} "
-        f"{'keeps' if len(moving) == 1 else 'keep'} the given velocity, for {covers}; the guarantee ends at arrival"
+        f"the guarantee holds only from 0 to {duration:.2f} s, while the motion is on time and {' and '.join(moving)} "
+        f"{'keeps' if len(moving) == 1 else 'keep'} the given velocity, and ends at arrival; {covers}"
     )
 
 

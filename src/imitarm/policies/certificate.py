@@ -216,7 +216,7 @@ class PathClearance:
         tool: the spheres and the obstacles.
         positions: positions of the tip, shape (n, 3) [m].
         distance: distance of each pair at each sample, shape (n_pairs, n) [m].
-        normal: gradients of these distances, shape (n_pairs, n, 3).
+        normal: gradients of the distances, shape (n_pairs, n, 3).
     """
 
     tool: ToolAmongObstacles
@@ -235,8 +235,8 @@ class PathClearance:
         Let ``f`` be a convex function on a segment of length L, with slope a at the start and b at the end. Then ``f(s)
         >= max(f0 + a s, f1 - b (L - s))``. The minimum of this bound over s is at an end of the segment or at the
         crossing of the two lines. The tip moves straight between two samples. While the tool rotates by ``angle``, the
-        centre of a sphere beside the tip leaves the straight line by at most ``|offset| (1 - cos(angle / 2))``. The
-        bound is lowered by this amount.
+        centre of a sphere beside the tip leaves the straight line by at most ``|offset| (1 - cos(angle / 2))``. This
+        largest deviation is subtracted from the bound of the distance.
 
         Returns:
             Shape (n_pairs, n - 1) [m].
@@ -259,9 +259,10 @@ class PathClearance:
 
         Near a corner of an obstacle, the bound from the tangents at the two ends of a segment is much too low. The
         distance is therefore measured at the point where the tangents cross. If the distance there is below the
-        clearance, the path really is too close to the obstacle. Otherwise the crossing point replaces one end of the
-        segment: the first end if the distance still decreases at the point, the last end if the distance increases. The
-        minimum of the distance therefore stays between two tangents that converge to it.
+        clearance, the path really is too close to the obstacle. Otherwise the crossing point replaces one of the two
+        ends. If the distance still decreases at this point, the point replaces the first end; if the distance
+        increases, the point replaces the last end. The minimum of the distance therefore stays between the two ends,
+        and the bound converges to this minimum.
 
         Args:
             clearance: required clearance [m].
@@ -281,7 +282,7 @@ class PathClearance:
         return bounds, found
 
     def _closer_look(self, pair: int, j: Index, bounds: Array, clearance: float) -> tuple[Array, Array]:
-        """Return refined bounds (m,) of segments ``j`` (m,) of a pair, and the fractions of their minima (m,)."""
+        """Return refined bounds (m,) of segments ``j`` (m,) of a pair, and where they are lowest, as fractions (m,)."""
         start = self.tool.centres(pair, self.positions[j], j)
         step = self.tool.centres(pair, self.positions[j + 1], j + 1) - start
         bow = self.tool.bows[pair % self.tool.n_spheres, j]
@@ -338,10 +339,10 @@ def crossing_of_tangents(f0: Array, a: Array, f1: Array, b: Array, length: Array
     """Return the minimum of ``max(f0 + a s, f1 - b (length - s))`` over s in [0, length], and the s at the minimum.
 
     Args:
-        f0: values at the start, any shape.
-        a: slopes at the start.
-        f1: values at the end.
-        b: slopes at the end.
+        f0: values of the convex functions at the start of the interval, any shape.
+        a: slopes of the functions at the start.
+        f1: values of the functions at the end.
+        b: slopes of the functions at the end.
         length: length of the interval.
     """
     inside = (a < 0.0) & (b > 0.0)

@@ -4,10 +4,11 @@ The algorithm of :func:`find_detour`:
 
 1. **Side.** Take the obstacle with the largest violation. Try directions across the path. Along each direction, the
    lift of a violated sample is the distance by which the sample must move to leave the inflated convex obstacle.
-   Newton's method computes the lift from outside; it never overshoots, because the signed distance is convex. A small
-   quadratic program computes the smallest amplitudes of the components that give this lift. The search follows the
-   direction of least cost first, until nothing is violated. The cost is the displacement relative to the demonstrated
-   variance, plus the remaining violation. The other directions are kept and tried later if this direction fails.
+   Newton's method computes the lift, starting from a point outside the obstacle; because the signed distance is convex,
+   the method never overshoots. A small quadratic program computes the smallest amplitudes of the components that give
+   this lift. The search follows the direction of least cost first, until nothing is violated. The cost is the
+   displacement relative to the demonstrated variance, plus the remaining violation. The other directions are kept and
+   tried later if this direction fails.
 2. **Least detour** (:mod:`~imitarm.policies.least_detour`): the smallest displacement that keeps the clearance and
    passes each obstacle on the chosen side.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
@@ -213,7 +214,7 @@ class _SideSearch:
         worst: int,
         here: PathClearance,
     ) -> tuple[list[Array], list[float], bool]:
-        """Convert lifts (m, p) along directions (m, 3) to displacements with their costs.
+        """Convert lifts of samples (m, p) along directions (m, 3) to displacements of components, with their costs.
 
         First, every direction is rated with one common amplitude for all affected components. Then the smallest
         sufficient amplitudes are computed for the best few directions. The function also returns whether the cheapest
@@ -309,7 +310,7 @@ class _SideSearch:
         return np.flatnonzero((near | in_charge) & (self.path.basis[rows].max(axis=0) > NEGLIGIBLE_LEVER))
 
     def _amplitudes(self, lever: Array, lift: Array, u: Array, affected: Index) -> Array | None:
-        """Return amplitudes a >= 0 of least ``sum a_k^2 / (u^T Y_k u)`` with ``lever @ a >= lift``; None if impossible.
+        """Return the amplitudes a >= 0 with the least ``sum a_k^2 / (u^T Y_k u)`` and ``lever @ a >= lift``; or None.
 
         Args:
             lever: influence of each affected component on each violated sample, shape (p, k).

@@ -324,14 +324,14 @@ class LeastDetour:
         return best, ratio
 
     def _scale(self, moved: Index, smoothness: float | None) -> Array:
-        """Return :func:`style_scale` of the moved components with a weight, or the default weight of this path."""
+        """Return :func:`style_scale` of the moved components; without a ``smoothness``, the path's default is used."""
         weight = (SMOOTHNESS if self.exact else 0.0) if smoothness is None else smoothness
         return style_scale(self.path, self.allowed, moved, weight)
 
     def _step(
         self, moved: Index, scale: Array, here: PathClearance, held: ClosePoints, cuts: _Cuts
     ) -> tuple[Array, PathClearance, float] | None:
-        """Return the displacement of least cost under the tangents, its clearance and cost; None: no solution.
+        """Return the displacement of least cost that keeps the tangents' inequalities, its clearance and cost; or None.
 
         At first, only samples near an obstacle have an inequality. If the solution violates the clearance at another
         sample, all samples get an inequality.
@@ -351,7 +351,7 @@ class LeastDetour:
     def _least(
         self, moved: Index, scale: Array, here: PathClearance, held: ClosePoints, cuts: _Cuts, influence: float
     ) -> tuple[Array, float] | None:
-        """Minimise the cost under the tangents along a path; None: no solution.
+        """Minimise the cost subject to the inequalities from the tangents along a path; None without a solution.
 
         If there is no solution, all tangents are relaxed by one common distance, as small as possible; the tangents
         along the resulting path may then have a solution.

@@ -174,8 +174,8 @@ class ACFRA(Policy):
         gain: K [1/s].
         patience: e_0, the position error at which the phase stops [m]; None: the clearance, at least 5 mm.
         arrival: distance to the end of the path at which the motion counts as arrived [m].
-        allowance: margin added to the clearance in planning, if possible, because a robot has tracking errors [m];
-            None: 2 mm for a plan of the tool, 5 mm for a plan of the whole arm.
+        allowance: margin added to the clearance in planning, if possible, because a robot has tracking errors [m]. The
+            default is 2 mm for a plan of the tool, and 5 mm for a plan of the whole arm.
 
     Attributes:
         adaptation: result of the last ``reset``.
@@ -249,7 +249,7 @@ class ACFRA(Policy):
         self._phase, self._void = 0.0, ""
 
     def _adapted(self, scene: Scene, start: Pose | None, state: ArmState) -> Adaptation:
-        """Return the adapted path, from a start (None: the learned one)."""
+        """Return the adapted path that begins at ``start``; None: at the learned start."""
         path = self._path.between(self.skill, start, scene.goal)
         allowance = self._allowance if self._refuses else 0.0
         return adapt(
@@ -342,7 +342,7 @@ class ACFRA(Policy):
 
 
 def _at(time: float, times: Array, values: Array) -> Array:
-    """Return the rows of values (n, m) at times (n,), interpolated linearly at one time, shape (m,)."""
+    """Return the row at ``time``, shape (m,), interpolated linearly between the rows of ``values`` (n, m)."""
     return np.array([np.interp(time, times, column) for column in values.T])
 
 

@@ -4,7 +4,7 @@ At some times along the nominal path (layers), rays start at the nominal positio
 the inflated obstacles are the nodes. Edges lead from each node to the nodes of the next layer on the same and on
 neighbouring rays. The cost of an edge is the change of the displacement, plus a large amount where the two tangents at
 its ends do not prove the clearance. Dynamic programming from both ends gives the cheapest route through every node at
-once. A route is only a proposal: the least detour takes its tangents along it.
+once. A route is only a proposal: the search for the least detour takes its first tangents along the route.
 """
 
 from __future__ import annotations

@@ -204,7 +204,7 @@ class _Search:
     def approach(self, end: Array) -> Approach | None:
         """Return a clear motion from the posture of the task to another posture; None if none was found.
 
-        The motion is straight in joint space, or straight to a via posture and from there to the end.
+        The motion is a straight line in joint space, or two straight lines that meet in an intermediate posture.
         """
         arm, start = self.task.arm, self.task.start
         random = np.random.default_rng(1)
@@ -266,7 +266,8 @@ class _Search:
     def _goal_postures(self) -> list[Array]:
         """Return distinct postures in which the tool is at the goal and the whole arm is clear.
 
-        Inverse kinematics from random starts finds postures at the goal. Self-motion then changes each posture.
+        Inverse kinematics from random starts finds postures at the goal. The self-motion of the arm
+        then changes each of these postures.
         """
         arm, path = self.task.arm, self._components.nominal
         goal = Pose(path.positions[-1], self._quaternions[-1])
@@ -359,7 +360,7 @@ class _Search:
         return None
 
     def _timing(self, path: ArmPath, times: Array, clock: Array) -> Timing:
-        """Return the times of a path with the parameters ``times``, among obstacles as they are at ``clock``."""
+        """Return execution times for a path with the parameters ``times``, among the obstacles' places at ``clock``."""
         gaps = self._around.gaps(path, clock, _REACH)
         speed = np.linalg.norm(np.gradient(path.centers, times, axis=0), axis=2)
         own = gaps.obstacle == SELF
@@ -400,7 +401,7 @@ class _Search:
             return f"{self.task.arm.name} can't move its tool along the path: move the path nearer to the arm"
         first = "" if self._first is None else f"on the path planned for the tool alone, {self._placed(self._first)}; "
         if self._goals is not None and not self._goals:
-            nearest = "" if self._goal is None else f" (in the best one, {self.named(self._goal)})"
+            nearest = "" if self._goal is None else f" (in the best posture, {self.named(self._goal)})"
             return (
                 f"no posture was found in which the tool is at the goal and the whole arm is clear{nearest}: move the "
                 "obstacle or the goal"

@@ -68,7 +68,7 @@ class Supervisor:
     as the joints can move in 0.15 s at full speed.
 
     Let :math:`q_c` be the commanded position and :math:`\dot q_c` its velocity. The set-point q moves towards
-    :math:`q_c` at the velocity
+    :math:`q_c` at the following velocity:
 
     .. math:: \dot q = f\,\dot q_c + \mathrm{sign}(e) \min(k |e|, \sqrt{a |e|}), \qquad
               e = q_c + \dot q_c\, s - q

@@ -333,7 +333,7 @@ def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
     Link 0 is the base; link k is moved by k joints. Neighbouring links are always reported as not meeting. For links
     with two or three joints between them, the distance of their exact shapes is measured in 512 postures that fill the
     ranges of these joints evenly (a Sobol sequence). Links that touch in none of these postures are reported as not
-    meeting. Links with more joints between them are always reported as meeting.
+    meeting. Links with four or more joints between them are always reported as meeting.
 
     Args:
         arm: the arm with its tool.

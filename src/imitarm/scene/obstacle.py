@@ -288,7 +288,7 @@ class Obstacle(ABC):
         return _distance(self._single, finite_points(points), True)
 
     def distances_at(self, points: Array, gradient: bool) -> tuple[Array, Any]:
-        """Return distances, and gradients on request, for points known to be finite; this saves the check.
+        """Return distances, and gradients on request, without the check that all points are finite, to save time.
 
         Args:
             points: float64 points in the base frame, shape (..., 3) [m].

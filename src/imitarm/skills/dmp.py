@@ -110,7 +110,7 @@ class DMP:
     positions are not differentiated, samples may have any times, and the motion reaches the goal at the end of the
     duration.
 
-    **Another start or goal.** Let ``p`` be the fraction of the path that has been travelled. This fraction is itself a
+    **Another start or goal**: let ``p`` be the fraction of the path that has been travelled. This fraction is itself a
     primitive from 0 to 1, with weights w_p. The argument ``adjustment`` then selects the weights:
 
     * ``"progress"``: w + (change of g - x_0) w_p. The change of start and goal is added in proportion to the travelled

@@ -302,10 +302,10 @@ def choose(candidates: Sequence[Candidate]) -> int:
 
     The function returns the smallest K that meets two conditions:
 
-    * Its held-out error is within 2 % (or 0.1 mm) of the smallest held-out error, so it generalises as well as any
-      other K.
-    * Its bias is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small compared with the
-      differences between demonstrations. The held-out error alone hardly shows a bias, because the squared bias is
+    * The held-out error of K is within 2 % (or 0.1 mm) of the smallest held-out error, so K generalises as well as any
+      other number.
+    * The bias of K is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small compared with
+      the differences between demonstrations. The held-out error alone hardly shows a bias, because the squared bias is
       added to much larger squared differences.
 
     If no K meets both conditions, only the K that meet the first condition are compared. Among these K, the result is

@@ -252,7 +252,7 @@ def fit_of(fields: FitFields, sources: list[str], n_components: int) -> FitQuali
         InputError: when the number of rows of distances differs from the number of sources.
     """
     if len(fields.distances) != len(sources) or any(len(row) != 4 for row in fields.distances):
-        raise InputError(f"fit: one row of 4 distances needed for each of {len(sources)} sources")
+        raise InputError(f"fit: needs one row of 4 distances for each of the {len(sources)} sources")
     distances = tuple(DemonstrationDistance(s, *row) for s, row in zip(sources, fields.distances, strict=True))
     rest = {name: getattr(fields, name) for name in fields.__struct_fields__ if name != "distances"}
     return FitQuality(distances, n_components, **rest)

@@ -6,9 +6,10 @@ obstacle.
 
 * ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The last term does not depend on the
   position, so it drops out of the force, and the spread has no effect.
-* ``mapf``: a dimensionless potential with the effect that the thesis describes in words, ``U = 1/2 eta s d_th^2 (1/rho
-  - 1)^2`` with ``rho = d / d_th``. The gain ``s = exp((sigma(n)^2 - median) / max)`` pushes components with a large
-  spread farther than components with a small spread. Here, ``median`` and ``max`` are those of ``sigma(n)^2``.
+* ``mapf``: a dimensionless potential with the effect that the thesis describes in words:
+  ``U = 1/2 eta s d_th^2 (1/rho - 1)^2`` with ``rho = d / d_th``. The gain ``s = exp((sigma(n)^2 - median) / max)``
+  pushes components with a large spread farther than components with a small spread. Here, ``median`` and ``max`` are
+  those of ``sigma(n)^2``.
 
 Neither potential checks whether the path *between* two pushed means is clear. Two components on opposite sides of an
 obstacle are pushed apart, so the path between them passes through the obstacle. Both potentials are kept for
