@@ -187,10 +187,10 @@ def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[R
     period = abs(float(times[-1])) / max(n - 1, 1)
     if n > 1 and period < 1.0 / _FASTEST_RATE:
         fit = time_unit_that_fits(1.0 / period, TICK) if period > 0.0 else None
-        unit = "" if fit is None else f"they are plausible in {fit[0]}: multiply them by {fit[1]:.10g}; "
+        unit = "" if fit is None else f"the times are plausible in {fit[0]}: multiply them by {fit[1]:.10g}; "
         raise FileFormatError(
             f"{path}: {n} frames within {abs(float(times[-1])):.3g} s; the times are not in units of 100 ns, in "
-            f"which the Kinect SDK writes them; {unit}if they are in seconds, multiply them by 10 000 000"
+            f"which the Kinect SDK writes them; {unit}if the times are in seconds, multiply them by 10 000 000"
         )
     return skeletons, issues
 

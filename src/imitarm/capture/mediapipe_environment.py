@@ -42,8 +42,9 @@ REQUIREMENTS = (
 )
 """Packages that pose tracking needs.
 
-MediaPipe is installed with these packages instead of the packages that it declares as requirements.
-MediaPipe's declared requirements also include jax, sentencepiece and sounddevice, which pose tracking does not need.
+MediaPipe is installed with only the packages in this list, instead of all the packages that it declares as
+requirements. MediaPipe's declared requirements also include jax, sentencepiece and sounddevice, which pose tracking
+does not need.
 """
 
 _STAMP = "imitarm-mediapipe.txt"  # written last: without it the environment is incomplete

@@ -28,7 +28,7 @@ _SPEED = (0.25, 0.55)  # [m/s] mean speed of a reach
 def minimum_jerk(points: ArrayLike, times: ArrayLike) -> BSpline:
     """Return the quintic spline through ``points`` (n, d) at ``times`` (n,) that is at rest at both ends.
 
-    This spline is the minimum-jerk path through the points (Flash and Hogan 1985).
+    The quintic spline is the minimum-jerk path through the points (Flash and Hogan 1985).
     """
     at = np.asarray(points, dtype=float)
     zero = np.zeros(at.shape[1])

@@ -82,9 +82,9 @@ def length_unit_that_fits(limb: float) -> str | None:
 def axes_that_fit(positions: Array) -> tuple[str, str] | None:
     """Return what is wrong with the axes of positions (n, 25, 3), and the axes to use; None when the axes are correct.
 
-    The axes are correct when the spine points up (y) and the trunk is in front of the sensor (z above 0). Among the
-    axes that meet these two conditions, the function proposes axes in which the person also faces the sensor, so that
-    the right shoulder has a larger x than the left shoulder. Right-handed axes are preferred to left-handed axes.
+    The axes are correct when the spine points up (y) and the trunk is in front of the sensor (z above 0). If several
+    axes are correct, the function proposes axes in which the person also faces the sensor, so that the right shoulder
+    has a larger x than the left shoulder. Right-handed axes are preferred to left-handed axes.
     """
     spine = _median(_mean(positions[:, _UPPER]) - _mean(positions[:, _LOWER]))
     trunk = _median(_mean(positions[:, _TRUNK]))

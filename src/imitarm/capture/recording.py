@@ -281,8 +281,8 @@ def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
     """Slow a recording down, for a robot whose joints are slower than a person's.
 
     Frames are inserted so that the frame rate stays about the same. In an inserted frame, the joints are interpolated
-    linearly. A joint that is lost in one of the two original frames keeps its position from the earlier frame. Gaps
-    between frames are not filled, and become longer.
+    linearly between the previous and the next original frame; a joint that is lost in one of these two frames keeps its
+    position from the previous frame. Gaps between frames are not filled, and become longer.
 
     Args:
         skeletons: skeletons in the order of their times.

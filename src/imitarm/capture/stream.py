@@ -98,12 +98,12 @@ class UdpSource(SkeletonSource):
 
     A :class:`~imitarm.transmission.datagram_filter.DatagramFilter` drops and counts datagrams that are late, damaged,
     hostile, or from another sender. A sender that is killed and started again is accepted after half a second of
-    silence. The time stamps of the restarted sender are shifted so that they continue those from before the restart.
-    Every retargeter stops while the sender is silent, and then starts again.
+    silence. The time stamps of a restarted sender are shifted so that they keep increasing after the restart. Every
+    retargeter stops while the sender is silent, and then starts again.
 
     Args:
         port: port to listen on; 0: any free port.
-        host: address of this machine to listen on; by default, only this machine can send.
+        host: address of this machine to listen on; by default, only programs on this machine can send skeletons.
         clock_ns: function that returns the time of receiving [ns].
 
     Attributes:

@@ -112,7 +112,7 @@ def _about_vertical(hand: Array, before: Array, home: Array) -> Array:
     """Rotate ``home`` about the base's z axis as the hand has rotated since ``before``; quaternions, shape (4,).
 
     The rotation about z is the twist of the swing-twist decomposition. The function computes the twist with plain
-    floats, because only two components of its quaternion are not zero.
+    floats, because two components of the twist's quaternion are zero.
     """
     (a, b, c, d), (e, f, g, h), (w, x, y, z) = hand.tolist(), before.tolist(), home.tolist()
     real, up = a * e + b * f + c * g + d * h, d * e - a * h + c * f - b * g

@@ -7,9 +7,9 @@ Only a recording can be fitted, because a live motion is not known in advance. T
 where :math:`W` is the position of the person's wrist along the axes of the base, :math:`W_0` its position when the
 clutch engages, :math:`p_0` the start position of the tool, and :math:`\rho` the scale. For each scale, the search
 places the middle of the motion at positions near the tool's home position, and then at positions throughout the
-workspace. The scale is reduced until the arm reaches the start and the six outermost points of the motion. At each of
-these points, the tool must have the same orientation as at home. The arm must be away from singularities, and its links
-must keep a minimum distance from each other and from the fixtures on which the arm stands.
+workspace. The scale is reduced until the arm reaches the start and the six outermost points of the motion. At the start
+and at the six outermost points, the tool must have the same orientation as at home. The arm must be away from
+singularities, and its links must keep a minimum distance from each other and from the fixtures on which the arm stands.
 """
 
 from __future__ import annotations

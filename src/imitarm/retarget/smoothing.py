@@ -230,9 +230,10 @@ class TrackingOffsets:
 
     .. math:: o \leftarrow o\,\exp(-\Delta t / T - |\Delta x| / L).
 
-    A person who watches the robot does not notice this decay, but would notice if the robot jumped away and back.
+    A person who watches the robot does not notice the slow decay of the offset, but would notice if the robot jumped
+    away and back.
 
-    If a joint flickers between tracked and inferred, the filter keeps one offset for each of these two states, for up
+    If a joint flickers between tracked and inferred, the filter keeps two offsets, one for each tracking state, for up
     to 0.12 s. If every change of the state started a new offset, the absolute measured position would never have an
     effect, and the estimate would drift away. The length of an offset is at most 0.2 m.
 

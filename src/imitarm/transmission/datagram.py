@@ -1,9 +1,9 @@
 """Datagrams: messages encoded as bytes, and decoded with every value checked.
 
 A datagram consists of a header of 28 bytes and a payload, both little-endian. The message type alone determines the
-size of the payload; docs/transmission.md has a table of the fields. A datagram that does not have this form is rejected
-with a reason. No part of a datagram is executed or used as a length. The only effect of a hostile datagram is therefore
-that it is counted.
+size of the payload; docs/transmission.md has a table of the fields. An invalid datagram is rejected with a reason. No
+part of a datagram is executed or used as a length. The only effect of a hostile datagram is therefore that it is
+counted.
 """
 
 from __future__ import annotations

@@ -131,7 +131,7 @@ class AdaptiveLaw:
     where the forgetting factor is :math:`\gamma = a/(1 + b|\varepsilon|^2)`. The closure h of the person's hand (0
     open, 1 closed) raises the largest stiffness: :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. The inertia matrix
     M, the Coriolis matrix C and the gravity torque G are those of the rigid arm in ``ArmModel``. The adapted values F,
-    K and D compensate for effects that this model does not include, which are rotor inertia and friction. C consists of
+    K and D compensate for rotor inertia and friction, which the rigid-arm model does not include. C consists of
     Christoffel symbols, so that :math:`C(q, a)\,b = \tfrac12\,(c(a+b) - c(a) - c(b))` with :math:`c(v) = C(q, v)\,v`.
 
     The control law is a discrete form of the laws of Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet; we

@@ -239,7 +239,7 @@ def fit_nurbs(
 
     where D is the matrix of second differences from :func:`bends`. The parameter is the time, not the chord length,
     because the speed is part of the motion. The normal equations have a band matrix of width p, so the computing time
-    grows linearly with the number of samples. The rule ``"gcv"`` takes longer because it needs the inverse of the
+    grows linearly with the number of samples. The rule ``"gcv"`` takes longer because it needs the inverse of the band
     matrix.
 
     Args:
@@ -335,7 +335,7 @@ def bends(knots: Array, degree: int) -> Array:
     Each control point corresponds to the parameter :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`, the mean of p knots.
     The parameters :math:`g_j` are denser near the ends of the curve. Near the ends, plain differences :math:`P_{j+1} -
     2 P_j + P_{j-1}` would not vanish for a straight uniform motion, so a fit would slow this motion down. The second
-    differences are therefore divided differences,
+    differences are therefore computed as divided differences,
 
     .. math:: h \left( \frac{P_{j+1} - P_j}{g_{j+1} - g_j} - \frac{P_j - P_{j-1}}{g_j - g_{j-1}} \right)
 

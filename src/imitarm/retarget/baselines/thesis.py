@@ -61,7 +61,7 @@ class HumanArmTracker:
 
     In each frame, the tracker starts from the angles :math:`\tau` of the previous frame.
 
-    The tracker then repeats an update one to three times:
+    The tracker repeats the following update one to three times per frame:
 
     .. math:: \tau \leftarrow \tau + J^+ \varepsilon, \qquad
         \varepsilon = \begin{pmatrix} p_d - p(\tau) \\ \log(R_d R(\tau)^T) \end{pmatrix}
