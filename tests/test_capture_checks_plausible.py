@@ -68,7 +68,7 @@ def test_quick_hands_at_an_implausible_rate_are_an_error():
 @pytest.mark.parametrize(("unit", "name"), [(1e-3, "ms"), (1.0, "s")])
 def test_a_kinect_table_in_far_too_long_units_is_refused_with_the_unit(tmp_path, unit, name):
     path = kinect_table(tmp_path / "a.csv", skeletons(40, rate=0.9 if unit == 1.0 else 30.0), unit=unit)
-    expected = "not in units of 100 ns" if name == "s" else f"they are plausible in {name}: multiply them by 10000"
+    expected = "not in units of 100 ns" if name == "s" else f"the times are plausible in {name}: multiply them by 10000"
     with pytest.raises(FileFormatError, match=expected):
         read_recording(path)
 
