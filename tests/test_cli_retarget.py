@@ -170,7 +170,11 @@ def test_a_tool_that_does_not_follow_its_target_is_reported_first_and_is_not_gre
     assert "warning: the tool did not follow its target: try --orientation fixed" in printed.err
     text = page.read_text(encoding="utf-8")
     assert 'class="verdict bad"' in text and 'class="verdict good"' not in text
-    assert "modern: does not follow" in text and "farther than 5 cm for" in text and "try --orientation fixed" in text
+    assert (
+        "modern: does not follow" in text
+        and "the distance exceeds 5 cm for" in text
+        and "try --orientation fixed" in text
+    )
     assert len(Demonstration.load(demo)) > 100
     assert run(shown, "--report", page) == 0
     printed = capsys.readouterr()

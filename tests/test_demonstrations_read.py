@@ -174,7 +174,7 @@ def test_real_recordings_of_a_guided_panda(real_data, name, n, columns):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("kinect_gestures/Ges01_wavehand.csv", "101 columns without names; a table without names must have 2"),
+        ("kinect_gestures/Ges01_wavehand.csv", "101 columns without names; a table without column names must have 2"),
         ("mocap_arm/recording.tsv", "recording.tsv, line "),
         ("mocap_trolley/mid.csv", "mid.csv, line 2: 8 values where 7 are expected"),
     ],

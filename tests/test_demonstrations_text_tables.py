@@ -303,7 +303,7 @@ def test_a_rate_gives_times():
 def test_other_numbers_of_columns_are_refused():
     with pytest.raises(
         FileFormatError,
-        match=r"f: 5 columns without names; a table without names must have 2 .* Write the column names",
+        match=r"f: 5 columns without names; a table without column names must have 2 .* Write the column names",
     ):
         unnamed_columns("f", TABLE[:, :5], ReadOptions())
 

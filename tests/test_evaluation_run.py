@@ -26,12 +26,12 @@ GOOD = TargetTracking("modern", 0.01, 0.0, 0.0, 0.03, 1, 0.95, 0)
         (
             {},
             True,
-            "modern: follows its target (RMS distance 10 mm, farther than 5 cm for 0 % of the time); the "
+            "modern: follows its target (RMS distance 10 mm; the distance exceeds 5 cm for 0 % of the time); the "
             "person controlled the robot for",
         ),
         ({"rms": FAR}, True, "follows"),
         ({"rms": 1.01 * FAR}, False, "does not follow"),
-        ({"far_fraction": FAR_FRACTION}, True, "farther than 5 cm for 10 % of the time"),
+        ({"far_fraction": FAR_FRACTION}, True, "the distance exceeds 5 cm for 10 % of the time"),
         ({"far_fraction": 1.01 * FAR_FRACTION}, False, "does not follow"),
         ({"far_fraction": 0.001}, True, "for under 1 % of the time"),
         ({"far_fraction": 0.999, "rms": 1.0}, False, "for over 99 % of the time"),

@@ -78,7 +78,7 @@ class _Draft(NamedTuple):
     """The parameters of a random obstacle. Drawing random parameters is much faster than building the obstacle.
 
     ``outer`` is the radius of a sphere around ``centre`` that contains the obstacle [m]. ``inner`` is the distance from
-    ``centre`` to some point of the obstacle [m].
+    ``centre`` to one point that belongs to the obstacle [m].
     """
 
     build: Callable[[], Obstacle]

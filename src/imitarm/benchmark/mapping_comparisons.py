@@ -68,8 +68,8 @@ def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
     note = (
         "↑ marks measures for which a larger value is better. For all other measures, a smaller value is better. "
         "Intervals are computed by resampling the persons. p is computed by sign flips of the persons' differences, "
-        "and corrected for the number of methods within each measure. Pairs: recordings for which both methods have a "
-        "value."
+        "and corrected for the number of methods that are compared in each measure. "
+        "Pairs: recordings for which both methods have a value."
     )
     return Table(f"Paired comparison: {', '.join(tasks)}", columns, tuple(rows), note)
 
@@ -298,7 +298,7 @@ CLAIMS: Sequence[tuple[str, Callable[[Results, str, Sequence[str]], Verdict]]] =
     ("shorter time than M1, M2, M3 (Fig 3.8)", _quicker),
     ("M2 has the smallest torque, but takes longest (text beside Fig 3.7)", _two_leads),
     (
-        "singularities are avoided: at the edge of reach, the arm is farther from them than with M3",
+        "singularities are avoided better than with M3 at the edge of reach",
         _farther_from_singular,
     ),
     (f"mean torques of {min(_MEANS):.0f} to {max(_MEANS):.0f} N m at every joint (Table 3.1)", _rated),

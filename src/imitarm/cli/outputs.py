@@ -24,8 +24,8 @@ def check_outputs(
     """Reject outputs that would overwrite an input, another output or an existing file.
 
     Args:
-        outputs: option and file of each output; a file None means that the output is not written.
-        inputs: option or argument of each input, and its file or the name of its source.
+        outputs: option and file of each output; if the file is None, the output is not written.
+        inputs: option or argument of each input, with its file or the name of its source.
         force: whether existing files may be replaced; None if the command has no option ``--force``.
         new_folders: whether the command creates missing folders.
 

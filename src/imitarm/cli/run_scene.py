@@ -210,11 +210,10 @@ def show_results(report: Report) -> None:
     headings = ["scene", "", "obstacles>", "clearance>", "certified>", "RMSE>", "unmoved>", "adaptation>"]
     show_table(headings, rows, styles=styles)
     remark(
-        "clearance: smallest measured distance between the arm (with tool) and any obstacle [mm]; certified: "
-        "guaranteed lower bound on the planned path, for the whole arm or, with --tool-only, for the tool [mm]; "
-        "RMSE: root mean square distance to the demonstrations [mm]; unmoved: fraction of the Gaussian components "
-        "that were not moved; "
-        "adaptation: computing time [ms]"
+        "Clearance: smallest measured distance between the arm (with tool) and any obstacle [mm]. Certified: "
+        "guaranteed lower bound of this distance on the planned path [mm]; with --tool-only, of the tool's distance. "
+        "RMSE: root mean square distance to the demonstrations [mm]. Unmoved: fraction of the Gaussian components "
+        "that were not moved. Adaptation: computing time [ms]."
     )
     if any(scene.certificate_void for scene in report.scenes):
         say(f"void: {CERTIFICATE_VOID}")

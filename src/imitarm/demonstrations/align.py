@@ -1,8 +1,8 @@
 """Align demonstrations: cut off rest at both ends, and warp time so that all motions pass matching points together.
 
 People never repeat a motion at exactly the same speed. A bend may therefore occur early in one demonstration and late
-in another. The mean at equal times would smear such a bend, because averaging cuts corners and flattens peaks.
-Alignment changes the time at which a demonstration reaches each point of its path, but never the path.
+in another. The mean of the demonstrations at equal times would smear a bend, because averaging cuts corners and
+flattens peaks. Alignment changes the time at which a demonstration reaches each point of its path, but never the path.
 
 Dynamic time warping within a band finds the matching points. For two motions ``a``, ``b`` of n samples, the cheapest
 monotone path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` follows from a recursion:
@@ -176,9 +176,9 @@ def _retimed(demonstration: Demonstration, warp: Array, times: Array) -> Demonst
 def noise_level(values: Array) -> float:
     """Estimate the standard deviation of white noise on samples (n, d), from their third differences.
 
-    For white noise of standard deviation s, the variance of a third difference is 20 s^2. The estimate uses the median,
-    so that motion that remains in the third differences has little influence. With fewer than 20 samples, noise and
-    motion can't be separated, and the result is 0.
+    For white noise of standard deviation s, the variance of a third difference is 20 s^2. Third differences still
+    contain a little motion; the estimate uses the median, so that this motion has little influence. With fewer than 20
+    samples, noise and motion can't be separated, and the result is 0.
     """
     if len(values) < 20:
         return 0.0

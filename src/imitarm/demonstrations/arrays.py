@@ -99,7 +99,7 @@ def _stack(source: str, array: Array, options: ReadOptions) -> list[RawDemonstra
     _check_matrices(source, array)
     if array.ndim not in (2, 3) or array.shape[-1] not in UNNAMED:
         raise FileFormatError(
-            f"{source}: shape {array.shape}, must be (n, columns) or (n_demonstrations, n, columns); columns: {COUNTS}"
+            f"{source}: shape {array.shape}, must be (n, columns) or (n_demonstrations, n, columns); {COUNTS}"
         )
     if array.ndim == 2:
         return [unnamed_columns(source, array, options)]

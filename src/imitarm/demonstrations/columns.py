@@ -21,7 +21,10 @@ Array = NDArray[np.float64]
 
 # columns without names, by their number ("q": the four numbers of a quaternion)
 UNNAMED = {2: "xy", 3: "xyz", 4: "txyz", 7: "xyzq", 8: "txyzq"}
-COUNTS = "2 (x y), 3 (x y z), 7 (x y z and quaternion), or 4 or 8 with the time as first column"
+COUNTS = (
+    "a table without column names must have 2 (x y), 3 (x y z), 4 (t x y z), 7 (x y z and quaternion) or 8 columns "
+    "(t x y z and quaternion)"
+)
 
 _UNIT_WORDS = {
     "length": {
@@ -242,7 +245,7 @@ def named_columns(
 def _with_tum_positions(columns: list[Column], names: Sequence[str]) -> list[Column]:
     """Return the columns; ``tx ty tz`` become positions if there is also a quaternion, as in trajectory files of TUM.
 
-    Without a quaternion, or together with forces, ``tx ty tz`` may be torques and do not become positions.
+    If the table has no quaternion, or if it also has forces, ``tx ty tz`` may be torques and do not become positions.
     """
     plain = [name.strip().lower() for name in names]
     known = {column.what for column in columns}
@@ -400,8 +403,7 @@ def unnamed_columns(
     layout = UNNAMED.get(values.shape[1])
     if layout is None:
         raise FileFormatError(
-            f"{source}: {values.shape[1]} columns without names; a table without names must have {COUNTS}. Write "
-            "the column names in the first line"
+            f"{source}: {values.shape[1]} columns without names; {COUNTS}. Write the column names in the first line"
         )
     start, n = int(layout[0] == "t"), len(values)
     times = options.seconds(source, values[:, 0], said.time) if start else options.even_times(source, n)

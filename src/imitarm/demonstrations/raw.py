@@ -215,7 +215,7 @@ class RawDemonstration:
         return np.asarray(np.isfinite(self.times) & (self.times <= before))
 
     def held(self) -> NDArray[np.bool_]:
-        """Return for each row whether it only repeats the previous row, because the recorder outran its sensor.
+        """Return for each row whether it only repeats the previous row, as the sensor was slower than the recorder.
 
         A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest also repeats
         values, and so does rounding. Repetitions caused by rest or rounding do not count. Values count as held only if

@@ -53,21 +53,21 @@ class MappingMetrics:
         engagements: how often the robot began to follow the person.
         tool_rms: root mean square distance of the tool to the reference, including the lag [m].
         tool_rms_without_lag: ``tool_rms`` after removing the constant lag that gives the smallest value [m].
-        lag: that lag [s].
+        lag: the constant lag that is removed in ``tool_rms_without_lag`` [s].
         tool_rms_from_first: root mean square distance of the tool to the reference of the first engagement, over all
             later frames in any state, including the lag [m].
-        executed_rms: as ``tool_rms``, but for an arm that keeps its limits of position, velocity and acceleration while
-            it executes the commands, so that commands beyond the limits give no advantage [m].
+        executed_rms: ``tool_rms`` of an arm that executes the commands within its limits of position, velocity and
+            acceleration [m]. Commands beyond the limits therefore give no advantage.
         executed_rms_without_lag: ``executed_rms`` after removing the constant lag that gives the smallest value [m].
         target_rms: root mean square distance of the tool to the method's own target [m].
         orientation_rms: root mean square angle between the tool's rotation and the reference [rad].
         elbow_direction_rms: root mean square angle between the actual and the correct direction of the robot's upper
             arm, see :func:`~imitarm.evaluation.tracking.elbow_direction_errors` [rad].
-        elbow_angle_rms: root mean square difference between the changes of the robot's and the person's SEW angle
-            (swivel angle of the elbow) since the start of the engagement [rad].
+        elbow_angle_rms: root mean square of an angle difference: the change of the robot's SEW angle (swivel angle of
+            the elbow) since the start of the engagement, minus the change of the person's SEW angle [rad].
         path_length: path length of the tool [m].
         settling_time: time from the end of the true hand's motion until the tool comes within 1 cm of the method's last
-            target and stays there for 0.5 s [s]; nan when it never does.
+            target and stays there for 0.5 s [s]; nan if the tool never stays there.
         mean_torque: mean absolute torque of each joint [N m].
         rms_torque: root mean square torque of each joint [N m].
         mean_gravity_torque: mean absolute torque that holds each joint against gravity [N m].

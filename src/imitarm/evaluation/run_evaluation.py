@@ -106,10 +106,10 @@ class TargetTracking:
         if not np.isfinite(self.rms):
             return f"{self.title}: followed nothing; {limits}"
         word = "follows its target" if self.near else "does not follow its target"
-        far = f"farther than {1e2 * FAR:.0f} cm for {_percent(self.far_fraction)} of the time"
+        far = f"the distance exceeds {1e2 * FAR:.0f} cm for {_percent(self.far_fraction)} of the time"
         led = f"the person controlled the robot for {_percent(self.engaged_fraction)} of the time"
         mostly = "" if self.mostly_engaged else "nobody controlled the robot for most of the time: "
-        return f"{self.title}: {mostly}{word} (RMS distance {1e3 * self.rms:.0f} mm, {far}); {led}; {limits}"
+        return f"{self.title}: {mostly}{word} (RMS distance {1e3 * self.rms:.0f} mm; {far}); {led}; {limits}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -270,7 +270,7 @@ def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods
 
     The correct direction is the direction of the robot's upper arm at the start of the engagement, rotated in the same
     way as the person's upper arm has rotated since then. The rotation of the person's upper arm is the smallest
-    rotation between its two directions.
+    rotation that takes its direction at the start of the engagement to its current direction.
 
     Args:
         true: the person's arm, in the axes of the base.
@@ -325,11 +325,11 @@ def settling_time(
         positions: shape (n, 3) [m].
         goal: goal position, shape (3,) [m].
         end: time at which the motion towards the goal ended [s].
-        radius: [m].
-        stay: [s].
+        radius: largest distance to the goal [m].
+        stay: time for which the point must stay within ``radius`` [s].
 
     Returns:
-        The time [s], at least 0; nan if the point never comes that close, or if the recording ends too early to tell.
+        The time [s], at least 0; nan if the recording shows no such stay of ``stay`` seconds after ``end``.
     """
     t = np.asarray(times, dtype=float)
     inside = np.linalg.norm(np.asarray(positions, dtype=float) - np.asarray(goal, dtype=float), axis=1) <= radius

@@ -97,9 +97,9 @@ class Teacher:
     def demonstrate(self, arm: ArmModel | None = None) -> tuple[Demonstration, SimulatedRobot]:
         """Guide the arm through the sweep; return the demonstration and the robot with its crumbs.
 
-        The hand pulls the tool like a spring and a damper, ``f = K (x_hand - x) + D (v_hand - v)``, and acts on its
-        rotation in the same way. The arm compensates its own weight and follows the hand. The demonstration contains
-        the joint positions every 30 ms, and the corresponding poses of the tool.
+        The hand pulls the tool like a spring and a damper, ``f = K (x_hand - x) + D (v_hand - v)``, and acts on the
+        tool's rotation in the same way. The arm compensates its own weight and follows the hand. The demonstration
+        contains the joint positions every 30 ms, and the corresponding poses of the tool.
 
         Args:
             arm: the Sawyer with the brush, if it is already loaded.

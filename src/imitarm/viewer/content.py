@@ -141,7 +141,7 @@ class SceneResult:
 
     @property
     def certificate_void(self) -> bool:
-        """Whether the certificate is void: an obstacle moves, and the motion was not completed on schedule."""
+        """Whether the certificate is void, because an obstacle moves and the motion was not completed on schedule."""
         return self.adaptation is not None and self.adaptation.only_on_schedule and not self.success
 
     @property

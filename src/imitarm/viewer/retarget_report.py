@@ -50,7 +50,7 @@ _WORDS: Final = {
     "s, and the target stands still. Stopped: the arm has been lost for longer than 0.3 s; following resumes after "
     "the arm has been seen for 0.5 s.",
     "Frames beyond a limit": "Control periods in which a joint exceeds a limit of position, velocity or "
-    "acceleration. The frames are counted from the commanded joint positions, which the drives of a real arm would "
+    "acceleration. The numbers are computed from the commanded joint positions, which the drives of a real arm would "
     "have to execute.",
     "Smallest singular value": "How well the arm can move its tool in the direction in which moving is hardest. If the "
     "value is near 0, the arm is almost stretched or folded, and small motions of the tool need fast motions of the "
@@ -103,8 +103,8 @@ class MethodResult:
         tables: further tables for the tab of this method.
         notes: remarks about this run for the reader, one sentence each.
         caption: one sentence that describes the method.
-        clock: time in the recording of the person that corresponds to each sample of the run, counted from the first
-            skeleton, shape (n,) [s]; None if it equals the time of the run.
+        clock: for each sample of the run, the corresponding time in the recording of the person, from the first
+            skeleton on, shape (n,) [s]; None if both times are equal.
     """
 
     name: str
