@@ -44,6 +44,7 @@ _PATIENCE = 4.0  # a reproduction may take this many times as long as the demons
 _SPREAD = 0.02  # [m] standard deviation of an obstacle's centre about the path
 _FREE_ENDS = 0.01  # [m] beyond the clearance, that an obstacle leaves to the tool at start and goal
 _TRIES = 200
+LATE = 1.5  # times the duration of the skill
 
 
 @dataclass(frozen=True)
@@ -237,32 +238,47 @@ def _joblib() -> Any:
 
 
 def placement_table(results: Sequence[PlacementResult]) -> Table:
-    """Return a table with one row for each policy: how often each outcome occurred, and the smallest clearance."""
+    """Return one row for each policy: the frequency of each outcome, the smallest clearance, and times."""
     rows = []
     for policy in dict.fromkeys(result.policy for result in results):
         own = [result for result in results if result.policy == policy]
         counts = [sum(result.outcome == outcome for result in own) for outcome in OUTCOMES]
-        low, high = wilson_interval(counts[0], len(own))
-        nearest = [1e3 * r.clearance for r in own if r.outcome == "arrived" and np.isfinite(r.clearance)]
-        refusals = [1e3 * r.planning for r in own if r.outcome == "refused"]
+        accepted, arrived = len(own) - counts[1], [result for result in own if result.outcome == "arrived"]
+        nearest = [1e3 * r.clearance for r in arrived if np.isfinite(r.clearance)]
+        late = sum(result.duration > LATE for result in arrived)
+        times = [[1e3 * r.planning for r in own if (r.outcome == "refused") == refused] for refused in (False, True)]
         rows.append(
             (
                 policy,
                 str(len(own)),
-                f"{100 * counts[0] / len(own):.0f} % ({100 * low:.0f} to {100 * high:.0f})",
-                *map(str, counts[1:]),
+                _rate(accepted, len(own)),
+                _rate(counts[0], accepted),
+                *map(str, counts[2:]),
+                str(late),
                 f"{min(nearest):.1f}" if nearest else "-",
-                f"{np.median(refusals):.0f}" if refusals else "-",
+                *(f"{np.median(t):.0f}" if t else "-" for t in times),
             )
         )
-    headings = ["policy", "placements>", "arrived", *(f"{name}>" for name in OUTCOMES[1:])]
+    headings = ("policy", "placements>", "accepted", "arrived, of the accepted", *(f"{name}>" for name in OUTCOMES[2:]))
     return Table(
         "Placements of one to three obstacles on the learned path",
-        (*headings, "smallest clearance when arrived [mm]>", "time to refuse, median [ms]>"),
+        (
+            *headings,
+            f"arrived after more than {LATE:g} times the learned duration>",
+            "smallest clearance when arrived [mm]>",
+            "time to plan, median [ms]>",
+            "time to refuse, median [ms]>",
+        ),
         tuple(rows),
-        f"On a simulated arm; every part of the arm must keep a clearance of {1e3 * CLEARANCE:.0f} mm. Intervals: "
-        f"Wilson, 95 %.",
+        f"A simulated arm, {1e3 * CLEARANCE:.0f} mm required of every part of it. Intervals: Wilson, 95 %.",
     )
+
+
+def _rate(count: int, of: int) -> str:
+    if not of:
+        return "-"
+    low, high = wilson_interval(count, of)
+    return f"{count} ({100 * count / of:.1f} %, {100 * low:.1f} to {100 * high:.1f})"
 
 
 def packaged_setup(folder: Path) -> Setup:

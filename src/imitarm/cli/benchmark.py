@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from imitarm.benchmark import avoidance, placements, real_motions, refusals
 from imitarm.benchmark.experiment import METHODS, Result
@@ -36,6 +37,7 @@ examples:
   imitarm benchmark mapping --methods modern thesis --no-replay --sigma 5
   imitarm benchmark avoidance --seeds 200
   imitarm benchmark placements --skill pour.json --robot panda --tool gripper --seeds 100
+  imitarm benchmark placements --skill pour.json shelf.json --robots sawyer panda --tool gripper --jobs 2
   imitarm benchmark people recordings person.mp4
   imitarm benchmark refusals --scenes 1000
 
@@ -108,12 +110,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     third.add_argument("--skills", type=Path, nargs="+", default=[], metavar="FILE", help="additional skills to adapt")
     _add_fill(third)
     third.set_defaults(benchmark=_refusals)
+    _add_placements(parsers)
+    people = parsers.add_parser("people", help="retarget recordings of real people to simulated arms")
+    people.add_argument(
+        "data",
+        type=Path,
+        metavar="DATA",
+        help="folder of real recordings, with the subfolders kinect_gestures and mocap_arm",
+    )
+    people.add_argument("videos", nargs="*", metavar="VIDEO", help="videos or recordings of a person")
+    _add_fill(people)
+    people.set_defaults(benchmark=_people)
+
+
+def _add_placements(parsers: Any) -> None:
     placed = parsers.add_parser(
         "placements", help="compare policies on a simulated arm with randomly placed obstacles on the path"
     )
     placed.add_argument(
-        "--skill", type=Path, metavar="FILE", help="default: the skill 'sweep' of the package, with Sawyer and brush"
+        "--skill",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="skill files; default: the skill 'sweep' of the package, with Sawyer and brush",
     )
+    placed.add_argument("--robots", nargs="+", metavar="NAME", help="several arms instead of --robot")
     placed.add_argument("--policies", nargs="+", choices=POLICIES, default=["acfra"], metavar="NAME")
     placed.add_argument("--seeds", type=int, default=50, metavar="N", help="number of placements; default: 50")
     placed.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
@@ -127,16 +148,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-tilt", type=float, metavar="DEG", help="largest tilt of the tool; default: as in the demonstrations"
     )
     placed.set_defaults(benchmark=_placements)
-    people = parsers.add_parser("people", help="retarget recordings of real people to simulated arms")
-    people.add_argument(
-        "data",
-        type=Path,
-        metavar="DATA",
-        help="folder of real recordings, with the subfolders kinect_gestures and mocap_arm",
-    )
-    people.add_argument("videos", nargs="*", metavar="VIDEO", help="videos or recordings of a person")
-    _add_fill(people)
-    people.set_defaults(benchmark=_people)
 
 
 def _add_fill(parser: argparse.ArgumentParser) -> None:
@@ -244,13 +255,14 @@ def _placements(arguments: argparse.Namespace) -> int:
     place = _place(arguments, "placements")
     with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
         if arguments.skill is None:
-            setup = placements.packaged_setup(Path(folder))
+            setups = [placements.packaged_setup(Path(folder))]
         else:
-            setup = placements.Setup(str(arguments.skill), arguments.robot, arguments.tool)
+            robots = arguments.robots or [arguments.robot]
+            setups = [placements.Setup(str(skill), arm, arguments.tool) for skill in arguments.skill for arm in robots]
         task = bar.add_task("reproducing", total=None)
         results = placements.run_placements(
             arguments.policies,
-            [setup],
+            setups,
             range(arguments.first, arguments.first + arguments.seeds),
             max_tilt=None if arguments.max_tilt is None else math.radians(arguments.max_tilt),
             jobs=arguments.jobs,
@@ -259,7 +271,8 @@ def _placements(arguments: argparse.Namespace) -> int:
     _report([placements.placement_table(results)], place, [code_version()])
     for result in results if arguments.list else []:
         if result.outcome != "arrived":
-            say(f"{result.policy}, seed {result.seed}: {result.outcome}: {result.reason}")
+            where = f"{Path(result.setup.skill).stem}, {result.setup.robot}, seed {result.seed}"
+            say(f"{result.policy}, {where}: {result.outcome}: {result.reason}")
     return 0
 
 
