@@ -199,7 +199,7 @@ class _Log:
         if not fault and required is not None and nearest < required:
             fault = f"clearance fell to {1e3 * nearest:.1f} mm, {1e3 * required:.1f} mm required"
             if self.clearances[0] < required:
-                fault += f"; the clearance was {1e3 * self.clearances[0]:.1f} mm at the start"
+                fault += f"; at the start, the clearance was {1e3 * self.clearances[0]:.1f} mm"
         details: dict[str, Any] = {
             "twists": np.array(self.twists),
             "clamped": dict(self.clamped),

@@ -69,7 +69,7 @@ class ArmModel(ArmKinematics):
 
     A model can't be changed after it is built.
 
-    The equation of motion of the arm's links and tool, which :meth:`inverse_dynamics` evaluates, is
+    The links and the tool of the arm obey the following equation of motion (:meth:`inverse_dynamics`):
 
     .. math:: M(q) \ddot q + C(q, \dot q) \dot q + g(q) = \tau
 
@@ -129,8 +129,8 @@ class ArmModel(ArmKinematics):
 
         The posture ``home`` comes from the file's keyframe ``home``, or else from its first keyframe. If the file has
         no keyframe, ``home`` is the middle of the joints' ranges, provided that this posture is not singular and keeps
-        the links at least 20 mm apart. Otherwise ``home`` is the posture that meets these two criteria best among 1024
-        samples.
+        the links at least 20 mm apart. If this posture does not meet the two criteria, ``home`` is the posture that
+        meets them best among 1024 samples.
 
         Args:
             name_or_path: ``"sawyer"``, ``"panda"`` or a path.

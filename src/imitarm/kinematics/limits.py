@@ -45,14 +45,14 @@ class JointLimits(Limit):
     r"""Position, velocity and acceleration limits of the joints, as a box that is never empty.
 
     Let D be the distance to the upper position limit and a the acceleration limit. A joint can stop before the position
-    limit only if its velocity is at most
+    limit only if its velocity is at most :math:`v_b(D)`:
 
-    .. math:: v_b(D) = -a\,dt + \sqrt{a^2 dt^2 + 2 a D}.
+    .. math:: v_b(D) = -a\,dt + \sqrt{a^2 dt^2 + 2 a D}
 
-    This :math:`v_b` is the solution of :math:`v^2/(2a) + v\,dt = D`. The upper bound is :math:`\min(v_{max},\; v_p +
-    a\,dt,\; \max(v_b(D),\, v_p - a\,dt))` where :math:`v_p` is the previous velocity; the lower bound is its mirror
-    image. If :math:`v_p` satisfied this bound in the previous step, braking with the acceleration a satisfies the bound
-    in this step. The box is therefore never empty.
+    The velocity :math:`v_b` is the solution of :math:`v^2/(2a) + v\,dt = D`. The upper bound is
+    :math:`\min(v_{max},\; v_p + a\,dt,\; \max(v_b(D),\, v_p - a\,dt))` where :math:`v_p` is the previous velocity; the
+    lower bound is its mirror image. If :math:`v_p` satisfied this bound in the previous step, braking with the
+    acceleration a satisfies the bound in this step. The box is therefore never empty.
 
     The bound assumes that the joint moves by :math:`v\,dt` in one step. A robot with constant acceleration moves by
     :math:`(v_p + v)\,dt/2`; ``imitarm.robots.limit_velocity`` therefore evaluates this box at :math:`q + v_p\,dt/2`.

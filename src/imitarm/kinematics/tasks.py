@@ -133,7 +133,8 @@ class ElbowTask(NamedTuple):
 
     The elbow moves by the arm's self-motion, a joint motion that does not move the tool. The unit vector n of the
     self-motion points along :math:`(I - J^+ J) J_\psi^T`, where J is the Jacobian of the tool's task (the first task)
-    and e the target of that task. The elbow task adds the cost :math:`\tfrac{w}2\,(n^T v - s)^2`, where
+    and e the target of that task. The elbow task adds the cost :math:`\tfrac{w}2\,(n^T v - s)^2` with
+    the desired speed s of the self-motion (:math:`v` is the joint velocity):
 
     .. math:: s = c\,\min(1, 10\sin^2\!\beta)\;\frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
 

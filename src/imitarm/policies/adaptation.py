@@ -200,7 +200,8 @@ def adapt(
         tool_spheres: the tool as spheres that contain it: rows x y z r in the tool's frame, shape (m, 4) [m]. The
             spheres rotate with the tool's learned orientation.
         arm: the arm with its tool. The path of its joints is planned, and every moving part of the arm keeps the
-            clearance. Its links stay 12 mm apart, and the motion is slowed down where the limits of the arm require it.
+            clearance. The links stay at least 12 mm apart, and the motion is slowed down where the limits of the arm
+            require it.
         clearance: required distance from the tool, or from the whole arm, to every obstacle [m].
         forbidden: directions in which no component may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
         pinned: times [s] at which the path must not move, for example contact points.
@@ -490,13 +491,14 @@ def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str
     sample = int(np.argmin(detour.clearance.distance[worst]))
     held = path.basis[sample].sum() < 0.5
     n_forbidden = len(problem.allowed.forbidden)
-    return (
-        f"no path around {name} with {required}: the best attempt has a clearance of {left}"
-        + (f", and {', '.join(map(scene.name_of, sorted(near)))} are also too close" if near else "")
-        + ("; the obstacle is too close to a point that must not move" if held else "")
-        + (f"; {n_forbidden} forbidden direction(s) were excluded" if n_forbidden else "")
-        + ": move an obstacle, allow another direction, or reduce the required clearance"
-    )
+    clauses = [
+        f"no path around {name} with {required}: the best attempt has a clearance of {left}",
+        f"other obstacles that are too close: {', '.join(map(scene.name_of, sorted(near)))}" if near else "",
+        "the obstacle is too close to a point that must not move" if held else "",
+        f"the path may not move in {n_forbidden} forbidden direction(s)" if n_forbidden else "",
+        "move an obstacle, allow another direction, or reduce the required clearance",
+    ]
+    return "; ".join(filter(None, clauses))
 
 
 def _at_fixed(path: ComponentPath, name: str, sample: int, left: float, required: str) -> str:

@@ -1,7 +1,7 @@
 r"""Proof that a whole arm keeps its clearance on a joint path, between the samples too.
 
 Between two samples every joint moves linearly, and the centre c of a sphere of the arm moves on an arc. The distance of
-this arc from the straight line between its two ends is at most
+this arc from the straight line between its two ends is at most :math:`e`:
 
 .. math:: e = \tfrac18 \sum_{i,j} |\Delta q_i|\,|\Delta q_j|\,R_{\max(i,j)}
 
@@ -116,7 +116,7 @@ class ArmAmongObstacles:
             sphere about its centre that contains it.
         clearance: required distance from every moving part of the arm to every obstacle [m].
         fixtures: objects on which the arm stands or works, such as a table. A part of the arm may come as near to a
-            fixture as it is in one of the postures ``contacts`` or at home; otherwise it keeps the clearance.
+            fixture as it is in one of the postures ``contacts`` or at home; all other parts keep the clearance.
         contacts: postures in which parts of the arm may be near fixtures, shape (k, n_joints) [rad].
         own: the links that must stay apart, and their required clearance; None: links are not checked.
 

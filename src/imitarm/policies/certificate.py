@@ -259,10 +259,10 @@ class PathClearance:
 
         Near a corner of an obstacle, the bound from the tangents at the two ends of a segment is much too low. The
         distance is therefore measured at the point where the tangents cross. If the distance there is below the
-        clearance, the path really is too close to the obstacle. Otherwise the crossing point replaces one of the two
-        ends. If the distance still decreases at this point, the point replaces the first end; if the distance
-        increases, the point replaces the last end. The minimum of the distance therefore stays between the two ends,
-        and the bound converges to this minimum.
+        clearance, the path really is too close to the obstacle. If it is not, the crossing point replaces one of the
+        two ends of the segment. If the distance still decreases at this point, the point replaces the first end; if the
+        distance increases, the point replaces the last end. The minimum of the distance therefore stays between the two
+        ends, and the bound converges to this minimum.
 
         Args:
             clearance: required clearance [m].

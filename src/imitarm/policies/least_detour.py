@@ -398,7 +398,7 @@ def style_scale(path: ComponentPath, allowed: AllowedDirections, moved: Index, s
 
     Args:
         path: the path and its components.
-        allowed: directions in which components may move; ``delta`` has d coordinates in its axes for each component.
+        allowed: directions in which components may move; for each component, ``delta`` has d coordinates along them.
         moved: indices of the m components that may move.
         smoothness: weight of the squared jerk, in units of the largest nominal jerk.
     """

@@ -179,7 +179,7 @@ class Roadmap:
         return edges.take(slow), cost, violation
 
     def _sweep(self, *, forward: bool) -> tuple[Array, Index]:
-        """Return the lowest cost from start to each node (or from each node to goal), and the adjacent node."""
+        """Return the lowest cost from the start to each node (or on to the goal), and the neighbour on this route."""
         precisions = np.linalg.inv(self.path.tolerance[self.layers] + 0.005**2 * np.eye(3))
         style = np.einsum("lkd,lkd->lk", self.nodes @ precisions, self.nodes) * (
             self.path.n_components / len(self.layers)
@@ -233,7 +233,7 @@ class Roadmap:
     def _worst_layer(self, chosen: Index) -> int:
         """Return the layer at which a route costs most.
 
-        When all edges of the route are free, this is the layer with the largest displacement.
+        When all edges of the route are free, the result is the layer with the largest displacement.
         """
         costs = self.costs[self._edges_of(chosen)]
         if costs.max() > 1.0:

@@ -267,8 +267,8 @@ class RobotServer:
 
     The server sends nothing without a request, and a :class:`~imitarm.robots.server.Supervisor` checks every datagram
     that it receives. If the machine was too busy and periods were missed, the next step is lengthened by the missed
-    time, up to 20 ms in total, so that the robot keeps up with the commands. The limits still hold, because they are
-    computed from the length of the step. Missed time beyond 20 ms is skipped.
+    time, up to 20 ms in total, so that the robot keeps up with the commands. The longer step keeps the limits of the
+    joints, because they are computed from the length of the step. Missed time beyond 20 ms is skipped.
 
     Args:
         robot: robot to serve.

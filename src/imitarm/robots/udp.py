@@ -49,8 +49,9 @@ class UdpRobot(Robot):
 
     :meth:`move` limits a velocity as every robot does and sends the resulting set-point; the server checks the
     set-point again. The client sends commands only while the newest state from the server is at most 0.1 s old and says
-    that the robot follows this client. Otherwise the client sends no command and adopts the server's set-point.
-    Therefore the arm never jumps after a restart of the client or the server, or after an interrupted connection.
+    that the robot follows this client. At all other times, the client sends no command and adopts the server's
+    set-point. Therefore the arm never jumps after a restart of the client or the server, or after an interrupted
+    connection.
 
     A stopped robot moves again only after :meth:`enable`, which requires a decision by a person.
 

@@ -40,7 +40,7 @@ class ClearanceLimit:
     Spheres cover the arm and its tool (``ArmModel.collision_spheres``). Let ``c`` and ``r`` be the centre and the
     radius of a sphere near an obstacle with the signed distance ``sd`` and the outward normal ``n``. The remaining
     distance is ``h = sd(c) - r - clearance``. Let ``v_o`` be the velocity of the obstacle's nearest point. The row for
-    this sphere is
+    this sphere is the following inequality on :math:`\dot q`:
 
     .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - \xi h
 
@@ -128,7 +128,7 @@ class SelfClearance:
     r"""Keeps links that are not neighbours, and the tool, apart from each other.
 
     The arm is covered by spheres (``ArmModel.collision_spheres``). For the spheres i and j of two links, with centres
-    c and radii r, the distance and its gradient are
+    c and radii r, the following formulas give the distance :math:`d` and its gradient:
 
     .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
 

@@ -175,10 +175,10 @@ def _distance(single: _Single, p: Array, gradient: bool) -> tuple[Array, Any]:
 class Obstacle(ABC):
     """A convex solid in the base frame that must not be touched; it may move at a constant velocity.
 
-    Every shape has an exact signed distance::
+    Every shape has an exact signed distance ``sd(x)``. Its magnitude is the distance from ``x`` to the nearest surface
+    point ``s``, and its sign is positive when ``x`` is outside and negative when ``x`` is inside::
 
-        sd(x) =  min |x - s| over the surface points s   when x is outside
-        sd(x) = -min |x - s| over the surface points s   when x is inside
+        |sd(x)| = min_s |x - s|
 
     The gradient of this distance is a unit vector. Outside, the gradient points from the nearest surface point to
     ``x``; inside, it points from ``x`` to the nearest surface point; on the surface, it is the outward normal. Because

@@ -28,8 +28,8 @@ class Scene:
     Attributes:
         goal: tool_to_base at the end of the motion; None: the learned goal of the skill.
         obstacles: any iterable of obstacles; stored as a tuple.
-        stamp: time for which the poses of the obstacles are valid [s]. For a scene from a sensor, this is the time of
-            the measurement, from which :meth:`at` predicts.
+        stamp: time for which the poses of the obstacles are valid [s]. For a scene from a sensor, ``stamp`` is the time
+            of the measurement, from which :meth:`at` predicts.
         fixtures: objects on which the arm stands or works, such as floor, pedestal and table. Fixtures are part of a
             simulated world and cause contacts. Planners keep no distance from fixtures, because a tool must reach its
             table.

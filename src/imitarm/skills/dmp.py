@@ -164,7 +164,7 @@ class DMP:
 
         Args:
             trajectory: the motion to reproduce.
-            exact_ends: whether to start and end exactly at the first and the last sample and rotation. Otherwise, if
+            exact_ends: whether to start and end exactly at the first and the last sample and rotation. If False, and
                 noise moves the first or the last sample more than 0.1 mm away from the path that fits all samples, the
                 motion starts or ends on that path instead.
 

@@ -13,7 +13,7 @@ statistics of one component are the second moments of ``[1; z]``. The inverse of
         [mu    Sigma + mu mu^T  ]            [-P mu            P     ]
 
 Fits that differ only in their start or in their samples (restarts, folds of a cross-validation) are computed together,
-as further rows of the same two products. The samples must be standardised (each column with mean 0 and standard
+as further rows of these two matrix products. The samples must be standardised (each column with mean 0 and standard
 deviation 1), so that the sums of squares are well conditioned.
 """
 
