@@ -331,7 +331,7 @@ class Result:
         """Read a result that :meth:`save` wrote; null in the file stands for nan.
 
         Raises:
-            FileFormatError: when the file is not such a result.
+            FileFormatError: when the file is not a result, or a result of another version.
         """
         try:
             content = json.loads(path.read_text(encoding="utf-8"))

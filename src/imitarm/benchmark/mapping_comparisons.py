@@ -195,10 +195,10 @@ def claims_table(results: Results, tasks: Sequence[str]) -> Table:
         rows.append((claim, *cells))
     columns = ("the thesis claims", "thesis, corrected", "held?", "modern", "held?")
     note = (
-        "Each percentage is the difference of the column's method from the baseline, in paired trials. yes: for every "
-        "baseline, the 95 % interval of the difference is on the claimed side, and the corrected p is below 0.05. no: "
-        "for at least one baseline, the interval is on the other side. not shown: neither. Times are compared only for "
-        "trials in which both methods succeeded."
+        "Each percentage is the difference of the column's method from the baseline, in paired trials. "
+        'The result is "yes" if, for every baseline, the 95 % interval of the difference is on the claimed side and '
+        'the corrected p is below 0.05. The result is "no" if, for at least one baseline, the interval is on the other '
+        'side. All other results are "not shown". Times are compared only for trials in which both methods succeeded.'
     )
     return Table("Claims of the thesis, and results", columns, tuple(rows), note)
 

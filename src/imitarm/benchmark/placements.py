@@ -1,4 +1,4 @@
-"""Test policies on a simulated arm with random obstacles on the path: how often they arrive, refuse or make contact.
+"""Test policies on a simulated arm with random obstacles on the path: count arrivals, refusals and contacts.
 
 Each placement puts one to three obstacles on the learned path of a skill. Every policy reproduces the skill around
 these obstacles, with the same safety filter. The simulator measures clearance and contact with its own geometry.

@@ -125,7 +125,7 @@ def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
         details["largest displacement [σ]"] = f"{policy.plan.deviation:.1f}"
     if isinstance(policy.plan, Adaptation):
         whole = policy.plan.joints is not None
-        details["certified clearance is that of"] = "every moving part of the arm" if whole else "the tool"
+        details["clearance is certified for"] = "every moving part of the arm" if whole else "the tool"
         if whole:
             details["largest tilt of the tool"] = f"{np.degrees(policy.plan.tilt):.1f} degrees"
     return details

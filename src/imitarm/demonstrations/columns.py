@@ -209,7 +209,8 @@ def named_columns(
         missing = needed - set(place)
         if missing and set(place) & (needed | ({"z"} if group == "xyz" else set())):
             raise FileFormatError(
-                f"{source}: the {group} columns lack {', '.join(sorted(missing))}; add or remove them"
+                f"{source}: the {group} columns lack {', '.join(sorted(missing))}; add these columns or "
+                "remove the others"
             )
     joints = [i for i, column in enumerate(columns) if column.what == "joint"]
     if "x" not in place and not joints:
@@ -352,13 +353,14 @@ def _one_unit(
         )
     if len(found) > 1:
         raise FileFormatError(
-            f"{source}: has different units of {kind}: {' and '.join(sorted(map(str, found)))}; convert them to one"
+            f"{source}: has different units of {kind}: {' and '.join(sorted(map(str, found)))}; convert all "
+            "columns to one unit"
         )
     stated_units = {units[i] for i in columns} - {None}
     if elsewhere is not None and stated_units - {elsewhere}:
         raise FileFormatError(
             f"{source}: a remark states the unit {elsewhere}, but a column name states "
-            f"{stated_units.pop()}; make them the same"
+            f"{stated_units.pop()}; correct one of the two units"
         )
     return found.pop() if found else None
 

@@ -161,7 +161,8 @@ class RawDemonstration:
         they are sorted by the numbers in the names, which must be consecutive.
 
         Raises:
-            InputError: when the demonstration has no joints, has those of another arm, or their order is unknown.
+            InputError: when the demonstration has no joints or the joints of another arm, or the order of its
+                joints is unknown.
         """
         if self.joints is None:
             raise InputError(f"{self.source}: holds no joint angles")
@@ -178,8 +179,8 @@ class RawDemonstration:
         numbers = [int(match[1]) for name in names if (match := _NUMBER_AT_END.search(name))]
         if sorted(numbers) != list(range(min(numbers), min(numbers) + len(names))):
             raise InputError(
-                f"{self.source}: the numbers of joints {', '.join(names)} do not follow one another; name them as "
-                f"{arm.name} does: {', '.join(arm.joint_names)}"
+                f"{self.source}: the numbers of joints {', '.join(names)} do not follow one another; use the joint "
+                f"names of {arm.name}: {', '.join(arm.joint_names)}"
             )
         return self.joints[:, np.argsort(numbers)]
 
@@ -289,7 +290,7 @@ class RawDemonstration:
 
 
 def check_arm_model(arm: object, what: str) -> None:
-    """Raise InputError if ``arm`` is neither an ArmModel nor None; the slow module of ArmModel is not imported."""
+    """Raise InputError if ``arm`` is neither an ArmModel nor None, without importing the slow module of ArmModel."""
     if arm is not None and not hasattr(arm, "tool_path"):
         raise InputError(f"{what} must be an ArmModel, got {arm!r:.60}; load it with ArmModel.load('sawyer')")
 

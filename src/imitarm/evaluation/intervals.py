@@ -82,7 +82,7 @@ def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) ->
     r"""Return the percentile bootstrap interval of a mean.
 
     Resampled means of n samples scatter too little: their standard deviation is too small by the factor
-    :math:`\sqrt{(n-1)/n}`. Therefore the deviation of each resampled mean from the mean is divided by
+    :math:`\sqrt{(n-1)/n}`. Therefore the deviation of each resampled mean from the sample mean is divided by
     :math:`\sqrt{(n-1)/n}`. Without this division, a "95 %" interval of ten samples would cover only 90 %.
 
     Args:

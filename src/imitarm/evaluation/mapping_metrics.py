@@ -205,7 +205,7 @@ def _tracking(
     correspondence: Correspondence,
     true: TrueArm | None,
 ) -> tuple[float, ...]:
-    """Return the seven measures that need the true arm; the order is that of :class:`MappingMetrics`."""
+    """Return the seven measures that need the true arm, in the order of :class:`MappingMetrics`."""
     if true is None or not periods.engaged.any():
         return (math.nan,) * 7
     scale, engaged = correspondence.scale, periods.engaged

@@ -268,9 +268,9 @@ def rotation_errors(first: Array, second: Array) -> Array:
 def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) -> Array:
     """Return the angle between the actual and the correct direction of the robot's upper arm, shape (n,) [rad].
 
-    The correct direction is the direction of the robot's upper arm at the start of the engagement, rotated in the same
-    way as the person's upper arm has rotated since then. The rotation of the person's upper arm is the smallest
-    rotation that takes its direction at the start of the engagement to its current direction.
+    The correct direction is the direction of the robot's upper arm at the start of the engagement, rotated by the
+    rotation of the person's upper arm since that time. The rotation of the person's upper arm is the smallest rotation
+    that takes its direction at the start of the engagement to its current direction.
 
     Args:
         true: the person's arm, in the axes of the base.
