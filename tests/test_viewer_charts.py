@@ -37,6 +37,13 @@ def test_torques_show_each_joint_with_its_share_of_the_rated_torque() -> None:
     assert "torque [N m]" in words and "80" in words
 
 
+def test_long_names_of_joints_lose_the_part_that_all_share() -> None:
+    assert charts.short_names([f"panda_joint{i}" for i in (1, 2)]) == ["joint1", "joint2"]
+    assert charts.short_names(["right_j0", "right_j1"]) == ["right_j0", "right_j1"]
+    assert charts.short_names(["shoulder_pan_joint", "elbow_joint"]) == ["shoulder_pan_joint", "elbow_joint"]
+    assert charts.short_names([]) == []
+
+
 def test_displacement_says_which_components_stayed() -> None:
     svg = charts.displacement([0.0, 0.031, 0.0002, 0.0], [False, True, True, False])
     assert "31" in text_of(svg) and "<1" in text_of(svg) and "2 of 4 components" in svg

@@ -5,6 +5,7 @@ Every function returns one ``<svg>`` element. Figures of paths are in :mod:`~imi
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -19,6 +20,7 @@ Array = NDArray[np.float64]
 
 _WIDTH: Final = 5.5  # [inch]
 _ROW: Final = 1.15  # [inch]
+_LONGEST_NAME: Final = 9  # characters of a joint's name that fit above a chart together with a percentage
 _SMALL: Final[dict[str, Any]] = {"fontsize": 7.5}
 
 
@@ -92,13 +94,20 @@ def torques(
         An SVG element.
     """
     t, tau, rated = np.asarray(times, float), np.asarray(values, float), np.asarray(limits, float)
-    names = list(joint_names) or [f"joint {i + 1}" for i in range(tau.shape[1])]
+    names = short_names(joint_names) or [f"joint {i + 1}" for i in range(tau.shape[1])]
     curves = [
         JointCurve(f"{names[i]}: {100.0 * np.abs(tau[:, i]).max() / rated[i]:.0f} %", tau[:, i], -rated[i], rated[i])
         for i in range(tau.shape[1])
     ]
     text = f"Torques of {len(curves)} joints over time, with the rated torques"
     return small_multiples(name, text, "torque [N m]", t, curves)
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Return names of joints that fit above a small chart: long names without the part before "_" that all share."""
+    shared = os.path.commonprefix(list(names))
+    cut = shared.rfind("_") + 1 if max(map(len, names), default=0) > _LONGEST_NAME else 0
+    return [name[cut:] for name in names]
 
 
 def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacement") -> str:

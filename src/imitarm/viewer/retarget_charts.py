@@ -15,7 +15,7 @@ from imitarm.retarget import Retargeting
 from imitarm.retarget.engagement import EngagementState
 from imitarm.viewer import palette
 from imitarm.viewer.canvas import INK, MM, canvas, thin, thin_extremes
-from imitarm.viewer.charts import JointCurve, small_multiples
+from imitarm.viewer.charts import JointCurve, short_names, small_multiples
 
 Array = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def joints(run: Retargeting, *, name: str = "joints") -> str:
     """Draw the position of each joint with its limits [degrees]."""
     arm = run.arm
     curves = []
-    for i, title in enumerate(arm.joint_names):
+    for i, title in enumerate(short_names(arm.joint_names)):
         values = _DEGREES * run.joints[:, i]
         free = not (np.isfinite(arm.lower[i]) and np.isfinite(arm.upper[i]))
         low, high = (float(values.min()) - 1.0, float(values.max()) + 1.0) if free else (arm.lower[i], arm.upper[i])
@@ -150,7 +150,7 @@ def _percentages(run: Retargeting, times: Array, percentages: Array, what: str, 
     """Draw percentages of a limit (n, n_joints) over times (n,) [s]."""
     curves = [
         JointCurve(f"{title}: {np.abs(percentages[:, i]).max():.0f} %", percentages[:, i], -100.0, 100.0)
-        for i, title in enumerate(run.arm.joint_names)
+        for i, title in enumerate(short_names(run.arm.joint_names))
     ]
     text = f"{what.capitalize()} of {len(curves)} joints as a percentage of the limit"
     return small_multiples(name, text, f"{what} [% of the limit]", times, curves)
