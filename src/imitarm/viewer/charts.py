@@ -5,7 +5,6 @@ Every function returns one ``<svg>`` element. Figures of paths are in :mod:`~imi
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -105,9 +104,9 @@ def torques(
 
 def short_names(names: Sequence[str]) -> list[str]:
     """Return names of joints that fit above a small chart: long names without the part before "_" that all share."""
-    shared = os.path.commonprefix(list(names))
-    cut = shared.rfind("_") + 1 if max(map(len, names), default=0) > _LONGEST_NAME else 0
-    return [name[cut:] for name in names]
+    first, _, _ = min(names, default="").rpartition("_")
+    shared = f"{first}_" if max(map(len, names), default=0) > _LONGEST_NAME else ""
+    return [name.removeprefix(shared) for name in names] if all(n.startswith(shared) for n in names) else list(names)
 
 
 def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacement") -> str:
