@@ -212,8 +212,8 @@ def adapt(
         max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]. At start and goal, this
             rotation is always 0. The default is two standard deviations of the demonstrated rotation, and 0 if no
             orientation was learned.
-        allowance: distance that is added to the clearance if a path with this larger clearance is found, because no
-            robot moves exactly as commanded [m].
+        allowance: additional clearance for the tracking errors of the robot, used if a path with this larger clearance
+            is found [m].
 
     Returns:
         The adaptation; check ``feasible`` before executing it.
