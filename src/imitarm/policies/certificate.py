@@ -336,7 +336,7 @@ def without_rotation(obstacle: Obstacle) -> Obstacle:
 
 
 def crossing_of_tangents(f0: Array, a: Array, f1: Array, b: Array, length: Array | float) -> tuple[Array, Array]:
-    """Return the minimum of ``max(f0 + a s, f1 - b (length - s))`` over s in [0, length], and the s at the minimum.
+    """Return the minimum of ``max(f0 + a s, f1 - b (length - s))`` over s in [0, length], and its position s.
 
     Args:
         f0: values of the convex functions at the start of the interval, any shape.

@@ -137,7 +137,7 @@ class Cylinder(PosedObstacle):
 
 
 def _rim(v: Array, radius: float) -> Array:
-    """Return the points (x, y) (2, n) of a circle in directions ``v`` (3, n); the point on x where ``v`` is along z."""
+    """Return points (2, n) of a circle in directions ``v`` (3, n); for ``v`` along z, the point on the x axis."""
     rho = np.hypot(v[0], v[1])
     on_axis = rho < TINY
     rim = radius * v[:2] / np.where(on_axis, 1.0, rho)

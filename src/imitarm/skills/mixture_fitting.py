@@ -244,7 +244,7 @@ def responsibilities_by_segments(features: Array, column: Array, numbers: Sequen
 
 
 def _segment_costs(statistics: Array, n_samples: int) -> Array:
-    """Return the costs of segments with these sums of features; inf for segments with too few samples."""
+    """Return the costs of segments, given their sums of features; inf for segments with too few samples."""
     number = statistics[:, 0]
     size = round(float(np.sqrt(8 * statistics.shape[1] + 1) - 1) / 2)
     moments = (statistics / np.maximum(number, 1.0)[:, None]).take(packing(size)[1], axis=-1)
@@ -266,7 +266,7 @@ def _cut(slot: NDArray[np.intp], came_from: list[NDArray[np.intp]], n_slots: int
 
 
 def responsibilities_by_bins(column: Array, n_bins: int) -> Array:
-    """Return responsibilities of 0 or 1, shape (K, n), of equally wide bins; for few samples, of equally full bins."""
+    """Return responsibilities of 0 or 1, shape (K, n), for equally wide bins, or equally full bins of few samples."""
     low, high = column.min(), column.max()
     labels = np.minimum(((column - low) * (n_bins / max(high - low, 1e-300)) + _EDGE).astype(np.intp), n_bins - 1)
     if np.bincount(labels, minlength=n_bins).min() < 2:
@@ -443,7 +443,7 @@ def _resampled(Z: Array, places: NDArray[np.intp], grid: Array) -> Array:
 
 
 def _regression(fit: Fit, which: NDArray[np.intp], t: Array, places: NDArray[np.intp]) -> Array:
-    """Return the mean of some columns at standardised times (n,), each from the fit with the index ``which`` (n,)."""
+    """Return the mean of some columns at standardised times (n,); ``which`` (n,) gives the fit for each time."""
     means, covariances = fit.means, fit.covariances
     variance = covariances[:, :, 0, 0]
     slopes = covariances[:, :, 0, :] / variance[..., None]
