@@ -39,6 +39,7 @@ SELF = -1
 """Replaces the index of an obstacle if the distance is between two links of the arm."""
 _REACH = 0.1  # [m] beyond the clearance: pairs that are farther apart at both ends of a segment are not bounded
 _MOST_HALVINGS = 8  # of a segment
+_LONGER = 2.0  # times its largest distance from the first joint, no point of an arm is farther from any axis
 _CONTACT = 1e-3  # [m] a part may come nearer to a fixture by this than it is where contact is meant
 _TINY = 1e-9  # [m] a joint that moves a sphere has at least this distance from it
 
@@ -362,11 +363,12 @@ class _Ends:
 
 def _lowest(pairs: _Pairs, path: ArmPath, times: Array, segment: Index, pair: Index) -> tuple[float, int]:
     """Return the lowest bound over segments, or a measured value if one is negative, and the index of the segment."""
+    chosen, room = _decisive(pairs, path, times, segment, pair)
+    if room < 0.0:
+        return room, int(chosen[0])
+    whole, segment, pair = chosen, segment[chosen], pair[chosen]
     start = _Ends.of(pairs, path, times[segment], segment, pair)
     end = _Ends.of(pairs, path, times[segment + 1], segment + 1, pair)
-    at = int(np.argmin(np.minimum(start.room, end.room)))
-    if min(start.room[at], end.room[at]) < 0.0:
-        return float(min(start.room[at], end.room[at])), at
     of, lowest, where = np.arange(len(segment)), np.inf, 0
     for halvings in range(_MOST_HALVINGS + 1):
         bounds = _bounds(start, end)
@@ -385,9 +387,35 @@ def _lowest(pairs: _Pairs, path: ArmPath, times: Array, segment: Index, pair: In
         )
         at = int(np.argmin(middle.room))
         if middle.room[at] < 0.0:
-            return float(middle.room[at]), int(of[at])
+            return float(middle.room[at]), int(whole[of[at]])
         start, end, of = start + middle, middle + end, np.tile(of, 2)
-    return lowest, where
+    return lowest, int(whole[where])
+
+
+def _decisive(pairs: _Pairs, path: ArmPath, times: Array, segment: Index, pair: Index) -> tuple[Index, float]:
+    """Return the segments that may have the lowest bound or a negative one, and 0; or the lowest sample if negative.
+
+    The tangents alone, without the arcs, are cheap to compute; a coarse bound of all arcs then suffices for the rest.
+    """
+    needed = np.zeros((len(path), len(pairs.sphere)), dtype=bool)
+    needed[segment, pair] = needed[segment + 1, pair] = True
+    sample, which = np.nonzero(needed)
+    points = pairs.points(path, sample, which, times[sample])
+    room, normal = pairs.measured(points, which)
+    number = np.zeros(needed.shape, dtype=np.intp)
+    number[sample, which] = np.arange(len(sample))
+    first, last = number[segment, pair], number[segment + 1, pair]
+    ends = np.minimum(room[first], room[last])
+    at = int(np.argmin(ends))
+    if ends[at] < 0.0:
+        return np.array([at]), float(ends[at])
+    step = points[last] - points[first]
+    a, b = np.einsum("kd,kd->k", normal[first], step), np.einsum("kd,kd->k", normal[last], step)
+    low = crossing_of_tangents(room[first], a, room[last], b, 1.0)[0]
+    turn = np.abs(np.diff(path.joints, axis=0)).sum(axis=1)
+    farthest = np.linalg.norm(path.centers[:, :, None] - path.anchors[:, None, :1], axis=3).max(initial=1.0)
+    coarse = (0.125 * turn**2 * farthest * _LONGER * (1.0 + 0.5 * turn))[segment]
+    return np.flatnonzero(low - coarse <= max(float(low.min()), 0.0)), 0.0
 
 
 def _bounds(start: _Ends, end: _Ends) -> Array:

@@ -361,8 +361,8 @@ class _Search:
 
     def _timing(self, path: ArmPath, times: Array, clock: Array) -> Timing:
         """Return execution times for a path with the parameters ``times``, among the obstacles' places at ``clock``."""
-        gaps = self._around.gaps(path, clock, _REACH)
         speed = np.linalg.norm(np.gradient(path.centers, times, axis=0), axis=2)
+        gaps = self._around.gaps(path, clock, min(2.0 * float(speed.max(initial=0.0)) / _SELF_RATE, _REACH))
         own = gaps.obstacle == SELF
         margin = np.where(own, SELF_CLEARANCE - _FILTER_SELF, max(self.task.allowance - _FILTER_MARGIN, 0.0))
         rate = np.where(own, _SELF_RATE, _APPROACH_RATE)
