@@ -141,7 +141,7 @@ def resolved(name: str) -> object | None:
 def test_names_that_do_not_exist_are_noticed() -> None:
     assert resolved("imitarm.skills.gmr.GMR.predict") is not None
     assert resolved("imitarm.skills.gmr.GMR.time_means_") is not None
-    assert resolved("imitarm.policies.adaptation.Adaptation.certified_clearance") is not None
+    assert resolved("imitarm.policies.adapted_path.Adaptation.certified_clearance") is not None
     for wrong in ("imitarm.skills.gmr.GMR.predicted", "imitarm.skills.gmx", "imitarm.skills.gmr.GMR.predict.x"):
         assert resolved(wrong) is None
 

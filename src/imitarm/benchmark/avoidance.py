@@ -23,7 +23,8 @@ from imitarm.benchmark.families import (
 )
 from imitarm.benchmark.tables import Table
 from imitarm.evaluation.intervals import wilson_interval
-from imitarm.policies.adaptation import ADAPTERS, Adaptation, adapt
+from imitarm.policies.adaptation import ADAPTERS, adapt
+from imitarm.policies.adapted_path import Adaptation
 from imitarm.skills.gmm import DegenerateAxisWarning
 from imitarm.skills.skill import Skill
 

@@ -16,7 +16,8 @@ from imitarm.benchmark.refusal_proof import Question, separation
 from imitarm.benchmark.tables import Table
 from imitarm.demonstrations import align, read
 from imitarm.evaluation.intervals import wilson_interval
-from imitarm.policies.adaptation import Adaptation, adapt
+from imitarm.policies.adaptation import adapt
+from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.component_path import ComponentPath
 from imitarm.skills.skill import Skill
 from imitarm.tasks import DEMONSTRATIONS

@@ -3,7 +3,8 @@
 ``POLICIES`` is the registry: to add a policy, write one file and add one line here.
 """
 
-from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, Adaptation, adapt
+from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, adapt
+from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.least_detour import PathAdapter
 from imitarm.policies.policy import ACFRA, Observation, Policy
 from imitarm.registry import Registry

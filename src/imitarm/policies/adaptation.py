@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
-from imitarm.html_table import html_table
 from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
+from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.certificate import ToolAmongObstacles
 from imitarm.policies.certified import CERTIFIED
 from imitarm.policies.component_path import STILL, ComponentPath
@@ -27,7 +27,7 @@ from imitarm.policies.least_detour import (
     LeastDetour,
     PathAdapter,
 )
-from imitarm.policies.whole_arm import Approach, ArmSolution, ArmTask, solve
+from imitarm.policies.whole_arm import ArmSolution, ArmTask, solve
 from imitarm.registry import Registry
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
@@ -61,106 +61,6 @@ def adapter_named(method: str) -> PathAdapter:
         InputError: when the name is not text.
     """
     return CERTIFIED if text(method, "method") == "certified" else ADAPTERS[method]
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Adaptation:
-    """The path of a skill, adapted to a scene.
-
-    Attributes:
-        nominal: the path without obstacles.
-        trajectory: the adapted path, at the same times; if not ``feasible``, it is the best attempt, which must not be
-            executed.
-        displacement: displacement of each component's mean, shape (n_components, 3) [m].
-        moved: whether each component moved, shape (n_components,).
-        means: centres of the components before they moved, shape (n_components, 3) [m].
-        covariances: position covariances of the components, shape (n_components, 3, 3) [m^2].
-        responsibilities: responsibilities of each component for each sample, shape (n, n_components).
-        divided: whether the learned components were too wide for this scene; if so, the arrays above describe more,
-            narrower components.
-        tolerance: covariance of the demonstrations along the path, shape (n, 3, 3) [m^2].
-        min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without
-            obstacles.
-        certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m].
-        only_on_schedule: whether the guarantee depends on the schedule, because an obstacle moves. The guarantee then
-            holds only while the motion is on time, which means that the tool reaches each sample of ``trajectory`` at
-            the sample's time, counted from the scene's ``stamp``. The guarantee ends with the last sample.
-        validity: text that says what the guarantee assumes and what it does not cover.
-        deviation: largest displacement of a mean, in standard deviations of the demonstrations (Mahalanobis distance).
-        jerk_ratio: largest jerk of the adapted path, divided by the largest jerk of the nominal path.
-        jerk_reason: why ``jerk_ratio`` exceeds 10; empty if it does not.
-        feasible: whether ``certified_clearance`` reaches the required clearance and the path is within the method's
-            limits on displacement and step length.
-        reason: which obstacle blocks the path and why it can't be avoided; empty when feasible.
-        method: name of the method.
-        compute_time: computing time of the whole adaptation [s].
-        joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned. Between
-            two samples the joints move linearly.
-        tilt: largest rotation of the tool away from the learned rotation [rad].
-        approach: motion of the joints to the first posture of ``joints``, which is executed first; None if the arm is
-            there already.
-    """
-
-    nominal: Trajectory
-    trajectory: Trajectory
-    displacement: Array
-    moved: NDArray[np.bool_]
-    means: Array
-    covariances: Array
-    responsibilities: Array
-    divided: bool
-    tolerance: Array
-    min_clearance: float
-    certified_clearance: float
-    only_on_schedule: bool
-    validity: str
-    deviation: float
-    jerk_ratio: float
-    jerk_reason: str
-    feasible: bool
-    reason: str
-    method: str
-    compute_time: float
-    joints: Array | None = None
-    tilt: float = 0.0
-    approach: Approach | None = None
-
-    @property
-    def unmoved_fraction(self) -> float:
-        """Fraction of the components that were not moved."""
-        return float(1.0 - np.mean(self.moved))
-
-    @property
-    def rmse_to_nominal(self) -> float:
-        """Root mean square distance between adapted and nominal path (thesis Eq 4.9, with the square root) [m]."""
-        return float(np.sqrt(np.mean(np.sum((self.trajectory.positions - self.nominal.positions) ** 2, axis=1))))
-
-    def __repr__(self) -> str:
-        if not self.feasible:
-            return f"Adaptation({self.method}, not feasible: {self.reason})"
-        clear = "no obstacles" if np.isinf(self.certified_clearance) else f"{1e3 * self.certified_clearance:.1f} mm"
-        return (
-            f"Adaptation({self.method}, feasible, certified clearance {clear}, {int(self.moved.sum())} of "
-            f"{len(self.moved)} components moved, {1e3 * self.compute_time:.1f} ms)"
-        )
-
-    def _repr_html_(self) -> str:
-        clear = "no obstacles" if np.isinf(self.certified_clearance) else f"{1e3 * self.certified_clearance:.2f} mm"
-        rows = {
-            "method": self.method,
-            "feasible": "yes" if self.feasible else f"no: {self.reason}",
-            "certified clearance": clear,
-            "valid": self.validity,
-            "components moved": f"{int(self.moved.sum())} of {len(self.moved)}",
-            "RMSE to the nominal path": f"{1e3 * self.rmse_to_nominal:.1f} mm",
-            "jerk": f"{self.jerk_ratio:.1f} times that of the nominal path",
-            "jerk above the limit": self.jerk_reason,
-            "joint path": "not planned" if self.joints is None else f"{self.joints.shape[1]} joints",
-            "largest tilt of the tool": f"{np.degrees(self.tilt):.1f} degrees",
-            "motion to the first posture": "none" if self.approach is None else f"{self.approach.times[-1]:.1f} s",
-            "compute time": f"{1e3 * self.compute_time:.1f} ms",
-        }
-        return html_table("Adaptation", rows)
 
 
 def adapt(

@@ -19,7 +19,8 @@ from imitarm.command import Command, Status
 from imitarm.errors import InfeasibleError, InputError
 from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply
-from imitarm.policies.adaptation import Adaptation, adapt, adapter_named
+from imitarm.policies.adaptation import adapt, adapter_named
+from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.component_path import ComponentPath
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill

@@ -1,0 +1,114 @@
+"""Adaptation: a path that was adapted to a scene, with its certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.html_table import html_table
+from imitarm.policies.whole_arm import Approach
+from imitarm.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Adaptation:
+    """The path of a skill, adapted to a scene.
+
+    Attributes:
+        nominal: the path without obstacles.
+        trajectory: the adapted path, at the same times; if not ``feasible``, it is the best attempt, which must not be
+            executed.
+        displacement: displacement of each component's mean, shape (n_components, 3) [m].
+        moved: whether each component moved, shape (n_components,).
+        means: centres of the components before they moved, shape (n_components, 3) [m].
+        covariances: position covariances of the components, shape (n_components, 3, 3) [m^2].
+        responsibilities: responsibilities of each component for each sample, shape (n, n_components).
+        divided: whether the learned components were too wide for this scene; if so, the arrays above describe more,
+            narrower components.
+        tolerance: covariance of the demonstrations along the path, shape (n, 3, 3) [m^2].
+        min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without
+            obstacles.
+        certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m].
+        only_on_schedule: whether the guarantee depends on the schedule, because an obstacle moves. The guarantee then
+            holds only while the motion is on time, which means that the tool reaches each sample of ``trajectory`` at
+            the sample's time, counted from the scene's ``stamp``. The guarantee ends with the last sample.
+        validity: text that says what the guarantee assumes and what it does not cover.
+        deviation: largest displacement of a mean, in standard deviations of the demonstrations (Mahalanobis distance).
+        jerk_ratio: largest jerk of the adapted path, divided by the largest jerk of the nominal path.
+        jerk_reason: why ``jerk_ratio`` exceeds 10; empty if it does not.
+        feasible: whether ``certified_clearance`` reaches the required clearance and the path is within the method's
+            limits on displacement and step length.
+        reason: which obstacle blocks the path and why it can't be avoided; empty when feasible.
+        method: name of the method.
+        compute_time: computing time of the whole adaptation [s].
+        joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned. Between
+            two samples the joints move linearly.
+        tilt: largest rotation of the tool away from the learned rotation [rad].
+        approach: motion of the joints to the first posture of ``joints``, which is executed first; None if the arm is
+            there already.
+    """
+
+    nominal: Trajectory
+    trajectory: Trajectory
+    displacement: Array
+    moved: NDArray[np.bool_]
+    means: Array
+    covariances: Array
+    responsibilities: Array
+    divided: bool
+    tolerance: Array
+    min_clearance: float
+    certified_clearance: float
+    only_on_schedule: bool
+    validity: str
+    deviation: float
+    jerk_ratio: float
+    jerk_reason: str
+    feasible: bool
+    reason: str
+    method: str
+    compute_time: float
+    joints: Array | None = None
+    tilt: float = 0.0
+    approach: Approach | None = None
+
+    @property
+    def unmoved_fraction(self) -> float:
+        """Fraction of the components that were not moved."""
+        return float(1.0 - np.mean(self.moved))
+
+    @property
+    def rmse_to_nominal(self) -> float:
+        """Root mean square distance between adapted and nominal path (thesis Eq 4.9, with the square root) [m]."""
+        return float(np.sqrt(np.mean(np.sum((self.trajectory.positions - self.nominal.positions) ** 2, axis=1))))
+
+    def __repr__(self) -> str:
+        if not self.feasible:
+            return f"Adaptation({self.method}, not feasible: {self.reason})"
+        clear = "no obstacles" if np.isinf(self.certified_clearance) else f"{1e3 * self.certified_clearance:.1f} mm"
+        return (
+            f"Adaptation({self.method}, feasible, certified clearance {clear}, {int(self.moved.sum())} of "
+            f"{len(self.moved)} components moved, {1e3 * self.compute_time:.1f} ms)"
+        )
+
+    def _repr_html_(self) -> str:
+        clear = "no obstacles" if np.isinf(self.certified_clearance) else f"{1e3 * self.certified_clearance:.2f} mm"
+        rows = {
+            "method": self.method,
+            "feasible": "yes" if self.feasible else f"no: {self.reason}",
+            "certified clearance": clear,
+            "valid": self.validity,
+            "components moved": f"{int(self.moved.sum())} of {len(self.moved)}",
+            "RMSE to the nominal path": f"{1e3 * self.rmse_to_nominal:.1f} mm",
+            "jerk": f"{self.jerk_ratio:.1f} times that of the nominal path",
+            "jerk above the limit": self.jerk_reason,
+            "joint path": "not planned" if self.joints is None else f"{self.joints.shape[1]} joints",
+            "largest tilt of the tool": f"{np.degrees(self.tilt):.1f} degrees",
+            "motion to the first posture": "none" if self.approach is None else f"{self.approach.times[-1]:.1f} s",
+            "compute time": f"{1e3 * self.compute_time:.1f} ms",
+        }
+        return html_table("Adaptation", rows)
