@@ -49,10 +49,17 @@ bench: $(VENV)/.bench  ## speed against installed peers, as ratios
 	$(BIN)/python benchmarks/speed.py
 
 DATA ?= ../shared/data
-tables: $(VENV)/.dev $(MEDIAPIPE)  ## print all tables of docs/ again, which takes hours; DATA=folder of real recordings
+SKILLS := $(addprefix .cache/skills/,pouring.json letter_h.json bottle2shelf.json)
+tables: $(VENV)/.dev $(MEDIAPIPE) $(SKILLS)  ## print all tables of docs/ again, which takes hours; DATA=folder of real recordings
 	$(BIN)/imitarm benchmark mapping --out benchmark-mapping --data $(DATA) --fill docs/mapping_benchmark.md
 	$(BIN)/imitarm benchmark avoidance --seeds 200 --fill docs/avoidance.md
+	$(BIN)/imitarm benchmark placements --skill $(SKILLS) --robots sawyer panda --tool gripper --seeds 334 --max-tilt 30 \
+		--jobs $(JOBS) --fill docs/avoidance.md
 	$(BIN)/imitarm benchmark people $(DATA) $(VIDEOS)/cam01.mp4 $(VIDEOS)/cam02.mp4 --fill docs/real_data.md
+
+.cache/skills/%.json: $(VENV)/.dev
+	@mkdir -p $(@D)
+	$(BIN)/imitarm learn $(DATA)/panda_kinesthetic/$*.npy --units cm --duration 10 --task $* --out $@ --force
 
 pictures: demo  ## renew the picture of the report in docs/images, which needs Chromium, Chrome or Edge
 	$(BIN)/python scripts/take_picture.py demo/report.html docs/images/report.png --anchor scene-4-boxes-and-cone --seconds 40
