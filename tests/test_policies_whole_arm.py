@@ -33,6 +33,7 @@ from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.policy import Observation
 from imitarm.safety import SafetyFilter
 from imitarm.scene import HalfSpace
+from imitarm.trajectory import Demonstration, Trajectory
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
 ZEROS = np.zeros(7)
@@ -218,3 +219,54 @@ def test_arguments_that_do_not_go_together_are_refused(real_data):
         adapt(skill, Scene(), arm=arm, state=at_rest(start), max_tilt=-1.0)
     with pytest.raises(InputError, match="decompose it with that start"):
         adapt(ComponentPath.of_skill(skill), Scene(), arm=arm, state=at_rest(start + 0.1))
+
+
+SIX = """<mujoco><compiler angle="radian"/><worldbody>
+<body name="l1" pos="0 0 .2"><joint name="a" axis="0 0 1" range="-3 3"/>
+<geom type="capsule" fromto="0 0 0 0 0 .1" size=".06" mass="3" group="3"/><body name="l2" pos="0 0 .1">
+<joint name="b" axis="0 1 0" range="-2 2"/><geom type="capsule" fromto="0 0 0 0 0 .4" size=".05" mass="3" group="3"/>
+<body name="l3" pos="0 0 .4"><joint name="c" axis="0 1 0" range="-2.5 2.5"/>
+<geom type="capsule" fromto="0 0 .06 0 0 .35" size=".045" mass="2" group="3"/><body name="l4" pos="0 0 .35">
+<joint name="d" axis="0 0 1" range="-3 3"/><geom type="capsule" fromto="0 0 0 0 0 .06" size=".04" mass="1" group="3"/>
+<body name="l5" pos="0 0 .06"><joint name="e" axis="0 1 0" range="-2 2"/>
+<geom type="capsule" fromto="0 0 0 0 0 .06" size=".04" mass="1" group="3"/><body name="l6" pos="0 0 .1">
+<joint name="f" axis="0 0 1" range="-3 3"/><geom type="capsule" fromto="0 0 0 0 0 .08" size=".035" mass=".5" group="3"/>
+<site name="flange" pos="0 0 .1"/></body></body></body></body></body></body></worldbody>
+<keyframe><key name="home" qpos="0 .3 1.2 0 1.2 0"/></keyframe></mujoco>"""
+
+
+def test_an_arm_with_six_joints_has_no_self_motion_and_is_planned_all_the_same(tmp_path):
+    file = tmp_path / "six.xml"
+    file.write_text(SIX)
+    arm = ArmModel.load(file)
+    home = arm.tool_pose(arm.home).position
+    steps = np.linspace(0.0, 1.0, 100)
+    rise = steps**3 * (10.0 - 15.0 * steps + 6.0 * steps**2)
+    shown = [
+        Demonstration(
+            Trajectory(4.0 * steps, home + np.outer(rise, [-0.1, 0.3, -0.05]) + [0.002 * i, 0.0, 0.0]), task="go"
+        )
+        for i in range(4)
+    ]
+    skill = Skill(6).fit(shown)
+    learned = skill.generate().positions
+    middle = learned[len(learned) // 2]
+    scene = Scene(None, [Sphere(middle + [0.0, 0.0, -0.02], 0.03, name="ball")])
+    plan = adapt(skill, scene, arm=arm)
+    assert plan.feasible, plan.reason
+    for q in plan.joints:
+        centers, radii = arm.collision_spheres(q)
+        assert (scene.obstacles[0].signed_distance(centers) - radii).min() >= 0.02 - 1e-9
+
+
+def test_an_arm_without_collision_shapes_is_refused(tmp_path):
+    file = tmp_path / "bare.xml"
+    file.write_text(SIX.replace(' group="3"', ' group="1" contype="0" conaffinity="0"'))
+    arm = ArmModel.load(file)
+    assert len(arm.cover.radii) == 0
+    end = arm.tool_pose(arm.home).position
+    steps = np.linspace(0.0, 1.0, 50)
+    path = Trajectory(steps, end + np.outer(steps**2 * (3.0 - 2.0 * steps), [0.02, 0.1, 0.03]))
+    skill = Skill(3).fit([Demonstration(path, task="go")] * 3)
+    with pytest.raises(InputError, match="no collision shapes"):
+        adapt(skill, Scene(), arm=arm)

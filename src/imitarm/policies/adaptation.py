@@ -286,7 +286,10 @@ def _spheres(path: ComponentPath, radius: float | None, spheres: ArrayLike | Non
     if arm is not None:
         rows = np.asarray(instance(arm, ArmModel, "arm").tool_spheres, dtype=float)
         if not len(rows):
-            raise InputError(f"adapt: the arm {arm.name} has no tool; give tool_radius or tool_spheres")
+            raise InputError(
+                f"adapt: the arm {arm.name} has no collision shapes at its last link or tool, so no clearance can be "
+                "certified for it: add them to its file, or give tool_radius or tool_spheres instead of arm"
+            )
     elif radius is not None:
         rows = np.array([[0.0, 0.0, 0.0, finite_number(radius, "tool_radius", "m", at_least=0.0)]])
     else:

@@ -359,7 +359,7 @@ class _Local:
         moved = allowed.enforced((scale @ y[:n]).reshape(-1, allowed.dimension))
         moved[np.einsum("kd,kd->k", moved, moved) < _NEGLIGIBLE**2] = 0.0
         tilt = (_TILT_SIGMA * y[n : n + n_tilts]).reshape(-1, 3)
-        return moved, tilt, y[n + n_tilts :].reshape(self.planner._selves.shape[1], -1)
+        return moved, tilt, y[n + n_tilts :].reshape(self.planner._selves.shape[1], self.null.shape[2])
 
 
 def _rank(plan: ArmPlan) -> tuple[float, float]:
