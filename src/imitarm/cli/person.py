@@ -54,7 +54,7 @@ def add_source(parser: argparse.ArgumentParser, name: str = "source", purpose: s
     Args:
         parser: parser of the command.
         name: ``"source"``, or ``"--source"`` for an option.
-        purpose: what the source is for, at the beginning of the help.
+        purpose: what the command uses the source for; the help text of the argument begins with it.
     """
     parser.add_argument(name, metavar="SOURCE", action=_SourceArgument, help=purpose)
 

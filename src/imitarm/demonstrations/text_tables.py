@@ -1,8 +1,8 @@
 """Readers of text tables: imitarm's own CSV, and any other table of numbers.
 
 Column names are read from a separate row or from a remark (a line that starts with ``#`` or ``%``). If nothing in the
-file looks like column names, the number of columns gives their meaning. An unknown unit is an error, and so is a remark
-that looks like column names but can't be understood.
+file looks like column names, the meaning of the columns is derived from their number. An unknown unit is an error, and
+so is a remark that looks like column names but can't be understood.
 """
 
 from __future__ import annotations

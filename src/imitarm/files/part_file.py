@@ -74,8 +74,8 @@ class PartFile:
         Args:
             take: function that is called with the path ``part``. The function may create ``PATH`` from ``PATH.part``,
                 and returns whether ``PATH.part`` was renamed. If ``take`` returns False, ``PATH.part`` is removed. If
-                ``take`` returns True, no file is removed, because a new file called ``PATH.part`` would belong to
-                another recorder.
+                ``take`` returns True, no file is removed: if a file ``PATH.part`` exists at that time, another recorder
+                has created it.
             begin: text that replaces the ``begin`` given to the constructor; both must have the same length.
 
         Raises:

@@ -77,9 +77,10 @@ class ArmModel(ArmKinematics):
     gravity and :math:`\tau` are the joint torques. Rotor inertia (``armature``), viscous damping and dry friction of
     the joints, which a simulated arm also has, are not included; their values are in ``spec()``.
 
-    All poses are in the base frame, whose origin is the origin of the robot's file. Jacobians have the linear rows
-    first. All methods take one posture ``q`` of shape (n_joints,) and raise :class:`InputError` if its shape is wrong
-    or a number is not finite. Several threads can use one model.
+    All poses are in the base frame, whose origin is the origin of the robot's file. In Jacobians, the three rows of the
+    linear velocity come before the three rows of the angular velocity. All methods take one posture ``q`` of shape
+    (n_joints,) and raise :class:`InputError` if its shape is wrong or a number is not finite. Several threads can use
+    one model.
 
     Attributes:
         name: for example ``"sawyer"``.

@@ -1,7 +1,8 @@
 """Limits of the joint velocity in one control step, as small objects that can be combined.
 
-In each control step, a :class:`Limit` returns a :class:`Box` or :class:`Rows`. A box is hard, so it is always kept.
-Rows are soft linear inequalities, which may be violated if they contradict a box, or at a given price.
+In each control step, a :class:`Limit` returns a :class:`Box` or :class:`Rows`. A box is a lower and an upper bound of
+each joint velocity. The solver never violates these bounds. Rows are linear inequalities on the joint velocities. The
+solver may violate them where they contradict a box, or where their penalty weight (price) is finite.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ class Limit(ABC):
     """One limit of the joint velocity. To write your own limit, implement this one method in a subclass.
 
     Attributes:
-        soft: whether the limit returns rows; only the method ``"qp"`` can keep rows.
+        soft: whether the limit returns :class:`Rows` instead of a :class:`Box`; only the solver method ``"qp"`` accepts
+            rows.
     """
 
     soft: ClassVar[bool] = False
@@ -181,10 +183,10 @@ class WristSingularityLimit(Limit):
     r"""Softly keeps the wrist joint at least 0.1 rad away from its singular positions.
 
     The wrist is singular at every multiple of pi, because the joint axes before and after the wrist joint are parallel
-    there. Let e be the joint's distance from the nearest multiple [rad]. If e exceeds 0.1, the joint's velocity away
-    from the multiple must be at least :math:`-v_b(e - 0.1)` (see :class:`JointLimits`). If e is smaller, this velocity
-    must be at least 5/s times :math:`0.1 - e`. The price of a violation is low, so that the wrist can rotate through a
-    singular position if necessary.
+    there. Let e be the joint's distance from the nearest multiple of pi [rad], and :math:`e'` the rate at which e grows
+    [rad/s]. If e exceeds 0.1, the limit is :math:`e' \ge -v_b(e - 0.1)` (see :class:`JointLimits`). If e is at most
+    0.1, the limit is :math:`e' \ge 5\,(0.1 - e)`. The price of a violation is low, so that the wrist can rotate through
+    a singular position if necessary.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.
@@ -207,7 +209,7 @@ class WristSingularityLimit(Limit):
             self._rows.append(row)
 
     def restrict(self, problem: IKProblem) -> Rows | None:
-        """Return one row for the wrist joint; None when no velocity can violate it."""
+        """Return one inequality on the wrist joint's velocity; None when no velocity can violate the inequality."""
         position = float(problem.q[self._joint])
         away = position - math.pi * round(position / math.pi)
         distance = abs(away) - WRIST_MARGIN

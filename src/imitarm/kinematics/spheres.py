@@ -41,7 +41,7 @@ class SphereCover:
 
         Args:
             model: model with all shapes.
-            working: model with the same bodies; the methods take the data of this model.
+            working: model with the same bodies, whose ``MjData`` the other methods expect.
             names: names of the joints to which the columns of the Jacobians belong.
         """
         joints = np.array([model.joint(name).id for name in names])
@@ -142,8 +142,8 @@ class SphereCover:
             data: the kinematics of a posture.
             outer: indices of the spheres farther from the base, shape (k,); all joints that move the inner spheres
                 also move the outer spheres.
-            inner: indices of the spheres nearer to the base, shape (k,); indices of the base's spheres come after all
-                others.
+            inner: indices of the spheres nearer to the base, shape (k,). The index of a sphere of the base itself is
+                higher than the indices of all moving spheres.
             centers: centers of the outer spheres, shape (k, 3) [m].
             normals: unit vectors from inner to outer, shape (k, 3).
         """
@@ -217,7 +217,7 @@ def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:
 
 
 def _pieces(half_length: float, radius: float) -> int:
-    """Return the number of spheres that cover a round bar; a thin wire gets fewer, larger spheres."""
+    """Return the number of spheres that cover a round bar; the number is limited, so a thin wire gets larger ones."""
     return max(1, math.ceil(min(2.0 * half_length / (_SPACING * radius), _MOST_PIECES)))
 
 

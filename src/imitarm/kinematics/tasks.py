@@ -133,16 +133,17 @@ class ElbowTask(NamedTuple):
 
     The elbow moves by the arm's self-motion, a joint motion that does not move the tool. The unit vector n of the
     self-motion points along :math:`(I - J^+ J) J_\psi^T`, where J is the Jacobian of the tool's task (the first task)
-    and e the target of that task. The elbow task adds the cost :math:`\tfrac{w}2\,(n^T v - s)^2` with
-    the desired speed s of the self-motion (:math:`v` is the joint velocity):
+    and :math:`J_\psi` the gradient of the SEW angle. The elbow task adds the cost :math:`\tfrac{w}2\,(n^T v - s)^2`,
+    where :math:`v` is the joint velocity and s the desired speed of the self-motion:
 
     .. math:: s = c\,\min(1, 10\sin^2\!\beta)\;\frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
 
-    Here, :math:`\psi` is the arm's :func:`~imitarm.kinematics.sew.sew_angle` and :math:`\beta` the angle at its elbow.
-    The elbow's speed goes to zero as the arm becomes straight, and near the one direction in which the stereographic
-    angle is undefined. From one step to the next, s changes by at most half of the change that the joints'
-    accelerations allow. As long as no limit is active, the task does not affect the tool, whatever its weight. When a
-    limit is active, the weights decide between the tool's task and the elbow task.
+    Here, :math:`\psi` is the arm's :func:`~imitarm.kinematics.sew.sew_angle`, :math:`\beta` is the angle at its elbow,
+    and e is the target velocity of the tool's task. The elbow's speed goes to zero as the arm becomes straight, and
+    near the one direction in which the stereographic angle is undefined. From one step to the next, the speed s changes
+    by at most half of the change that the acceleration limits of the joints allow. As long as no limit is active, the
+    task does not affect the tool, whatever its weight. When a limit is active, the weights decide between the tool's
+    task and the elbow task.
 
     Attributes:
         angle: desired SEW angle :math:`\psi_h` [rad].
@@ -202,7 +203,7 @@ def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] 
     r"""Return the joint motion that does not move the tool and changes a given quantity most.
 
     Let J be the tool's Jacobian and g the gradient of the quantity. The returned motion is along :math:`(I - J^+
-    J)\,g`. A motion e of the tool changes the quantity by :math:`g^T J^+ e`.
+    J)\,g`. The joint motion :math:`J^+ e`, which moves the tool by e, changes the quantity by :math:`g^T J^+ e`.
 
     Args:
         jacobian: Jacobian of the tool, shape (m, n_joints).
@@ -234,7 +235,10 @@ def _root(weight: float, task: str) -> float:
 def _scales(
     rotation_length: float | tuple[float, float, float], frame: str, arm: ArmModel, scaled: bool
 ) -> tuple[Array, Array, float, int]:
-    """Return the weights of a twist (6,), the factors for its Jacobian (6, n_joints), the effort and the site."""
+    """Return the weights of a twist (6,), the factors for its Jacobian (6, n_joints), the effort and the site.
+
+    The effort is :attr:`TaskRows.effort`, the factor of the cost of joint motion.
+    """
     try:
         lengths = np.broadcast_to(np.asarray(rotation_length, dtype=float), 3)
         usable = bool(np.isfinite(lengths).all() and lengths.min() > 0.0)

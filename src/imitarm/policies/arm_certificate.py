@@ -6,9 +6,9 @@ this arc from the straight line between its two ends is at most :math:`e`:
 .. math:: e = \tfrac18 \sum_{i,j} |\Delta q_i|\,|\Delta q_j|\,R_{\max(i,j)}
 
 Here :math:`R_j` is the largest distance of the centre from the axis of joint j (1 for a prismatic joint). The bound
-holds because the second derivative of c with respect to the joints i and j has at most the norm
-:math:`R_{\max(i,j)}`. The signed distance to a convex obstacle is a convex function of the point, so the tangents at
-the two ends bound the distance on the line from below. On the arc, the distance is smaller by at most e. Where this
+holds because the second derivative of c with respect to the joints i and j has at most the norm :math:`R_{\max(i,j)}`.
+The signed distance to a convex obstacle is a convex function of the point, so the tangents at the two ends give a lower
+bound of the distance on the line. On the arc, the distance is at most e smaller than on the line. Where the resulting
 bound is too low, the segment is divided into halves, which makes e four times smaller.
 
 The same proof holds for two links of the arm. In the frame of the inner link, only the joints between the two links
@@ -50,7 +50,7 @@ class ArmClearance:
 
     Attributes:
         room: distance minus required clearance [m]. A value of at least 0 is a guaranteed lower bound on the whole
-            path. A negative value was measured at one point of the path, and other points may be worse.
+            path. A negative value was measured at one point of the path; at other points, the value may be lower.
         obstacle: index of the obstacle; ``SELF`` for two links.
         sphere: index of the sphere of the arm; for two links, the sphere of the outer link.
         other: index of the sphere of the inner link; -1 for an obstacle.
@@ -72,12 +72,13 @@ class Gaps:
         path: the arm at the samples.
         obstacle: index of the obstacle; ``SELF`` for two spheres of the arm, shape (k,).
         sample: index of the sample of the path, shape (k,).
-        sphere: index of the sphere; for two spheres, index of the outer sphere, shape (k,).
-        other: index of the inner sphere for two spheres; -1 for an obstacle, shape (k,).
+        sphere: index of the sphere; if the pair is two spheres, index of the sphere farther from the base, shape (k,).
+        other: index of the sphere nearer to the base; -1 if the pair contains an obstacle, shape (k,).
         first: number of joints that move both spheres and therefore do not change their distance, shape (k,); 0 for an
             obstacle.
         room: distance minus required clearance, shape (k,) [m].
-        normal: unit vector along which the sphere moves away fastest, in the base frame, shape (k, 3).
+        normal: direction of motion of the sphere in which the distance grows fastest, as a unit vector in the base
+            frame, shape (k, 3).
         drift: change of the distance with time, caused by the motion of the obstacle, shape (k,) [m/s].
     """
 
@@ -116,8 +117,9 @@ class ArmAmongObstacles:
         obstacles: convex obstacles at time 0, which move at their velocities. A rotating obstacle is replaced by a
             sphere about its centre that contains it.
         clearance: required distance from every moving part of the arm to every obstacle [m].
-        fixtures: objects on which the arm stands or works, such as a table. A part of the arm may come as near to a
-            fixture as it is in one of the postures ``contacts`` or at home; all other parts keep the clearance.
+        fixtures: objects on which the arm stands or works, such as a table. If a part of the arm is nearer to a fixture
+            than ``clearance`` in one of the postures ``contacts`` or at home, this part may come as near as in that
+            posture. All other parts keep the clearance.
         contacts: postures in which parts of the arm may be near fixtures, shape (k, n_joints) [rad].
         own: the links that must stay apart, and their required clearance; None: links are not checked.
 
@@ -147,22 +149,22 @@ class ArmAmongObstacles:
             self._pairs.append(_ToLink(arm, own))
 
     def gaps(self, path: ArmPath, times: Array, reach: float) -> Gaps:
-        """Return all pairs that are nearer than the required clearance plus ``reach``, at the samples.
+        """Return, for each sample, the pairs whose distance is below the required clearance plus ``reach``.
 
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: largest room of the pairs that are returned [m].
+            reach: largest distance minus required clearance of the pairs that are returned [m].
         """
         return Gaps.joined(path, [pairs.gaps(path, times, reach) for pairs in self._pairs])
 
     def clearance_at(self, path: ArmPath, times: Array, reach: float) -> ArmClearance:
-        """Return the smallest clearance at the samples of a path; a room above ``reach`` is returned as ``reach``.
+        """Return the smallest clearance at the samples of a path; its ``room`` is at most ``reach``.
 
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: largest room of the pairs that are returned [m].
+            reach: the ``room`` of the result if the room of every pair is larger [m].
         """
         gaps = self.gaps(path, times, reach)
         if not len(gaps):
@@ -194,8 +196,8 @@ def _finer(path: ArmPath, times: Array) -> tuple[ArmPath, Array, Index, float]:
     """Divide segments on which a sphere could move farther than ``_REACH``.
 
     Returns:
-        The divided path, the time of each of its samples, the index of the sample of ``path`` at or before each of its
-        samples, and the longest distance that a sphere moves on a segment [m].
+        The divided path; for each of its samples, the time and the index of the last sample of ``path`` that is not
+        later; and the longest distance that a sphere moves on one segment of the divided path [m].
     """
     away = np.linalg.norm(path.centers[:, :, None] - path.anchors[:, None], axis=3).max(axis=1, initial=0.0)
     away[:, path.arm.cover.slides] = 1.0
@@ -214,13 +216,14 @@ def _finer(path: ArmPath, times: Array) -> tuple[ArmPath, Array, Index, float]:
 
 
 class _Pairs(ABC):
-    """Pairs of one sphere of the arm with one obstacle, or with spheres of other links.
+    """Pairs whose distance is checked: spheres of the arm with one obstacle, or with spheres of other links.
 
     Attributes:
         arm: the arm.
         obstacle: index of the obstacle, or ``SELF``.
-        sphere: index of the sphere of each pair; for two spheres, index of the outer sphere, shape (n_pairs,).
-        other: index of the inner sphere of each pair; -1 for an obstacle, shape (n_pairs,).
+        sphere: index of the sphere of each pair; if the pair is two spheres, index of the sphere farther from the base,
+            shape (n_pairs,).
+        other: index of the sphere nearer to the base; -1 if the pair contains an obstacle, shape (n_pairs,).
         first: number of joints, counted from the base, that do not change the distance of each pair, shape (n_pairs,).
         moves: whether each joint changes the distance of each pair, shape (n_pairs, n_joints).
         velocity: velocity of the obstacle, shape (3,) [m/s].
@@ -244,7 +247,7 @@ class _Pairs(ABC):
 
     @abstractmethod
     def measured(self, points: Array, pair: Index) -> tuple[Array, Array]:
-        """Return distance minus required clearance (k,) [m] for results of ``points``, and its gradient (k, 3)."""
+        """Return distance minus required clearance (k,) [m], and its gradient (k, 3), at the results of ``points``."""
 
     def gaps(self, path: ArmPath, times: Array, reach: float) -> Gaps:
         sample, pair = np.nonzero(self.near(path, times, reach))
@@ -338,7 +341,7 @@ class _ToLink(_Pairs):
 
 @dataclass(eq=False)
 class _Ends:
-    """The first or last points of k segments: joints, times, points, room, gradients, and distances from the axes."""
+    """One end of each of k segments: joints, times, points, room, gradients, and distances from the joints' axes."""
 
     joints: Array
     times: Array
@@ -362,7 +365,10 @@ class _Ends:
 
 
 def _lowest(pairs: _Pairs, path: ArmPath, times: Array, segment: Index, pair: Index) -> tuple[float, int]:
-    """Return the lowest bound over segments, or a measured value if one is negative, and the index of the segment."""
+    """Return the lowest bound of all segments, and the index of its segment.
+
+    If a negative value is measured at a point, that value and its segment are returned instead.
+    """
     chosen, room = _decisive(pairs, path, times, segment, pair)
     if room < 0.0:
         return room, int(chosen[0])
@@ -393,9 +399,11 @@ def _lowest(pairs: _Pairs, path: ArmPath, times: Array, segment: Index, pair: In
 
 
 def _decisive(pairs: _Pairs, path: ArmPath, times: Array, segment: Index, pair: Index) -> tuple[Index, float]:
-    """Return the segments that may have the lowest bound or a negative one, and 0; or the lowest sample if negative.
+    """Return the segments that need an exact bound, and 0.
 
-    The tangents alone, without the arcs, are cheap to compute; a coarse bound of all arcs then suffices for the rest.
+    These segments may have the lowest bound, or a negative bound. They are found from the tangents, which are cheap to
+    compute, and from one coarse bound of all arcs. If a sample has a negative value, the result is instead the segment
+    of the lowest sample, and its value.
     """
     needed = np.zeros((len(path), len(pairs.sphere)), dtype=bool)
     needed[segment, pair] = needed[segment + 1, pair] = True
@@ -419,7 +427,7 @@ def _decisive(pairs: _Pairs, path: ArmPath, times: Array, segment: Index, pair: 
 
 
 def _bounds(start: _Ends, end: _Ends) -> Array:
-    """Bound distance minus required clearance from below on each segment, shape (k,) [m]."""
+    """Return a lower bound of the distance minus the required clearance on each segment, shape (k,) [m]."""
     step = end.points - start.points
     a = np.einsum("kd,kd->k", start.normal, step)
     b = np.einsum("kd,kd->k", end.normal, step)
@@ -428,12 +436,12 @@ def _bounds(start: _Ends, end: _Ends) -> Array:
 
 
 def bows(steps: Array, radii: Array) -> Array:
-    """Return a bound of the distance of each arc from the straight line between its ends, shape (k,) [m].
+    """Return an upper bound of each arc's distance from the straight line between its ends, shape (k,) [m].
 
     Args:
         steps: absolute motion of each joint, shape (k, n_joints) [rad].
-        radii: distance of the point from the axis of each joint, at the end where this distance is larger; 0 for joints
-            that do not move the point, shape (k, n_joints) [m].
+        radii: distance of the point from the axis of each joint: the larger of the distances at the two ends of the
+            arc; 0 for joints that do not move the point, shape (k, n_joints) [m].
     """
     steps = np.where(radii > 0.0, steps, 0.0)
     whole, farther = radii.copy(), np.zeros(len(steps))

@@ -67,9 +67,10 @@ class AllowedDirections:
     """The directions in which components may move: all ``u`` with ``u . f <= 0`` for every forbidden direction ``f``.
 
     Attributes:
-        forbidden: unit rows, shape (m, 3). Forbidding a direction and its opposite forbids the whole axis.
+        forbidden: forbidden directions, one unit vector per row, shape (m, 3). Forbidding a direction and its opposite
+            forbids the whole axis.
         axes: orthonormal basis of the space without the forbidden axes, as columns, shape (3, d).
-        one_sided: the remaining forbidden directions in the basis ``axes``, unit rows, shape (m', d).
+        one_sided: the remaining forbidden directions, one unit vector per row, in the basis ``axes``, shape (m', d).
     """
 
     forbidden: Array
@@ -112,9 +113,9 @@ class AllowedDirections:
         return np.asarray(reduced @ self.axes.T)
 
     def unit_directions(self, candidates: Array) -> Array:
-        """Return the directions (m, 3) without their forbidden parts, as unit rows.
+        """Return the directions (m, 3) without the parts that are forbidden, one unit vector per row.
 
-        Directions with a small allowed part are dropped.
+        A direction is dropped if its allowed part is small.
         """
         allowed = self.enforced(candidates @ self.axes) if len(self.forbidden) else candidates
         length = np.sqrt(np.einsum("md,md->m", allowed, allowed))
@@ -161,7 +162,7 @@ class Detour:
         feasible: whether every bound reaches the required clearance and the path is within ``MAX_DISPLACEMENT`` and
             ``MAX_STEP_RATIO``.
         out_of_limits: whether the path exceeds ``MAX_DISPLACEMENT`` or ``MAX_STEP_RATIO``.
-        close: points that are too close although the samples before and after them are not.
+        close: points of the path that are too close to an obstacle although the samples before and after them are not.
     """
 
     path: ComponentPath
@@ -183,9 +184,9 @@ class _Cuts:
     """Half-spaces ``direction . (lever @ Delta) <= bound``.
 
     Attributes:
-        lever: influence of the components, shape (m, n_components).
-        direction: unit rows, shape (m, 3).
-        bound: upper bounds, shape (m,) [m].
+        lever: factors by which the components' displacements are multiplied, shape (m, n_components).
+        direction: one unit vector per row, shape (m, 3).
+        bound: upper bound of each half-space, shape (m,) [m].
     """
 
     lever: Array
@@ -235,7 +236,7 @@ class LeastDetour:
         self.movable = path.lever > (1e-3 if exact else NEGLIGIBLE_LEVER)
 
     def _beyond_limits(self, positions: Array) -> _Cuts:
-        """Return half-spaces that exclude ``positions`` and contain every path with allowed displacements and steps."""
+        """Return half-spaces that exclude ``positions``, but no path with allowed displacements and steps."""
         nominal, basis = self.path.nominal.positions, self.path.basis
         away, step = positions - nominal, np.diff(positions, axis=0)
         far, long = np.linalg.norm(away, axis=1), np.linalg.norm(step, axis=1)
@@ -260,16 +261,19 @@ class LeastDetour:
     def shrink(
         self, start: PathClearance, moved: Index | None = None, *, smoothness: float | None = None
     ) -> Detour | None:
-        """Return the least detour that the tangents along a path allow, or the best attempt; None without an attempt.
+        """Return the least detour that the tangents along a path allow.
 
-        Where a segment is too close although the samples at its ends are not, its closest point adds an inequality. A
-        larger clearance at the samples would not help for two reasons. With longer steps around an edge, the samples
-        can be farther out while the path still cuts the edge. Next to a fixed time, a small additional distance needs a
-        very large displacement.
+        If no attempt is feasible, the best attempt is returned; None if there was no attempt.
+
+        Where a segment is too close to an obstacle although the samples at its ends are not, the closest point of the
+        segment adds an inequality. A larger required clearance at the samples would not help, for two reasons. First,
+        a path around an edge can move its samples away from the edge and still cut the edge, if its steps become
+        longer. Second, components can hardly move samples near a time at which the path is fixed, so a little more
+        distance there needs very large displacements of the components.
 
         Args:
-            start: clearance along the path at which the tangents are taken; this path need not be a sum of the
-                components.
+            start: clearance along the path at which the first tangents are taken. It may be a path
+                that no displacement of the components produces.
             moved: indices of the components that may move; None: all.
             smoothness: weight of the squared jerk; None: the default weight of this path.
         """
@@ -324,14 +328,16 @@ class LeastDetour:
         return best, ratio
 
     def _scale(self, moved: Index, smoothness: float | None) -> Array:
-        """Return :func:`style_scale` of the moved components; without a ``smoothness``, the path's default is used."""
+        """Return :func:`style_scale` of the moved components; if ``smoothness`` is None, a default weight is used."""
         weight = (SMOOTHNESS if self.exact else 0.0) if smoothness is None else smoothness
         return style_scale(self.path, self.allowed, moved, weight)
 
     def _step(
         self, moved: Index, scale: Array, here: PathClearance, held: ClosePoints, cuts: _Cuts
     ) -> tuple[Array, PathClearance, float] | None:
-        """Return the displacement of least cost that keeps the tangents' inequalities, its clearance and cost; or None.
+        """Return the displacement of least cost that satisfies the tangents' inequalities; None if there is none.
+
+        The clearance along the displaced path and the cost are also returned.
 
         At first, only samples near an obstacle have an inequality. If the solution violates the clearance at another
         sample, all samples get an inequality.
@@ -448,8 +454,8 @@ class PathAdapter(ABC):
     To add a method, write one file and register it in ``ADAPTERS`` or by an entry point.
 
     Attributes:
-        refuses: whether the method detects that it can't keep the clearance. ``ACFRA`` then refuses to move. The
-            paths of other methods are always followed, for comparison.
+        refuses: whether the method detects that it can't keep the clearance. ``ACFRA`` then refuses to move. If this
+            attribute is False, the path is always followed, so that the methods can be compared.
     """
 
     refuses: ClassVar[bool] = False
@@ -460,6 +466,10 @@ class PathAdapter(ABC):
 
 
 def best_of(detours: Iterable[Detour | None]) -> Detour | None:
-    """Return the feasible detour, or the one with the largest clearance; None when the list is empty."""
+    """Return the best detour; None when there is none.
+
+    Feasible detours come before detours that are only within the limits, and these come before all others. Within each
+    group, the detour with the largest clearance is the best.
+    """
     found = [detour for detour in detours if detour is not None]
     return max(found, key=lambda x: (x.feasible, not x.out_of_limits, x.lowest), default=None)

@@ -3,8 +3,8 @@
 At some times along the nominal path (layers), rays start at the nominal position. On each ray, the points just outside
 the inflated obstacles are the nodes. Edges lead from each node to the nodes of the next layer on the same and on
 neighbouring rays. The cost of an edge is the change of the displacement, plus a large amount where the two tangents at
-its ends do not prove the clearance. Dynamic programming from both ends gives the cheapest route through every node at
-once. A route is only a proposal: the search for the least detour takes its first tangents along the route.
+its ends do not prove the clearance. Dynamic programming from both ends computes, for each node, the cheapest route
+through this node. A route is only a proposal: the search for the least detour takes its first tangents along the route.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Roadmap:
     """Nodes, edges and the cheapest routes among one set of obstacles.
 
     Attributes:
-        layers: samples of the path that are layers, shape (n_layers,).
+        layers: index of the path's sample at each layer, shape (n_layers,).
         nodes: displacements of the nominal positions, shape (n_layers, n_nodes, 3) [m]; node 0 is the nominal position.
     """
 
@@ -179,7 +179,11 @@ class Roadmap:
         return edges.take(slow), cost, violation
 
     def _sweep(self, *, forward: bool) -> tuple[Array, Index]:
-        """Return the lowest cost from the start to each node (or on to the goal), and the neighbour on this route."""
+        """Return the cheapest route from the start to each node: its cost, and the node before its last node.
+
+        If ``forward`` is False, the routes lead from each node to the goal; the second result is the node after the
+        first node.
+        """
         precisions = np.linalg.inv(self.path.tolerance[self.layers] + 0.005**2 * np.eye(3))
         style = np.einsum("lkd,lkd->lk", self.nodes @ precisions, self.nodes) * (
             self.path.n_components / len(self.layers)
@@ -218,7 +222,7 @@ class Roadmap:
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether no route exists, or the cheapest route lacks so much clearance at an edge that it is useless."""
+        """Whether no route exists, or the cheapest route has an edge with far too little clearance."""
         if not self._forward[0][-1, 0] < _BLOCKED:
             return True
         edges = self._edges_of(self._through(len(self.layers) - 1, 0))
@@ -247,7 +251,7 @@ class Roadmap:
 
 
 def _columns(vectors: Array) -> Array:
-    """Return vectors (..., 3) as contiguous columns (3, m), from which gathering is several times as fast."""
+    """Return vectors (..., 3) as contiguous columns (3, m), because numpy selects columns of this array faster."""
     return np.ascontiguousarray(vectors.reshape(-1, 3).T)
 
 

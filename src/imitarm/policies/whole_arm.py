@@ -142,7 +142,7 @@ def _rank(plan: ArmPlan) -> tuple[bool, float]:
 
 
 class _Search:
-    """The attempts of one search, and the places where the failed attempts came too close."""
+    """The attempts of one search, and the clearance of the best failed attempt."""
 
     def __init__(self, task: ArmTask, detour: Detour) -> None:
         self.task, self.detour = task, detour
@@ -166,7 +166,10 @@ class _Search:
         self._goals: list[Array] | None = None
 
     def attempts(self) -> Iterator[tuple[ArmPlanner, Array, Array]]:
-        """Yield the planner, displacement and joint path with which each attempt begins, in the order given above."""
+        """Yield the planner, displacement and joint path with which each attempt begins.
+
+        The order of the attempts is given at the beginning of this module.
+        """
         learned, detour = self._planner(self._components), self.detour.displacement
         joints = self._followed(learned, detour, None)
         first = ArmPath.of(self.task.arm, joints)
@@ -192,7 +195,7 @@ class _Search:
         yield from self._other_starts(detour)
 
     def _other_starts(self, displacement: Array) -> Iterator[tuple[ArmPlanner, Array, Array]]:
-        """Yield first guesses for a joint path that ends in a clear posture and may start in another posture."""
+        """Yield first guesses for a joint path that ends in a clear posture; its start posture is not prescribed."""
         if self._moving:  # there is no time for an approach
             return
         planner = self._planner(self._components, free_start=True)
@@ -222,7 +225,7 @@ class _Search:
         return ArmPath.of(self.task.arm, np.linspace(start, end, n + 10))
 
     def _timed_legs(self, legs: list[ArmPath]) -> Approach | None:
-        """Return the motion along the legs with its execution times; the arm rests between two legs."""
+        """Return the motion along successive straight lines with its execution times; the arm rests between lines."""
         joints, times, now = [self.task.start[None]], [np.zeros(1)], 0.0
         for leg in legs:
             whole = np.abs(leg.joints[-1] - leg.joints[0]) / (_LEG_SPEED * self.task.arm.max_velocity)
@@ -284,7 +287,7 @@ class _Search:
         return sorted(found, key=lambda q: float(np.abs(q - self.task.start).max()))[:_MOST_GOALS]
 
     def _swept(self, starts: Array, goal: Pose) -> Iterator[Array]:
-        """Yield clear postures along the self-motions through ``starts`` (k, n_joints), the nearest postures first."""
+        """Yield clear postures along the self-motions through ``starts`` (k, n_joints), in order of distance."""
         arm, k = self.task.arm, len(starts)
         times = np.full(k, self._times[-1])
         poses = np.tile(goal.position, (k, 1)), np.tile(goal.quaternion, (k, 1))
@@ -312,9 +315,10 @@ class _Search:
                 headings[i] = now * np.where(np.einsum("kj,kj->k", now, headings[i]) < 0.0, -1.0, 1.0)[:, None]
 
     def _sides(self, planner: ArmPlanner) -> list[tuple[Array, Array]]:
-        """Return displacements that lead the tool past the worst place on other sides, each with its joint path.
+        """Return displacements with which the tool passes the closest place on other sides, each with its joint path.
 
-        Of all displacements, those that violate the required clearances least are returned.
+        The closest place is where the clearance of the best failed attempt was smallest. Of all displacements, those
+        that violate the required clearances least are returned.
         """
         worst = self._worst
         if worst is None or not self.task.allowed.dimension:
@@ -342,8 +346,9 @@ class _Search:
     def timed(self, planner: ArmPlanner, plan: ArmPlan) -> tuple[ArmPlan, Timing] | None:
         """Return a plan with execution times within the limits of the arm and of the safety filter.
 
-        New execution times change the distances to moving obstacles. The plan is then repeated for the new times, until
-        it keeps its clearance at the times at which it is executed. If this does not succeed, the result is None.
+        New execution times change the distances to moving obstacles. A new plan is then made for the new times, and it
+        gets execution times of its own. This is repeated until a plan keeps its clearance at its own execution times.
+        If this does not succeed, the result is None.
         """
         for _ in range(_RETIMINGS):
             timing = self._timing(plan.path, self._times, planner.clock)
@@ -360,7 +365,10 @@ class _Search:
         return None
 
     def _timing(self, path: ArmPath, times: Array, clock: Array) -> Timing:
-        """Return execution times for a path with the parameters ``times``, among the obstacles' places at ``clock``."""
+        """Return execution times for a path whose samples have the parameters ``times``.
+
+        Each sample is compared with the places of the obstacles at its time in ``clock``.
+        """
         speed = np.linalg.norm(np.gradient(path.centers, times, axis=0), axis=2)
         gaps = self._around.gaps(path, clock, min(2.0 * float(speed.max(initial=0.0)) / _SELF_RATE, _REACH))
         own = gaps.obstacle == SELF

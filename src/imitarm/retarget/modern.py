@@ -278,8 +278,8 @@ class JerkLimiter:
 
     A blocked arm falls behind its commands, and its drives push harder as the error grows. The command of a joint
     therefore brakes when it is ahead of the measured position by more than half of ``max_lead``, as if ``max_lead``
-    were an additional position limit. While the command brakes, it may exceed half of ``max_lead`` by the braking
-    distance.
+    were an additional position limit. While the command brakes, its distance from the measured position may exceed half
+    of ``max_lead`` by the braking distance.
 
     Args:
         arm: arm model that provides the joint limits.

@@ -54,8 +54,8 @@ class DMPState(NamedTuple):
             fraction)``.
         target: start, goal and duration of the motion.
         rotation: state of the rotation; None when no rotation was learned.
-        steps: length of each step so far (as a fraction of the duration) and number of steps; None if the steps differ
-            in length.
+        steps: if all steps so far have the same length, this length (as a fraction of the duration) and the number of
+            steps; otherwise None.
         checked: the ``motion`` array that is known to be finite; None before a check. A step checks only states
             that the caller changed, not the state that the previous step returned.
     """
@@ -116,8 +116,8 @@ class DMP:
     * ``"progress"``: w + (change of g - x_0) w_p. The change of start and goal is added in proportion to the travelled
       path. The motion therefore rests where the demonstration rests, does not reverse when the distance is halved, and
       needs no special treatment for an axis without motion.
-    * ``"hoffmann"``: w as learned, as in the published form. The change of start and goal is added as fast as the
-      spring allows.
+    * ``"hoffmann"``: the learned w, unchanged, as in the published method. The change of start and goal is added as
+      fast as the spring allows.
     * ``"rotodilatation"``: w is rotated and stretched like g - x_0 (Ginesi et al. 2019), so the shape scales.
 
     **Integration.** The integration is exact for a target that is a parabola within each 1/200 of the duration.
@@ -314,8 +314,8 @@ class DMP:
             patience: lag at which the primitive's clock runs at half speed [m].
 
         Raises:
-            InputError: when an argument is not finite or of a wrong shape, ``dt`` is not above 0 or above
-                100 durations, or ``patience`` is not above 0.
+            InputError: when an argument is not finite or has a wrong shape, when ``dt`` is 0, negative or longer than
+                100 durations, or when ``patience`` is not above 0.
         """
         if type(state) is not DMPState:
             instance(state, DMPState, "DMP.step: state")
@@ -381,7 +381,7 @@ class DMP:
             coupling: see :meth:`step`.
 
         Raises:
-            InputError: for the same reasons as :meth:`begin`, and when ``dt`` is not above 0 or longer than twice the
+            InputError: for the same reasons as :meth:`begin`, and when ``dt`` is 0, negative or longer than twice the
                 duration.
         """
         state = self.begin(start, goal, duration, start_velocity=start_velocity, adjustment=adjustment)
@@ -407,7 +407,8 @@ def number_of_steps(duration: float, dt: float, what: str) -> int:
     """Return ``round(duration / dt)``, at least 1.
 
     Raises:
-        InputError: when ``dt`` [s] is not above 0, or the duration has no step or more than 10 million steps.
+        InputError: when ``dt`` [s] is 0, negative or longer than twice the duration, or when there are more than 10
+            million steps.
     """
     steps = duration / finite_number(dt, f"{what}: dt", "s", above=0.0)
     if not 0.5 <= steps <= MOST_STEPS:
@@ -428,7 +429,7 @@ def _position(value: Pose | ArrayLike | None, default: Array, what: str) -> Arra
 
 
 def _step_length(dt: float, duration: float, position: Array, measured: ArrayLike | None, patience: float) -> float:
-    """Return a step as a fraction of the duration, slowed down by a lag."""
+    """Return the length of a step as a fraction of the duration; if the robot lags, the step is shorter."""
     h = finite_number(dt, "DMP.step: dt", "s", above=0.0, at_most=_LONGEST_STEP * duration) / duration
     if measured is not None:
         lag = finite_vector(measured, 3, "DMP.step: measured", "m") - position

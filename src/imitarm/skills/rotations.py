@@ -160,7 +160,7 @@ class RotationState(NamedTuple):
     Attributes:
         quaternion: wxyz, shape (4,).
         offset: [r; T r'] with T the duration and r the rotation vector from the target to the rotation, in the base
-            frame, shape (2, 3) [rad]. The offset differs from 0 only because of a coupling.
+            frame, shape (2, 3) [rad]. Without a coupling, the offset is 0.
         fraction: elapsed fraction of the duration.
         start_change: rotation vector (3,) [rad] from the learned start to the new start, in the base frame.
         goal_change: rotation vector (3,) [rad] from the learned goal to the new goal, in the base frame.
@@ -360,7 +360,7 @@ def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, go
 
     Args:
         quaternions: R, the learned rotations wxyz, shape (n, 4).
-        fraction: fraction of the duration at each rotation, shape (n,).
+        fraction: time of each rotation, as a fraction of the duration, shape (n,).
         start_change: d_start, rotation vector in the base frame, shape (3,) [rad].
         goal_change: d_goal, rotation vector in the base frame, shape (3,) [rad].
     """

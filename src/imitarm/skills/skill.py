@@ -119,7 +119,7 @@ class Skill:
         return self
 
     def _primitive(self, gmr: GMR) -> DMP:
-        """Return the smallest primitive that follows the nominal path after training, or the largest if none does."""
+        """Train primitives on the nominal path; return the smallest that follows it, or the largest if none does."""
         for dmp in self._primitives:
             nominal = gmr.trajectory(max(_SAMPLES, _SAMPLES_PER_BASIS * dmp.n_basis))
             dmp.fit(nominal, exact_ends=True)
@@ -307,7 +307,7 @@ def _pose(position: Array, quaternion: Array | None) -> Pose:
 
 
 def _ends_of(dmp: DMP, gmr: GMR) -> Array:
-    """Return start and goal of a primitive as rows with the columns of a regression, shape (2, D)."""
+    """Return start and goal of a primitive as two rows, with the same columns as the data of ``gmr``, shape (2, D)."""
     ends = np.stack([dmp.start_, dmp.goal_])
     if gmr.reference_ is None or dmp.orientation_ is None:
         return ends

@@ -347,7 +347,7 @@ def _checksum(whole: Mapping[str, Any]) -> str:
 
 
 def _lines(value: Any, indent: str) -> Iterator[str]:
-    """Write groups one field per line, and tables one row per line."""
+    """Yield the lines of the JSON text: one line for each field of a group, and one for each row of a table."""
     deeper = indent + "  "
     if isinstance(value, dict) and value:
         items = [(f"{deeper}{json.dumps(k)}: ", v) for k, v in value.items()]

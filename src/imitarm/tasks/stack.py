@@ -83,7 +83,7 @@ class CubeHistory:
     Attributes:
         highest: largest height of each cube's center so far, shape (4,) [m].
         tallest: largest number of cubes in the tower so far, at times when the gripper touched no cube.
-        lost: indices of the cubes that left the gripper in the air.
+        lost: indices of the cubes that left the gripper while they were in the air.
         held: index of the cube in the gripper; None if there is none.
     """
 

@@ -80,7 +80,7 @@ class Habits:
         sense_of_lag: lag of the robot that the person expects, which is the same for every retargeter [s].
         dwell: rest after the hand has closed or opened [s].
         height: additional height of movements over long distances [m].
-        begin: time at the start for which the person holds the hand still, so that the robot can begin to follow [s].
+        begin: duration for which the person first holds the hand still, so that the robot can begin to follow [s].
     """
 
     delay: float
@@ -273,10 +273,10 @@ class StackPlan:
         return float(np.hypot(*(self._tool - goal)[:2]))
 
     def _above(self, place: Array, height: float, away: float) -> Array:
-        """Return the next goal of a motion to the point above ``place`` at ``height`` [m].
+        """Return the next goal of a motion that ends above ``place``, at the height ``height`` [m].
 
-        If the gripper is low and far away, the goal is straight above the gripper. Otherwise, the goal is
-        the point above ``place``.
+        If the gripper is low and far away, the goal is straight above the gripper. Otherwise, the goal is the end of
+        the motion.
         """
         if self._tool[2] < height - 0.03 and away > 0.03:
             return np.array([self._tool[0], self._tool[1], height])

@@ -150,7 +150,7 @@ def node_name(kind: str, *names: object) -> str:
 def lit(rgba: Sequence[float], *, linear: bool = False) -> tuple[float, float, float]:
     """Return the colour that looks like ``rgba`` under viser's lights, which are brighter than those of MuJoCo.
 
-    Batches need ``linear`` RGB colours, meshes need sRGB colours.
+    The colours of viser's batched meshes must be ``linear`` RGB; those of single meshes must be sRGB.
     """
     srgb = np.asarray(rgba[:3], dtype=float)
     light = _EXPOSURE * np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

@@ -73,8 +73,8 @@ class DemonstrationModification(BaselineRetargeter):
 
     The method combines two published ideas. Argall's advice operators correct a segment of an execution according to a
     teacher's advice. Mueller et al. 2018 annotate constraints and replace key frames that violate them. The paper that
-    the thesis cites is about policies of a mobile robot. We therefore designed corrections for an arm, which a program
-    selects instead of a teacher.
+    the thesis cites is about policies of a mobile robot. We therefore designed corrections for the motion of an arm. A
+    program, not a teacher, selects these corrections.
 
     The method is offline. :meth:`run` processes the whole recording in four steps:
 
@@ -98,8 +98,8 @@ class DemonstrationModification(BaselineRetargeter):
     * ``"infeasible_before"`` and ``"infeasible_after"``: number of infeasible samples before and after the corrections;
     * ``"failures"``: number of segments that remain infeasible;
     * ``"execution_time"``: duration of the robot's motion [s]; ``"shown_time"``: duration of the person's motion [s];
-    * ``"teaching_time"``: assumed working time of a teacher [s], who needs the duration of a segment plus
-      ``annotation_time`` for every segment in every round.
+    * ``"teaching_time"``: assumed working time of a teacher [s]: the duration of each segment plus ``annotation_time``,
+      summed over all segments of all rounds.
 
     Args:
         arm: the robot's arm with its tool.
@@ -220,8 +220,8 @@ class DemonstrationModification(BaselineRetargeter):
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
         """Append the times at which the person showed the newest steps to ``shown_times``.
 
-        While the robot waits before the motion, the appended times are evenly spaced, but never later than the first
-        time in ``shown``.
+        ``shown`` contains the times of a motion. The robot waits before the motion; the times of the waiting steps are
+        ``dt`` apart, but a time that would be later than the first time in ``shown`` is replaced by that first time.
         """
         rest = len(steps) - len(self._shown_times) - len(shown)
         begin = float(self._shown_times[-1]) if len(self._shown_times) else -self.dt
@@ -285,10 +285,10 @@ def slowed(
 def pull(points: Array, joints: Array) -> Array:
     r"""Return the factor :math:`\kappa` by which to shorten the distance from shoulder to wrist, shape (n,).
 
-    The factor limits the stretch of the robot's arm to 78/80. If the elbow angles of robot and person are equal,
-    :math:`\kappa = \frac{78}{80} L / |W - S|`, where L is the length of the straight arm. In a relative mapping, the
-    elbow angles of robot and person can differ. The person's elbow is then bent further by the angle by which the
-    robot's elbow must bend to reach a stretch of 78/80.
+    With this factor, the robot's arm is stretched to at most 78/80 of its reach. If the elbow angles of robot and
+    person are equal, :math:`\kappa = \frac{78}{80} L / |W - S|`, where L is the length of the straight arm. In a
+    relative mapping, the elbow angles of robot and person can differ. The function then computes how much further the
+    robot's elbow must bend until the arm is stretched to 78/80, and bends the person's elbow by the same angle.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
