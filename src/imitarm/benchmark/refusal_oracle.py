@@ -15,8 +15,8 @@ The oracle gives one of three answers:
 * **undecided**: even the finest grid gave neither a proof nor a path.
 
 The oracle uses the same limits as the library. No sample is displaced by more than 0.5 m. No step is longer than 8
-times the longest step of the nominal path. The path is not displaced at fixed times, and no displacement has a
-component in a forbidden direction.
+times the longest step of the nominal path. At fixed times, the path is not displaced. No displacement has a component
+in a forbidden direction.
 """
 
 from __future__ import annotations
@@ -165,10 +165,10 @@ def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Arr
 def _advanced(
     cost: Array, middle: tuple[int, ...], away: Array, longest: float, from_fixed: bool, to_fixed: bool
 ) -> Array:
-    """Return the cost of each cell in the next layer, reached from the previous layer.
+    """Return, for each cell of the next layer, the cost of reaching it directly from the previous layer.
 
-    The path keeps its cell from layer to layer. Only next to a fixed time, the path moves from the undisplaced position
-    to a cell, or back.
+    From one layer to the next, the path stays in the same cell. There is one exception: next to a fixed time, the path
+    moves from the undisplaced position to a cell, or back.
     """
     if from_fixed and not to_fixed:
         return np.where(away <= longest, cost[middle] + _CHANGE_COST * away, np.inf)
@@ -256,16 +256,16 @@ def _layer(
 def _keeps(need: float, f0: Array, f1: Array, slope0: Array, slope1: Array, step: Array) -> Bools:
     """Return whether the distance to an obstacle is proven to be at least ``need`` [m] along a step.
 
-    The distance changes by at most the length of the step. If the distance at one end exceeds ``need`` by more than
-    the length of the step, the whole step keeps the distance. If the distance at one end is below ``need``, the step
-    does not keep the distance. In all other cases, :func:`_tangent_bound` decides.
+    The distance changes by at most the length of the step. If the distance at one end exceeds ``need`` by more than the
+    length of the step, the answer is True. If the distance at one end is below ``need``, the answer is False. In all
+    other cases, :func:`_tangent_bound` decides.
 
     Args:
         need: required distance [m].
-        f0: distances at the beginning, shape (...) [m].
-        f1: distances at the end, shape (...) [m].
-        slope0: gradients at the beginning, shape (..., 3).
-        slope1: gradients at the end, shape (..., 3).
+        f0: distances to the obstacle at the beginning of the step, shape (...) [m].
+        f1: distances to the obstacle at the end of the step, shape (...) [m].
+        slope0: gradients of ``f0``, shape (..., 3).
+        slope1: gradients of ``f1``, shape (..., 3).
         step: shape (3,) [m].
     """
     kept = np.asarray(np.minimum(f0, f1) >= need)
@@ -282,7 +282,7 @@ def _tangent_bound(f0: Array, a: Array, f1: Array, b: Array) -> Array:
 
 
 def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
-    """Return the costs when one more move is allowed, to a neighbouring cell with no obstacle between the two cells."""
+    """Return the costs when a chain may make one more move: to a neighbouring cell, without an obstacle in between."""
     d = cost.ndim
     result = cost.copy()
     for axis in range(d):
@@ -298,7 +298,7 @@ def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
 def _backtracked(
     costs: list[Array], sides: list[list[Bools]], arrivals: list[Any], away: Array, middle: tuple[int, ...], h: float
 ) -> Array:
-    """Return the coordinates (k, d) [m] of the cheapest chain: its last cell in each layer."""
+    """Return the displacements (k, d) [m] of the cheapest chain: in each layer, the position of its last cell there."""
     chain = np.zeros((len(costs), len(middle)))
     cell = middle
     for k in range(len(costs) - 1, 0, -1):
@@ -396,9 +396,10 @@ def _fit(question: Question, axes: Array, basis: Array, wanted: Array) -> bool:
 def _tangent_rows(
     question: Question, axes: Array, basis: Array, tip: Array, relative: Array, here: Array, extra: Array
 ) -> tuple[Array, Array]:
-    """Return r linear constraints that keep the distances to obstacles: rows (r, m d) and lower bounds (r,).
+    """Return r linear constraints that keep the path away from obstacles: rows (r, m d) and lower bounds (r,).
 
-    Each constraint is the tangent of one small distance at the path ``tip + here``.
+    The variables are the weights of m functions along d axes. Each constraint is the tangent of one small distance at
+    the path ``tip + here``.
     """
     times = question.nominal.times
     j, s = extra[:, 0].astype(int), extra[:, 1:2]
@@ -426,8 +427,8 @@ def _close_points(question: Question, times: Array, tip: Array, relative: Array,
     """Return the r places at which the path comes too close to an obstacle, shape (r, 2).
 
     On each segment between samples, 49 points are examined. If any point is too close, the closest point of the segment
-    is returned. Each place is a pair: the index of the segment's first sample, and the fraction of the segment before
-    the point.
+    is returned. Each place is a pair: the index of the segment's first sample, and the position of the point on the
+    segment, from 0 to 1.
     """
     found = []
     fractions = np.linspace(0.02, 0.98, 49)[:, None, None]

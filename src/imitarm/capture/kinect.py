@@ -194,7 +194,7 @@ _TRACKING = np.array([Tracking.LOST, Tracking.INFERRED, Tracking.TRACKED, Tracki
 
 
 def _joint_indices() -> tuple[tuple[int, ...], ...]:
-    """Return, for each of the 25 joints of a skeleton, the two SDK joints whose midpoint it is."""
+    """Return, for each of the 25 joints of a skeleton, the SDK joints whose mean position is the joint's position."""
     named: dict[str, tuple[int, ...]] = {"spine_base": (0,), "spine_mid": (1,), "spine_shoulder": (4, 11)}
     named |= {"neck": (3,), "head": (26,)}  # spine_shoulder: between the clavicles
     arm = ("shoulder", "elbow", "wrist", "hand", "hand_tip", "thumb")

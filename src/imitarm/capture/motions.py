@@ -42,7 +42,7 @@ def reaching(person: Person, seed: int, *, duration: float = 12.0, kind: str = "
 
     Args:
         person: who moves.
-        seed: seed of the points and the speeds.
+        seed: seed of the random points and speeds.
         duration: duration of the motion [s]; the hand is at rest during the first second.
         kind: ``"inside"``: all reaches end well within the workspace. ``"edge"``: every second reach stretches the arm
             fully and stays there for some time, at or beyond the reach of a robot with the same proportions.
@@ -121,7 +121,7 @@ def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "c
 
     Args:
         person: who moves.
-        seed: seed of position, size and period of the shape.
+        seed: seed of the shape's random position, size and period.
         duration: duration of the motion [s]; the hand is at rest during the first second.
         kind: shape, one of :data:`DRAWINGS`.
 

@@ -172,7 +172,7 @@ class SkeletonRecording(SkeletonSource):
         return self._next >= len(self.skeletons)
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton; None at the end, or when it is not due within ``timeout`` seconds in real time."""
+        """Return the next skeleton; None at the end, or if a real-time replay waits longer than ``timeout`` seconds."""
         if self.over:
             return None
         skeleton = self.skeletons[self._next]

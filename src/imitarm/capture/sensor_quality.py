@@ -52,7 +52,7 @@ class SensorNoise:
         late: fraction of the intervals that are longer than 1.4 times the median interval.
         longest_interval: [s].
         at_rest: white noise of each joint while it moves slower than 0.1 m/s, as the root mean square over the three
-            axes, shape (25,) [m]; nan if the joint moved slowly for too short a time.
+            axes, shape (25,) [m]; nan if there are too few frames in which the joint moves so slowly.
         in_motion: white noise of each joint while it moves faster than 0.4 m/s, shape (25,) [m].
         bones: mean and standard deviation of the length of each bone of both arms, by name (``"left forearm"``) [m].
         inferred: fraction of the frames in which each joint is inferred or lost, shape (25,).

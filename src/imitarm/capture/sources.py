@@ -71,7 +71,7 @@ def _class_of(name: str) -> type[SkeletonSource]:
 
 
 def source_words() -> dict[str, str]:
-    """Return what a user writes to select each source, and a description of the source; this imports all sources."""
+    """Return the description of each source, by the word that selects the source; this imports all sources."""
     words = {}
     for name in SOURCES:
         try:
@@ -94,7 +94,7 @@ def is_live(word: str | Path) -> bool:
 
 
 def followed(source: SkeletonSource, *, person: int | None = None) -> PersonFilter:
-    """Return a source that delivers one person of another source, with left and right corrected, for a retargeter.
+    """Return a source, for a retargeter, that delivers only one person of ``source`` and corrects left and right.
 
     Args:
         source: opened source.

@@ -55,7 +55,7 @@ The first line of the output says whether the tool followed its target closely e
 "Closely enough" means an RMS distance of at most {100 * FAR:.0f} cm between tool and target.
 In addition, the distance may exceed {100 * FAR:.0f} cm for at most {100 * FAR_FRACTION:.0f} % of the time.
 If the tool did not follow its target, the files are written, with a warning.
-The exit status is 1 if the arm was never seen for half a second, so that the robot did not move.
+If the camera never saw the person's arm for half a second, the robot did not move, and the exit status is 1.
 """
 
 PERIOD = 0.01  # [s] control period
@@ -78,7 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--person",
         type=int,
         metavar="N",
-        help="number of the person, if there are several; default: the one seen most (recordings), else the first",
+        help="number of the person, if there are several; default: in a recording, the person in the most frames; "
+        "otherwise the first person",
     )
     person.add_argument("--calibration", type=Path, metavar="FILE", help="file written by 'imitarm calibrate'")
     person.add_argument(
@@ -398,7 +399,7 @@ def suggestion(
 
 
 def _wrist_motion(skeletons: Sequence[Skeleton], side: str) -> float:
-    """Return the RMS distance of a wrist from its mean position, relative to the shoulder [m]; 0 if never seen."""
+    """Return the RMS distance of the wrist, relative to the shoulder, from its mean position [m]; 0 if never seen."""
     wrists = np.array([skeleton.arm(side).wrist - skeleton.arm(side).shoulder for skeleton in skeletons])
     seen = wrists[np.isfinite(wrists).all(axis=1)]
     return float(np.sqrt(np.mean(np.sum((seen - seen.mean(axis=0)) ** 2, axis=1)))) if len(seen) else 0.0

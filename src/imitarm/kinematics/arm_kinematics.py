@@ -43,8 +43,8 @@ class Landmarks:
 
     Attributes:
         sites: indices of the three sites.
-        elbow: index of the elbow joint among the arm's joints.
-        wrist: index of the joint that bends the wrist among the arm's joints.
+        elbow: index, among the arm's joints, of the elbow joint.
+        wrist: index, among the arm's joints, of the joint that bends the wrist.
         elbow_straight: position of the elbow joint at which the arm is stretched and singular [rad]. The value comes
             from the file's ``<custom><numeric name="elbow_straight" data="..."/></custom>``, or is 0 if the file has no
             such entry.

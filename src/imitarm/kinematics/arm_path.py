@@ -206,7 +206,8 @@ def track(arm: ArmModel, start: Array, positions: Array, quaternions: Array, dri
         start: posture before the first pose, shape (n_joints,) [rad].
         positions: shape (n, 3) [m].
         quaternions: tool_to_base, shape (n, 4).
-        drift: posture that the self-motion approaches at the last pose, shape (n_joints,) [rad]; None: no self-motion.
+        drift: posture that the self-motion approaches gradually, up to the last pose, shape (n_joints,) [rad]; None:
+            there is no self-motion.
 
     Returns:
         Shape (n, n_joints) [rad]. If a pose is out of reach, its posture is the nearest one that was found.

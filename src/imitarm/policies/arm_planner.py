@@ -2,8 +2,8 @@ r"""A joint path on which the whole arm keeps its clearance, close to a given di
 
 Three sets of numbers describe the motion: the displacements :math:`\Delta` of the components of the learned path, a
 rotation of the tool away from the learned rotation (the *tilt* :math:`\tau`), and the self-motion :math:`\psi`, which
-moves the arm but not its tool. Each set is multiplied by smooth functions of time :math:`B`. Near a joint path q(t), a
-small change of these numbers changes the joint positions by :math:`\delta q`:
+moves the arm but not its tool. Smooth functions of time, :math:`B`, turn each set of numbers into a function of time.
+Near a joint path q(t), a small change of these numbers changes the joint positions by :math:`\delta q`:
 
 .. math:: \delta q(t) = J^+(t) \begin{bmatrix} B_\Delta(t)\,\delta\Delta \\ B_\tau(t)\,\delta\tau \end{bmatrix}
           + N(t)\,B_\psi(t)\,\delta\psi
@@ -63,7 +63,7 @@ class ArmPlan:
         displacement: displacement of each component's mean, shape (n_components, 3) [m].
         tilt: coefficients of the tool's rotation away from the learned rotation, shape (n_tilts, 3) [rad].
         path: the arm at the samples.
-        clearance: the smallest clearance and its place. If ``complete``, a clearance that is not negative is certified
+        clearance: the smallest clearance and its place. If it is not negative and ``complete`` is True, it is certified
             for the whole path.
         complete: whether ``path`` has all samples of the component path.
         cost: squared size of displacement and tilt, in demonstrated standard deviations.
@@ -211,7 +211,7 @@ class ArmPlanner:
         return best
 
     def _evaluated(self, path: ArmPath, displacement: Array, tilt: Array, samples: Index) -> ArmPlan:
-        """Return a plan with its smallest clearance at the samples; if these are all samples, also between them."""
+        """Return a plan with its smallest clearance at ``samples``; if these are all samples, also between samples."""
         complete = len(samples) == len(self.times)
         beyond = np.minimum(path.joints - self.arm.lower, self.arm.upper - path.joints)
         sample, joint = np.unravel_index(int(np.argmin(beyond)), beyond.shape)
@@ -289,7 +289,7 @@ class ArmPlanner:
         return new, turned, change
 
     def _limits(self, n_self: int, tilt: Array) -> tuple[Array, Array]:
-        """Return rows that keep the tilt within its limit, and the displacements out of forbidden directions."""
+        """Return rows that limit the tilt, and rows that prevent displacements in forbidden directions."""
         n_moved, n_tilts = 3 * self.components.n_components, self.n_tilts
         at = self.coarse
         limit, now = self.max_tilt[at], self._tilts[at] @ tilt
@@ -313,7 +313,7 @@ class ArmPlanner:
 
 
 JOINT_LIMIT = SELF - 1
-"""Replaces the index of an obstacle if the limit of a joint is violated; ``sphere`` is then the index of the joint."""
+"""Stands for a joint limit where an obstacle's index is expected; ``sphere`` is then the index of the joint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,7 +330,7 @@ class _Local:
         return self.planner._selves.shape[1] * self.null.shape[2]
 
     def rows(self, at: Index, rates: Array) -> Array:
-        """Return one row per quantity; ``rates`` (r, n_joints) are its derivatives by the joints at sample ``at``."""
+        """Return the rows of r quantities at samples ``at``; ``rates`` (r, n_joints) are derivatives by the joints."""
         planner, sample = self.planner, self.samples[at]
         of_tool = np.einsum("rj,rji->ri", rates, self.inverse[at])
         of_self = np.einsum("rj,rje->re", rates, self.null[at])
@@ -346,7 +346,10 @@ class _Local:
         return np.concatenate(columns, axis=1)
 
     def scaled(self, matrix: Array, scale: Array) -> Array:
-        """Return the rows for variables with unit cost; ``scale`` converts displacements along the allowed axes."""
+        """Return the rows of ``matrix`` for variables whose cost is the sum of their squares.
+
+        ``scale`` times such variables gives the displacements along the allowed axes.
+        """
         k, axes = self.planner.components.n_components, self.planner.allowed.axes
         moved = (matrix[:, : 3 * k].reshape(-1, k, 3) @ axes).reshape(len(matrix), -1) @ scale
         n_tilts = 3 * self.planner.n_tilts
@@ -384,7 +387,7 @@ def _least(rows: Array, lower: Array, soft: tuple[int, int]) -> Array | None:
     """Return the smallest y with ``rows @ y >= lower``, shape (n,); None when there is none.
 
     Where the rows contradict each other, the first ``soft[0]`` rows (clearances) are relaxed by one common distance, as
-    small as possible. If that is not enough, the first ``soft[1]`` rows (also limits of joints) are relaxed.
+    small as possible. If that is not enough, limits of joints are relaxed too (the first ``soft[1]`` rows).
     """
     n, upper = rows.shape[1], np.full(len(rows), UNBOUNDED)
     y, _, flag, _ = daqp.solve(np.eye(n), np.zeros(n), np.ascontiguousarray(rows), upper, lower)

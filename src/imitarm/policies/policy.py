@@ -103,7 +103,7 @@ class Policy(ABC):
 
     @classmethod
     def build(cls, skill: Skill, **options: Any) -> Self:
-        """Return a policy for the command line and the benchmark, with the constructor's common arguments.
+        """Return a policy, built from the arguments that the command line and the benchmark give to every policy.
 
         Options about the arm are left out if the constructor does not take them.
 
@@ -148,17 +148,17 @@ class ACFRA(Policy):
 
         twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
-    The phase ``s`` therefore waits for a robot that lags, for example at its speed limits or when a hand holds it. If
-    ``e_0`` is the required clearance, the straight line back to the path cuts a corner by at most half of the
-    clearance. Each point of this line is within ``e_0 / 2`` of the tool or of its target, which are both clear of
-    obstacles.
+    The phase ``s`` therefore waits for a robot that lags, for example at its speed limits or when a hand holds it. The
+    robot returns to the path on the straight line from the tool to its target. Tool and target are both clear of
+    obstacles, and each point of the line is within ``e_0 / 2`` of one of them. If ``e_0`` is the required clearance,
+    the line therefore cuts a corner by at most half of the clearance.
 
     Among moving obstacles the plan is valid only at the planned times, so the phase follows the clock and does not
     wait. When the tool is farther than ``e_0 / 2`` from its planned position, the plan is no longer valid: the arm
     brakes and stays at rest.
 
-    Only ``"certified"`` refuses in advance when it can't keep the clearance. The paths of the thesis's potential fields
-    (``"mapf"``, ``"literal"``) are always followed, for comparison.
+    Only ``"certified"`` refuses in advance when it can't keep the clearance. The thesis's potential fields (``"mapf"``,
+    ``"literal"``) serve for comparison, so the robot follows their paths even if these paths do not keep the clearance.
 
     Args:
         skill: skill to reproduce.
@@ -174,9 +174,9 @@ class ACFRA(Policy):
             :func:`~imitarm.policies.adapt`.
         gain: K [1/s].
         patience: e_0, the position error at which the phase stops [m]; None: the clearance, at least 5 mm.
-        arrival: distance to the end of the path at which the motion counts as arrived [m].
-        allowance: margin added to the clearance in planning, if possible, because a robot has tracking errors [m]. The
-            default is 2 mm for a plan of the tool, and 5 mm for a plan of the whole arm.
+        arrival: the motion has arrived when the tool is nearer than this to the end of the path [m].
+        allowance: additional clearance for the robot's tracking errors, used if a path with this larger clearance is
+            found [m]. The default is 2 mm for a plan of the tool, and 5 mm for a plan of the whole arm.
 
     Attributes:
         adaptation: result of the last ``reset``.
@@ -250,7 +250,7 @@ class ACFRA(Policy):
         self._phase, self._void = 0.0, ""
 
     def _adapted(self, scene: Scene, start: Pose | None, state: ArmState) -> Adaptation:
-        """Return the adapted path that begins at ``start``; None: at the learned start."""
+        """Return the adapted path that begins at ``start``, or at the learned start if ``start`` is None."""
         path = self._path.between(self.skill, start, scene.goal)
         allowance = self._allowance if self._refuses else 0.0
         return adapt(
@@ -334,7 +334,7 @@ class ACFRA(Policy):
         return Pose(positions[0], self._hold.quaternion if quaternions is None else quaternions[0])
 
     def finished(self, observation: Observation) -> bool:
-        """Return whether the end of the path is reached within ``arrival``."""
+        """Return whether the phase is at its end, and the tool is nearer than ``arrival`` to the end of the path."""
         if self.adaptation is None or self._void:
             return False
         path = self._path_to_follow

@@ -6,10 +6,10 @@ and :math:`a = \ddot s`:
 .. math:: |q'| \sqrt b \le \dot q_{max}, \qquad |q' a + q'' b| \le \ddot q_{max}, \qquad
           |M q'\,a + (M q'' + C(q, q') q')\,b + g| \le \tau_{max}
 
-A first pass, from the end to the start, finds for each sample the largest b with which the rest of the path can still
-be executed. A second pass, from the start to the end, takes the largest possible a at each sample. The method is that
-of Pham and Pham, "A new approach to time-optimal path parameterization based on reachability analysis", IEEE T-RO
-34(3), 2018.
+A first pass, from the end to the start, finds for each sample the largest :math:`b` from which the rest of the path can
+still be executed. A second pass, from the start to the end, takes the largest possible :math:`a` at each sample. The
+method is that of Pham and Pham, "A new approach to time-optimal path parameterization based on reachability analysis",
+IEEE T-RO 34(3), 2018.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def _limits(arm: ArmModel, joints: Array, first: Array, second: Array) -> tuple[
 
 
 def _interval(of_a: Array, of_b: Array, bound: Array, b: float) -> tuple[float, float]:
-    """Return the smallest and the largest a that the limits allow at ``b``."""
+    """Return the smallest and the largest acceleration ``a`` that the limits allow at the squared speed ``b``."""
     room = bound - of_b * b
     up, down = of_a > _NO_EFFECT, of_a < -_NO_EFFECT
     if (room[~(up | down)] < 0.0).any():
@@ -110,7 +110,10 @@ def _interval(of_a: Array, of_b: Array, bound: Array, b: float) -> tuple[float, 
 
 
 def _largest(of_a: Array, of_b: Array, bound: Array, most: float, step: float, after: float) -> float:
-    """Return the largest b up to ``most`` for which an allowed a leads to a b in [0, ``after``] at the next sample."""
+    """Return the largest squared speed ``b``, at most ``most``, from which the path can continue.
+
+    The limits must allow an acceleration that leads to a squared speed in [0, ``after``] at the next sample.
+    """
 
     def works(b: float) -> bool:
         low, high = _interval(of_a, of_b, bound, b)

@@ -52,9 +52,9 @@ class ClearanceLimit:
     Args:
         arm: arm with its tool.
         clearance: required distance of every link to every obstacle [m].
-        rate: ``xi``, the fraction of h by which h may shrink per second [1/s].
+        rate: ``xi``; while h is positive, it may shrink by at most this fraction of itself per second [1/s].
         influence: value of h beyond which a sphere has no row [m].
-        retreat_rate: fraction of a negative h that is regained per second [1/s].
+        retreat_rate: while h is negative, it must grow by at least this fraction of its magnitude per second [1/s].
 
     Raises:
         InputError: when ``arm`` is not an ArmModel, or a number is not finite or is negative.
@@ -133,14 +133,15 @@ class SelfClearance:
     .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
 
     A row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets the distance shrink no faster than exponentially towards the
-    required clearance :math:`d_{safe}`. If the distance is below the clearance, the distance must grow; the row then
-    has the rate 25/s instead of :math:`\xi`. Every pair of spheres within 6 cm of the clearance has a row (at most the
-    64 nearest pairs). In addition, each of the ``n_rows`` nearest pairs of links within 15 cm has a row for its nearest
-    pair of spheres.
+    required clearance :math:`d_{safe}`. If the distance is below the clearance, the distance must grow, and 25/s
+    replaces :math:`\xi` in the row. Every pair of spheres whose distance is less than the clearance plus 6 cm has a row
+    (at most the 64 nearest pairs). In addition, each of the ``n_rows`` nearest pairs of links within 15 cm has a row
+    for its nearest pair of spheres.
 
     Three kinds of pairs are not checked: links that share a joint, links that can't touch within their joint limits
-    (:func:`meeting_links`), and spheres that are nearer than the clearance in the arm's home posture. The base is
-    included in the check. The object on which the base stands is not part of the arm; add this object to the scene.
+    (:func:`meeting_links`), and pairs of spheres that are nearer to each other than the clearance when the arm is in
+    its home posture. The base is included in the check. The object on which the base stands is not part of the arm; add
+    this object to the scene.
 
     Args:
         arm: the arm with its tool.
@@ -241,13 +242,13 @@ class SelfClearance:
         return gradients, distances - self.clearance
 
     def lower(self, room: Array) -> Array:
-        """Return the lower bound of each distance's rate (k,) [m/s], for given distances minus clearance (k,) [m]."""
+        """Return the least allowed rates (k,) [m/s] of distances that exceed the clearance by ``room`` (k,) [m]."""
         if min(room.tolist(), default=0.0) >= 0.0:  # nearly always
             return -self._gain * room
         return np.where(room < 0.0, -_RETREAT_RATE, -self._gain) * room
 
     def periodic(self, dt: float = 0.01) -> PeriodicSelfClearance:
-        """Return a version of this check for a control loop with period ``dt`` [s] that needs a fifth of the time."""
+        """Return a version of this check that takes a fifth of its time, for a control loop with period ``dt`` [s]."""
         return PeriodicSelfClearance(self, dt)
 
     def _found(self, q: ArrayLike) -> tuple[Indices, Indices, Array, Array, Array]:

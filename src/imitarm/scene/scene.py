@@ -57,7 +57,7 @@ class Scene:
 
         Args:
             seen: the scene from which the shapes, the goal and the fixtures are taken.
-            packed: the obstacles of ``seen`` with other poses and velocities.
+            packed: poses and velocities that replace those of the obstacles of ``seen``.
             stamp: time for which the poses of ``packed`` are valid [s].
         """
         scene = object.__new__(cls)

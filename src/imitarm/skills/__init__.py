@@ -1,4 +1,4 @@
-"""Skills: motions learned from demonstrations. Skills are independent of obstacles; policies handle them."""
+"""Skills: motions learned from demonstrations. A skill contains no obstacles; a policy avoids obstacles."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def torques(
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Return names of joints that fit above a small chart: long names without the part before "_" that all share."""
+    """Return joint names that fit above a small chart; if one is too long, a common prefix up to "_" is removed."""
     first, _, _ = min(names, default="").rpartition("_")
     shared = f"{first}_" if max(map(len, names), default=0) > _LONGEST_NAME else ""
     return [name.removeprefix(shared) for name in names] if all(n.startswith(shared) for n in names) else list(names)

@@ -221,7 +221,7 @@ class Report:
         scenes: results, in the order in which they are shown; names must be unique.
         summary: one or two sentences that introduce the page.
         learning: demonstrations and result of learning.
-        provenance: facts by name that are needed to repeat the run, such as command, seed, platform and versions. A
+        provenance: facts that are needed to repeat the run, such as command, seed, platform and versions, by name. A
             value that is a mapping becomes a separate table.
 
     Raises:

@@ -127,11 +127,10 @@ class Grid:
         return cls(view, *(np.arange(low[i], high[i] + step, step) for i in range(2)))
 
     def distance_to(self, obstacle: Obstacle, depths: Array) -> Array:
-        """Return the distance from each grid point to an obstacle, the smallest over ``depths`` (rows, columns) [m].
+        """Return the smallest distance over ``depths`` from each grid point to an obstacle, shape (rows, columns) [m].
 
-        ``depths`` are coordinates along the line of sight. With one depth, the line of distance 0 outlines the
-        cross-section of the obstacle. With many depths, the line of distance 0 outlines
-        the projection of the obstacle.
+        ``depths`` are coordinates along the line of sight. The grid points with distance 0 form an outline of the
+        obstacle: with one depth, of its cross-section; with many depths, of its projection.
         """
         points = np.empty((len(depths), len(self.up), len(self.across), 3))
         points[..., self.view.across] = self.across
@@ -237,7 +236,10 @@ def _draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance
 
 
 def _name(axes: Any, grid: Grid, distance: Array, name: str, path: Array) -> None:
-    """Write an obstacle's name beside the obstacle (``distance`` < 0), on the side away from the path (n, 2) [m]."""
+    """Write the name of an obstacle above or below it, on the side that faces away from the path (n, 2) [m].
+
+    The obstacle covers the grid points at which ``distance`` is negative.
+    """
     rows, columns = np.nonzero(distance < 0.0)
     across = float(grid.across[columns].mean())
     beside = path[np.argmin(np.abs(path[:, 0] - across)), 1]

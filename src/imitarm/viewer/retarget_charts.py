@@ -157,7 +157,7 @@ def _percentages(run: Retargeting, times: Array, percentages: Array, what: str, 
 
 
 def elbow(run: Retargeting, points: Array, *, name: str = "elbow") -> str:
-    """Draw the directions of the upper arms of person and robot as two angles: upwards, and to the left.
+    """Draw two angles of the upper arms of person and robot: how far they point upwards, and how far to the left.
 
     Args:
         run: the retargeted motion.

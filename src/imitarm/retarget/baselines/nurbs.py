@@ -185,7 +185,7 @@ def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
 
 
 class _Problem:
-    """Data of a fit: samples, basis functions, and the parts of the normal equations without confidences."""
+    """Data of a fit: samples, basis functions, and what the normal equations contain besides the confidences."""
 
     def __init__(self, first: Indices, values: Array, points: Array, rows: Array) -> None:
         self.first, self.values, self.points, self.rows = first, values, points, rows
