@@ -1,7 +1,7 @@
 """Reproduce a skill on a simulated arm around obstacles, and let the simulator measure the result.
 
-The plan guarantees the clearance of the brush only. The simulator, with its own shapes, inertias, limits and servos,
-measures whether the arm follows the plan, and whether the links of the arm keep the clearance too.
+The plan guarantees the clearance of the brush only. The simulator has its own shapes, inertias, limits and servos. It
+measures whether the arm follows the plan, and whether the links of the arm keep the clearance as well.
 """
 
 from __future__ import annotations

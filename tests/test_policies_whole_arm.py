@@ -213,7 +213,7 @@ def test_a_moving_obstacle_is_certified_on_schedule_for_the_whole_arm(real_data)
 
 def test_arguments_that_do_not_go_together_are_refused(real_data):
     skill, arm, start = prepared(real_data, "sawyer")
-    with pytest.raises(InputError, match="state needs arm"):
+    with pytest.raises(InputError, match="state can't be used without arm"):
         adapt(skill, Scene(), tool_radius=0.01, state=at_rest(start))
     with pytest.raises(InputError, match="max_tilt"):
         adapt(skill, Scene(), arm=arm, state=at_rest(start), max_tilt=-1.0)

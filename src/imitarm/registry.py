@@ -15,8 +15,8 @@ Item = TypeVar("Item")
 class Registry(Mapping[str, Item], Generic[Item]):
     """The members of one family by name; each is imported when it is first used.
 
-    Built-in members are given as ``"module:attribute"``. An installed package adds its members to the entry-point group
-    of the family in its ``pyproject.toml``::
+    Built-in members are given as ``"module:attribute"``. An installed package adds its members in its
+    ``pyproject.toml``, under the family's entry-point group::
 
         [project.entry-points."imitarm.policies"]
         mine = "my_package.my_policy:MyPolicy"

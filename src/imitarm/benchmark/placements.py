@@ -88,16 +88,16 @@ class PlacementResult:
 
 
 def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
-    """Return a scene with one to three obstacles on the learned path that do not touch the arm in its start posture.
+    """Return a scene: one to three obstacles on the learned path, none of which touches the arm in its start posture.
 
     Args:
-        skill: whose path.
-        arm: arm, whose tool must not touch an obstacle at start and goal.
+        skill: the skill with the learned path.
+        arm: the arm; at the start and at the goal, its tool must not touch an obstacle.
         seed: seed of the scene; every third seed gives a scene with one obstacle.
         start: joint positions at the start, shape (n_joints,) [rad].
 
     Raises:
-        InputError: when there is no place for an obstacle that the tool does not touch at start and goal.
+        InputError: when no place is found that is far enough from the tool at the start and at the goal.
     """
     rng = np.random.default_rng([31, seed])
     path = skill.generate()

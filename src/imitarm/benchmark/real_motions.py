@@ -83,7 +83,10 @@ def _person(word: str) -> list[Skeleton]:
 
 
 def tables(motions: Sequence[Motion]) -> list[Table]:
-    """Return two tables: ``modern`` with every motion, arm and playback speed; and all methods with the first motion.
+    """Return two tables.
+
+    The first is for ``modern``, with every motion, arm and playback speed. The second is for all methods, with the
+    first motion only.
 
     Args:
         motions: at least one motion.

@@ -1,4 +1,4 @@
-"""Recordings of simulated people by simulated cameras for the mapping benchmark, the same for all methods."""
+"""The recordings of the mapping benchmark, the same for all methods: simulated cameras record simulated people."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ class Plan:
     Attributes:
         kind: one of :data:`KINDS`, or :data:`CAPTURED`.
         person: seed of the person; persons differ in limb lengths and habits.
-        repeat: number of this person's recording, 0 to 99, which seeds motion and camera; for motion capture, number of
-            the simulated camera.
+        repeat: number of the recording among the recordings of this person, 0 to 99. It seeds the motion and the
+            camera. For motion capture, it is the number of the simulated camera.
         seconds: approximate duration of reaches and drawings [s]. Motion capture is cut to this duration; stacking
             ignores it.
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
@@ -198,12 +198,12 @@ def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
 
 
 def _scale(plan: Plan, person: Person) -> float:
-    """Return the scale, robot motion divided by the person's motion: 1 except in recordings of the kind "edge"."""
+    """Return the scale: robot motion divided by the person's motion. It is 1 for all kinds except "edge"."""
     return BEYOND * REACH / (person.upper_arm + person.forearm) if plan.kind == "edge" else 1.0
 
 
 def _start(plan: Plan, arm: ArmModel, points: Array) -> Array:
-    """Return the start posture: the one of the stacking task, or a posture that corresponds to the person's wrist."""
+    """Return the start posture: for stacking, the task's own; otherwise, one that matches the person's first wrist."""
     if plan.kind == "stacking":
         return StackTask().start_posture(arm)
     s, e, w = FACING.apply(points[:3])
@@ -245,7 +245,7 @@ def _drawing(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
 
 
 def _stacking(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
-    """Return the motion of a person who stacks with a gripper that moves exactly with the hand, without any method."""
+    """Return the motion of a person who stacks with a gripper that moves exactly like the hand (no retargeter)."""
     for k in range(_TRIES):
         done = run_stack(plan.person, plan.repeat + REPEATS * k, IdealFollower, camera=ideal_camera)
         if done.success:

@@ -257,8 +257,8 @@ def _cross(a: Array, b: Array) -> Array:
 def _rotated(vector: Array, direction: Array) -> Array:
     """Rotate a vector by the smallest rotation that takes the person's forward axis to ``direction``.
 
-    The vector, shape (3,), must be perpendicular to the forward axis. A direction that is defined for an arm pointing
-    forward thus changes continuously as the arm moves, except when the arm points straight backwards.
+    The vector, shape (3,), must be perpendicular to the forward axis. When the arm moves, the result changes
+    continuously, except when the arm points straight backwards.
     """
     both = direction + _FORWARD
     square = float(both @ both)

@@ -83,8 +83,8 @@ class Arrival(NamedTuple):
 
     Attributes:
         waited: time between exposure and sending [s].
-        queued: time between sending and receiving [s]; for a sender on another machine, relative to the shortest time
-            of the last one to two minutes.
+        queued: time between sending and receiving [s]; for a sender on another machine, only the excess over the
+            shortest such time within the last one to two minutes.
         received_ns: time of receiving, on this machine's clock [ns].
     """
 
@@ -98,8 +98,8 @@ class UdpSource(SkeletonSource):
 
     A :class:`~imitarm.transmission.datagram_filter.DatagramFilter` drops and counts datagrams that are late, damaged,
     hostile, or from another sender. A sender that is killed and started again is accepted after half a second of
-    silence. The time stamps of a restarted sender are shifted so that they keep increasing after the restart. Every
-    retargeter stops while the sender is silent, and then starts again.
+    silence. The time stamps of a restarted sender are shifted so that they keep increasing after the restart. While the
+    sender is silent, every retargeter stops the robot; when skeletons arrive again, it follows the person again.
 
     Args:
         port: port to listen on; 0: any free port.

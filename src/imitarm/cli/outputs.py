@@ -25,7 +25,7 @@ def check_outputs(
 
     Args:
         outputs: option and file of each output; if the file is None, the output is not written.
-        inputs: option or argument of each input, with its file or the name of its source.
+        inputs: for each input, its option or argument, and its file or the name of its source.
         force: whether existing files may be replaced; None if the command has no option ``--force``.
         new_folders: whether the command creates missing folders.
 

@@ -1,4 +1,4 @@
-"""The arguments that all commands for reading demonstrations share, and the function that reads files accordingly."""
+"""The arguments shared by all commands that read demonstrations, and the function that reads files with them."""
 
 from __future__ import annotations
 

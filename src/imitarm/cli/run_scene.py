@@ -211,7 +211,7 @@ def show_results(report: Report) -> None:
     show_table(headings, rows, styles=styles)
     remark(
         "Clearance: smallest measured distance between the arm (with tool) and any obstacle [mm]. Certified: "
-        "guaranteed lower bound of this distance on the planned path [mm]; with --tool-only, of the tool's distance. "
+        "guaranteed lower bound of the clearance on the planned path [mm]; with --tool-only, it is for the tool only. "
         "RMSE: root mean square distance to the demonstrations [mm]. Unmoved: fraction of the Gaussian components "
         "that were not moved. Adaptation: computing time [ms]."
     )

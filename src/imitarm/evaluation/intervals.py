@@ -83,7 +83,8 @@ def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) ->
 
     Resampled means of n samples scatter too little: their standard deviation is too small by the factor
     :math:`\sqrt{(n-1)/n}`. Therefore the deviation of each resampled mean from the sample mean is divided by
-    :math:`\sqrt{(n-1)/n}`. Without this division, a "95 %" interval of ten samples would cover only 90 %.
+    :math:`\sqrt{(n-1)/n}`. Without this division, a "95 %" interval of ten samples would contain the true mean in only
+    90 % of all cases.
 
     Args:
         samples: shape (n,).
@@ -141,16 +142,17 @@ def rate_interval(outcomes: Values) -> Interval:
 
     The interval is the Wilson interval for :math:`N / D` trials instead of N, because the trials of one person are
     similar (Rao and Scott, Biometrics 1992). :math:`D = 1 + (m - 1) \rho` is the design effect of m trials per person.
-    :math:`\rho` is the correlation between trials of one person. The correlation is estimated from how much more the
-    persons' success rates differ than they would by chance. The estimate from a few persons is poor, so it is averaged
-    with a prior correlation of 0.3, which has the weight of two persons. If all trials had the same result, or if there
-    is only one person, the correlation is set to 0.3. :math:`N / D` lies between the number of persons and N.
+    :math:`\rho` is the correlation between trials of one person. The correlation is estimated from the variance of the
+    persons' success rates, compared with the variance that chance alone would cause. The estimate from a few persons is
+    poor, so it is averaged with a prior correlation of 0.3, which has the weight of two persons. If all trials had the
+    same result, or if there is only one person, the correlation is set to 0.3. :math:`N / D` lies between the number of
+    persons and N.
 
-    A result with one more failure could have a narrower interval: if only one person failed, the persons seem to
-    differ; if a second person failed as well, the persons seem to be alike. To prevent such narrowing, the function
-    also computes the interval of every result that is at least as good in each trial, and returns the lowest of these
-    lower ends. In the same way, the returned upper end is the highest upper end of all results that are at least as bad
-    in each trial.
+    One more failure can make the computed interval narrower: if only one person fails, the persons seem to differ; if a
+    second person fails as well, the persons seem to be alike. To prevent such narrowing, the function also considers
+    every result that is at least as good as ``outcomes`` in each trial, and returns the lowest of the lower ends. In
+    the same way, it considers every result that is at least as bad as ``outcomes`` in each trial, and returns the
+    highest of the upper ends.
 
     Args:
         outcomes: outcome of each trial, 1 for success, 0 for failure.
@@ -170,15 +172,16 @@ def rate_interval(outcomes: Values) -> Interval:
 def _lower_end(rates: Array, each: float, step: int) -> float:
     """Return the lower end of the interval of a success rate.
 
-    The function computes the interval of every result in which each person has at least the given rate, and returns the
-    lowest of the lower ends. Among results with the same mean, the lower end is lowest where the persons differ most.
-    The persons differ most if the best person becomes perfect before another person improves (this result majorises all
-    others). Therefore only results in which the best persons are perfect are examined.
+    The function considers every result in which each person has at least the rate in ``rates``, and returns the lowest
+    of the lower ends. Among results with the same mean, the lower end is lowest where the persons differ most. To make
+    the persons differ most, first raise the rate of the best person to 1, then the rate of the next best person, and so
+    on (such a result majorises all others with the same mean). Therefore the function examines only results that are
+    reached in this way.
 
     Args:
         rates: success rate of each person, shape (n,).
         each: average number of trials per person.
-        step: rates are examined in steps of ``1 / step``.
+        step: the sum of the rates is raised in steps of ``1 / step``.
     """
     own = np.sort(rates)[::-1]
     room = 1.0 - own

@@ -31,9 +31,9 @@ class Rows(NamedTuple):
     """Linear inequalities on the joint velocity, ``matrix @ v >= lower``.
 
     With a finite price, violating a row ``a`` by ``s`` adds ``price * (s / |a|)^2 / 2`` to the cost; the weights of the
-    tasks are about 1. The cost depends on the joint velocity [rad/s] that is missing along the row, not on the unit of
-    the row. Without a finite price, rows have priority over all tasks: they are violated only if they contradict the
-    boxes or one another.
+    tasks are about 1. Because of the division by ``|a|``, the cost does not depend on the unit of the row: ``s / |a|``
+    is the smallest change of the joint velocity [rad/s] that would satisfy the row. Without a finite price, rows have
+    priority over all tasks: they are violated only if they contradict the boxes or one another.
 
     Attributes:
         matrix: coefficients of the inequalities, shape (m, n_joints).
@@ -71,8 +71,8 @@ class IKProblem:
         velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: unknown, so accelerations are
             not limited.
         dt: length of the control step [s].
-        box: hard bounds of the joint velocity; at first the arm's velocity limits, then narrowed by each limit of the
-            solver.
+        box: hard bounds of the joint velocity: at first the arm's velocity limits, which each limit of the solver may
+            then narrow.
         tasks: rows of the tasks; the tool's rows come first.
         rows: soft inequalities.
         max_speed: largest norm of a twist, for tasks without their own limit [m/s].

@@ -39,7 +39,6 @@ Array = NDArray[np.float64]
 HORIZONTAL_ONLY = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))  # stay in the plane of the table: 2-D avoidance
 NOT_DOWN = ((0.0, 0.0, -1.0),)  # never into the table
 
-_JERKY = "no smoother path was found on which the whole arm is clear: its jerk is {:.0f} times that of the nominal path"
 _SAME_START = 1e-3  # [m] between a decomposed path and the tool
 
 ADAPTERS: Registry[PathAdapter] = Registry(
@@ -54,7 +53,7 @@ ADAPTERS: Registry[PathAdapter] = Registry(
 
 
 def adapter_named(method: str) -> PathAdapter:
-    """Return the method ``name`` from ``ADAPTERS``, without a search of installed packages for the default method.
+    """Return a method of ``ADAPTERS``. For the default method, installed packages are not searched, to save time.
 
     Raises:
         UnknownNameError: when no method has that name.
@@ -201,7 +200,9 @@ def _start_of(arm: ArmModel | None, state: ArmState, start: Pose | None) -> Pose
     """Return the pose of the tool in the measured posture."""
     instance(state, ArmState, "state")
     if arm is None or start is not None:
-        raise InputError("adapt: state needs arm, and replaces start; give arm and state, or start")
+        raise InputError(
+            "adapt: state can't be used without arm, or together with start; give both arm and state, or start alone"
+        )
     return arm.tool_pose(state.q)
 
 
@@ -318,8 +319,8 @@ def _unit_rows(directions: ArrayLike) -> Array:
 def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
     """Return the detour that the method finds.
 
-    No method searches when the path is already clear. When an obstacle covers a fixed point, only the methods that
-    never refuse (``refuses`` is False) search.
+    If the path is already clear, no method searches for a detour. If an obstacle covers a fixed point, no detour can be
+    clear, so methods that may refuse (``refuses`` is True) do not search either.
     """
     path, clearance, lowest = problem.path, problem.clearance, problem.nominal.lowest
     still = np.zeros((path.n_components, 3))
@@ -343,8 +344,8 @@ def _validity(scene: Scene, duration: float, *, arm: bool = False) -> str:
     if not moving:
         return f"the guarantee holds while the obstacles stand still; {covers}"
     return (
-        f"the guarantee holds only from 0 to {duration:.2f} s, while the motion is on time and {' and '.join(moving)} "
-        f"{'keeps' if len(moving) == 1 else 'keep'} the given velocity, and ends at arrival; {covers}"
+        f"the guarantee ends at arrival, at {duration:.2f} s; until then, it holds while the motion is on time and "
+        f"{' and '.join(moving)} {'keeps' if len(moving) == 1 else 'keep'} the given velocity; {covers}"
     )
 
 

@@ -59,9 +59,9 @@ class ComponentPath:
         basis: products w h of the window and the responsibilities, shape (n, n_components); never negative.
         means: centres of the components on the nominal path, shape (n_components, 3) [m].
         covariances: position covariances of the components, with the lower bound (5 mm)^2, (n_components, 3, 3) [m^2].
-            The covariances also include the motion itself, so a component is long in the direction of the path.
-        yields: GMR's covariance at the time of each component's centre, with the same lower bound, (n_components, 3, 3)
-            [m^2]. The size of a displacement is measured relative to this covariance.
+            The covariances also include the motion itself, so a component is elongated along the path.
+        yields: GMR's covariance at the time of each component's centre, with the same lower bound as ``covariances``,
+            (n_components, 3, 3) [m^2]. The size of a displacement is measured relative to this covariance.
         centres: index of the sample at the centre of each component, (n_components,).
         precisions: inverses of ``yields``, (n_components, 3, 3) [1/m^2].
         tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].

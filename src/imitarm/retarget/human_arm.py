@@ -53,8 +53,8 @@ def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike,
         d: distance along the previous z axis [m].
         a: distance along the new x axis [m].
         alpha: angle about the new x axis [rad].
-        as_printed: whether to use the second row of the matrix as printed in the thesis, with sin instead of cos, so
-            that the rotational part of the transform is not a rotation.
+        as_printed: whether to use the second row of the matrix as printed in the thesis, with sin instead of cos. The
+            rotational part of the transform is then not a rotation.
 
     Returns:
         shape (..., 4, 4).

@@ -42,9 +42,9 @@ class OneEuro:
 
     The speed is the norm of the whole velocity vector, so the filter acts equally in all directions. The velocity is
     computed from the difference of two successive measured values. The original filter instead uses the difference
-    between a measured value and the previous smoothed value. During steady motion, smoothed values lag behind measured
-    values, so this difference would give a velocity that is too large for predictions. The weight :math:`\alpha` of a
-    value is multiplied by the value's confidence.
+    between a measured value and the previous smoothed value. The resulting velocity is too large for predictions,
+    because smoothed values lag behind measured values during steady motion. The weight :math:`\alpha` of a value is
+    multiplied by the value's confidence.
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].
@@ -233,9 +233,10 @@ class TrackingOffsets:
     A person who watches the robot does not notice the slow decay of the offset, but would notice if the robot jumped
     away and back.
 
-    If a joint flickers between tracked and inferred, the filter keeps two offsets, one for each tracking state, for up
-    to 0.12 s. If every change of the state started a new offset, the absolute measured position would never have an
-    effect, and the estimate would drift away. The length of an offset is at most 0.2 m.
+    A joint may flicker between tracked and inferred. Therefore the offset of each tracking state is kept for up to
+    0.12 s and used again when the state returns. If every change of the state started a new offset, the absolute
+    measured position would never have an effect, and the estimate would drift away. The length of an offset is at most
+    0.2 m.
 
     Args:
         time: T [s].

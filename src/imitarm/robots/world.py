@@ -80,7 +80,7 @@ def fixture_names(fixtures: Sequence[Obstacle]) -> list[str]:
 
 
 def add_obstacles(spec: mujoco.MjSpec, scene: Scene) -> None:
-    """Add every obstacle of ``scene`` as a solid body that follows given motions and that contacts can't push.
+    """Add every obstacle of ``scene`` as a solid body; the body follows a given motion, and contacts don't move it.
 
     Args:
         spec: world; changed in place.
@@ -95,7 +95,7 @@ def add_obstacles(spec: mujoco.MjSpec, scene: Scene) -> None:
 def _add_geom(
     spec: mujoco.MjSpec, body: Any, name: str, obstacle: Obstacle, color: tuple[float, ...], **place: Any
 ) -> None:
-    """Add the shape of an obstacle to a body with the obstacle's local frame."""
+    """Add the shape of an obstacle to ``body``, whose frame must be the obstacle's local frame."""
     shape, size, vertices = _shape(obstacle)
     if vertices is None:
         body.add_geom(name=name, type=shape, size=size, rgba=color, **place)
@@ -150,8 +150,8 @@ class ClearanceGauge:
         arm_geoms: ids of the geoms of arm and tool.
         obstacle_geoms: ids of the geoms whose distance is measured.
         fixture_geoms: ids of the geoms on which the arm stands; they count only for contact.
-        links: number of the arm's joints that move each arm geom. Contact between two geoms with different values is a
-            self-contact; None: self-contacts are not checked.
+        links: index of the link to which each arm geom belongs: the number of joints between the base and the geom.
+            Contact between geoms of two different links is a self-contact. None: self-contacts are not checked.
     """
 
     def __init__(

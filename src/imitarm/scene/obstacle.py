@@ -119,7 +119,8 @@ class Family(NamedTuple):
 
     The formula works in the obstacle's local frame, for any number of obstacles and points. The formula takes points
     ``q`` (3, ...), a flag for normals, and the parameters of its shapes, which broadcast against ``q``. The formula
-    returns signed distances (...) [m] and outward unit normals (3, ...), or None. It may overwrite ``q``.
+    returns signed distances (...) [m] and outward unit normals (3, ...); the normals are None if the flag is False. The
+    formula may overwrite ``q``.
 
     Attributes:
         kinds: names of the shapes.
@@ -191,7 +192,8 @@ class Obstacle(ABC):
         velocity: velocity of the shape's centre, in the base frame, shape (3,) [m/s].
         name: name in messages; without a name, a :class:`~imitarm.scene.Scene` uses ``"box 1"``.
         angular_velocity: angular velocity about the shape's centre, in the base frame, shape (3,) [rad/s].
-        covariance: covariance of the position, shape (3, 3) [m^2]; None when it is exact or unknown.
+        covariance: covariance of the position, shape (3, 3) [m^2]; None if the position is exact or the covariance is
+            unknown.
         track_id: number of the obstacle's track in a tracker; None without a tracker.
 
     Raises:

@@ -142,9 +142,9 @@ class Propagator(NamedTuple):
     Attributes:
         transition: transition matrix, shape (2, 2).
         drive: drive matrix, shape (2, 2 m + 1).
-        push: change of z due to a constant acceleration of 1 (in units of the duration) during the step, shape (2,).
-        instants: times at which the target is needed, as fractions of the duration since the start of the step, shape
-            (2 m + 1,).
+        push: change of z during the step if ``tau^2 x''`` is increased by 1, shape (2,).
+        instants: times at which the target is needed, shape (2 m + 1,). They are counted from the start of the step, in
+            fractions of the motion's duration.
     """
 
     transition: Array
@@ -186,7 +186,7 @@ def propagator(gains: Gains, step: float, n_basis: int = 0) -> Propagator:
 
 
 def targets_by_step(step: Propagator, target: Array) -> Array:
-    """Return ``target`` (2 n m + 1, C) in groups, one for the instants of each step, shape (2 m + 1, n, C)."""
+    """Return ``target`` (2 n m + 1, C) as one column for each of the n steps, shape (2 m + 1, n, C)."""
     stride = len(step.instants) - 1
     last = len(target) - stride
     return np.stack([target[i : last + i : stride] for i in range(stride + 1)])
@@ -201,7 +201,7 @@ def roll_out(step: Propagator, start: Array, target: Array) -> Array:
     Args:
         step: one of n equal steps.
         start: [x; tau x'] at the beginning, shape (2, C).
-        target: y at the instants of all steps, one step after the other, shape (2 n m + 1, C).
+        target: y at the ``instants`` of all n steps, in the order of time, shape (2 n m + 1, C).
 
     Returns:
         x and tau x', shape (2, n + 1, C).
@@ -264,8 +264,9 @@ class MovingTarget:
     def plan(self, gains: Gains, step: float) -> PlannedSteps | None:
         """Return all steps of length ``step`` [fraction of the duration]; None in the first call with this length.
 
-        The target does not depend on the state, so for a fixed step it is computed only once. A moving goal gives a new
-        target at every step. A target for a moving goal is used only once, so the first call computes no plan.
+        The target does not depend on the state, so a plan can be computed once and used in all steps. A moving goal
+        gives a new target at every step, and a plan for a target that is used only once would be a waste. Therefore the
+        plan is computed in the second call.
         """
         if step not in self._plans:
             self._plans[step] = None
@@ -334,18 +335,19 @@ def fit_weights(
 ) -> FittedWeights:
     r"""Return the weights with which the primitive reproduces a path.
 
-    The motion is linear in ``d_i = w_i - (g - x_0)``. Let R be the responses of the spring to a start, a rate, a goal
-    and each basis function. Then ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression
-    compares forces (such as ``tau v' + D v``) and needs measured accelerations. Here the spring itself filters both
-    sides of the regression, which converts forces to positions. Therefore noise is not differentiated, the samples may
-    have any times, and the regression minimises the error of the reproduction in metres.
+    The motion is linear in ``d_i = w_i - (g - x_0)``. Let R be the responses of the spring to a unit start position, a
+    unit start velocity, a unit goal and each basis function. Then
+    ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression compares forces (such as
+    ``tau v' + D v``) and needs measured accelerations. Here the spring itself filters both sides of the regression,
+    which converts forces to positions. Therefore noise is not differentiated, the samples may have any times, and the
+    regression minimises the error of the reproduction in metres.
 
     The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. If noise
     moves one of these samples more than 0.1 mm away from the path that fits all samples, the end of this path is used
-    instead. A motion forced through a noisy sample would jerk there. The argument ``exact_ends`` turns this smoothing
-    off. The last drive is 0, so that the target is the goal when the duration is over. (The regression hardly
-    determines the last drive; without this condition, the last drive can pull the tool decimetres away from the goal
-    after the end.)
+    instead. A motion that is forced through a noisy sample would have a high jerk there. The argument ``exact_ends``
+    turns this smoothing off. The last ``d_i`` is set to 0, so that the target is the goal when the duration is over.
+    (The regression hardly determines the last ``d_i``. A last ``d_i`` other than 0 can pull the tool decimetres away
+    from the goal after the end of the motion.)
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).
@@ -383,7 +385,7 @@ def progress_at(fraction: Array, progress_weights: Array, gains: Gains) -> Array
 
 
 def _without_last(R: Array, y: Array, force: Array, regularisation: float, end: Array) -> Array:
-    """Return the solution of :func:`_ridge` whose last drive is 0."""
+    """Return the solution d of :func:`_ridge` in which the last element is set to 0."""
     drives = _ridge(R[:, :-1], y, force[:-1], regularisation, end)
     return np.concatenate([drives, np.zeros((1, y.shape[1]))])
 
@@ -397,7 +399,7 @@ def _beside(R: Array, y: Array, n_basis: int, regularisation: float) -> Array:
 
 
 def _ridge(R: Array, y: Array, force: Array, regularisation: float, end: Array | None = None) -> Array:
-    """Return d from ridge regression of ``R d = y``, penalising ``force d``; ``end`` prescribes ``R[-1] d``."""
+    """Solve ``R d = y`` for d by ridge regression with a penalty on ``force d``; ``R[-1] d`` must equal ``end``."""
     n = R.shape[1]
     S = R / force
     kkt = np.zeros((n + 1, n + 1))

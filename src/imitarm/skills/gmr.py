@@ -41,7 +41,7 @@ class SingleDemonstrationWarning(UserWarning):
 
 
 class UnalignedWarning(UserWarning):
-    """Demonstrations of different durations were given; demonstrations that are not aligned flatten the mean."""
+    """The demonstrations differ in duration. Align them first, because the mean of unaligned motions is flattened."""
 
 
 class GMR:
@@ -348,7 +348,8 @@ class GMR:
         r"""Return the nominal path at ``times`` (n,) [s]: the mean motion, with exact start and goal.
 
         The mean :math:`\hat x` blends straight pieces and therefore misses the mean start and the mean goal of the
-        demonstrations by some millimetres. The nominal path corrects both ends by the smooth steps :math:`b`:
+        demonstrations by some millimetres. To obtain the nominal path, both ends of the mean are corrected, weighted by
+        the smooth step :math:`b`:
 
         .. math::
             \bar x(t) = \hat x(t) + b(t / w_1) (x_{start} - \hat x(0)) + b((T - t) / w_K) (x_{goal} - \hat x(T)), \quad

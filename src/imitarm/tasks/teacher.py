@@ -37,10 +37,11 @@ _TREMOR_BAND = (4.0, 9.0)  # [Hz] physiological tremor of a hand
 class Teacher:
     """The sweeping motion of one simulated person: the path of the hand, its speed and its tremor.
 
-    The hand follows the minimum-jerk path through S, T, G and two points between them: the quintic spline that starts
-    and ends at rest (Flash and Hogan 1985). Persons differ in many respects: total duration, time until T, sideways
-    displacement of the path, accuracy at T and G, height of the brush, rotation of the wrist, tremor, and rest before
-    and after the motion.
+    The hand moves from the start S over the dirt T to the goal G (see :class:`~imitarm.tasks.sweep.SweepTask`). Its
+    path is the minimum-jerk path through S, T, G and two points between them: the quintic spline that starts and ends
+    at rest (Flash and Hogan 1985). Persons differ in many respects: total duration, time until T, sideways displacement
+    of the path, accuracy at T and G, height of the brush, rotation of the wrist, tremor, and rest before and after the
+    motion.
 
     Attributes:
         seed: seed of the person, which determines all these quantities.

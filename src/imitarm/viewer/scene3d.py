@@ -188,7 +188,7 @@ def _free_port() -> int:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence rich, with which viser prints the address of its temporary server; users do not need this address."""
+    """Silence the package ``rich``, with which viser prints the address of its temporary server."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:

@@ -201,7 +201,7 @@ class ThesisRetargeter(Retargeter):
             misprints, the arm stays within its limits.
         smoothing: ``"live"``: a curve is fitted to the last 0.6 s; ``"global"``: :meth:`run` fits one curve to the
             whole recording, without lag, but :meth:`step` uses a live curve; None: no curve.
-        lag: time by which the evaluated point of the live curve lies in the past [s].
+        lag: the live curve is evaluated this long before the current time [s].
         iterations: number of increments of the person's joint angles per frame.
         gain: gain K of the tool's twist :math:`K \log(T_d T^{-1})` [1/s]; the default is the inverse of the frame
             period.
