@@ -344,7 +344,7 @@ def _validity(scene: Scene, duration: float, *, arm: bool = False) -> str:
     if not moving:
         return f"the guarantee holds while the obstacles stand still; {covers}"
     return (
-        f"the guarantee ends at arrival, at {duration:.2f} s; until then, it holds while the motion is on time and "
+        f"the guarantee holds only from 0 to {duration:.2f} s (arrival), and only while the motion is on time and "
         f"{' and '.join(moving)} {'keeps' if len(moving) == 1 else 'keep'} the given velocity; {covers}"
     )
 
