@@ -30,7 +30,7 @@ _WORDS: Final = {
     "intervals do not rule out a difference; the paired comparison tests for it.",
     "Lag": "The constant delay that gives the best match between the path of the tool and the true path of the hand.",
     "From first engagement": "The distance between the tool and its true target, from the time at which the robot "
-    "begins to follow until the end. Time in which the method does not follow is included.",
+    "begins to follow until the end. This includes the time in which the robot does not follow the person.",
     "SPARC": "Spectral arc length of the speed: the closer to 0, the smoother the motion.",
     "Our interpretation": "The thesis describes its baselines only in words. The methods M1 to M3 "
     "are our implementations of these descriptions.",

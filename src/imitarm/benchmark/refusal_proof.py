@@ -1,7 +1,7 @@
 """Proof that no path exists, by a flood fill of boxes in space over time.
 
 A box of positions counts as free if any of its points may be free at any time of an interval. If no chain of free boxes
-leads from the start to the goal, then no continuous displacement of the path exists.
+leads from the start to the goal, then no continuous displacement of the path keeps it clear of the obstacles.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Question:
     fixed_times: tuple[float, ...]
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return at times (m,) the tip (m, 3) and the sphere centres relative to the tip (n_spheres, m, 3)."""
+        """Return the tip (m, 3) at times (m,), and the sphere centres relative to the tip (n_spheres, m, 3)."""
         tip, quaternions = self.nominal.at(times)
         if quaternions is None:
             return tip, np.zeros((len(self.spheres), len(times), 3))
@@ -114,10 +114,10 @@ class _Cells:
     counts: tuple[int, ...]
 
     def window(self, centre: Array) -> tuple[tuple[int, int], ...]:
-        """Return the boxes within the largest displacement from ``centre`` (3,) [m].
+        """Return the boxes that the largest displacement from ``centre`` (3,) [m] can reach.
 
         Returns:
-            The first index and the index after the last along each edge.
+            For each edge, the index of the first box, and the index of the last box plus one.
         """
         low = np.floor((self.frame @ centre - MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
         high = np.ceil((self.frame @ centre + MAX_DISPLACEMENT - self.lowest) / self.size).astype(int)
@@ -126,13 +126,13 @@ class _Cells:
     def within(
         self, window: tuple[tuple[int, int], ...], obstacle: Obstacle, shift: Array, need: float
     ) -> tuple[tuple[int, int], ...] | None:
-        """Return the part of a window whose boxes fit into the bounding box of an inflated obstacle.
+        """Return those boxes of a window that fit into the bounding box of an inflated obstacle.
 
         The boxes are moved by ``shift`` (3,) [m], and the obstacle is inflated by ``need`` [m]. Every other box has a
         corner outside the inflated obstacle.
 
         Returns:
-            The first index and the index after the last along each edge; None when no box fits.
+            For each edge, the index of the first box, and the index of the last box plus one; None when no box fits.
         """
         part = []
         for axis, (a, b), low, size in zip(self.frame, window, self.lowest, self.size, strict=True):
@@ -205,9 +205,9 @@ def is_impossible(question: Question, cells: _Cells) -> bool:
     """Return whether there is provably no path, because a flood fill of possibly free boxes can't reach the goal.
 
     A box is blocked if all of its corners are inside the same inflated obstacle. The corners suffice, because the
-    obstacle is convex. Boxes are fixed in space, so the motion of the tip in the permitted plane does not matter. The
-    obstacles are made smaller, because the tip may move out of the permitted plane, spheres may move relative to the
-    tip, and obstacles may move.
+    obstacle is convex. Boxes are fixed in space, so the motion of the tip in the permitted plane does not matter. All
+    other motions are allowed for by making the obstacles smaller: motions of the tip out of the permitted plane, of the
+    spheres relative to the tip, and of the obstacles.
     """
     d = len(cells.frame)
     moving = any(obstacle.velocity.any() for obstacle in question.obstacles)
@@ -348,7 +348,10 @@ def _permitted(
 
 
 def halves(axis: int, d: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Return two indices of a d-dimensional array: along ``axis``, all entries but the last, and all but the first."""
+    """Return two indices of a d-dimensional array.
+
+    Along ``axis``, the first index omits the last entry, and the second index omits the first entry.
+    """
     first, last = [slice(None)] * d, [slice(None)] * d
     first[axis], last[axis] = slice(None, -1), slice(1, None)
     return tuple(first), tuple(last)

@@ -68,7 +68,7 @@ def _mixing() -> Array:
 
 
 def _white_ratios() -> Array:
-    """Return each joint's white noise at rest, and its increase per m/s, both relative to sigma, shape (2, 25)."""
+    """Return each joint's white noise at rest, and its increase per m/s of speed, relative to sigma, shape (2, 25)."""
     return np.array([_WHITE.get(name.removesuffix("_left").removesuffix("_right"), _WHITE_BODY) for name in JOINTS]).T
 
 

@@ -30,7 +30,7 @@ class PersonFilter(SkeletonSource):
 
     Args:
         source: the source to filter.
-        person: number, in the source, of the only person to follow; None: the first person who is seen.
+        person: the only person to follow, by the number that the source gives; None: the first person who is seen.
         patience: time out of view after which another person may be followed [s].
 
     Attributes:
@@ -96,7 +96,10 @@ class PersonFilter(SkeletonSource):
         return True
 
     def _can_be_there(self, time: float, torso: Array | None) -> bool:
-        """Return whether the followed person can have walked to a position, and no other person was closer to it."""
+        """Return whether a position can be that of the followed person.
+
+        The followed person must be able to have walked there, and must have been closer to it than any other person.
+        """
         if torso is None or self._place is None:
             return self._stranger is None
         before, place = self._place
@@ -159,9 +162,9 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
 
     The sums run over the n pairs of joints that are visible in both frames. The inequality is first evaluated for
     shoulders and hips, with v = 0.5 m/s; if it holds, the whole body is swapped back. The inequality is then evaluated
-    for the hands with and without the elbows, with v = 4 m/s; if it holds, only the arms are swapped back. Hands that
-    touch are too close to each other to satisfy the inequality, so they are not swapped. If one joint of a pair is
-    lost, only the other joint is used.
+    with v = 4 m/s, first for elbows and hands together, and if it does not hold, for the hands alone. If it holds, only
+    these joints are swapped back. Hands that touch are too close to each other to satisfy the inequality, so they are
+    not swapped. If one joint of a pair is lost, only the other joint is used.
 
     Args:
         skeleton: skeleton as the camera reports it.
@@ -174,7 +177,10 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
 
 
 def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
-    """Return the skeleton with left and right assigned as in ``before``, the positions ``period`` seconds ago [m]."""
+    """Return the skeleton with left and right assigned as in ``before``.
+
+    The positions ``before`` [m] were measured ``period`` seconds earlier than the skeleton.
+    """
     if not (_gain(skeleton.positions, before, _DECIDING, _LEAST) > 0.0).any():  # nearly always
         return skeleton
     order = np.arange(len(JOINTS))
@@ -197,13 +203,13 @@ def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
 
 
 def _gain(now: Array, before: Array, pairs: NDArray[np.int64], margin: float) -> Array:
-    """Return by how much a swap shortens the motion of each joint, minus ``margin / 2``.
+    """Return the length by which a swap shortens each joint's motion since the previous frame, minus ``margin / 2``.
 
     Args:
         now: positions (25, 3) [m].
         before: positions in the previous frame, shape (25, 3) [m].
         pairs: indices of the joints of the left and the right side, shape (2, n).
-        margin: distance by which the swap must shorten the motion of a pair of joints [m].
+        margin: length by which a swap must shorten the motions of the two joints of a pair, added together [m].
 
     Returns:
         The result for each joint, shape (2, n) [m]; nan for a joint that is lost in one of the two frames.

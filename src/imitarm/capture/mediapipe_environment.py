@@ -174,8 +174,8 @@ class LineProcess:
     Args:
         command: command with all its arguments.
         keep: largest number of unread lines to store.
-        newest: whether to drop the oldest unread line, but never the program's first line, when ``keep`` unread lines
-            are stored; otherwise, the program waits until a line is read.
+        newest: what happens when ``keep`` unread lines are stored. True: the oldest unread line is dropped, but never
+            the program's first line. False: the program waits until a line is read.
         chatter: regular expression for lines on standard error that :meth:`ended` leaves out.
 
     Raises:

@@ -115,7 +115,9 @@ class ReadOptions:
         )
 
     def wxyz(self, source: str, quaternions: Array, said: str | None = None) -> Array:
-        """Return unnamed quaternion columns (..., 4) in the order w, x, y, z; ``said`` is the order stated in the file.
+        """Return quaternions (..., 4) from columns without names, in the order w, x, y, z.
+
+        ``said`` is the order that the file states; None if it states no order.
 
         Raises:
             InputError: when the option contradicts the file.

@@ -71,9 +71,10 @@ class MappingMetrics:
         mean_torque: mean absolute torque of each joint [N m].
         rms_torque: root mean square torque of each joint [N m].
         mean_gravity_torque: mean absolute torque that holds each joint against gravity [N m].
-        mean_motion_torque: mean absolute torque of each joint without the part that holds it against gravity [N m].
+        mean_motion_torque: mean absolute torque of each joint, after the part that holds the joint against gravity is
+            subtracted [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
-        gravity_effort: the same integral as ``effort``, of the torques that hold the arm against gravity [N^2 m^2 s].
+        gravity_effort: like ``effort``, but only for the torques that hold the arm against gravity [N^2 m^2 s].
         peak_torque_ratio: largest torque relative to the rated torque.
         position_violations: number of frames in which a joint is outside its range.
         velocity_violations: number of frames in which a joint exceeds its velocity limit, by finite differences of the
@@ -141,9 +142,9 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
     Args:
         run: run of the method.
         correspondence: correspondence between person and robot, the input of the method.
-        true: the person's true arm, one sample for each time of the run. If the method slows the motion down, each
-            sample shows the arm at the earlier time that the robot reproduces. None if the true arm is unknown, as with
-            a real camera; measures that need the true arm are then nan.
+        true: the person's true arm, one sample for each time of the run. If the method slows the motion down, the
+            robot reproduces an earlier moment of the person's motion, and the sample shows the arm at that moment. None
+            if the true arm is unknown, as with a real camera; measures that need the true arm are then nan.
 
     Raises:
         InputError: when the run is shorter than 4 control periods or a joint position is not finite.
@@ -231,7 +232,7 @@ def _executed(
     correspondence: Correspondence,
     true: TrueArm | None,
 ) -> tuple[float, float]:
-    """Return the tool error with and without lag when an arm that keeps its limits executes the commands."""
+    """Return the tool error, with the lag and without it, of an arm that executes the commands within its limits."""
     if true is None or not periods.engaged.any():
         return math.nan, math.nan
     tool = run.arm.tool_path(execute_within_limits(run.arm, run.joints, motion.dt))[0]
@@ -246,7 +247,7 @@ def _settling(
     correspondence: Correspondence,
     true: TrueArm | None,
 ) -> float:
-    """Return the settling time; the last target is the mean of the method's targets in the last half second."""
+    """Return the settling time of the tool at the mean of the method's targets in the last half second."""
     if true is None or not periods.engaged.any():
         return math.nan
     late = run.times >= run.times[-1] - _REST

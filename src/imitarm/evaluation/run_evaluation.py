@@ -33,14 +33,13 @@ class TargetTracking:
 
     The tool tracked the target if three conditions hold: the robot was engaged for at least half of the time, the RMS
     distance was at most :data:`FAR`, and the tool was farther away than :data:`FAR` for at most :data:`FAR_FRACTION` of
-    the time with a target. FAR is 5 cm, because a gripper within 5 cm of its target is still at the object that it
-    should grasp. The method ``modern``, with its normal lag, exceeds neither FAR nor FAR_FRACTION.
+    the time with a target. FAR is 5 cm: at this distance from its target, a gripper is still at the object
+    that it should grasp. The method ``modern``, with its normal lag, exceeds neither FAR nor FAR_FRACTION.
 
     Attributes:
         title: title of the method.
         rms: root mean square distance to the target [m]; nan when there was no target.
-        far_fraction: fraction of the time with a target in which the tool was farther away than :data:`FAR`, 0 to
-            1; nan without a target.
+        far_fraction: ``far_time`` divided by the time in which there was a target, 0 to 1; nan without a target.
         far_time: time in which the tool was farther away than :data:`FAR` [s].
         farthest: largest distance to the target [m]; nan without a target.
         engagements: number of times that the robot began to follow the person.
@@ -124,8 +123,8 @@ class RunEvaluation:
         hand_lag: lag of the tool behind the hand [s]; nan when the tool does not follow the hand.
         link_distance: smallest distance between links that are not neighbours, measured between spheres that cover the
             links [m].
-        truth_known: whether the measures compare with the true hand; otherwise they compare with the hand measured
-            by the camera.
+        truth_known: whether the measures compare the robot with the true hand; otherwise they compare it with the hand
+            that the camera measured.
         warnings: remarks for the user about this run, one sentence each.
     """
 

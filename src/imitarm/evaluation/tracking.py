@@ -54,7 +54,7 @@ class TrueArm:
         """Sample the true positions of the arm of a simulated or motion-captured person.
 
         Args:
-            truth: the person's skeleton over time; called in the order of the times.
+            truth: function of time that returns the person's skeleton; it is called with increasing times.
             times: times of a run, shape (n,) [s].
             correspondence: correspondence with the side of the arm and the pose of the sensor.
             start: reading of the person's clock at time 0 of the run, when the first skeleton was measured [s].
@@ -125,8 +125,8 @@ class EngagementPeriods:
 
     Attributes:
         engaged: for each frame, whether the robot was engaged, shape (n,).
-        start: for each engaged frame, the index of the last frame before its engagement, shape (n,); undefined
-            elsewhere.
+        start: for each engaged frame, the index of the last frame before the engagement began, shape (n,); undefined
+            in all other frames.
         count: number of engagements.
     """
 
@@ -283,7 +283,9 @@ def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods
 
 
 def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) -> Array:
-    """Return how differently the SEW angles (swivel angles) of robot and person changed since the engagement began.
+    """Return the difference between the changes of the robot's and the person's SEW angle since the engagement began.
+
+    The SEW angle is the swivel angle of the elbow.
 
     Args:
         true: the person's arm, in the axes of the base.
@@ -301,7 +303,9 @@ def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) ->
 
 
 def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, rest: float = 0.5) -> float:
-    """Return the time at which a point came within ``radius`` [m] of its mean position in the last ``rest`` seconds.
+    """Return the time at which a point came within ``radius`` of its final position for the last time.
+
+    The final position is the mean of the positions in the last ``rest`` seconds.
 
     Args:
         times: time stamps, shape (n,) [s].

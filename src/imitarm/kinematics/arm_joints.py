@@ -420,7 +420,7 @@ def complete_home(
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return a position for every joint of ``model``, and notes on the choice.
 
-    A joint in ``given`` has the position that ``given`` contains. A tool's fingers are open, other joints that do not
+    A joint that ``given`` names gets its position from ``given``. A tool's fingers are open, other joints that do not
     belong to the arm are in the middle of their ranges, and coupled joints follow their leader. The arm's own joints
     are also in the middle of their ranges if that posture is not singular and its links are at least 20 mm apart. If
     that posture is not suitable, the function chooses the best of many postures.

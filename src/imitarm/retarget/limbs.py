@@ -32,7 +32,7 @@ class LimbLengths:
     Attributes:
         upper_arm: distance from shoulder to elbow [m].
         forearm: distance from elbow to wrist [m].
-        spread: standard deviations of the single measurements of the two lengths about their medians [m].
+        spread: for each of the two lengths, the standard deviation of its measurements about their median [m].
         n_frames: number of frames used for the measurement; 0 when the lengths were given.
 
     Raises:

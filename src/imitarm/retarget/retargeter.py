@@ -104,7 +104,7 @@ class Retargeter(ABC):
         name: name of the method, as in :data:`imitarm.retarget.RETARGETERS`; default: the class's name.
         title: title of the method in tables and reports; default: ``name``.
         caption: one sentence about the method for reports.
-        rule: times at which the engagement changes its state.
+        rule: durations after which the engagement changes its state.
         arm: the robot's arm with its tool.
         n_joints: number of joints of the arm.
         correspondence: correspondence between the person's arm and the robot's.
@@ -320,8 +320,8 @@ class Retargeting:
         notes: counts and other figures that the method reports, by name.
         title: title of the method for tables and reports; empty: ``method``.
         caption: one sentence about the method for reports.
-        shown_times: time at which the person showed each sample, counted from the first skeleton, shape (n,) [s];
-            earlier than ``times`` for methods that slow the motion down. None: ``times``.
+        shown_times: for each sample, the time at which the person made this part of the motion, counted from the first
+            skeleton, shape (n,) [s]; earlier than ``times`` for methods that slow the motion down. None: ``times``.
     """
 
     method: str

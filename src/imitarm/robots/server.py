@@ -64,8 +64,8 @@ class Supervisor:
     owner until the next stop. Any client may stop the robot.
 
     A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this arm,
-    and is within the joints' position and velocity limits. The command must also be at most as far from the set-point
-    as the joints can move in 0.15 s at full speed.
+    and is within the joints' position and velocity limits. The command must also be near the set-point: no joint may
+    be farther from its set-point than it moves in 0.15 s at full speed.
 
     Let :math:`q_c` be the commanded position and :math:`\dot q_c` its velocity. The set-point q moves towards
     :math:`q_c` at the following velocity:
@@ -267,8 +267,9 @@ class RobotServer:
 
     The server sends nothing without a request, and a :class:`~imitarm.robots.server.Supervisor` checks every datagram
     that it receives. If the machine was too busy and periods were missed, the next step is lengthened by the missed
-    time, up to 20 ms in total, so that the robot keeps up with the commands. The longer step keeps the limits of the
-    joints, because they are computed from the length of the step. Missed time beyond 20 ms is skipped.
+    time, up to 20 ms in total, so that the robot keeps up with the commands. The joints keep their limits in a
+    longer step, because the permitted velocity is computed from the length of the step. Missed time beyond 20 ms is
+    skipped.
 
     Args:
         robot: robot to serve.

@@ -27,15 +27,15 @@ _ACTIVE = (RobotStatus.FOLLOWING, RobotStatus.SLOWING)
 
 
 class Echo(NamedTuple):
-    """The times of a command that the server reports.
+    """When one command was sent, received and applied, as reported by the server.
 
     Attributes:
         sequence: sequence number of the command.
-        sent: time from sending to receiving [s]; if the server is on another machine, relative to the time of the
-            fastest command.
-        applied: time from receiving the command until the drives had a set-point computed from it [s].
-        applied_ns: time at which the drives had the set-point computed from the command, on the clock of this process
-            [ns]. If the server is on another machine, the travel time of the fastest command is assumed to be 0.
+        sent: time from sending to receiving [s]. If the server is on another machine, the travel time of the fastest
+            command is subtracted.
+        applied: time from receiving the command until a set-point computed from it was given to the drives [s].
+        applied_ns: time at which this set-point was given to the drives, on the clock of this process [ns]. If the
+            server is on another machine, the travel time of the fastest command is assumed to be 0.
     """
 
     sequence: int
@@ -47,11 +47,11 @@ class Echo(NamedTuple):
 class UdpRobot(Robot):
     """The client of a :class:`~imitarm.robots.server.RobotServer`.
 
-    :meth:`move` limits a velocity as every robot does and sends the resulting set-point; the server checks the
-    set-point again. The client sends commands only while the newest state from the server is at most 0.1 s old and says
-    that the robot follows this client. At all other times, the client sends no command and adopts the server's
-    set-point. Therefore the arm never jumps after a restart of the client or the server, or after an interrupted
-    connection.
+    :meth:`move` limits the velocity in the same way as for every other robot. It then sends the resulting set-point,
+    and the server checks the set-point again. The client sends commands only while the newest state from the server is
+    at most 0.1 s old and says that the robot follows this client. At all other times, the client sends no command and
+    adopts the server's set-point. Therefore the arm never jumps after a restart of the client or the server, or after
+    an interrupted connection.
 
     A stopped robot moves again only after :meth:`enable`, which requires a decision by a person.
 

@@ -113,7 +113,7 @@ class PackedObstacles:
     ) -> PackedObstacles:
         """Return the same shapes with other poses, seen at ``stamp`` [s].
 
-        The other arguments have the names and meanings of the attributes.
+        Each of the other arguments is the new value of the attribute with the same name.
         """
         moved = self._copy(
             positions=positions,
@@ -205,7 +205,10 @@ class PackedObstacles:
         return []
 
     def _limits(self, reach: Array) -> Array:
-        """Return the squared distance (n, m) from each origin beyond which a point is farther than ``reach``."""
+        """Return squared distances (n, m) between origins and points.
+
+        A point that is farther than this from a solid's origin is farther than ``reach`` from the solid.
+        """
         if not self._kept or self._kept[0][0] is not reach:
             limit = reach + self.radii[self._sorted[0], None]
             self._kept[:] = [(reach, limit * limit)]
@@ -358,12 +361,12 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
 
 
 def _every(parameters: Parameters) -> list[Array | None]:
-    """Return the parameters of all members of a family, with an additional last axis for the points."""
+    """Return the parameters of all obstacles of a family, with a last axis of length 1, to combine them with points."""
     return [None if p is None else p[..., None] for p in parameters]
 
 
 def _take(parameters: Parameters, members: Indices) -> list[Array | None]:
-    """Return, for each point, the parameters of one member of a family."""
+    """Return the parameters of one obstacle of a family for each point; ``members`` are the obstacles' indices."""
     return [None if p is None else p.take(members, axis=-1) for p in parameters]
 
 

@@ -120,7 +120,7 @@ class Cylinder(PosedObstacle):
     """A flat-ended cylinder: the formula of :class:`Box` with ``a = (rho - radius, |z| - length/2)``.
 
     Attributes:
-        pose: obstacle_to_base, at the middle of the axis; the axis is its z.
+        pose: obstacle_to_base, at the middle of the cylinder's axis, with z along this axis.
         radius: [m].
         length: length from end to end [m].
     """
@@ -137,7 +137,10 @@ class Cylinder(PosedObstacle):
 
 
 def _rim(v: Array, radius: float) -> Array:
-    """Return points (2, n) of a circle in directions ``v`` (3, n); for ``v`` along z, the point on the x axis."""
+    """Return the points (2, n) of a circle in the directions of vectors ``v`` (3, n), projected along z.
+
+    For a vector along z, it is the point on the x axis.
+    """
     rho = np.hypot(v[0], v[1])
     on_axis = rho < TINY
     rim = radius * v[:2] / np.where(on_axis, 1.0, rho)
@@ -194,8 +197,8 @@ def cones(
 ) -> tuple[Array, Array | None]:
     """Return distances to cones: triangles in the half-plane ``(rho, z)``, base at ``-height/2``, tip at ``+height/2``.
 
-    Outside, the distance is the smaller distance to two segments, the slant side and the base; inside, it is the larger
-    signed distance to their lines.
+    Outside, the distance is the smaller of the distances to two segments, the slant side and the base; inside, it is
+    the larger of the signed distances to their lines.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
@@ -245,8 +248,8 @@ CONES = Family(("cone",), cones, _prepare_cones)
 class Cone(PosedObstacle):
     """A circular cone whose tip points along its local z axis.
 
-    In the half-plane ``(rho, z)`` the cone is a triangle. Outside, the distance is the smaller distance to two
-    segments, the slant side and the base; inside, it is the larger signed distance to their lines.
+    In the half-plane ``(rho, z)`` the cone is a triangle. Outside, the distance is the smaller of the distances to two
+    segments, the slant side and the base; inside, it is the larger of the signed distances to their lines.
 
     Attributes:
         pose: obstacle_to_base, on the axis at half the height (as for a cylinder): base at ``z = -height/2``, tip at

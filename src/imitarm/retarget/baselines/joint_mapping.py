@@ -100,7 +100,7 @@ class JointMapping:
 
     @property
     def _from(self) -> tuple[Array, Array]:
-        """The joint positions of robot and person from which the mapping measures the changes of the angles."""
+        """The joint positions of robot and person at which the changes that the mapping transfers are zero."""
         if self.relative and self._origin is not None:
             return self._origin
         return self.zero, np.zeros(7)
