@@ -143,8 +143,8 @@ def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | No
         run: run of the method.
         correspondence: correspondence between person and robot, the input of the method.
         true: the person's true arm, one sample for each time of the run. If the method slows the motion down, the
-            robot reproduces an earlier moment of the person's motion, and the sample shows the arm at that moment. None
-            if the true arm is unknown, as with a real camera; measures that need the true arm are then nan.
+            robot reproduces what the person did at an earlier time, and the sample shows the arm at this earlier time.
+            None if the true arm is unknown, as with a real camera; measures that need the true arm are then nan.
 
     Raises:
         InputError: when the run is shorter than 4 control periods or a joint position is not finite.
