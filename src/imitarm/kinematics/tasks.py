@@ -162,7 +162,7 @@ class ElbowTask(NamedTuple):
     convention: str = "stereographic"
 
     def rows(self, problem: IKProblem) -> TaskRows | None:
-        """Return one row along the self-motion; None where the angle is not defined or there is no self-motion."""
+        """Return one row, for the speed along the self-motion; None if the angle or the self-motion is undefined."""
         angle, weight, confidence, gain, max_rate, convention = self
         try:
             usable = math.isfinite(angle + weight + confidence + gain + max_rate)

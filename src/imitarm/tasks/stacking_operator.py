@@ -77,7 +77,7 @@ class Habits:
         speed: mean speed of the hand over long distances [m/s].
         fine_speed: mean speed of the hand near a contact [m/s].
         tolerance: largest error at which the gripper looks aligned, so that the hand closes or opens [m].
-        sense_of_lag: lag of the robot that the person expects, which is the same for every retargeter [s].
+        sense_of_lag: the lag [s] that the person expects of the robot; the same for every retargeter.
         dwell: rest after the hand has closed or opened [s].
         height: additional height of movements over long distances [m].
         begin: duration for which the person first holds the hand still, so that the robot can begin to follow [s].
@@ -371,7 +371,7 @@ class SimulatedOperator:
     Args:
         seed: seed of the person and the habits.
         repeat: number of the run of this person, which seeds the differences between runs.
-        scale: ratio of robot motion to hand motion that the person expects.
+        scale: the ratio of robot motion to hand motion, as the person expects it.
 
     Attributes:
         person: model of the person's body and arm motion.

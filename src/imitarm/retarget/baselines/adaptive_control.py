@@ -246,7 +246,7 @@ class AdaptiveControl(BaselineRetargeter):
         velocity_scaling: whether to scale every step of the reference and of the command so that no joint exceeds its
             velocity limit.
         relative: whether to map the change of the person's joint angles since the robot began to follow the person;
-            otherwise the angles themselves are mapped and approached at limited speed. See
+            otherwise the angles themselves are mapped, and the robot approaches the result at limited speed. See
             :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
 
     Attributes:

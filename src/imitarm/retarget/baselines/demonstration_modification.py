@@ -108,7 +108,7 @@ class DemonstrationModification(BaselineRetargeter):
         scene: ignored.
         velocity_scaling: whether to scale every step as a whole so that no joint exceeds its velocity limit.
         relative: whether to map the change of the person's joint angles since the robot began to follow the person;
-            otherwise the angles themselves are mapped and approached at limited speed. See
+            otherwise the angles themselves are mapped, and the robot approaches the result at limited speed. See
             :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
         constraints: additional conditions that the tool must satisfy, by name, for example ``{"table": above(0.02)}``.
         annotation_time: assumed time that a teacher needs to annotate a segment, in addition to the time for watching

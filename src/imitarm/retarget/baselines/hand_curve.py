@@ -181,7 +181,7 @@ class DelayedCurve:
 
     Args:
         window: length of the time window to which the curve is fitted [s].
-        lag: time by which the evaluated point lies in the past [s].
+        lag: how far in the past the curve is evaluated [s].
         smooth: whether to fit a curve; False returns the newest frame unchanged.
         whole: curve of the complete motion, to be evaluated without lag; None: a curve is fitted live.
     """
