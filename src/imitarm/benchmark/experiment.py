@@ -138,7 +138,7 @@ class Experiment:
 
     @property
     def plan(self) -> Plan:
-        """Definition of the recording to follow; the live task has a stacking recording with the same seeds."""
+        """Definition of the recording to follow; for the live task, a stacking recording with the same seeds."""
         kind = "stacking" if self.task == LIVE else self.task
         return Plan(kind, self.seed, self.repeat, self.seconds, self.sigma, self.data)
 
@@ -263,12 +263,12 @@ def run_stacking(
 
 
 def camera_maker(sigma: float | None) -> Callable[[int], SkeletonCamera]:
-    """Return a function that makes a camera from a seed; ``sigma`` [m]: its measuring error; None: set by the seed."""
+    """Return a function that makes a camera from a seed, with the error ``sigma`` [m]; None: the seed sets it too."""
     return SkeletonCamera.from_seed if sigma is None else partial(SkeletonCamera, sigma=sigma)
 
 
 def count_failures(outcomes: Sequence[str]) -> str:
-    """Return a text that counts each kind of failure, the most frequent first; an empty outcome means success."""
+    """Return a text with the number of failures of each kind, most frequent first; an empty outcome means success."""
     counted = Counter(outcome for outcome in outcomes if outcome)
     return ", ".join(f"{n} {what}" for what, n in counted.most_common()) or "none"
 

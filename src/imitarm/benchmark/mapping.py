@@ -103,7 +103,7 @@ _TORQUES = {
 
 
 def tables(results: Results) -> list[Table]:
-    """Return all tables for which there are results, with the table on the claims of the thesis first."""
+    """Return all tables for which there are results; the table on the claims of the thesis comes first."""
     replayed, found = results.tasks(), []
     if replayed:
         stacking = results.tasks(["stacking"]) or replayed

@@ -59,7 +59,7 @@ def _compared(results: Results, tasks: Sequence[str]) -> Iterator[tuple[Figure, 
 
 
 def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return a table that compares ``modern`` with each other method on pairs of the same recordings or trials."""
+    """Return a table that compares ``modern`` with each other method, in pairs on the same recordings or trials."""
     rows = [
         (_titled(figure), METHODS[name].title, *_difference(comparison, figure), f"{p:.3f}")
         for figure, name, comparison, p in _compared(results, tasks)
@@ -94,9 +94,9 @@ def better_methods_table(results: Results, tasks: Sequence[str]) -> Table:
         "p, Holm>",
     )
     note = (
-        f"The table lists every measure whose interval shows that {OURS} is worse, whatever the value of p, and every "
-        "method that stacked more often. ↑ marks measures for which a larger value is better. For all other measures, "
-        "a smaller value is better."
+        f"The table lists every measure whose interval shows that {OURS} is worse, whatever the value of p. It also "
+        f"lists every method that had a higher success rate in stacking than {OURS}, whatever the interval. "
+        "↑ marks measures for which a larger value is better. For all other measures, a smaller value is better."
     )
     return Table(f"Where another method is better than {OURS}", columns, tuple(rows), note)
 
@@ -196,9 +196,10 @@ def claims_table(results: Results, tasks: Sequence[str]) -> Table:
     columns = ("the thesis claims", "thesis, corrected", "held?", "modern", "held?")
     note = (
         "Each percentage is the difference of the column's method from the baseline, in paired trials. "
-        'The result is "yes" if, for every baseline, the 95 % interval of the difference is on the claimed side and '
-        'the corrected p is below 0.05. The result is "no" if, for at least one baseline, the interval is on the other '
-        'side. All other results are "not shown". Times are compared only for trials in which both methods succeeded.'
+        'The result is "yes" if, for every baseline, the 95 % interval of the difference is on the claimed side of '
+        'zero and the corrected p is below 0.05. The result is "no" if, for at least one baseline, the interval is on the '
+        'opposite side of zero. All other results are "not shown". Times are compared only for trials in which both '
+        "methods succeeded."
     )
     return Table("Claims of the thesis, and results", columns, tuple(rows), note)
 
@@ -298,7 +299,7 @@ CLAIMS: Sequence[tuple[str, Callable[[Results, str, Sequence[str]], Verdict]]] =
     ("shorter time than M1, M2, M3 (Fig 3.8)", _quicker),
     ("M2 has the smallest torque, but takes longest (text beside Fig 3.7)", _two_leads),
     (
-        "singularities are avoided better than with M3 at the edge of reach",
+        "at the edge of reach, singularities are avoided better than with M3",
         _farther_from_singular,
     ),
     (f"mean torques of {min(_MEANS):.0f} to {max(_MEANS):.0f} N m at every joint (Table 3.1)", _rated),

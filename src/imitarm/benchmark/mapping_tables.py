@@ -100,10 +100,10 @@ class Results:
         return [task for task in among if any(r.experiment.task == task for r in self.all)]
 
     def values(self, method: str, tasks: Sequence[str], name: str, joint: int | None = None) -> Values:
-        """Return the value of a measure for each recording, by person and recording; nan if it is unknown.
+        """Return one value of a measure for each recording, indexed by person and recording; nan where unknown.
 
         Args:
-            method: whose.
+            method: name of the method.
             tasks: tasks whose results are included.
             name: name of the measure. ``"limit_violations"`` is the sum of the violations of position, velocity and
                 acceleration limits. In closed loop, ``"success"`` is 1 or 0, and the other measures are known only for
@@ -188,7 +188,7 @@ def recordings_table(results: Results) -> Table:
 
 
 def persons_note(results: Results) -> str:
-    """Return a sentence about the simulated persons of the tables and whether methods were developed with them."""
+    """Return a sentence that names the simulated persons, and says whether methods were developed with them."""
     seen = sorted({r.experiment.seed for r in results.all if r.experiment.task != CAPTURED})
     if not seen:
         return ""

@@ -307,8 +307,8 @@ class MotionCapture:
     def load(cls, path: str | Path, *, to_body: ArrayLike | None = None) -> MotionCapture:
         """Read markers of a right arm from a file of tab-separated values in millimetres.
 
-        The wrist is the midpoint of the markers ``hand_left`` and ``hand_right`` at the end of the hand next to the
-        forearm.
+        The wrist is the midpoint of the markers ``hand_left`` and ``hand_right``. These markers are at the end of the
+        hand that is next to the forearm.
 
         Args:
             path: the file.

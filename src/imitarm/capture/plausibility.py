@@ -46,7 +46,7 @@ def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
 
     Args:
         rate: frame rate that results if the time stamps are in ``unit`` [Hz].
-        unit: length of the unit in which the time stamps were read [s].
+        unit: unit in which the time stamps were read, given by its length [s].
 
     Returns: The name of the unit, and the factor by which the times that were read must be multiplied; None when no
         unit other than ``unit`` gives a plausible frame rate.
@@ -69,7 +69,7 @@ def length_unit_that_fits(limb: float) -> str | None:
     """Return the unit of length in which a limb has a plausible length; None when no unit fits.
 
     Args:
-        limb: length of an upper arm or a forearm, as read from a file, that is not plausible in metres.
+        limb: number that a file gives for the length of an upper arm or a forearm, and that is not plausible in metres.
     """
     low, high = PLAUSIBLE_LIMB
     fits = [name for name, unit in _LENGTH_UNITS.items() if low <= limb * unit <= high]
@@ -154,7 +154,9 @@ def joint_steps(times: Array, positions: Array) -> tuple[Array, Array]:
 
 
 def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
-    """Return the speed of the faster hand [m/s]: the 90th percentile of its speed over three frames, without spikes.
+    """Return the speed of the faster hand [m/s].
+
+    The speed of a hand is the 90th percentile of its mean speeds over three frames; spikes are left out.
 
     Args:
         times: time stamps, shape (n,) [s], increasing.
@@ -180,8 +182,8 @@ def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
 
     * The distance d of the joint from the straight line between A and B is more than 0.2 m.
     * The distance between A and B is less than d / 2.
-    * The joint moves there and back faster than 10 m/s, or an arm bone that ends at the joint is more than 0.12 m
-      longer or shorter than in the frames before and after the spike.
+    * The joint moves faster than 10 m/s into the spike and out of it, or an arm bone that ends at the joint is more
+      than 0.12 m longer or shorter than in the frames before and after the spike.
 
     At the beginning and at the end of a recording, any jump of more than 0.3 m at more than 10 m/s is a spike.
 

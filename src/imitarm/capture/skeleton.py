@@ -254,7 +254,7 @@ class SkeletonSource(ABC):
         The default implementation passes this argument to the constructor.
 
         Args:
-            argument: the text after the colon; empty when :attr:`argument` is empty.
+            argument: the text after the colon; always empty for a source whose attribute ``argument`` is empty.
             realtime: whether a source that is not live returns its skeletons at the recorded speed.
 
         Raises:

@@ -416,9 +416,10 @@ def _angles(rotations: Array, reference: Array) -> Array:
 def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | None:
     """Divide m demonstrations into two groups by their distances (m, m); return None when there is only one group.
 
-    The result is a mask (m,) that selects one group, and the gap between the two groups. The gap is the longest link of
-    the minimum spanning tree. There are two groups only if the gap exceeds ``floor`` and is several times as long as
-    the second longest link. In that case, demonstrations within a group are much closer together than the groups.
+    The result is a mask (m,) that selects one group, and the gap between the two groups. The gap is the longest edge of
+    the minimum spanning tree of the demonstrations. There are two groups only if the gap exceeds ``floor``, and the
+    second longest edge either is several times shorter or exceeds ``floor`` too. If it is several times shorter,
+    demonstrations within a group are much closer together than the groups.
     """
     m = len(distance)
     nearest, inside, links = distance[0].copy(), np.arange(m) == 0, []

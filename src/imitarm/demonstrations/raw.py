@@ -161,7 +161,7 @@ class RawDemonstration:
         they are sorted by the numbers in the names, which must be consecutive.
 
         Raises:
-            InputError: when the demonstration has no joints or the joints of another arm, or the order of its
+            InputError: when the demonstration has no joints, its joints are those of another arm, or the order of its
                 joints is unknown.
         """
         if self.joints is None:
@@ -216,12 +216,12 @@ class RawDemonstration:
         return np.asarray(np.isfinite(self.times) & (self.times <= before))
 
     def held(self) -> NDArray[np.bool_]:
-        """Return for each row whether it only repeats the previous row, as the sensor was slower than the recorder.
+        """Return for each row whether it repeats the previous row only because the sensor was slower than the recorder.
 
         A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest also repeats
         values, and so does rounding. Repetitions caused by rest or rounding do not count. Values count as held only if
-        they are repeated many times during the motion and change by more than their last digits in between. The result
-        has the shape (n,).
+        they are repeated many times during the motion, and if their changes are larger than rounding to the last digit
+        would cause. The result has the shape (n,).
         """
         masks = [held_rows(part) for part in (self.positions, self.quaternions, self.joints) if part is not None]
         return max(masks, key=lambda mask: int(mask.sum()), default=np.zeros(len(self), dtype=bool))
@@ -247,8 +247,8 @@ class RawDemonstration:
 
         Args:
             arm: arm that was recorded; needed when only joints were recorded.
-            repair: whether to drop rows that contain numbers that are not finite or whose time stamps do not increase;
-                ``source`` then states how many rows were dropped.
+            repair: whether to drop the rows that contain a number that is not finite, and the rows whose time stamp is
+                not later than all previous ones. ``source`` then states how many rows were dropped.
 
         Raises:
             FileFormatError: when a row is invalid; the message names file, line and remedy.
@@ -290,7 +290,7 @@ class RawDemonstration:
 
 
 def check_arm_model(arm: object, what: str) -> None:
-    """Raise InputError if ``arm`` is neither an ArmModel nor None, without importing the slow module of ArmModel."""
+    """Raise InputError if ``arm`` is neither an ArmModel nor None; this does not import the slow module of ArmModel."""
     if arm is not None and not hasattr(arm, "tool_path"):
         raise InputError(f"{what} must be an ArmModel, got {arm!r:.60}; load it with ArmModel.load('sawyer')")
 

@@ -27,12 +27,12 @@ def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
 
     .. math:: \dot q_k = \mathrm{clip}\left((q^c_{k+1} - q^c_k) / dt + 5\,\mathrm{s}^{-1}\,(q^c_k - q_k)\right)
 
-    The function ``clip`` limits the velocity to the box of velocities from which all limits of position, velocity and
-    acceleration can still be kept (:class:`~imitarm.kinematics.limits.JointLimits`). Commands within the limits are
-    executed unchanged.
+    The function ``clip`` limits the velocity to a box (:class:`~imitarm.kinematics.limits.JointLimits`). After any
+    velocity in this box, the arm can still keep all its limits of position, velocity and acceleration. Commands within
+    the limits are executed unchanged.
 
     Args:
-        arm: whose limits.
+        arm: arm whose limits are kept.
         joints: commanded positions, shape (n, n_joints) [rad]; the arm starts at rest at the first position.
         dt: sampling period [s].
     """

@@ -54,7 +54,7 @@ def usable_posture(
 
 
 class _HomeSearch:
-    """Rates postures of an arm by their distances from singularities, from limits and between links."""
+    """Rates postures of an arm by their distances from singularities and limits, and by the distances between links."""
 
     def __init__(self, model: mujoco.MjModel, joints: tuple[str, ...], home: Mapping[str, float]) -> None:
         self._model, self._data = model, mujoco.MjData(model)
@@ -106,7 +106,7 @@ class _HomeSearch:
         return np.linalg.svd(linear, compute_uv=False), np.linalg.svd(stacked, compute_uv=False)
 
     def score(self, q: Array) -> float:
-        """Return a score of a home posture, which is higher far from singularities and limits and above the base."""
+        """Return a score: high far from singularities and limits, and higher if the flange is above the base."""
         bend = self.bend(q)
         margin = float(np.min(np.minimum(q - self._low, self._high - q) / (self._high - self._low)))
         below = self._data.site_xpos[self._flange, 2] < 0.0
@@ -127,7 +127,7 @@ class _HomeSearch:
         return self._data
 
     def _link_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of shapes on links with at least two joints between them."""
+        """Return the pairs of shapes whose links are separated by at least two joints."""
         model = self._model
         links: list[tuple[int, int]] = []
         for geom in np.flatnonzero(model.geom_group == COLLISION_GROUP).tolist():

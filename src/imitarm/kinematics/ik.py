@@ -63,9 +63,9 @@ class IKSolver:
 
     Here, each task has a Jacobian :math:`J_i` and a target :math:`t_i`, and :math:`v_p` is the joint velocity of the
     previous step. The rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite
-    price are hard constraints, which are kept whenever the boxes allow it. If the boxes do not allow it, the sum of the
-    squared violations, in rad/s along each row, is minimised first, and the tasks have second priority. The other
-    methods accept one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one
+    price are hard constraints, which are kept whenever the boxes allow it. If the boxes contradict these constraints,
+    the sum of their squared violations, in rad/s along each row, is minimised first, and the tasks have second
+    priority. The other methods accept one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one
     :class:`~imitarm.kinematics.tasks.PostureTask`, and no limits except boxes. These methods are the following:
 
     * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9), computes :math:`v = J^T (J J^T+\lambda^2)^{-1} t` in
@@ -326,7 +326,7 @@ def _stacked(tasks: list[TaskRows]) -> tuple[Array, Array]:
 
 
 def _sorted_rows(rows: list[Rows]) -> tuple[Array | None, Array | None, Sequence[Rows]]:
-    """Return the rows without a finite price, stacked, and the other rows."""
+    """Return matrix and bounds of all rows without a finite price, and separately the rows with a finite price."""
     if len(rows) == 1 and rows[0].price == math.inf:
         return rows[0].matrix, rows[0].lower, ()
     stiff = [part for part in rows if part.price == math.inf]

@@ -33,7 +33,9 @@ _MAX_PROBES = 12  # points measured on a segment whose bound is too low; the bra
 
 @dataclass(frozen=True, eq=False)
 class ClosePoints:
-    """Points between two samples that are closer to an obstacle than required, although the samples themselves are not.
+    """Points between two samples at which a sphere of the tool is closer to an obstacle than required.
+
+    At the two samples themselves, the sphere is not too close.
 
     Attributes:
         pair: index of the pair of a sphere and an obstacle, shape (m,).
@@ -131,7 +133,7 @@ class ToolAmongObstacles:
         return len(self.radii) * len(self.obstacles)
 
     def centres(self, pair: int, positions: Array, samples: Index | slice = slice(None)) -> Array:
-        """Return the centres of a pair's sphere, relative to the obstacle's position at the same time.
+        """Return positions of the centre of a pair's sphere, each relative to the obstacle's position at the same time.
 
         Args:
             pair: index of the pair.
@@ -165,13 +167,13 @@ class ToolAmongObstacles:
 
         Args:
             pair: index of the pair.
-            points: centres of the pair's sphere, shape (p, 3) [m].
+            points: positions of the centre of the pair's sphere, shape (p, 3) [m].
             directions: unit rows, shape (m, 3).
             target: distance to reach [m].
             tolerance: largest accepted excess of the distance over ``target`` [m].
 
         Returns:
-            Lifts, shape (m, p) [m]; inf where the ray never leaves the obstacle.
+            Displacements along the directions, shape (m, p) [m]; inf where the ray never leaves the obstacle.
         """
         obstacle, sphere = divmod(pair, self.n_spheres)
         solid = self.obstacles[obstacle]
@@ -234,9 +236,9 @@ class PathClearance:
 
         Let ``f`` be a convex function on a segment of length L, with slope a at the start and b at the end. Then ``f(s)
         >= max(f0 + a s, f1 - b (L - s))``. The minimum of this bound over s is at an end of the segment or at the
-        crossing of the two lines. The tip moves straight between two samples. While the tool rotates by ``angle``, the
-        centre of a sphere beside the tip leaves the straight line by at most ``|offset| (1 - cos(angle / 2))``. This
-        largest deviation is subtracted from the bound of the distance.
+        crossing of the two lines. The tip moves straight between two samples. While the tool rotates by ``angle``, a
+        sphere's centre that is not at the tip deviates from the straight line by at most ``|offset| (1 - cos(angle /
+        2))``. This largest deviation is subtracted from the bound of the distance.
 
         Returns:
             Shape (n_pairs, n - 1) [m].
@@ -282,7 +284,7 @@ class PathClearance:
         return bounds, found
 
     def _closer_look(self, pair: int, j: Index, bounds: Array, clearance: float) -> tuple[Array, Array]:
-        """Return refined bounds (m,) of segments ``j`` (m,) of a pair, and where they are lowest, as fractions (m,)."""
+        """Return refined bounds of segments ``j`` of a pair, and the fraction of each segment where its bound is lowest."""
         start = self.tool.centres(pair, self.positions[j], j)
         step = self.tool.centres(pair, self.positions[j + 1], j + 1) - start
         bow = self.tool.bows[pair % self.tool.n_spheres, j]

@@ -184,7 +184,8 @@ def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor:
         gradient: whether to return the normals too.
         semi_axes: lengths of the semi-axes, shape (3, ...) [m].
         beyond: ``g_j^2 - min g^2``, shape (3, ...) [m^2].
-        floor: smallest value of the coordinate along the shortest axis, 0 along the other axes, shape (3, ...) [m].
+        floor: lower bound for the absolute values of the coordinates, shape (3, ...) [m]; positive along the shortest
+            axis, 0 along the other axes.
     """
     y = np.maximum(np.abs(q), floor)  # off the plane of symmetry, where s and y vanish together
     scaled = semi_axes * y

@@ -266,7 +266,10 @@ def _cut(slot: NDArray[np.intp], came_from: list[NDArray[np.intp]], n_slots: int
 
 
 def responsibilities_by_bins(column: Array, n_bins: int) -> Array:
-    """Return responsibilities of 0 or 1, shape (K, n), for equally wide bins, or equally full bins of few samples."""
+    """Return responsibilities of 0 or 1, shape (K, n), for bins of equal width.
+
+    If a bin would have fewer than two samples, all bins get nearly the same number of samples instead.
+    """
     low, high = column.min(), column.max()
     labels = np.minimum(((column - low) * (n_bins / max(high - low, 1e-300)) + _EDGE).astype(np.intp), n_bins - 1)
     if np.bincount(labels, minlength=n_bins).min() < 2:
@@ -338,8 +341,8 @@ def try_numbers_of_components(
 
     For each number, the fit to all demonstrations and the fits without one demonstration run together, as rows of the
     same matrix products. Only a subset of the samples is used; the longer the path, the more samples are used. For a
-    pure rotation, errors are computed for a point 100 mm from the axis. The search stops when four numbers of
-    components in a row do not reduce the held-out error by 0.5 %, and one of the numbers meets both conditions of
+    pure rotation, errors are computed for a point 100 mm from the axis. The search stops when four consecutive numbers
+    of components do not reduce the held-out error by 0.5 %, and one of the numbers meets both conditions of
     :func:`choose`.
 
     Args:
@@ -443,7 +446,7 @@ def _resampled(Z: Array, places: NDArray[np.intp], grid: Array) -> Array:
 
 
 def _regression(fit: Fit, which: NDArray[np.intp], t: Array, places: NDArray[np.intp]) -> Array:
-    """Return the mean of some columns at standardised times (n,); ``which`` (n,) gives the fit for each time."""
+    """Return the means of some columns at standardised times (n,); ``which`` (n,) is the fit to use at each time."""
     means, covariances = fit.means, fit.covariances
     variance = covariances[:, :, 0, 0]
     slopes = covariances[:, :, 0, :] / variance[..., None]

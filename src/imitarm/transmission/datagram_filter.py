@@ -72,10 +72,10 @@ class ClockOffsetEstimator:
     An unconfirmed sample is rejected as a false time stamp in two cases:
 
     * Two datagrams that arrive later have an earlier time stamp, although a sender's clock never goes back.
-    * Three datagrams that arrive later, over a period of at least ``max_age``, are fresh relative to the confirmed
-      minimum, and three datagrams had supported this minimum before the sample arrived. The rejection by three
-      datagrams applies only while at most four samples are unconfirmed, because a larger number of unconfirmed samples
-      comes from a queue of delayed datagrams.
+    * The datagrams before and after the sample agree with the confirmed minimum. Before the sample arrived, three
+      datagrams had given samples near this minimum. After it, three datagrams that arrive over a period of at least
+      ``max_age`` have a delay of at most ``max_age`` relative to this minimum. This case applies only while at most
+      four samples are unconfirmed. If more samples are unconfirmed, they come from a queue of delayed datagrams.
 
     Args:
         max_age: longest accepted delay [ns].

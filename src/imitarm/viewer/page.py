@@ -76,7 +76,7 @@ class Player:
 
     Attributes:
         title: title for screen readers.
-        own: the part of the 3-D page that differs from the other players, see :func:`shared_players`.
+        own: the middle part of this player's 3-D page, which no other player shares; see :func:`shared_players`.
         keys: its legend.
     """
 

@@ -94,8 +94,8 @@ class PersonMark:
         """Place a recorded person beside a robot, rotated so that person and robot move in the same directions.
 
         Args:
-            skeletons: at least one skeleton, in the order of their times. The person disappears when no skeleton
-                follows within 0.25 s, and stands still after the last skeleton.
+            skeletons: at least one skeleton, in the order of their times. In a gap of more than 0.25 s between
+                skeletons, the person disappears after 0.25 s. After the last skeleton, the person stands still.
             times: times of the frames to draw, counted from the first skeleton, shape (n_frames,) [s].
             sensor_to_base: pose of the sensor in the base frame; only its rotation is used.
             side: side of the arm that is followed.

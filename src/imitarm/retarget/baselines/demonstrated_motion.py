@@ -33,8 +33,8 @@ class DemonstratedMotion:
     """The motion during one engagement (while the robot follows the person), sampled at the control period.
 
     Attributes:
-        shown_times: time at which the person made the motion of each sample, on the recording's clock, shape (n,) [s];
-            evenly spaced until the motion is slowed down.
+        shown_times: for each sample, the time at which the person made this motion, on the recording's clock, shape
+            (n,) [s]. The times are evenly spaced as long as no correction has slowed the motion down.
         points: shoulder, elbow and wrist in the base frame, after all corrections made so far, shape (n, 3, 3) [m].
         hands: rotations of the hand, quaternions wxyz, shape (n, 4).
         shown: shoulder, elbow and wrist as the person showed them, before all corrections, shape (n, 3, 3) [m].
@@ -51,7 +51,7 @@ class DemonstratedMotion:
 
     @classmethod
     def through(cls, estimates: Sequence[ArmEstimate], dt: float) -> DemonstratedMotion:
-        """Interpolate the estimates of one engagement (at least two) without overshoot, with a step of ``dt`` [s]."""
+        """Interpolate the two or more estimates of one engagement without overshoot, with a step of ``dt`` [s]."""
         times = np.array([e.time for e in estimates])
         shown_times = times[0] + dt * np.arange(int((times[-1] - times[0]) / dt + 1e-9) + 1)
         keys = np.array([(e.shoulder, e.elbow, e.wrist) for e in estimates])
@@ -101,7 +101,7 @@ class DemonstratedMotion:
 def engagements(
     frames: Iterable[Skeleton], correspondence: Correspondence, rule: EngagementRule
 ) -> Iterator[tuple[ArmEstimate, ...]]:
-    """For each engagement in a recording, yield the estimates of the arm (at least two).
+    """For each engagement in a recording, yield the estimates of the person's arm; there are at least two.
 
     Args:
         frames: frames in order of time.
