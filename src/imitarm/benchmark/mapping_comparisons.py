@@ -197,9 +197,9 @@ def claims_table(results: Results, tasks: Sequence[str]) -> Table:
     note = (
         "Each percentage is the difference of the column's method from the baseline, in paired trials. "
         'The result is "yes" if, for every baseline, the 95 % interval of the difference is on the claimed side of '
-        'zero and the corrected p is below 0.05. The result is "no" if, for at least one baseline, the interval is on the '
-        'opposite side of zero. All other results are "not shown". Times are compared only for trials in which both '
-        "methods succeeded."
+        'zero and the corrected p is below 0.05. The result is "no" if, for at least one baseline, the interval is on '
+        'the opposite side of zero. All other results are "not shown". Times are compared only for trials in which '
+        "both methods succeeded."
     )
     return Table("Claims of the thesis, and results", columns, tuple(rows), note)
 
