@@ -192,7 +192,7 @@ def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
         positions: shape (n, 25, 3) [m].
 
     Returns:
-        Whether each joint is in a spike, shape (n, 25), and how far it jumps in that frame, shape (n, 25) [m].
+        Two arrays (n, 25), for each frame and joint: whether the joint is in a spike, and how far it jumps [m].
     """
     n = len(times)
     found, size = np.zeros(positions.shape[:2], dtype=bool), np.zeros(positions.shape[:2])

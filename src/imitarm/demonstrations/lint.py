@@ -326,7 +326,7 @@ def _mean_distance(paths: Array, others: Array) -> Array:
 
 
 def _backwards(paths: Array, size: float, motions: Sequence[ValidRows], scale: _Scale) -> Iterator[_Odd]:
-    """Find motions that are much nearer to the most typical motion when they are reversed."""
+    """Find motions that run backwards: reversed, they are much nearer to the most typical motion."""
     forward, backward = _mean_distance(paths, paths), _mean_distance(paths[:, ::-1], paths)
     typical = int(np.argmin(forward.sum(axis=1)))
     differs = forward[:, typical] > max(scale.smallest, _DIFFERENT * size)

@@ -284,7 +284,7 @@ class PathClearance:
         return bounds, found
 
     def _closer_look(self, pair: int, j: Index, bounds: Array, clearance: float) -> tuple[Array, Array]:
-        """Return refined bounds of segments ``j`` of a pair, and the fractions of the segments where they are lowest."""
+        """Return refined bounds of a pair on segments ``j``, and the fraction of each segment where it is lowest."""
         start = self.tool.centres(pair, self.positions[j], j)
         step = self.tool.centres(pair, self.positions[j + 1], j + 1) - start
         bow = self.tool.bows[pair % self.tool.n_spheres, j]
