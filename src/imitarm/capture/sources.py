@@ -85,7 +85,7 @@ def source_words() -> dict[str, str]:
 
 
 def is_live(word: str | Path) -> bool:
-    """Return whether the source of this name is live, so that it runs until it is stopped; do not open the source.
+    """Return, without opening the source of this name, whether it is live, so that it runs until it is stopped.
 
     Raises:
         InputError: for the same reasons as :func:`find_source`.

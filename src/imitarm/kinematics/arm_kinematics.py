@@ -38,8 +38,8 @@ _MOST_RESTARTS = 100_000
 class Landmarks:
     """Shoulder, elbow and wrist of an arm, defined by the sites of these names, and the joints at elbow and wrist.
 
-    The site ``elbow`` is on the link that the elbow joint moves. The site ``wrist`` is on the link that the bending
-    joint of the wrist moves.
+    The site ``elbow`` is on the link that the elbow joint moves. The site ``wrist`` is on the link that is moved by the
+    joint that bends the wrist.
 
     Attributes:
         sites: indices of the three sites.

@@ -98,7 +98,7 @@ class ArmPath:
         return jacobians
 
     def sphere_speeds(self, sample: Index, sphere: Index, directions: Array) -> Array:
-        """Return the speed of spheres along directions for each joint moving at unit speed, (k, n_joints) [m/rad].
+        """Return the speeds of spheres along directions if only one joint moves, at unit speed, (k, n_joints) [m/rad].
 
         Args:
             sample: index of the posture, shape (k,).

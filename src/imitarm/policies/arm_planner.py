@@ -366,7 +366,7 @@ class _Local:
 
 
 def _rank(plan: ArmPlan) -> tuple[float, float]:
-    """Return a key for comparing plans: plans with enough clearance by their speed, all others by their clearance."""
+    """Return a key that compares plans by their speed if they have enough clearance, otherwise by their clearance."""
     return min(plan.clearance.room, 0.0), -max(plan.speed, _CALM)
 
 

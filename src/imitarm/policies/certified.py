@@ -262,7 +262,7 @@ class _SideSearch:
         return _STYLE_COST * style + _THINNED * _VIOLATION_COST * violation.sum(axis=0), violation
 
     def _violations_near(self, sampled: Array, here: PathClearance) -> Array:
-        """Return the violation of each pair, summed along each displaced path in ``sampled``, (n_pairs, c) [m].
+        """Return the violation by each pair, summed over the samples of each path in ``sampled``, (n_pairs, c) [m].
 
         A distance changes by at most the displacement of the sample, so only samples near an obstacle can violate its
         clearance.

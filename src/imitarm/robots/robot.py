@@ -83,7 +83,7 @@ class Robot(ABC):
 
     @abstractmethod
     def state(self) -> ArmState:
-        """Return the measured joint positions, velocities and torques, and the time of the robot."""
+        """Return the measured joint positions, velocities and torques, and the time on the robot's clock."""
 
     @abstractmethod
     def _send(self, previous: Array, velocity: Array, dt: float) -> None:

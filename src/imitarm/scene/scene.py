@@ -102,7 +102,7 @@ class Scene:
         return packed.positions, packed.quaternions
 
     def __getattr__(self, name: str) -> Any:
-        """Build ``obstacles`` at the first access to a predicted scene; raise an error for any unknown attribute."""
+        """Build ``obstacles`` when they are first read from a predicted scene; reject unknown attributes."""
         seen: Scene | None = self.__dict__.get("_seen")
         if name != "obstacles" or seen is None:
             raise AttributeError(f"Scene has no attribute {name!r}")

@@ -163,7 +163,7 @@ class SceneResult:
 
 
 class Candidate(Protocol):
-    """The evaluation of one number of components, such as :class:`imitarm.skills.mixture_fitting.Candidate`."""
+    """How good one number of components is; :class:`imitarm.skills.mixture_fitting.Candidate` has these attributes."""
 
     @property
     def n_components(self) -> int:

@@ -49,8 +49,8 @@ _WORDS: Final = {
     "deviations of the demonstrations to each side.",
     "Clearance": "The smallest distance between any part of the arm or its tool and any obstacle. The simulator "
     "measures this distance between the exact shapes while the arm moves; the value is not taken from the plan.",
-    "Certified clearance": "A guaranteed lower bound of the distance to any obstacle on the whole planned path. The "
-    "bound holds for every moving part of the arm or, if only the path of the tool was planned, for the tool.",
+    "Certified clearance": "A guaranteed lower bound of the distance to any obstacle on the whole planned path. If "
+    "only the path of the tool was planned, the bound holds for the tool; otherwise for every moving part of the arm.",
     "RMSE": "Root mean square error: the typical distance between the measured path and the demonstrations. The "
     "error is larger where the path has to go around an obstacle.",
     "Rated torque": "The torque that the drive of a joint can deliver continuously. A real arm can execute a motion "
