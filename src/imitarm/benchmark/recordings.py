@@ -29,8 +29,11 @@ from imitarm.tasks.stack_run import IdealFollower, calibrate_limbs, ideal_camera
 Array = NDArray[np.float64]
 
 KINDS = ("inside", "edge", "drawing", "stacking")
-"""Kinds of recordings of simulated people: reaches well inside the workspace; reaches in which the arm is stretched
-every few seconds, beyond the reach of the robot; drawings of circles, eights and waves; stacking of four cubes."""
+"""Kinds of recordings of simulated people.
+
+In "inside", the person reaches to points well inside the workspace. In "edge", the person also stretches the arm every
+few seconds, farther than the robot can reach. In "drawing", the person draws circles, eights and waves. In "stacking",
+the person stacks four cubes."""
 CAPTURED = "captured"
 """The kind of recording that needs real data: a simulated camera observes an arm that was recorded by motion
 capture."""
@@ -104,7 +107,7 @@ class MappingRecording:
         skeletons: skeletons measured by the camera.
         correspondence: correspondence between person and robot for all methods.
         start: start posture of the robot, shape (n_joints,) [rad].
-        true_times: times of the true positions since the first skeleton, shape (m,) [s].
+        true_times: times of the true positions, counted from the first skeleton, shape (m,) [s].
         true_points: true positions of shoulder, elbow, wrist, hand, hand tip and thumb, shape (m, 6, 3) [m], in the
             sensor's frame.
     """

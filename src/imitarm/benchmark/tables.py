@@ -60,8 +60,8 @@ class Place:
         Args:
             found: the tables.
             command: the command that printed the tables.
-            versions: code version of each result; the document states whether it differs from the version of the
-                running code.
+            versions: code version of each result. If a version differs from that of the running code, the document says
+                so.
         """
         head, tail = self._parts()
         body = "\n".join(table.markdown() for table in found)

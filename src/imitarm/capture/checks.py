@@ -355,7 +355,7 @@ def _followed(view: _View) -> list[int]:
 
 
 def _severity_of(joints: list[int], found: Mask) -> Severity:
-    """Return ``"warning"`` when only finger tips and thumbs jump, because they can rotate the tool but not move it."""
+    """Return ``"error"``, or ``"warning"`` if only finger tips and thumbs jump, because they do not move the tool."""
     return "error" if any(found[:, i].any() for i, joint in enumerate(joints) if joint not in _TIPS) else "warning"
 
 

@@ -266,7 +266,7 @@ class EnablePrompt:
         threading.Thread(target=self._reading, daemon=True).start()
 
     def reset(self) -> None:
-        """Remember that the robot can be controlled now, so that the user is asked about the next problem."""
+        """Forget the last problem, which has ended. The user will be asked about the next problem."""
         self._first, self._asked = False, ("", False)
 
     def __call__(self, problem: str, stopped: bool) -> bool:

@@ -199,7 +199,8 @@ def moving_rows(times: Array, positions: Array, quaternions: Array | None = None
     The first row is found in two steps: find the row at which the tool is first more than 0.5 mm away from its start,
     then go back to the last row that is within 0.1 mm of the start. The last row is found in the same way, from the end
     backwards. A margin of 0.1 s is kept on both sides. Speed is not used, so a slow motion is never mistaken for rest.
-    With noisy samples, the limits 0.5 mm and 0.1 mm are raised to at least 4 standard deviations of the averaged noise.
+    If the samples are noisy, both limits (0.5 mm and 0.1 mm) are raised to at least 4 standard deviations of the noise
+    that remains after averaging.
     Rotation without displacement counts as motion.
 
     Args:
@@ -240,7 +241,7 @@ def _moving(times: Array, values: Array, still: float) -> tuple[int, int] | None
 
 
 def held_rows(values: Array) -> NDArray[np.bool_]:
-    """Return for each row of one recorded quantity (n, d) whether it only repeats the previous row, shape (n,)."""
+    """Return whether each row of a recorded quantity (n, d) only repeats the previous row, shape (n,) bool."""
     none = np.zeros(len(values), dtype=bool)
     steps = np.abs(np.diff(values, axis=0))
     same = np.asarray(~(steps > 0.0).any(axis=1))
@@ -445,6 +446,6 @@ def _smooth_warp(path: Indices, n: int) -> Array:
 
 
 def _centred(warps: Array, even: Array) -> Array:
-    """Return the warps over a changed common time, so that the mean of all warps is the identity."""
+    """Return the warps as functions of a new common time, which makes the mean of all warps the identity."""
     back = np.interp(even, warps.mean(axis=0), even)
     return np.stack([np.interp(back, even, warp) for warp in warps])

@@ -342,7 +342,7 @@ def _one_unit(
 ) -> str | None:
     """Return the unit that all ``columns`` share.
 
-    The unit ``elsewhere``, from a remark in the file, applies to columns whose names state no unit.
+    A remark in the file may state a unit; this unit ``elsewhere`` applies to columns whose names state no unit.
     """
     found = {units[i] or elsewhere for i in columns}
     if None in found and len(found) > 1:

@@ -50,11 +50,11 @@ class Interval:
 
 
 Values = Mapping[tuple[int, Any], float]
-"""The measured values by person and a second key, such as the number of the recording; nan if a value is missing."""
+"""Measured values; the keys are (person, second key), for example (person, recording). A missing value is nan."""
 
 
 def person_means(values: Values) -> Array:
-    """Return for each person the mean over the recordings that have a value, in the order of the persons."""
+    """Return one mean for each person, in the order of the persons; recordings without a value are left out."""
     persons: dict[int, list[float]] = {}
     for (person, _), value in sorted(values.items(), key=lambda item: (item[0][0], str(item[0][1]))):
         if math.isfinite(value):
@@ -111,8 +111,8 @@ class Comparison:
     Attributes:
         difference: mean difference, first method minus second, over the recordings for which both methods have a value.
         relative: ``difference`` relative to the absolute mean of the second method; nan where that mean is zero.
-        p: probability of a difference at least this large if the two methods were equal, from random sign flips of the
-            persons' differences.
+        p: p-value of ``difference``: how probable a difference of at least this size would be if the two methods were
+            equal. It is computed by random sign flips of the persons' differences.
         corrected: ``p`` after Holm's correction for all comparisons that are made together.
     """
 

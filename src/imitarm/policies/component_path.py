@@ -44,8 +44,8 @@ class ComponentPath:
     r"""The nominal path, and the effect of moving its components.
 
     Time-driven GMR gives ``x0(t) = sum_k h_k(t) m_k(t)`` (thesis Eq 2.6 with its responsibilities). The
-    responsibilities ``h_k(t)`` depend only on time. Therefore, moving the mean of component ``k`` by ``Delta_k``
-    changes the path by an affine, smooth amount::
+    responsibilities ``h_k(t)`` depend only on time. Therefore, if the mean of each component ``k`` is moved by
+    ``Delta_k``, the path changes smoothly, and the change is linear in the ``Delta_k``::
 
         x(t) = x0(t) + w(t) sum_k h_k(t) Delta_k  =  x0(t) + basis(t) @ Delta
 

@@ -62,8 +62,8 @@ class GMR:
         \hat\Sigma(t) = \sum_k h_k \left( S_k + (m_k - \hat x)(m_k - \hat x)^T \right)
 
     If the demonstrations have quaternions, x has six columns: the position [m] and a rotation vector [rad] relative to
-    a reference rotation (:class:`~imitarm.skills.rotations.RotationReference`). The reference follows the motion if the
-    tool rotates far.
+    a reference rotation (:class:`~imitarm.skills.rotations.RotationReference`). If the tool rotates far, the
+    reference moves with the tool.
 
     Times are counted from the first sample. Outside the demonstrated time span, the regression returns its value at the
     nearest end of the span, because extrapolated linear pieces would drift away.
@@ -201,8 +201,8 @@ class GMR:
     ) -> GMR:
         """Build a regression from a mixture that was learned before.
 
-        The arguments are the attributes of the class. Without ``ends``, the start and the goal of the mixture's mean
-        are used.
+        Each argument becomes the attribute of the same name with an underscore, for example ``means_``. If ``ends`` is
+        None, the start and the goal of the mixture's mean are used.
 
         Raises:
             InputError: when shapes disagree, the weights do not sum to one, a covariance is not symmetric and positive

@@ -295,7 +295,7 @@ class Teleoperation:
         summary.acceleration = max(summary.acceleration, float(change.max()))
 
     def _log_latency(self, arrival: Arrival, taken: int, ready: int, sent: int) -> None:
-        """Log those latencies of a skeleton that are known as soon as its command has been sent."""
+        """Log the latencies of a skeleton up to the sending of its command; the later ones are not known yet."""
         log = self.summary.latency
         row = log.add()
         waits = {"expose": arrival.waited, "arrive": arrival.queued, "wait": 1e-9 * (taken - arrival.received_ns)}
