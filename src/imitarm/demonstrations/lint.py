@@ -403,7 +403,7 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
 
 
 def _largest(paths: Array) -> Array:
-    """Return the largest distance at equal times between each two of the paths (m, n, 3), shape (m, m)."""
+    """Return for each pair of paths (m, n, 3) the largest distance between them at equal times, shape (m, m)."""
     return np.stack([np.linalg.norm(paths - path, axis=2).max(axis=1) for path in paths])
 
 

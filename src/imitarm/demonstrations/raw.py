@@ -210,7 +210,7 @@ class RawDemonstration:
         return np.asarray(~(np.abs(table) < _BOUND).all(axis=1))
 
     def late(self) -> NDArray[np.bool_]:
-        """Return for each row whether its time stamp is not later than all time stamps before it, shape (n,)."""
+        """Return for each row whether an earlier row has the same or a later time stamp, shape (n,)."""
         times = np.where(np.isfinite(self.times), self.times, -np.inf)
         before = np.concatenate([[-np.inf], np.maximum.accumulate(times)[:-1]])
         return np.asarray(np.isfinite(self.times) & (self.times <= before))
@@ -247,8 +247,8 @@ class RawDemonstration:
 
         Args:
             arm: arm that was recorded; needed when only joints were recorded.
-            repair: whether to drop the rows that contain a number that is not finite, and the rows whose time stamp is
-                not later than all previous ones. ``source`` then states how many rows were dropped.
+            repair: whether to drop the rows that contain a number that is not finite, and the rows for which an earlier
+                row has the same or a later time stamp. ``source`` then states how many rows were dropped.
 
         Raises:
             FileFormatError: when a row is invalid; the message names file, line and remedy.
