@@ -135,7 +135,7 @@ def run_placement(policy: str, setup: Setup, seed: int, max_tilt: float | None =
         policy: name in :data:`~imitarm.policies.POLICIES`.
         setup: the skill and the arm.
         seed: seed of the placement.
-        max_tilt: largest rotation of the tool away from the learned rotation [rad]; None: as demonstrated.
+        max_tilt: largest rotation of the tool away from the learned rotation [rad]; None: the policy's default.
 
     Raises:
         InputError: when the skill or the arm can't be loaded.
@@ -205,7 +205,7 @@ def run_placements(
         policies: names in :data:`~imitarm.policies.POLICIES`.
         setups: skills with their arms.
         seeds: seeds of the placements.
-        max_tilt: largest rotation of the tool away from the learned rotation [rad]; None: as demonstrated.
+        max_tilt: largest rotation of the tool away from the learned rotation [rad]; None: the policy's default.
         jobs: processes.
         progress: function called with the number of finished placements and the total number.
 

@@ -230,7 +230,7 @@ _PATHS: WeakKeyDictionary[GMR, tuple[Array, tuple[int, tuple[float, ...]], Compo
 def _learned(gmr: GMR, n_samples: int, fixed_times: tuple[float, ...]) -> ComponentPath:
     """Decompose the learned path.
 
-    The last result for each regression is cached, because it does not depend on the scene.
+    The last result for each regression is cached, because a decomposition does not depend on the scene.
     """
     key = (n_samples, fixed_times)
     if gmr in _PATHS and _PATHS[gmr][0] is gmr.means_ and _PATHS[gmr][1] == key:  # fitting again makes new means

@@ -29,7 +29,7 @@ def now_ns() -> int:
     """Return the current time [ns] of a monotonic clock that all processes of this machine share.
 
     If the operating system allows it, the clock keeps running while the machine is suspended. If the clock stopped
-    during a suspension, every datagram that the machine sends afterwards would look delayed to its receiver.
+    during a suspension, every datagram sent by this machine after the suspension would look delayed to its receiver.
     """
     return time.clock_gettime_ns(_CLOCK) if _CLOCK is not None else time.monotonic_ns()
 
