@@ -160,7 +160,7 @@ def check_key_lengths(n_positions: int, path: Path, root: XmlElement) -> None:
 
 
 def check_units(model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root: XmlElement) -> None:
-    """Reject limits of hinges that are degrees read as radians, or radians read as degrees.
+    """Reject hinge limits that the file gives in degrees but that were read as radians, or the reverse.
 
     Raises:
         FileFormatError: when the limits are in the wrong unit; the message names a joint and its line.

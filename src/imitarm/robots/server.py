@@ -275,8 +275,7 @@ class RobotServer:
         robot: robot to serve.
         port: port to listen on; 0: any free port.
         host: address of this machine to listen on; by default, only this machine can connect. There is no password:
-            listen
-            on a network only if everyone on it may move the robot.
+            listen on a network only if everyone on it may move the robot.
         rate: control periods per second, 100 to 1000 [Hz]; the period of a simulated robot must be a multiple of its
             timestep.
         on_event: function called with a text when the robot is enabled, slows or stops.

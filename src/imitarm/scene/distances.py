@@ -127,7 +127,7 @@ class PackedObstacles:
         return moved
 
     def _copy(self, **changes: object) -> PackedObstacles:
-        """Return a copy with other poses that shares the values computed for the shapes."""
+        """Return a copy with other poses; the copy shares the values that were computed for the shapes."""
         moved = object.__new__(PackedObstacles)
         moved.__dict__.update(self._shapes, **changes)
         return moved
@@ -339,7 +339,10 @@ def _evaluate(
 
 
 def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradient: bool) -> tuple[Array, Array | None]:
-    """Return distances (n, m) and gradients (n, m, 3) of points (m, 3), or (n, k m) with ``times`` (k,)."""
+    """Return the distances (n, m) and gradients (n, m, 3) of points (m, 3) to all obstacles.
+
+    With ``times`` (k,), the points are k groups of equal size, one group for each time.
+    """
     frames, n, m = packed._frames, len(packed), len(points)
     q = np.dot(frames.rows, points.T).reshape(3, n, m)
     if times is None:

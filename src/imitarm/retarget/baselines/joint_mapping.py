@@ -48,7 +48,7 @@ class JointMapping:
     the tool and the hand are at different positions.
 
     The angles are continuous from frame to frame, without jumps by 360 degrees. An angle that is undefined keeps its
-    value.
+    last value.
 
     Args:
         arm: the robot's arm.
