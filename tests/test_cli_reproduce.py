@@ -151,3 +151,9 @@ def test_a_certificate_that_needs_a_schedule_is_void_when_the_motion_stops(sweep
     text = " ".join(capsys.readouterr().out.split())
     assert "void" in text and "on schedule, but the motion was not completed" in text, text
     assert "on schedule, but the motion was not completed" in report.read_text()
+
+
+def test_tilts_concern_the_plan_of_the_whole_arm(sweep, capsys):
+    for option in ("--max-tilt", "--goal-tilt"):
+        assert main(["reproduce", str(sweep), "--tool", "brush", "--tool-only", option, "10"]) == 2
+        assert f"{option} limits the plan of the whole arm" in " ".join(capsys.readouterr().err.split())

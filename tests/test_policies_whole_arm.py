@@ -93,7 +93,7 @@ def test_a_plan_keeps_the_clearance_by_the_geometry_of_the_simulator(real_data, 
     np.testing.assert_allclose(plan.joints[0], start, atol=1e-5)
     assert (plan.joints >= arm.lower).all()
     assert (plan.joints <= arm.upper).all()
-    assert plan.tilt <= TILT + np.deg2rad(1.0)
+    assert plan.tilt <= TILT + 1e-3
     assert plan.trajectory.duration <= 1.5 * skill.duration_
     for i in (0, 57, 120, -1):  # the trajectory is that of the joints
         pose = arm.tool_pose(plan.joints[i])
@@ -177,6 +177,27 @@ def test_a_blocked_goal_is_refused_before_anything_moves_with_the_link(real_data
     robot = SimulatedRobot(arm, scene=scene, q=start)
     with pytest.raises(InfeasibleError, match="jug"):
         ACFRA(skill, arm=arm, max_tilt=TILT).reset(Observation(0.0, robot.state(), arm.tool_pose(start), scene))
+
+
+def test_a_goal_that_only_a_tilted_tool_reaches_needs_the_option_for_it(real_data):
+    skill, arm, start = prepared(real_data, "panda", shelf)
+    goal_tilt, tilted = np.deg2rad(30.0), 0
+    for seed in (201, 204, 206, 219):
+        scene = placement(skill, arm, seed, start)
+        plan = adapt(skill, scene, arm=arm, state=at_rest(start), max_tilt=TILT)
+        if plan.feasible:
+            continue
+        assert "goal_tilt" in plan.reason
+        plan = adapt(skill, scene, arm=arm, state=at_rest(start), max_tilt=TILT, goal_tilt=goal_tilt)
+        if not plan.feasible:
+            continue
+        tilted += 1
+        end = arm.tool_pose(plan.joints[-1])
+        np.testing.assert_allclose(end.position, skill.goal_.position, atol=1e-4)
+        turned = np.linalg.norm(end.error_to(Pose(end.position, plan.nominal.quaternions[-1]))[3:])
+        assert 0.0 < turned <= goal_tilt + 1e-3
+        assert measured_clearance(arm, scene, plan.joints) >= 0.02
+    assert tilted > 0
 
 
 def test_an_arm_that_starts_too_near_is_refused(real_data):

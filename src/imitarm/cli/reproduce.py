@@ -75,6 +75,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="largest rotation of the tool away from the learned one, to make room for the arm; default: two standard "
         "deviations of the demonstrated rotation",
     )
+    avoid.add_argument(
+        "--goal-tilt",
+        type=float,
+        metavar="DEG",
+        help="largest rotation of the tool away from the learned one at the goal, used only where the arm is not clear "
+        "at the goal without it; default: 0",
+    )
     held = avoid.add_mutually_exclusive_group()
     held.add_argument("--keep-height", action="store_true", help="move the path only sideways, as on a table")
     held.add_argument("--not-down", action="store_true", help="never move the path downwards")
@@ -153,12 +160,15 @@ def _policy(arguments: argparse.Namespace, skill: Skill, arm: ArmModel, spheres:
         "clearance": 1e-3 * arguments.clearance,
         "forbidden": next((FORBIDDEN[key] for key in FORBIDDEN if getattr(arguments, key)), ()),
     }
-    if not arguments.tool_only and arguments.tool_radius is None:
+    whole_arm = not arguments.tool_only and arguments.tool_radius is None
+    if whole_arm:
         options["arm"] = arm
-        if arguments.max_tilt is not None:
-            options["max_tilt"] = math.radians(finite_number(arguments.max_tilt, "--max-tilt", "degrees", at_least=0.0))
-    elif arguments.max_tilt is not None:
-        raise InputError("--max-tilt concerns the plan of the whole arm: leave out --tool-only and --tool-radius")
+    for name in ("max_tilt", "goal_tilt"):
+        value, option = getattr(arguments, name), f"--{name.replace('_', '-')}"
+        if value is not None:
+            if not whole_arm:
+                raise InputError(f"{option} limits the plan of the whole arm: leave out --tool-only and --tool-radius")
+            options[name] = math.radians(finite_number(value, option, "degrees", at_least=0.0))
     if arguments.method is not None:
         if arguments.policy != "acfra":
             raise InputError(f"--method is an option of --policy acfra, not of {arguments.policy}; leave it out")

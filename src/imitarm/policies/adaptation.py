@@ -39,6 +39,7 @@ Array = NDArray[np.float64]
 HORIZONTAL_ONLY = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))  # stay in the plane of the table: 2-D avoidance
 NOT_DOWN = ((0.0, 0.0, -1.0),)  # never into the table
 
+_TILTED_END = 0.3  # fraction of the duration at the end, in which the tool turns to a tilted goal
 _SAME_START = 1e-3  # [m] between a decomposed path and the tool
 
 ADAPTERS: Registry[PathAdapter] = Registry(
@@ -77,6 +78,7 @@ def adapt(
     n_samples: int | None = None,
     state: ArmState | None = None,
     max_tilt: float | None = None,
+    goal_tilt: float = 0.0,
     allowance: float = 0.0,
 ) -> Adaptation:
     """Adapt the whole path of a skill to the obstacles of a scene.
@@ -111,6 +113,8 @@ def adapt(
         max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]. At start and goal, this
             rotation is always 0. The default is two standard deviations of the demonstrated rotation, and 0 if no
             orientation was learned.
+        goal_tilt: largest rotation of the tool of ``arm`` away from the learned rotation at the goal [rad]; used only
+            if the arm is not clear at the goal without it.
         allowance: additional clearance for the tracking errors of the robot, used if a path with this larger clearance
             is found [m].
 
@@ -141,9 +145,8 @@ def adapt(
         if path.nominal.quaternions is None:  # the tool keeps the rotation that it has at the start
             held = np.tile(arm.tool_pose(posture).quaternion, (len(path.nominal), 1))
             path = replace(path, nominal=Trajectory(path.nominal.times, path.nominal.positions, held))
-    limit = path.rotation_tolerance
-    if max_tilt is not None:
-        limit = np.full(len(path.nominal), finite_number(max_tilt, "max_tilt", "rad", at_least=0.0))
+    at_goal = finite_number(goal_tilt, "goal_tilt", "rad", at_least=0.0)
+    limit = _tilt_limits(path, max_tilt, at_goal)
     allowed = AllowedDirections.without(_unit_rows(forbidden))
     tool = ToolAmongObstacles.along(path.nominal, _spheres(path, tool_radius, tool_spheres, arm), scene.obstacles)
     nominal = tool.clearance_of(path.nominal.positions)
@@ -151,11 +154,25 @@ def adapt(
         problem = AvoidanceProblem(path, nominal, clearance + more, allowed)
         adaptation, detour = _of_tool(problem, scene, method, adapter, began)
         if arm is not None and posture is not None and adapter.refuses:
-            task = ArmTask(arm, posture, scene, problem.clearance, allowed, limit, more)
+            task = ArmTask(arm, posture, scene, problem.clearance, allowed, limit, at_goal, more)
             adaptation = _of_whole_arm(adaptation, solve(task, detour), scene, problem.clearance, began)
         if adaptation.feasible:
             break
     return adaptation
+
+
+def _tilt_limits(path: ComponentPath, max_tilt: float | None, goal_tilt: float) -> Array:
+    """Return the largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad]."""
+    limit = path.rotation_tolerance
+    if max_tilt is not None:
+        limit = np.full(len(path.nominal), finite_number(max_tilt, "max_tilt", "rad", at_least=0.0))
+    if goal_tilt == 0.0:
+        return limit
+    times = path.nominal.times
+    ends = times - times[0] > (1.0 - _TILTED_END) * (times[-1] - times[0])
+    limit = np.where(ends, np.maximum(limit, goal_tilt), limit)
+    limit[-1] = goal_tilt
+    return limit
 
 
 def _of_tool(

@@ -40,6 +40,7 @@ _PATIENCE = 7  # rounds without progress, then this attempt is given up
 _PROGRESS = 1e-3  # [m] progress of the smallest distance that counts
 _TILTS, _SELF_MOTIONS = 8, 10  # knots of the splines
 _TILT_SIGMA = 0.15  # [rad] a tilt of this size costs as much as a displacement by one demonstrated sigma
+_TILT_USED, _TILT_TOLERANCE = 0.98, 1e-3  # fraction of the limit of the tilt that is used; accepted excess [rad]
 _REACH = 0.06  # [m] pairs farther apart than the clearance and this have no row
 _NEAR = 0.01  # [m] every pair nearer than the clearance and this has a row; of the others, the nearest of each link
 _MARGIN = 5e-4  # [m] the rows ask for this much more, because distances are not linear
@@ -113,6 +114,7 @@ class ArmPlanner:
         allowed: directions in which components may move.
         smoothness: weight of the squared jerk of the displacement (see ``style_scale``).
         free_start: whether the self-motion may change the posture at the start.
+        tilted_goal: whether the tool may be tilted at the goal, where ``max_tilt`` is then the limit too.
 
     Attributes:
         coarse: indices of the few samples that are planned first, before all samples, shape (k,).
@@ -130,6 +132,7 @@ class ArmPlanner:
         *,
         smoothness: float = 0.0,
         free_start: bool = False,
+        tilted_goal: bool = False,
     ) -> None:
         self.around, self.arm, self.components, self.free_start = around, around.arm, components, free_start
         self.quaternions, self.max_tilt, self.allowed = quaternions, max_tilt, allowed
@@ -137,7 +140,7 @@ class ArmPlanner:
         self.clock = self.times
         n = len(self.times)
         self.coarse = np.unique(np.append(np.arange(0, n, _STRIDE), n - 1))
-        self._tilts = splines(self.times, _TILTS, first=False, last=False)
+        self._tilts = splines(self.times, _TILTS, first=False, last=tilted_goal)
         self._selves = splines(self.times, _SELF_MOTIONS, first=free_start, last=True)
         self._scale = style_scale(components, allowed, np.arange(components.n_components), smoothness)
 
@@ -151,6 +154,15 @@ class ArmPlanner:
         positions = self.components.nominal.positions[samples] + self.components.basis[samples] @ displacement
         rotation = quaternion_exp(self._tilts[samples] @ tilt)
         return positions, quaternion_multiply(rotation, self.quaternions[samples])
+
+    def tilt_at_goal(self, rotation: Array) -> Array:
+        """Return the coefficients (n_tilts, 3) [rad] of a tilt that ends with a rotation vector (3,) [rad].
+
+        The rotation vector must be zero unless the goal may be tilted.
+        """
+        tilt = np.zeros((self.n_tilts, 3))
+        tilt[-1] = rotation
+        return tilt
 
     def tilts(self, tilt: Array) -> Array:
         """Return the rotation of the tool away from the learned one at each sample, shape (n, 3) [rad]."""
@@ -222,10 +234,14 @@ class ArmPlanner:
             lowest = replace(lowest, sample=int(samples[lowest.sample]))
         if beyond[sample, joint] < min(lowest.room, 0.0):
             lowest = ArmClearance(float(beyond[sample, joint]), JOINT_LIMIT, int(joint), -1, int(samples[sample]))
-        turned = float(np.linalg.norm(self._tilts @ tilt, axis=1).max())
+        turned = np.linalg.norm(self._tilts @ tilt, axis=1)
+        tilted = int(np.argmax(turned - self.max_tilt))
+        excess = float(turned[tilted] - self.max_tilt[tilted])
+        if excess > max(_TILT_TOLERANCE, -lowest.room):
+            lowest = ArmClearance(-excess, TILT_LIMIT, -1, -1, tilted)
         cost = self._cost(displacement, tilt)
         speed = float((np.abs(np.diff(path.joints, axis=0)) / self._longest_steps(samples)).max(initial=0.0))
-        return ArmPlan(self.components, displacement, tilt, path, lowest, complete, cost, turned, speed)
+        return ArmPlan(self.components, displacement, tilt, path, lowest, complete, cost, float(turned.max()), speed)
 
     def _longest_steps(self, samples: Index) -> Array:
         """Return how far each joint can move from sample to sample at the learned times, (k - 1, n_joints) [rad]."""
@@ -292,7 +308,7 @@ class ArmPlanner:
         """Return rows that limit the tilt, and rows that prevent displacements in forbidden directions."""
         n_moved, n_tilts = 3 * self.components.n_components, self.n_tilts
         at = self.coarse
-        limit, now = self.max_tilt[at], self._tilts[at] @ tilt
+        limit, now = _TILT_USED * self.max_tilt[at], self._tilts[at] @ tilt
         length = np.linalg.norm(now, axis=1)
         beyond = length > 0.8 * limit
         directions = [np.tile(sign * axis, (len(at), 1)) for axis in np.eye(3) for sign in (1.0, -1.0)]
@@ -314,6 +330,8 @@ class ArmPlanner:
 
 JOINT_LIMIT = SELF - 1
 """Stands for a joint limit where an obstacle's index is expected; ``sphere`` is then the index of the joint."""
+TILT_LIMIT = SELF - 2
+"""Stands for the limit of the tool's tilt where an obstacle's index is expected."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ from imitarm.validation import finite_array, finite_number, instance
 
 Array = NDArray[np.float64]
 
-_OF_THE_ARM = ("arm", "max_tilt")  # options that a policy need not have
+_OF_THE_ARM = ("arm", "max_tilt", "goal_tilt")  # options that a policy need not have
 _LEAST_PATIENCE = 5e-3  # [m] no robot follows more closely than this at all times
 _ALLOWANCE, _ALLOWANCE_OF_ARM = 2e-3, 5e-3  # [m] usual margin of a plan for the tool, for the whole arm
 _SAME_START = 1e-4  # [m, rad] the joints are planned from exactly where the arm is
@@ -172,6 +172,7 @@ class ACFRA(Policy):
             ``tool_radius`` and ``tool_spheres`` are not used. None: only the path of the tool is planned.
         max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]; see
             :func:`~imitarm.policies.adapt`.
+        goal_tilt: largest rotation of the tool of ``arm`` at the goal [rad]; see :func:`~imitarm.policies.adapt`.
         gain: K [1/s].
         patience: e_0, the position error at which the phase stops [m]; None: the clearance, at least 5 mm.
         arrival: the motion has arrived when the tool is nearer than this to the end of the path [m].
@@ -194,6 +195,7 @@ class ACFRA(Policy):
         pinned: Sequence[float] = (),
         arm: ArmModel | None = None,
         max_tilt: float | None = None,
+        goal_tilt: float = 0.0,
         gain: float = 8.0,
         patience: float | None = None,
         arrival: float = 0.003,
@@ -204,7 +206,7 @@ class ACFRA(Policy):
         self._whole_arm = arm is not None and self._refuses
         self._options: dict[str, Any] = {"method": method, "forbidden": forbidden}
         if self._whole_arm:
-            self._options |= {"arm": arm, "max_tilt": max_tilt}
+            self._options |= {"arm": arm, "max_tilt": max_tilt, "goal_tilt": goal_tilt}
         else:
             self._options |= {"tool_radius": tool_radius, "tool_spheres": tool_spheres}
         self._path = ComponentPath.of_skill(skill, pinned=pinned)

@@ -13,23 +13,22 @@ If no attempt succeeds, the reason names the link and the obstacle that are too 
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.errors import UnreachableError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.arm_kinematics import find_posture
-from imitarm.kinematics.arm_path import ArmPath, self_motions, track
+from imitarm.kinematics.arm_path import ArmPath, track
 from imitarm.kinematics.pose import Pose
 from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles, ArmClearance
-from imitarm.policies.arm_planner import JOINT_LIMIT, ArmPlan, ArmPlanner
+from imitarm.policies.arm_planner import JOINT_LIMIT, TILT_LIMIT, ArmPlan, ArmPlanner
 from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.goal_postures import GoalPosture, GoalSearch, clear_postures
 from imitarm.policies.least_detour import SMOOTHNESS, AllowedDirections, Detour
 from imitarm.policies.retiming import Timing, retimed
 from imitarm.scene.clearance import SelfClearance
@@ -44,12 +43,8 @@ _APPROACH_RATE, _SELF_RATE = 5.4, 4.5  # [1/s] distances shrink no faster than t
 _REACH = 0.15  # [m] pairs farther apart than the clearance and this do not slow the motion
 _SLOWEST = 1e-3  # [m/s] closing speed that is always allowed, so that the motion goes on
 _RETIMINGS = 4  # among moving obstacles
-_GOAL_POSTURES = 24  # tried at the goal
-_SWEEP, _SWEEP_STEPS = 0.15, 24  # [rad] of self-motion in one step of the search for a clear posture; steps
 _VIAS, _VIA_SPREAD = 60, 0.6  # random via postures of an approach; their standard deviation [rad]
 _LEG_STEP, _LEG_SPEED = 0.05, 0.4  # [rad] between samples of an approach; fraction of the largest speed
-_REACHED = 1e-5  # [m, rad] error of a posture at the goal that is accepted
-_DIFFERENT, _MOST_GOALS = 0.3, 3  # [rad] two postures differ by this; how many are followed up
 _AHEAD = 0.05  # of the duration: a place this close to the goal is the goal
 _SIDES = 8  # directions tried across the path
 _AWAY = (0.1, 0.2)  # [m] by which the path is moved to another side
@@ -107,6 +102,7 @@ class ArmTask:
     clearance: float
     allowed: AllowedDirections
     max_tilt: Array
+    goal_tilt: float
     allowance: float
 
 
@@ -121,8 +117,8 @@ def solve(task: ArmTask, detour: Detour) -> ArmSolution:
     if search.start.room < 0.0:
         return ArmSolution(None, None, f"at the start, {search.named(search.start)}: move the obstacle or the arm")
     best: ArmPlan | None = None
-    for planner, displacement, joints in search.attempts():
-        plan = planner.plan(displacement, joints)
+    for planner, displacement, joints, tilt in search.attempts():
+        plan = planner.plan(displacement, joints, tilt)
         if plan is None:
             continue
         if plan.feasible:
@@ -139,6 +135,15 @@ def solve(task: ArmTask, detour: Detour) -> ArmSolution:
 
 def _rank(plan: ArmPlan) -> tuple[bool, float]:
     return plan.complete, plan.clearance.room
+
+
+class _Attempt(NamedTuple):
+    """A first guess: the planner that improves it, displacements, joints at its coarse samples, tilt coefficients."""
+
+    planner: ArmPlanner
+    displacement: Array
+    joints: Array
+    tilt: Array
 
 
 class _Search:
@@ -161,48 +166,49 @@ class _Search:
         self.start = self._around.clearance_at(ArmPath.of(task.arm, task.start[None]), np.zeros(1), _REACH)
         self._moving = any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
         self._first: ArmClearance | None = None
-        self._goal: ArmClearance | None = None
         self._worst: ArmClearance | None = None
-        self._goals: list[Array] | None = None
+        self._goals: GoalSearch | None = None
 
-    def attempts(self) -> Iterator[tuple[ArmPlanner, Array, Array]]:
-        """Yield the planner, displacement and joint path with which each attempt begins.
+    def attempts(self) -> Iterator[_Attempt]:
+        """Yield the first guesses with which the attempts begin.
 
         The order of the attempts is given at the beginning of this module.
         """
         learned, detour = self._planner(self._components), self.detour.displacement
-        joints = self._followed(learned, detour, None)
-        first = ArmPath.of(self.task.arm, joints)
+        begin = self._followed(learned, detour)
+        first = ArmPath.of(self.task.arm, begin.joints)
         self._first = self._around.clearance_at(first, learned.clock[learned.coarse], _REACH)
         self._first = replace(self._first, sample=int(learned.coarse[self._first.sample]))
-        yield learned, detour, joints
-        self._goals = self._goal_postures()
-        if not self._goals:
+        yield begin
+        path = self._components.nominal
+        goal, end = Pose(path.positions[-1], self._quaternions[-1]), float(self._times[-1])
+        self._goals = clear_postures(self._around, goal, end, self.task.start, self.task.goal_tilt)
+        if not self._goals.found:
             return
         if self._at_goal():
-            for goal in self._goals:
-                yield learned, detour, self._followed(learned, detour, goal)
+            for posture in self._goals.found:
+                yield self._followed(learned, detour, posture)
             if self._at_goal():
                 yield from self._other_starts(detour)
                 return
         narrow = self._planner(self._components.divided, smoothness=SMOOTHNESS)
         away = learned.components.basis @ detour
         same: Array = np.asarray(np.linalg.lstsq(narrow.components.basis, away, rcond=1e-6)[0], dtype=np.float64)
-        yield narrow, same, self._followed(narrow, same, None)
+        yield self._followed(narrow, same)
         for planner in (learned, narrow):
-            for displacement, joints in self._sides(planner):
-                yield planner, displacement, joints
+            yield from self._sides(planner)
         yield from self._other_starts(detour)
 
-    def _other_starts(self, displacement: Array) -> Iterator[tuple[ArmPlanner, Array, Array]]:
+    def _other_starts(self, displacement: Array) -> Iterator[_Attempt]:
         """Yield first guesses for a joint path that ends in a clear posture; its start posture is not prescribed."""
-        if self._moving:  # there is no time for an approach
+        if self._moving or self._goals is None:  # among moving obstacles there is no time for an approach
             return
         planner = self._planner(self._components, free_start=True)
-        positions, quaternions = planner.poses(displacement, np.zeros((planner.n_tilts, 3)), planner.coarse)
-        for goal in self._goals or []:
-            joints = track(self.task.arm, goal, positions[::-1], quaternions[::-1])[::-1]
-            yield planner, displacement, joints
+        for goal in self._goals.found:
+            tilt = planner.tilt_at_goal(goal.tilt)
+            positions, quaternions = planner.poses(displacement, tilt, planner.coarse)
+            joints = track(self.task.arm, goal.joints, positions[::-1], quaternions[::-1])[::-1]
+            yield _Attempt(planner, displacement, joints, tilt)
 
     def approach(self, end: Array) -> Approach | None:
         """Return a clear motion from the posture of the task to another posture; None if none was found.
@@ -246,7 +252,11 @@ class _Search:
     def _at_goal(self) -> bool:
         worst = self._worst
         last = len(self._times) - 1
-        return worst is not None and worst.obstacle != JOINT_LIMIT and worst.sample >= (1.0 - _AHEAD) * last
+        return (
+            worst is not None
+            and worst.obstacle not in (JOINT_LIMIT, TILT_LIMIT)
+            and worst.sample >= (1.0 - _AHEAD) * last
+        )
 
     def _planner(self, components: ComponentPath, *, smoothness: float = 0.0, free_start: bool = False) -> ArmPlanner:
         return ArmPlanner(
@@ -257,64 +267,20 @@ class _Search:
             self.task.allowed,
             smoothness=smoothness,
             free_start=free_start,
+            tilted_goal=self.task.goal_tilt > 0.0,
         )
 
-    def _followed(self, planner: ArmPlanner, displacement: Array, goal: Array | None) -> Array:
-        tilt = np.zeros((planner.n_tilts, 3))
-        return track(self.task.arm, self.task.start, *planner.poses(displacement, tilt, planner.coarse), goal)
+    def _followed(self, planner: ArmPlanner, displacement: Array, goal: GoalPosture | None = None) -> _Attempt:
+        """Return a first guess that follows the tool's path from the start, towards a posture at the goal."""
+        tilt = planner.tilt_at_goal(np.zeros(3) if goal is None else goal.tilt)
+        poses = planner.poses(displacement, tilt, planner.coarse)
+        joints = track(self.task.arm, self.task.start, *poses, None if goal is None else goal.joints)
+        return _Attempt(planner, displacement, joints, tilt)
 
     def _tracked(self, positions: Array, goal: Array | None) -> Array:
         return track(self.task.arm, self.task.start, positions, self._quaternions, goal)
 
-    def _goal_postures(self) -> list[Array]:
-        """Return distinct postures in which the tool is at the goal and the whole arm is clear.
-
-        Inverse kinematics from random starts finds postures at the goal. The self-motion of the arm
-        then changes each of these postures.
-        """
-        arm, path = self.task.arm, self._components.nominal
-        goal = Pose(path.positions[-1], self._quaternions[-1])
-        random = np.random.default_rng(0)
-        low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
-        starts: list[Array] = []
-        for _ in range(_GOAL_POSTURES):
-            with contextlib.suppress(UnreachableError):
-                starts.append(find_posture(arm, goal, q0=random.uniform(low, high), restarts=0))
-        found: list[Array] = []
-        for q in self._swept(np.array(starts), goal) if starts else ():
-            if all(np.abs(q - other).max() > _DIFFERENT for other in found):
-                found.append(q)
-        return sorted(found, key=lambda q: float(np.abs(q - self.task.start).max()))[:_MOST_GOALS]
-
-    def _swept(self, starts: Array, goal: Pose) -> Iterator[Array]:
-        """Yield clear postures along the self-motions through ``starts`` (k, n_joints), in order of distance."""
-        arm, k = self.task.arm, len(starts)
-        times = np.full(k, self._times[-1])
-        poses = np.tile(goal.position, (k, 1)), np.tile(goal.quaternion, (k, 1))
-        paths = [ArmPath.of(arm, starts)] * 2
-        null = self_motions(paths[0].tool_jacobians())
-        headings = [sign * null[:, :, :1].sum(axis=2) for sign in (1.0, -1.0)]
-        for step in range(_SWEEP_STEPS + 1):
-            for path in paths[: 2 if step else 1]:
-                usable = np.abs(path.errors_to(*poses)).max(axis=1) < _REACHED
-                usable &= ((path.joints >= arm.lower) & (path.joints <= arm.upper)).all(axis=1)
-                gaps = self._around.gaps(path, times, 0.0)
-                room = np.zeros(k)
-                np.minimum.at(room, gaps.sample, gaps.room)
-                yield from path.joints[usable & (room == 0.0)]
-                best = int(np.argmax(np.where(usable, room, -np.inf)))
-                if usable[best] and (self._goal is None or room[best] > self._goal.room):
-                    one = ArmPath.of(arm, path.joints[best][None])
-                    found = self._around.clearance_at(one, times[:1], _REACH)
-                    self._goal = replace(found, sample=len(self._times) - 1)
-            if not null.shape[2]:
-                return
-            for i, path in enumerate(paths):
-                paths[i], _ = ArmPath.of(arm, path.joints + _SWEEP * headings[i]).moved_to(*poses)
-                now = self_motions(paths[i].tool_jacobians())[:, :, 0]
-                headings[i] = now * np.where(np.einsum("kj,kj->k", now, headings[i]) < 0.0, -1.0, 1.0)[:, None]
-
-    def _sides(self, planner: ArmPlanner) -> list[tuple[Array, Array]]:
+    def _sides(self, planner: ArmPlanner) -> list[_Attempt]:
         """Return displacements with which the tool passes the closest place on other sides, each with its joint path.
 
         The closest place is where the clearance of the best failed attempt was smallest. Of all displacements, those
@@ -333,15 +299,14 @@ class _Search:
         across = np.linalg.svd(tangent[None])[2][1:]
         angles = np.arange(_SIDES) * (2.0 * np.pi / _SIDES)
         ring = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ across
-        found: list[tuple[float, int, Array, Array]] = []
+        found: list[tuple[float, int, _Attempt]] = []
         for distance in _AWAY:
             for direction in self.task.allowed.unit_directions(ring):
-                displacement = (distance / lever * path.basis[at])[:, None] * direction
-                joints = self._followed(planner, displacement, None)
-                arm = ArmPath.of(self.task.arm, joints)
+                attempt = self._followed(planner, (distance / lever * path.basis[at])[:, None] * direction)
+                arm = ArmPath.of(self.task.arm, attempt.joints)
                 gaps = self._around.gaps(arm, self._times[planner.coarse], 0.0)
-                found.append((float(-gaps.room.sum()), len(found), displacement, joints))
-        return [(displacement, joints) for _, _, displacement, joints in sorted(found)[:_MOST_SIDES]]
+                found.append((float(-gaps.room.sum()), len(found), attempt))
+        return [attempt for _, _, attempt in sorted(found, key=lambda one: one[:2])[:_MOST_SIDES]]
 
     def timed(self, planner: ArmPlanner, plan: ArmPlan) -> tuple[ArmPlan, Timing] | None:
         """Return a plan with execution times within the limits of the arm and of the safety filter.
@@ -388,6 +353,8 @@ class _Search:
         arm = self.task.arm
         if found.obstacle == JOINT_LIMIT:
             return f"joint {arm.joint_names[found.sphere]} would exceed its limit by {-found.room:.2f} rad"
+        if found.obstacle == TILT_LIMIT:
+            return f"the tool would be tilted by {np.degrees(-found.room):.1f} degrees more than allowed"
         link = arm.cover.bodies[found.sphere]
         if found.obstacle == SELF:
             bodies = arm.cover.bodies
@@ -408,11 +375,12 @@ class _Search:
         if best is None:
             return f"{self.task.arm.name} can't move its tool along the path: move the path nearer to the arm"
         first = "" if self._first is None else f"on the path planned for the tool alone, {self._placed(self._first)}; "
-        if self._goals is not None and not self._goals:
-            nearest = "" if self._goal is None else f" (in the best posture, {self.named(self._goal)})"
+        if self._goals is not None and not self._goals.found:
+            best_posture = self._goals.best
+            nearest = "" if best_posture is None else f" (in the best posture, {self.named(best_posture)})"
             return (
                 f"no posture was found in which the tool is at the goal and the whole arm is clear{nearest}: move the "
-                "obstacle or the goal"
+                "obstacle or the goal, or allow the tool to tilt at the goal (goal_tilt)"
             )
         return (
             "no joint path was found on which the whole arm keeps its clearance "
