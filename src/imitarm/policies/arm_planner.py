@@ -18,6 +18,7 @@ path; the rounds end when all distances reach the required clearance.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import daqp
 import numpy as np
@@ -53,6 +54,9 @@ _SLACK_SCALE = 1e-3  # [m] of missing clearance costs as much as one demonstrate
 _MOST_ROWS = 500
 _SOLVED = 1  # daqp's exit flag of an optimal solution
 _ACCURATE = 1e-5  # [m, rad] error of the tool's pose that is accepted
+_GRID = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
+_FACETS = _GRID[_GRID.any(axis=1)] / np.linalg.norm(_GRID[_GRID.any(axis=1)], axis=1, keepdims=True)  # 26 directions
+_AXES = np.abs(_FACETS).max(axis=1) == 1.0  # which of them are along an axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,8 +241,8 @@ class ArmPlanner:
         turned = np.linalg.norm(self._tilts @ tilt, axis=1)
         tilted = int(np.argmax(turned - self.max_tilt))
         excess = float(turned[tilted] - self.max_tilt[tilted])
-        if excess > max(_TILT_TOLERANCE, -lowest.room):
-            lowest = ArmClearance(-excess, TILT_LIMIT, -1, -1, tilted)
+        if excess > _TILT_TOLERANCE and -TILT_LEVER * excess < lowest.room:
+            lowest = ArmClearance(-TILT_LEVER * excess, TILT_LIMIT, -1, -1, tilted)
         cost = self._cost(displacement, tilt)
         speed = float((np.abs(np.diff(path.joints, axis=0)) / self._longest_steps(samples)).max(initial=0.0))
         return ArmPlan(self.components, displacement, tilt, path, lowest, complete, cost, float(turned.max()), speed)
@@ -310,16 +314,15 @@ class ArmPlanner:
         at = self.coarse
         limit, now = _TILT_USED * self.max_tilt[at], self._tilts[at] @ tilt
         length = np.linalg.norm(now, axis=1)
-        beyond = length > 0.8 * limit
-        directions = [np.tile(sign * axis, (len(at), 1)) for axis in np.eye(3) for sign in (1.0, -1.0)]
-        directions.append(np.where(beyond[:, None], now / np.maximum(length, 1e-9)[:, None], 0.0))
-        rows, low = [], []
-        for direction in directions:
-            part = np.zeros((len(at), n_moved + 3 * n_tilts + n_self))
-            turning = self._tilts[at][:, :, None] * direction[:, None, :]
-            part[:, n_moved : n_moved + 3 * n_tilts] = -turning.reshape(len(at), -1)
-            rows.append(part)
-            low.append(-limit)
+        own = now / np.maximum(length, 1e-9)[:, None]
+        # A polyhedron about the sphere of the allowed tilts, and a plane that touches the sphere where the tilt is now.
+        sample, facet = np.nonzero((now @ _FACETS.T > 0.3 * limit[:, None]) | _AXES)
+        far = np.flatnonzero(length > 0.8 * limit)
+        sample, direction = np.append(sample, far), np.concatenate([_FACETS[facet], own[far]])
+        turning = self._tilts[at[sample]][:, :, None] * direction[:, None, :]
+        part = np.zeros((len(sample), n_moved + 3 * n_tilts + n_self))
+        part[:, n_moved : n_moved + 3 * n_tilts] = -turning.reshape(len(sample), -1)
+        rows, low = [part], [-limit[sample]]
         for forbidden in self.allowed.forbidden:
             part = np.zeros((self.components.n_components, n_moved + 3 * n_tilts + n_self))
             part[:, :n_moved] = np.kron(np.eye(self.components.n_components), -forbidden)
@@ -332,6 +335,8 @@ JOINT_LIMIT = SELF - 1
 """Stands for a joint limit where an obstacle's index is expected; ``sphere`` is then the index of the joint."""
 TILT_LIMIT = SELF - 2
 """Stands for the limit of the tool's tilt where an obstacle's index is expected."""
+TILT_LEVER = 0.05
+"""[m/rad] A tilt beyond its limit is compared with a missing clearance by this factor."""
 
 
 @dataclass(frozen=True, eq=False)

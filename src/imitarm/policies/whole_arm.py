@@ -26,7 +26,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_path import ArmPath, track
 from imitarm.kinematics.pose import Pose
 from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles, ArmClearance
-from imitarm.policies.arm_planner import JOINT_LIMIT, TILT_LIMIT, ArmPlan, ArmPlanner
+from imitarm.policies.arm_planner import JOINT_LIMIT, TILT_LEVER, TILT_LIMIT, ArmPlan, ArmPlanner
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.goal_postures import GoalPosture, GoalSearch, clear_postures
 from imitarm.policies.least_detour import SMOOTHNESS, AllowedDirections, Detour
@@ -354,7 +354,7 @@ class _Search:
         if found.obstacle == JOINT_LIMIT:
             return f"joint {arm.joint_names[found.sphere]} would exceed its limit by {-found.room:.2f} rad"
         if found.obstacle == TILT_LIMIT:
-            return f"the tool would be tilted by {np.degrees(-found.room):.1f} degrees more than allowed"
+            return f"the tool would be tilted by {np.degrees(-found.room / TILT_LEVER):.1f} degrees more than allowed"
         link = arm.cover.bodies[found.sphere]
         if found.obstacle == SELF:
             bodies = arm.cover.bodies
