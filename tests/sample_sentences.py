@@ -25,6 +25,7 @@ _ITEM = r"\s*(?:[-*]\s|\d+\.\s|#+\s|\||>|!\["
 _START = re.compile(_ITEM + ")")
 _ARGUMENT = re.compile(_ITEM + r"|[\w*, ().]+:$|\w[\w, *]*(?: \([^)]*\))?: )")
 _END = re.compile(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*`$\[]*[A-Z0-9])")
+_BEFORE, _AFTER = 6, 4  # lines that ``--context`` prints before the line of a sentence and after it
 _ABBREVIATION = re.compile(r"\b(?:Eq|Eqs|Fig|Figs|e\.g|i\.e|et al|vs|cf|Trans|No|[A-Z])\.$")
 _WORD = re.compile(r"(?<![\w\\])[A-Za-z]{2,}(?!\w)")
 _REGULAR = re.compile(r"\(\?:|\[\^|\\[wd](?![A-Za-z])|\\\d")  # a string that is a regular expression
@@ -122,16 +123,27 @@ def sentences() -> list[Sentence]:
     return list(once.values())
 
 
+def _around(sentence: Sentence) -> list[str]:
+    """Return the lines of the file in which a reader meets a sentence: some lines before it and after it."""
+    name, _, place = sentence.place.partition(":")
+    line = int(place.split()[0])
+    lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
+    return lines[max(line - 1 - _BEFORE, 0) : line + _AFTER]
+
+
 def main() -> None:
     """Print the sentences that were drawn."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=200, metavar="N", help="number of sentences (default 200)")
+    parser.add_argument("--context", action="store_true", help="also print the lines around each sentence")
     parser.add_argument("--seed", type=int, default=1, metavar="SEED", help="seed of the draw (default 1)")
     arguments = parser.parse_args()
     everything = sentences()
     drawn = random.Random(arguments.seed).sample(everything, min(arguments.count, len(everything)))
     for number, sentence in enumerate(drawn, 1):
         print(f"{number:3d}  {sentence.place}\n     {sentence.text}")
+        if arguments.context:
+            print(*(f"     | {line}" for line in _around(sentence)), sep="\n")
     print(f"{len(drawn)} of {len(everything)} sentences, seed {arguments.seed}")
 
 

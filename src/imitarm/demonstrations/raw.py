@@ -439,7 +439,7 @@ def check_quaternions(raw: RawDemonstration) -> Iterator[Finding]:
     flips = np.flatnonzero(np.sum(q[1:] * q[:-1], axis=1) < 0.0) + 1
     if len(flips):
         message = f"the quaternion's sign flips {len(flips)} times (q and -q are the same rotation)"
-        remedy = "none needed: signs are made continuous when read"
+        remedy = "nothing to do: the reader makes the signs of the quaternions continuous"
         yield raw.finding("note", "quaternion-flips", message, remedy, int(flips[0]))
 
 

@@ -67,7 +67,7 @@ class PartFile:
             raise InputError(f"{self.part}: can't be written: {error.strerror or error}") from error
 
     def finish(self, take: Callable[[Path], bool], *, begin: str = "") -> None:
-        """Write all text to the disk, then rename ``PATH.part`` to ``PATH``, or let ``take`` create ``PATH`` from it.
+        """Write all text to the disk, then make ``PATH`` from ``PATH.part``: by renaming it, or by calling ``take``.
 
         Calling this method again does nothing.
 

@@ -66,7 +66,7 @@ class IKProblem:
 
     Attributes:
         arm: the arm.
-        memory: kinematics of the arm at ``q``.
+        memory: working memory of the arm, which holds its kinematics at ``q``.
         q: joint positions, shape (n_joints,) [rad].
         velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: unknown, so accelerations are
             not limited.

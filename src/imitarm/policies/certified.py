@@ -301,7 +301,8 @@ class _SideSearch:
     def _affected(self, rows: Index, worst: int, here: PathClearance) -> Index:
         """Return the indices of the components that are near the obstacle or influence a violated sample.
 
-        The centre of a component is approximated by the path position at the same time, where the distances are known.
+        Distances are known only at the samples of the path. The function therefore uses, for each component, the sample
+        at the time of the component's centre.
         """
         centre, n = here.distance[worst, self.path.centres], here.normal[worst, self.path.centres]
         spread = np.sqrt(np.einsum("kd,kde,ke->k", n, self.path.covariances, n))

@@ -113,9 +113,9 @@ class AllowedDirections:
         return np.asarray(reduced @ self.axes.T)
 
     def unit_directions(self, candidates: Array) -> Array:
-        """Return the directions (m, 3) without the parts that are forbidden, one unit vector per row.
+        """Return the allowed part of each direction (m, 3), scaled to length 1, one row for each direction.
 
-        A direction is dropped if its allowed part is small.
+        A direction is left out if its allowed part is short.
         """
         allowed = self.enforced(candidates @ self.axes) if len(self.forbidden) else candidates
         length = np.sqrt(np.einsum("md,md->m", allowed, allowed))

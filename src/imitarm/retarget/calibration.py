@@ -261,9 +261,9 @@ def suggested_scale(arm: ArmModel, lengths: LimbLengths, anchor: Anchor = "shoul
     Args:
         arm: the robot's.
         lengths: the person's.
-        anchor: ``"shoulder"``: the ratio of the arms' reaches, :math:`\rho = reach_{robot} / reach_{human}`, so that
-            the person can use the robot's whole workspace; ``"object"``: 1, for tasks in which the robot handles
-            objects of the same size as the person's.
+        anchor: what determines the scale. With ``"shoulder"``, the scale is the ratio of the two arms' reaches,
+            :math:`\rho = reach_{robot} / reach_{human}`, so that the person can use the robot's whole workspace. With
+            ``"object"``, the scale is 1, because the robot handles objects of the same size as the person's.
     """
     return 1.0 if anchor == "object" else robot_reach(arm) / lengths.reach
 

@@ -262,11 +262,11 @@ class MovingTarget:
         return np.asarray(self.goal + basis_on_grid(len(self.drive), n_steps)[1] @ self.drive)
 
     def plan(self, gains: Gains, step: float) -> PlannedSteps | None:
-        """Return all steps of length ``step`` [fraction of the duration]; None in the first call with this length.
+        """Return the plan of a whole motion in steps of length ``step`` [fraction of the duration], or None.
 
         The target does not depend on the state, so a plan can be computed once and used in all steps. A moving goal
-        gives a new target at every step, and a plan for a target that is used only once would be a waste. Therefore the
-        plan is computed in the second call.
+        gives a new target at every step, and a plan for a target that is used only once would be a waste. The first
+        call with a step length therefore returns None, and the second call computes the plan.
         """
         if step not in self._plans:
             self._plans[step] = None

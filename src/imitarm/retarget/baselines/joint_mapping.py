@@ -177,7 +177,7 @@ def continued(angles: Array, before: Array) -> Array:
 
 
 def _whole_turn_inside(angles: Array, lower: Array, upper: Array) -> Array:
-    """Shift each angle beyond its limits by 360 degrees if this brings it inside; angles and limits (n,) [rad]."""
+    """Shift an angle by 360 degrees if it exceeds its limits and the shift brings it inside; all arrays (n,) [rad]."""
     turned = angles - 2.0 * np.pi * np.sign(angles)
     helps = ((angles < lower) | (angles > upper)) & (turned >= lower) & (turned <= upper)
     return np.where(helps, turned, angles)
