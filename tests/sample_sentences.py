@@ -96,12 +96,23 @@ def _docstring(node: ast.AST) -> ast.Constant | None:
     return None
 
 
-def _code(path: Path) -> Iterator[Sentence]:
-    """Yield the sentences of a module's docstrings and messages."""
+def _public(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield a module and everything in it that is public: no name that begins with one underscore, nothing local."""
+    yield node
+    if isinstance(node, ast.Module | ast.ClassDef):
+        for inner in node.body:
+            name = getattr(inner, "name", "")
+            if not name.startswith("_") or name.startswith("__"):
+                yield from _public(inner)
+
+
+def _code(path: Path, *, public: bool) -> Iterator[Sentence]:
+    """Yield the sentences of a module's docstrings (or only of the public ones) and messages."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     name = str(path.relative_to(ROOT))
     docstrings = {id(held): held for node in ast.walk(tree) if (held := _docstring(node))}
-    for held in docstrings.values():
+    shown = {id(held) for node in _public(tree) if (held := _docstring(node))} if public else docstrings.keys()
+    for held in (docstrings[key] for key in docstrings if key in shown):
         plain = _BLOCK.sub(lambda match: "\n" * match[0].count("\n"), str(held.value))
         for line, paragraph in _paragraphs(plain.splitlines(), held.lineno, _ARGUMENT):
             if not paragraph.lstrip().startswith((">>>", "...")):
@@ -115,10 +126,14 @@ def _code(path: Path) -> Iterator[Sentence]:
                     yield Sentence(f"{name}:{getattr(node, 'lineno', 0)} (message)", sentence)
 
 
-def sentences() -> list[Sentence]:
-    """Return every sentence with at least four words that are not code, each text once."""
+def sentences(*, public: bool = False) -> list[Sentence]:
+    """Return every sentence with at least four words that are not code, each text once.
+
+    Args:
+        public: whether to leave out the docstrings of private functions, classes and methods.
+    """
     found = [sentence for path in PAGES for sentence in _prose(path)]
-    found += [sentence for path in [*SOURCES, *EXAMPLES] for sentence in _code(path)]
+    found += [sentence for path in [*SOURCES, *EXAMPLES] for sentence in _code(path, public=public)]
     once = {sentence.text: sentence for sentence in found if len(_WORD.findall(_CODE.sub(" ", sentence.text))) >= 4}
     return list(once.values())
 
@@ -136,9 +151,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=200, metavar="N", help="number of sentences (default 200)")
     parser.add_argument("--context", action="store_true", help="also print the lines around each sentence")
+    parser.add_argument("--public", action="store_true", help="leave out the docstrings of private functions")
     parser.add_argument("--seed", type=int, default=1, metavar="SEED", help="seed of the draw (default 1)")
     arguments = parser.parse_args()
-    everything = sentences()
+    everything = sentences(public=arguments.public)
     drawn = random.Random(arguments.seed).sample(everything, min(arguments.count, len(everything)))
     for number, sentence in enumerate(drawn, 1):
         print(f"{number:3d}  {sentence.place}\n     {sentence.text}")

@@ -81,7 +81,9 @@ def test_swapped_sides_are_found_and_mended():
     finding = found(wrong)["sides-swapped"]
     assert finding.frame == 20 and "in 5 frames" in finding.message
     mended, notes = repaired(SkeletonRecording(wrong))
-    assert all(map(same, mended.skeletons, frames)) and notes == ["swapped left and right back in 5 frames"]
+    assert all(map(same, mended.skeletons, frames)) and notes == [
+        "exchanged left and right again in 5 frames in which the sensor had swapped them"
+    ]
 
 
 def test_a_person_with_the_back_to_the_sensor():

@@ -47,7 +47,7 @@ def test_trim_repair_and_one_person(tmp_path, capsys):
     SkeletonRecording(both).save(source)
     assert main(["capture", str(source), "--out", str(out), "--trim", "0.5", "2", "--repair"]) == 0
     shown = capsys.readouterr()
-    assert "kept person 1" in shown.err and "swapped left and right back in 1 frames" in shown.err
+    assert "kept person 1" in shown.err and "exchanged left and right again in 1 frames" in shown.err
     back = read_recording(out)
     assert back.persons == (1,) and back.duration == pytest.approx(1.5, abs=0.05)
     assert main(["capture", str(source), "--out", str(out), "--person", "2", "--force"]) == 0

@@ -189,7 +189,11 @@ def test_one_of_two_persons_and_repairs(tmp_path, capsys):
     source = saved(tmp_path / "two.csv", both)
     assert run(source) == 0
     reported = capsys.readouterr().err
-    for words in ("repaired: kept person 1", "repaired: dropped 1 frames", "swapped left and right back in 1 frames"):
+    for words in (
+        "repaired: kept person 1",
+        "repaired: dropped 1 frames",
+        "exchanged left and right again in 1 frames",
+    ):
         assert words in reported
     assert run(source, "--person", 2) == 0
     assert "kept person" not in capsys.readouterr().err

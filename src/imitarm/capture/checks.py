@@ -101,7 +101,7 @@ def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]
     memory = SideMemory()
     right = [memory.update(skeleton) for skeleton in kept]
     if memory.swaps:
-        notes.append(f"swapped left and right back in {memory.swaps} frames")
+        notes.append(f"exchanged left and right again in {memory.swaps} frames in which the sensor had swapped them")
     return recording.with_skeletons(_without_spikes(right, notes)), notes
 
 

@@ -402,8 +402,8 @@ def _decisive(pairs: _Pairs, path: ArmPath, times: Array, segment: Index, pair: 
     """Return the segments that need an exact bound, and 0.
 
     These segments may have the lowest bound, or a negative bound. They are found from the tangents, which are cheap to
-    compute, and from one coarse bound of all arcs. If the clearance is already missing at a sample, the function
-    returns only the segment of the lowest sample, and the negative value at this sample.
+    compute, and from one coarse bound of all arcs. If an arm is too close at a sample, the function returns only the
+    segment of the closest sample, and the negative room at this sample.
     """
     needed = np.zeros((len(path), len(pairs.sphere)), dtype=bool)
     needed[segment, pair] = needed[segment + 1, pair] = True

@@ -214,7 +214,10 @@ class _SideSearch:
         worst: int,
         here: PathClearance,
     ) -> tuple[list[Array], list[float], bool]:
-        """Convert lifts of samples (m, p) along directions (m, 3) to displacements of components, with their costs.
+        """Return a displacement of the components for each direction, and the cost of each displacement.
+
+        ``directions`` (m, 3) are the directions, and ``lifts`` (m, p) [m] is how far each of p samples must move along
+        each of them.
 
         First, every direction is rated with one common amplitude for all affected components. Then the smallest
         sufficient amplitudes are computed for the best few directions. The function also returns whether the cheapest

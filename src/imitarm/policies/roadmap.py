@@ -1,10 +1,11 @@
 """A roadmap of displacements over time: possible positions of the tool at each time, and connections between them.
 
-At some times along the nominal path (layers), rays start at the nominal position. On each ray, the points just outside
-the inflated obstacles are the nodes. Edges lead from each node to the nodes of the next layer on the same and on
-neighbouring rays. The cost of an edge is the change of the displacement, plus a large amount where the two tangents at
-its ends do not prove the clearance. Dynamic programming from both ends computes, for each node, the cheapest route
-through this node. A route is only a proposal: the search for the least detour takes its first tangents along the route.
+The nodes are arranged in layers. Each layer belongs to one time on the nominal path. In each layer, rays in all
+directions start at the nominal position of this time. On each ray, the points just outside the inflated obstacles are
+the nodes. Edges lead from each node to the nodes of the next layer on the same and on neighbouring rays. The cost of an
+edge is the change of the displacement, plus a large amount where the two tangents at its ends do not prove the
+clearance. Dynamic programming from both ends computes, for each node, the cheapest route through this node. A route is
+only a proposal: the search for the least detour takes its first tangents along the route.
 """
 
 from __future__ import annotations

@@ -417,7 +417,10 @@ class Drives:
         mujoco.mj_step2(self._model, self._data)
 
     def free(self, force: Array, torque: Array, site: int) -> None:
-        """Step with ``tau = h + 0.7 c sign(v) - D v``, where ``c`` is the dry friction, while a hand pulls at a site.
+        """Simulate one step in which a hand pulls at a site and the drives let the arm move freely.
+
+        The drives compensate the weight and 70 % of the dry friction ``c``, and add the damping ``D``:
+        ``tau = h + 0.7 c sign(v) - D v`` with the bias forces ``h`` and the joint velocity ``v``.
 
         Args:
             force: force of the hand, in the base frame, shape (3,) [N].

@@ -205,9 +205,9 @@ class PackedObstacles:
         return []
 
     def _limits(self, reach: Array) -> Array:
-        """Return squared distances (n, m) between origins and points.
+        """Return limits of the squared distance between the origin of each solid and each point, shape (n, m).
 
-        A point that is farther than this from a solid's origin is farther than ``reach`` from the solid.
+        A point beyond its limit is farther than ``reach`` from the solid.
         """
         if not self._kept or self._kept[0][0] is not reach:
             limit = reach + self.radii[self._sorted[0], None]

@@ -336,11 +336,11 @@ def fit_weights(
     r"""Return the weights with which the primitive reproduces a path.
 
     The motion is linear in ``d_i = w_i - (g - x_0)``. Let R be the responses of the spring to a unit start position, a
-    unit start velocity, a unit goal and each basis function. Then
-    ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression compares forces (such as
-    ``tau v' + D v``) and needs measured accelerations. Here the spring itself filters both sides of the regression,
-    which converts forces to positions. Therefore noise is not differentiated, the samples may have any times, and the
-    regression minimises the error of the reproduction in metres.
+    unit start velocity, a unit goal and each basis function. Then ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i
+    d_i R_i``. The usual regression compares forces (such as ``tau v' + D v``) and needs measured accelerations. This
+    function compares positions: the response of the spring to each basis function with the path. Therefore noise is not
+    differentiated, the samples may have any times, and the regression minimises the error of the reproduction in
+    metres.
 
     The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. If noise
     moves one of these samples more than 0.1 mm away from the path that fits all samples, the end of this path is used

@@ -218,7 +218,7 @@ class DemonstrationModification(BaselineRetargeter):
         }
 
     def _append_shown_times(self, steps: list[RetargetStep], shown: Array) -> None:
-        """Append the times at which the person showed the newest steps to ``shown_times``.
+        """Extend ``shown_times`` by the times at which the person showed the newest steps.
 
         ``shown`` contains the times of a motion. The robot waits before the motion; the times of the waiting steps are
         ``dt`` apart, but a time that would be later than the first time in ``shown`` is replaced by that first time.
