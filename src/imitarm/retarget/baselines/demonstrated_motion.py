@@ -239,9 +239,10 @@ def stretch(joints: Array) -> Array:
     r"""Return how far a person's arm would be stretched if it had the joint angles of the robot, shape (n,).
 
     The argument is the robot's joint positions, shape (n, n_joints) [rad]. The stretch is the distance from shoulder to
-    wrist, divided by the length of the straight arm. For a person's arm with upper arm and forearm of equal length, the stretch is :math:`|\cos(q_3/2)|`. Sawyer's upper
-    arm and forearm have almost equal lengths (0.412 and 0.411 m). The distance from the robot's own shoulder to its
-    wrist is not used, because the offsets between the links make this distance largest when the elbow is bent.
+    wrist, divided by the length of the straight arm. For a person's arm with upper arm and forearm of equal length, the
+    stretch is :math:`|\cos(q_3/2)|`. Sawyer's upper arm and forearm have almost equal lengths (0.412 and 0.411 m). The
+    distance from the robot's own shoulder to its wrist is not used, because the offsets between the links make this
+    distance largest when the elbow is bent.
     """
     return np.asarray(np.abs(np.cos(0.5 * joints[:, ELBOW])))
 
