@@ -41,12 +41,12 @@ def test_the_demo_does_the_main_job(tmp_path, capsys):
 
 
 def test_a_demo_that_fails_says_so_by_its_status(tmp_path, monkeypatch, capsys):
-    """The thesis's potential field does not keep the path clear; the exit status tells."""
+    """Where no path is found, the exit status tells."""
     monkeypatch.setattr("imitarm.cli.demo.SCENES", ("two_boxes",))
     monkeypatch.setattr("imitarm.cli.demo.write_report", lambda report, path: path)
-    monkeypatch.setattr("imitarm.policies.least_detour.MAX_DISPLACEMENT", 0.0)  # every detour is too far
+    monkeypatch.setattr("imitarm.policies.arm_planner.ArmPlanner.plan", lambda *_: None)  # no path is found
     assert main(["demo", "--out", str(tmp_path)]) == 1
-    assert "no path around" in " ".join(capsys.readouterr().out.split())
+    assert "can't move its tool along the path" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_demo_folder_that_cannot_be_made_is_bad_input(tmp_path, capsys):

@@ -129,7 +129,8 @@ def _sweep(
     policy = ACFRA(
         skill,
         method=method,
-        tool_radius=task.tool_radius,
+        arm=robot.arm,
+        tool_radius=task.tool_radius,  # for the methods that plan only the tool
         clearance=task.clearance,
         forbidden=HORIZONTAL_ONLY,  # the bristles stay on the table
         pinned=[task.dirt_time(skill.gmr_.trajectory(1000))],

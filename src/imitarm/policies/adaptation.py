@@ -251,6 +251,7 @@ def _of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearan
     used = plan.components
     times = tool.nominal.times if timing is None else timing.times
     jerk = used.jerk_ratio(plan.path.positions)
+    guaranteed = clearance + plan.clearance.room if scene.obstacles else np.inf
     return replace(
         tool,
         trajectory=Trajectory(times, plan.path.positions, plan.path.quaternions),
@@ -260,8 +261,8 @@ def _of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearan
         covariances=used.covariances,
         responsibilities=used.responsibilities,
         divided=used.n_components != tool.responsibilities.shape[1] or tool.divided,
-        min_clearance=clearance + plan.clearance.room,
-        certified_clearance=clearance + plan.clearance.room,
+        min_clearance=guaranteed,
+        certified_clearance=guaranteed,
         validity=_validity(scene, float(times[-1]), arm=True),
         deviation=used.deviation(plan.displacement),
         jerk_ratio=jerk,

@@ -17,7 +17,7 @@ from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.robots.simulated import Control, SimulatedRobot
 from imitarm.robots.world import arm_world
-from imitarm.scene import Scene, load_scene
+from imitarm.scene import HalfSpace, Scene, load_scene, standard_fixtures
 from imitarm.trajectory import Rollout, Trajectory
 
 Array = NDArray[np.float64]
@@ -94,7 +94,9 @@ class SweepTask:
         """
         if name not in SCENES:
             raise UnknownNameError.among("scene", name, SCENES)
-        return Scene() if name == "free" else load_scene(DEMONSTRATIONS / "scenes" / f"{name}.yaml")
+        scene = Scene() if name == "free" else load_scene(DEMONSTRATIONS / "scenes" / f"{name}.yaml")
+        table = HalfSpace(np.zeros(3), name="table")
+        return replace(scene, fixtures=(table, *standard_fixtures()))
 
     @classmethod
     def scenes(cls) -> Mapping[str, Scene]:
