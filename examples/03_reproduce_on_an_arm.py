@@ -1,7 +1,7 @@
 """Reproduce a skill on a simulated arm around obstacles, and let the simulator measure the result.
 
-The plan guarantees the clearance of the brush only. The simulator has its own shapes, inertias, limits and servos. It
-measures whether the arm follows the plan, and whether the links of the arm keep the clearance as well.
+The plan covers the whole arm: it guarantees the clearance of every moving part. The simulator has its own shapes,
+inertias, limits and servos. It measures whether the arm follows the plan and keeps the clearance.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ def main() -> None:
     # SimulatedRobot(arm, scene=scene). The arm begins where the skill does.
     robot = SimulatedRobot(arm, scene=scene, world=task.world(arm), q=find_posture(arm, task.start))
 
-    # The policy adapts the whole path when it is reset, then follows it and waits when the arm lags.
+    # The policy plans the joints for the whole path when it is reset. It then follows the plan, and waits for the arm.
     policy = ACFRA(
         skill,
-        tool_radius=task.tool_radius,
+        arm=arm,
         clearance=CLEARANCE,
         forbidden=HORIZONTAL_ONLY,
         pinned=[task.dirt_time(skill.gmr_.trajectory(1000))],
@@ -62,7 +62,7 @@ def main() -> None:
             nearest[" to ".join(robot.nearest_pair() or ())] += 1
 
     # `observe` returns the scene at a given time; here it is the true scene of the simulator.
-    # The safety filter also keeps this clearance for the links, which the plan of the tool does not include.
+    # The safety filter checks every command again, before the arm gets it.
     rollout = reproduce(
         policy, robot, scene.at, timeout=40.0, safety=SafetyFilter(arm, clearance=CLEARANCE), on_step=watch
     )
@@ -71,7 +71,7 @@ def main() -> None:
     adaptation = policy.adaptation
     print(f"{'done' if rollout.success else 'FAILED'}: {rollout.reason}")
     print(f"  {rollout.trajectory.duration:.1f} s, demonstrated in {skill.duration_:.1f} s")
-    print(f"    certified clearance of the brush:  {1e3 * adaptation.certified_clearance:.1f} mm")
+    print(f"    certified clearance of arm and brush: {1e3 * adaptation.certified_clearance:.1f} mm")
     print(f"    measured clearance of arm and brush: {1e3 * rollout.min_clearance:.1f} mm")
     for pair, steps in nearest.most_common(3):
         print(f"    within 5 cm for {0.01 * steps:.1f} s: {pair}")

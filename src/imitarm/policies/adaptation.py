@@ -153,12 +153,21 @@ def adapt(
     for more in dict.fromkeys((extra, 0.0)):
         problem = AvoidanceProblem(path, nominal, clearance + more, allowed)
         adaptation, detour = _of_tool(problem, scene, method, adapter, began)
-        if arm is not None and posture is not None and adapter.refuses:
+        if arm is not None and posture is not None and adapter.refuses and not _covered(problem, at_goal):
             task = ArmTask(arm, posture, scene, problem.clearance, allowed, limit, at_goal, more)
             adaptation = _of_whole_arm(adaptation, solve(task, detour), scene, problem.clearance, began)
         if adaptation.feasible:
             break
     return adaptation
+
+
+def _covered(problem: AvoidanceProblem, goal_tilt: float) -> bool:
+    """Return whether the tool is too close at the start, or at a goal at which it may not tilt.
+
+    No plan of the whole arm can change this.
+    """
+    ends = [0] if goal_tilt > 0.0 else [0, -1]
+    return bool(problem.nominal.distance[:, ends].min(initial=np.inf) < problem.clearance)
 
 
 def _tilt_limits(path: ComponentPath, max_tilt: float | None, goal_tilt: float) -> Array:
