@@ -1,4 +1,4 @@
-"""An oracle that decides whether a path exists, to check refusals.
+"""An oracle that decides whether a path around the obstacles exists, to check the refusals of ``adapt``.
 
 The oracle shares no code with the library's search for a path. The oracle considers displacements of the nominal path
 at many times, called layers. In each layer, displacements are cells of a grid.
@@ -9,9 +9,9 @@ The oracle gives one of three answers:
   interval. If no chain of free boxes leads from the start to the goal, then no continuous displacement of the path
   exists.
 * **possible**: a path was found and verified. A cell counts as free if its centre is free. Tangents give a lower bound
-  of the distance to the obstacles during moves between neighbouring cells and between layers. The cheapest chain of
-  cells is then fitted by sums of the skill's components, or by sums of hat functions in time where the components are
-  too wide.
+  of the distance to the obstacles during moves between neighbouring cells and between layers. Dynamic
+  programming finds the chain of free cells with the smallest displacements. A sum of the skill's components is then
+  fitted to this chain. If the components are too wide for the fit, hat functions in time replace them.
 * **undecided**: even the finest grid gave neither a proof nor a path.
 
 The oracle uses the same limits as the library. No sample is displaced by more than 0.5 m. No step is longer than 8

@@ -133,7 +133,7 @@ class LandmarkConverter:
     def skeleton(self, landmarks: PoseLandmarks) -> Skeleton | None:
         """Return the skeleton; None when the image shows too little of the person to locate them.
 
-        The smallest visibility of the landmarks from which a joint is computed decides whether the joint is tracked,
+        Each joint is computed from some landmarks. The least visible of them decides whether the joint is tracked,
         inferred or lost. A joint outside the image is never tracked. MediaPipe does not detect whether a hand is open
         or closed, so hand states are unknown.
         """

@@ -344,10 +344,10 @@ def fit_weights(
 
     The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. If noise
     moves one of these samples more than 0.1 mm away from the path that fits all samples, the end of this path is used
-    instead. A motion that is forced through a noisy sample would have a high jerk there. The argument ``exact_ends``
-    turns this smoothing off. The last ``d_i`` is set to 0, so that the target is the goal when the duration is over.
-    (The regression hardly determines the last ``d_i``. A last ``d_i`` other than 0 can pull the tool decimetres away
-    from the goal after the end of the motion.)
+    instead. A motion that is forced through a noisy sample would have a high jerk there. If the argument ``exact_ends``
+    is True, the samples themselves are used. The last ``d_i`` is set to 0, so that the target is the goal when the
+    duration is over. (The regression hardly determines the last ``d_i``. A last ``d_i`` other than 0 can pull the tool
+    decimetres away from the goal after the end of the motion.)
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).

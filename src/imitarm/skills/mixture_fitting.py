@@ -214,7 +214,7 @@ def responsibilities_by_segments(features: Array, column: Array, numbers: Sequen
     Args:
         features: :func:`quadratic_features` of the standardised samples, shape (F, n).
         column: times of the samples, shape (n,).
-        numbers: all numbers K of segments for which to divide the time.
+        numbers: numbers of segments; for each number K in it, the time is divided into K segments.
 
     Returns:
         Responsibilities of 0 or 1, shape (K, n), in the order of time, for each K. If there are few samples or gaps in
