@@ -242,7 +242,7 @@ def run_stacking(
         person: seed of the person.
         repeat: index of the trial of this person, from 0.
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
-        arm: the Sawyer with the gripper, if it is already loaded.
+        arm: model of the Sawyer with the gripper; None: the model is loaded here.
     """
     arm = ArmModel.load("sawyer", tool="gripper") if arm is None else arm
     done = run_stack(person, repeat, method(method_name), arm=arm, camera=camera_maker(sigma))
@@ -263,12 +263,20 @@ def run_stacking(
 
 
 def camera_maker(sigma: float | None) -> Callable[[int], SkeletonCamera]:
-    """Return a function that makes a camera from a seed, with the error ``sigma`` [m]; None: the seed sets it too."""
+    """Return a function that makes a camera from a seed.
+
+    Args:
+        sigma: standard deviation of the camera's error [m]; None: the seed also determines this standard deviation.
+    """
     return SkeletonCamera.from_seed if sigma is None else partial(SkeletonCamera, sigma=sigma)
 
 
 def count_failures(outcomes: Sequence[str]) -> str:
-    """Return a text with the number of failures of each kind, most frequent first; an empty outcome means success."""
+    """Return a text with the number of failures of each kind, most frequent first.
+
+    Args:
+        outcomes: for each trial, the kind of failure; an empty text means success.
+    """
     counted = Counter(outcome for outcome in outcomes if outcome)
     return ", ".join(f"{n} {what}" for what, n in counted.most_common()) or "none"
 

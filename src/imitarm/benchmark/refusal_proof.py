@@ -1,7 +1,8 @@
 """Proof that no path exists, by a flood fill of boxes in space over time.
 
-A box of positions counts as free if any of its points may be free at any time of an interval. If no chain of free boxes
-leads from the start to the goal, then no continuous displacement of the path keeps it clear of the obstacles.
+Time is divided into intervals, and space into boxes. A box counts as free in an interval if any of its points may be
+free at any time in this interval. If no chain of free boxes leads from the start to the goal, then no continuous
+displacement of the path keeps the path clear of the obstacles.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _ROUNDING = 1e-9  # [m]
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """The question whether a path exists in a scene, in the form that the oracle uses.
+    """The question whether a path exists in a scene, in the form that :func:`is_impossible` takes.
 
     Attributes:
         nominal: the nominal path, n samples.
@@ -205,8 +206,8 @@ def is_impossible(question: Question, cells: _Cells) -> bool:
     """Return whether there is provably no path, because a flood fill of possibly free boxes can't reach the goal.
 
     A box is blocked if all of its corners are inside the same inflated obstacle. The corners suffice, because the
-    obstacle is convex. Boxes are fixed in space, so the motion of the tip in the permitted plane does not matter. All
-    other motions are allowed for by making the obstacles smaller: motions of the tip out of the permitted plane, of the
+    obstacle is convex. Boxes are fixed in space, so the motion of the tip in the permitted plane does not matter. For
+    all other motions, the obstacles are made smaller. These are motions of the tip out of the permitted plane, of the
     spheres relative to the tip, and of the obstacles.
     """
     d = len(cells.frame)

@@ -25,7 +25,7 @@ def check_outputs(
 
     Args:
         outputs: option and file of each output; if the file is None, the output is not written.
-        inputs: for each input, its option or argument, and its file or the name of its source.
+        inputs: name and value of each input: the option or argument that gives it, and its file or source name.
         force: whether existing files may be replaced; None if the command has no option ``--force``.
         new_folders: whether the command creates missing folders.
 

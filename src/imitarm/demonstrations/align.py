@@ -66,10 +66,12 @@ class Alignment:
         demonstrations: demonstrations with common times from 0 to ``duration``.
         duration: common duration of the aligned demonstrations, the median of the trimmed demonstrations' durations
             [s].
-        kept_rows: first and last row of each demonstration that were kept, shape (n_demonstrations, 2).
+        kept_rows: the first and the last of the rows that were kept of each demonstration, shape
+            (n_demonstrations, 2).
         durations: duration of each trimmed demonstration before alignment [s], shape (n_demonstrations,).
-        warps: time of each aligned sample in the trimmed demonstration, as a fraction of the duration of the trimmed
-            demonstration; 0 to 1, strictly increasing, shape (n_demonstrations, n).
+        warps: for each sample of an aligned demonstration, the time of the same point in the trimmed demonstration.
+            This time is a fraction of the trimmed demonstration's duration, from 0 to 1, strictly increasing, shape
+            (n_demonstrations, n).
         method: ``"dtw"`` or ``"resample"``.
     """
 
@@ -120,7 +122,10 @@ def align(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Meth
 
 
 def compute_alignment(demonstrations: Sequence[Demonstration], *, n: int = 200, method: Method = "dtw") -> Alignment:
-    """Align like :func:`align`, with the same arguments and errors, and also return how alignment changed them."""
+    """Align demonstrations, and return them together with a record of how alignment changed them.
+
+    The arguments and errors are those of :func:`align`.
+    """
     choice(method, METHODS, "method of alignment")
     n = whole_number(n, "align: n", at_least=10, at_most=_MOST_SAMPLES)
     if not sequence(demonstrations, Demonstration, "align: demonstrations"):

@@ -49,9 +49,9 @@ class Table:
     Attributes:
         path: path of the file as given by the caller.
         remarks: the ``key: value`` remarks before the numbers, keys in lower case.
-        names: column names, from a separate row, or from the last of those remarks before the numbers that have one
-            word for each column. Units from a row of units are added in brackets (``x [mm]``). The value None means
-            that the file has no column names.
+        names: column names. They come from a separate row, or from a remark before the numbers that has one word for
+            each column; if there are several such remarks, the last one counts. Units from a row of units are added in
+            brackets (``x [mm]``). The value None means that the file has no column names.
         values: the numbers, shape (n, columns). The caller must check for nan and inf.
         lines: line number of each row in the file, from 1, shape (n,).
         ends_in_newline: False when the last line may have been cut off.

@@ -25,7 +25,9 @@ _ROTATION_LENGTH = 0.3  # [m/rad] a rotation of 1 rad counts as much as a displa
 def usable_posture(
     model: mujoco.MjModel, joints: tuple[str, ...], home: Mapping[str, float]
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return the middle of the joints' ranges if that posture is usable, else the best of many postures, and notes.
+    """Return a usable home posture and notes for the user.
+
+    The posture is the middle of the joints' ranges if that is usable, otherwise the best of many postures.
 
     Args:
         model: a compiled model with a site ``flange``.

@@ -33,7 +33,7 @@ class Rows(NamedTuple):
     With a finite price, violating a row ``a`` by ``s`` adds ``price * (s / |a|)^2 / 2`` to the cost; the weights of the
     tasks are about 1. Because of the division by ``|a|``, the cost does not depend on the unit of the row: ``s / |a|``
     is the smallest change of the joint velocity [rad/s] that would satisfy the row. Without a finite price, rows have
-    priority over all tasks: they are violated only if they contradict the boxes or one another.
+    priority over all tasks: they are violated only if they contradict one another or the bounds in :class:`Box`.
 
     Attributes:
         matrix: coefficients of the inequalities, shape (m, n_joints).

@@ -12,7 +12,7 @@ bound of the distance on the line. On the arc, the distance is at most e smaller
 bound is too low, the segment is divided into halves, which makes e four times smaller.
 
 The same proof holds for two links of the arm. In the frame of the inner link, only the joints between the two links
-move the outer link, and the distance from a fixed point is a convex function too.
+move the outer link, and the distance of a moving point from a fixed point is a convex function too.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 SELF = -1
-"""Replaces the index of an obstacle if the distance is between two links of the arm."""
+"""Stands in place of an obstacle's index where a distance is between two links of the arm."""
 _REACH = 0.1  # [m] beyond the clearance: pairs that are farther apart at both ends of a segment are not bounded
 _MOST_HALVINGS = 8  # of a segment
 _LONGER = 2.0  # times its largest distance from the first joint, no point of an arm is farther from any axis
@@ -77,7 +77,7 @@ class Gaps:
         first: number of joints that move both spheres and therefore do not change their distance, shape (k,); 0 for an
             obstacle.
         room: distance minus required clearance, shape (k,) [m].
-        normal: direction of motion of the sphere in which the distance grows fastest, as a unit vector in the base
+        normal: direction in which the sphere must move to make the distance grow fastest, a unit vector in the base
             frame, shape (k, 3).
         drift: change of the distance with time, caused by the motion of the obstacle, shape (k,) [m/s].
     """
@@ -104,7 +104,7 @@ class Gaps:
         return len(self.room)
 
     def rates(self, chosen: Index) -> Array:
-        """Return the derivative of each chosen pair's distance by each joint, shape (m, n_joints) [m/rad]."""
+        """Return the derivative of each chosen pair's distance with respect to each joint, (m, n_joints) [m/rad]."""
         rates = self.path.sphere_speeds(self.sample[chosen], self.sphere[chosen], self.normal[chosen])
         return rates * (np.arange(rates.shape[1]) >= self.first[chosen, None])
 
@@ -154,7 +154,7 @@ class ArmAmongObstacles:
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: largest distance minus required clearance of the pairs that are returned [m].
+            reach: pairs are returned if their ``room`` (distance minus required clearance) is less than this [m].
         """
         return Gaps.joined(path, [pairs.gaps(path, times, reach) for pairs in self._pairs])
 
@@ -164,7 +164,7 @@ class ArmAmongObstacles:
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: the ``room`` of the result if the room of every pair is larger [m].
+            reach: upper bound of ``room``: if every pair has more room, the ``room`` of the result is ``reach`` [m].
         """
         gaps = self.gaps(path, times, reach)
         if not len(gaps):

@@ -261,7 +261,7 @@ class LeastDetour:
     def shrink(
         self, start: PathClearance, moved: Index | None = None, *, smoothness: float | None = None
     ) -> Detour | None:
-        """Return the least detour that the tangents along a path allow.
+        """Return the least detour that satisfies the tangent inequalities; the first tangents are those of ``start``.
 
         If no attempt is feasible, the best attempt is returned; None if there was no attempt.
 
@@ -312,7 +312,7 @@ class LeastDetour:
         return best
 
     def smoothed(self, detour: Detour) -> tuple[Detour, float]:
-        """Return the detour and its jerk ratio, after smoothing it as far as possible if its jerk exceeds the limit."""
+        """Smooth the detour as far as possible if its jerk exceeds the limit; return the detour and its jerk ratio."""
         ratio = self.path.jerk_ratio(detour.clearance.positions)
         best, limit = detour, max(MAX_JERK_RATIO, 1.0)
         moved = np.flatnonzero(detour.displacement.any(axis=1)) if not self.exact else None
@@ -399,8 +399,8 @@ class LeastDetour:
 def style_scale(path: ComponentPath, allowed: AllowedDirections, moved: Index, smoothness: float) -> Array:
     """Return the matrix G (m d, m d) with ``delta = G y``, so that the cost of ``delta`` is ``|y|^2``.
 
-    The cost is ``delta^T H delta`` with the demonstrated precisions on the diagonal blocks of H and the squared jerk of
-    the displacement.
+    The cost is ``delta^T H delta``. The matrix H is the sum of two terms: the demonstrated precisions, on the diagonal
+    blocks, and the squared jerk of the displacement.
 
     Args:
         path: the path and its components.

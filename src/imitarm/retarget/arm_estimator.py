@@ -66,7 +66,7 @@ class ArmEstimate(NamedTuple):
 class ArmEstimator:
     """Converts skeletons to an :class:`ArmEstimate`: removes outliers, corrects bone lengths, and smooths.
 
-    All retargeting methods use this estimator, so the filter does not affect a comparison of the methods.
+    All retargeting methods use this estimator, so its filtering does not affect a comparison of the methods.
 
     Args:
         correspondence: correspondence that contains the side of the person's arm and the pose of the sensor.
@@ -107,7 +107,7 @@ class ArmEstimator:
             one.reset()
 
     def update(self, skeleton: Skeleton) -> ArmEstimate | None:
-        """Return the estimate from the next skeleton; None if the skeleton is not newer or shows no usable arm."""
+        """Return the estimate from the next skeleton; None if it is not newer than the last, or shows no usable arm."""
         if skeleton.time <= self._time:
             return None
         self._time = skeleton.time

@@ -38,7 +38,7 @@ class EngagementState(StrEnum):
 
     @property
     def engaged(self) -> bool:
-        """Whether the robot follows the person, including short losses of tracking."""
+        """Whether the robot follows the person; also true while tracking is lost for a short time."""
         return self in _ENGAGED
 
 
@@ -116,8 +116,8 @@ class Engagement:
             estimate: estimate of the person's arm from a new frame; None: there is no new frame, or it does not show
                 the arm.
             period: time since the last call [s].
-            at_rest: whether the robot is at rest; only then may it begin to follow a person. While the robot moves,
-                the time for which the arm has been visible is counted nevertheless.
+            at_rest: whether the robot is at rest; only then may it begin to follow a person. The time for which the
+                arm has been visible is also counted while the robot moves.
         """
         self.time_since_seen = self.time_since_seen + period if estimate is None else 0.0
         self.ready = False

@@ -275,7 +275,7 @@ def standard_fixtures(*, floor: float = -0.75, pedestal_radius: float = 0.12) ->
     """Return the standard fixtures under an arm: a floor, and a pedestal below the base.
 
     Args:
-        floor: height of the floor in the base frame [m]; at 0 or above there is no pedestal.
+        floor: height of the floor in the base frame [m]; if this height is 0 or more, there is no pedestal.
         pedestal_radius: [m].
 
     Raises:

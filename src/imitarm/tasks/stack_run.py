@@ -136,7 +136,7 @@ def run_stack(
         seed: seed of the person.
         repeat: number of the run of this person.
         factory: function that builds the retargeter.
-        arm: the Sawyer with the gripper, if it is loaded already.
+        arm: model of the Sawyer with the gripper; None: the model is loaded here.
         camera: function that builds the camera from a seed; the default camera has noise of 1 to 2 cm and all other
             simulated errors.
         latency: time from the exposure of a camera frame until its skeleton arrives [s].
