@@ -28,7 +28,7 @@ from imitarm import (
 
 
 class Repelled(Policy):
-    """Follow the learned path in time, while near obstacles push the tool away (repulsive force of thesis Eq 2.19)."""
+    """Follow the learned path in time; obstacles near the tool push it away (repulsive force of thesis Eq 2.19)."""
 
     influence, gain = 0.06, 4.0  # [m], [1/s]
 

@@ -42,8 +42,8 @@ class MappingBenchmark:
         kinds: kinds of recordings, from :data:`imitarm.benchmark.recordings.KINDS`.
         seconds: approximate duration of a recording [s].
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
-        live: whether the main methods among ``methods`` are also tested in closed loop, in which the person stacks
-            cubes.
+        live: whether the main methods among ``methods`` are also tested in closed loop; in these trials, the person
+            stacks cubes.
         data: folder of real recordings; if empty, the recordings from motion capture are left out.
 
     Raises:

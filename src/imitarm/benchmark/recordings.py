@@ -39,7 +39,8 @@ CAPTURED = "captured"
 capture."""
 
 REPEATS = 100
-"""Largest number of recordings of one kind and person; more recordings would use the seeds of the next person."""
+"""Largest number of recordings of one kind and person; a larger number would need seeds that belong to the next
+person."""
 _LONGEST = 120.0  # [s] of a recording
 
 REACH = 0.80  # [m] from the Sawyer's shoulder to its wrist when it is stretched
@@ -120,13 +121,16 @@ class MappingRecording:
     true_points: Array
 
     def true_arm(self, times: Array) -> TrueArm:
-        """Return the person's true arm at times (n,) of a run [s]; the arm rests outside the recorded times."""
+        """Return the person's true arm at times (n,) of a run [s].
+
+        Before the first and after the last recorded time, the arm is at rest.
+        """
         flat = self.true_points.reshape(len(self.true_times), -1)
         points = np.column_stack([np.interp(times, self.true_times, column) for column in flat.T])
         return TrueArm.from_points(times, points.reshape(-1, 6, 3), self.correspondence)
 
     def save(self, path: Path) -> None:
-        """Write the recording to a file of arrays without executable code; an incomplete file is never left."""
+        """Write the recording to a file of arrays, without executable code; a failure leaves no incomplete file."""
         c, lengths = self.correspondence, self.correspondence.lengths
         assert lengths is not None
         aside = path.with_name(f".{path.name}.{np.random.default_rng().integers(1 << 62):x}.part")

@@ -1,4 +1,7 @@
-"""``imitarm benchmark refusals``: check accepted paths and refusals in random scenes with an oracle."""
+"""``imitarm benchmark refusals``: let ``adapt`` plan in random scenes, and check its paths and refusals.
+
+An oracle, :mod:`imitarm.benchmark.refusal_oracle`, decides independently whether a path exists.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +35,10 @@ class Verdict:
 
     Attributes:
         seed: number of the scene.
-        family: name of the family of the scene.
+        family: name of the rule by which the obstacles of the scene were placed.
         accepted: whether the library found a feasible adaptation.
         margin: proven lower bound of the distance along an accepted path, minus required clearance [m]; nan if refused.
-        oracle: answer of the oracle for the scene; for an accepted scene, "possible" or "undecided".
+        oracle: the oracle's answer to the question whether a path exists; if ``accepted``, "possible" or "undecided".
         seconds: compute time of the adaptation [s].
     """
 

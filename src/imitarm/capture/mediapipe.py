@@ -131,11 +131,11 @@ class LandmarkConverter:
         self._distance: tuple[float, float] | None = None  # time and t_z of the image before
 
     def skeleton(self, landmarks: PoseLandmarks) -> Skeleton | None:
-        """Return the skeleton; None when the image shows too little of the person to locate them.
+        """Return the skeleton; None when the person can't be located, because the image shows too little of the body.
 
-        Each joint is computed from some landmarks. The least visible of them decides whether the joint is tracked,
-        inferred or lost. A joint outside the image is never tracked. MediaPipe does not detect whether a hand is open
-        or closed, so hand states are unknown.
+        Each joint is computed from some landmarks. The least visible of these landmarks decides whether the joint is
+        tracked, inferred or lost. A joint outside the image is never tracked. MediaPipe does not detect whether a hand
+        is open or closed, so hand states are unknown.
         """
         uv = (landmarks.image - 0.5) * self._scale
         world, place = landmarks.world, None
@@ -378,7 +378,7 @@ class VideoSource(MediaPipeSource):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> VideoSource:
-        """Open the video file that a user wrote after the colon.
+        """Open the video file ``argument``, which a user named as ``video:FILE``.
 
         Raises:
             InputError: when the file does not exist or is not a video, or when MediaPipe is not installed.
@@ -397,7 +397,7 @@ class WebcamSource(MediaPipeSource):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> WebcamSource:
-        """Open the webcam whose number a user wrote after the colon.
+        """Open the webcam with the number ``argument``, which a user named as ``webcam:NUMBER``.
 
         Raises:
             InputError: when the text is not a number, there is no webcam with this number, or MediaPipe is not

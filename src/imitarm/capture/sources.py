@@ -71,7 +71,7 @@ def _class_of(name: str) -> type[SkeletonSource]:
 
 
 def source_words() -> dict[str, str]:
-    """Return the description of each source, by the word that selects the source; this imports all sources."""
+    """Return a mapping from the word that selects a source to its description; this function imports all sources."""
     words = {}
     for name in SOURCES:
         try:
@@ -85,7 +85,7 @@ def source_words() -> dict[str, str]:
 
 
 def is_live(word: str | Path) -> bool:
-    """Return, without opening the source of this name, whether it is live, so that it runs until it is stopped.
+    """Return whether the source of this name is live: it runs until it is stopped. The source is not opened.
 
     Raises:
         InputError: for the same reasons as :func:`find_source`.
@@ -94,7 +94,7 @@ def is_live(word: str | Path) -> bool:
 
 
 def followed(source: SkeletonSource, *, person: int | None = None) -> PersonFilter:
-    """Return a source, for a retargeter, that delivers only one person of ``source`` and corrects left and right.
+    """Return a source for a retargeter: it delivers only one person of ``source``, with swaps of left and right undone.
 
     Args:
         source: opened source.

@@ -17,7 +17,7 @@ MOTIONS: dict[str, Callable[..., Truth]] = {
     **{kind: partial(reaching, kind=kind) for kind in REACHES},
     **{kind: partial(drawing, kind=kind) for kind in DRAWINGS},
 }
-"""Functions, by name, that return a motion of a given synthetic person for a seed and a ``duration`` [s]."""
+"""Kinds of motion, by name: functions of a synthetic person, a seed and a ``duration`` [s] that return a motion."""
 
 
 class SyntheticSource(SkeletonSource):
@@ -84,7 +84,7 @@ class SyntheticSource(SkeletonSource):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> SyntheticSource:
-        """Return the synthetic person whose seed a user wrote after the colon.
+        """Return the synthetic person with the seed ``argument``, which a user named as ``synthetic:SEED``.
 
         Raises:
             InputError: when the seed is not a whole number.
@@ -97,7 +97,7 @@ class SyntheticSource(SkeletonSource):
         return self._next > self._duration
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton; None when its frame is lost or it is not due within ``timeout`` seconds."""
+        """Return the next skeleton; None when the next frame is lost or is not due within ``timeout`` seconds."""
         if self.over:
             return None
         if self._realtime:

@@ -1,4 +1,4 @@
-"""The arguments shared by all commands that read demonstrations, and the function that reads files with them."""
+"""The arguments of all commands that read demonstrations, and the function that reads files as these arguments say."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def as_options(text: str) -> str:
 def read_and_lint(
     arguments: argparse.Namespace, arm: ArmModel | None, *, task: str = "", repair: bool = False
 ) -> tuple[list[RawDemonstration], list[Finding]]:
-    """Read and check every file; a file that can't be read also becomes a finding.
+    """Read and check every file, and return demonstrations and findings; a file that can't be read is a finding too.
 
     Args:
         arguments: arguments added by :func:`add_reading_arguments`.

@@ -231,7 +231,7 @@ def warnings_of(
 
 
 def winding(run: Retargeting) -> float:
-    """Return the range of the heading of the tool's target [rad]; it exceeds 2 pi after more than a full rotation."""
+    """Return the largest minus the smallest heading of the tool's target [rad]; above 2 pi after more than a turn."""
     rotations = run.targets[1]
     rotations = rotations[np.isfinite(rotations).all(axis=1)]
     if not len(rotations):

@@ -39,8 +39,8 @@ class ArmPath:
             frame, shape (n, m, 3) [m].
         axes: unit vectors along the axes of the joints in the base frame, shape (n, n_joints, 3).
         anchors: a point on the axis of each joint in the base frame, shape (n, n_joints, 3) [m].
-        rotations: rotation matrices link_to_base of the base, then of the link that each joint moves, shape (n,
-            n_joints + 1, 3, 3).
+        rotations: rotation matrices link_to_base, shape (n, n_joints + 1, 3, 3): first of the base, then, for each
+            joint, of the link that the joint moves.
     """
 
     arm: ArmModel
@@ -98,7 +98,7 @@ class ArmPath:
         return jacobians
 
     def sphere_speeds(self, sample: Index, sphere: Index, directions: Array) -> Array:
-        """Return the speeds of spheres along directions if only one joint moves, at unit speed, (k, n_joints) [m/rad].
+        """Return each sphere's speed along its direction per unit speed of each joint, shape (k, n_joints) [m/rad].
 
         Args:
             sample: index of the posture, shape (k,).
@@ -206,8 +206,8 @@ def track(arm: ArmModel, start: Array, positions: Array, quaternions: Array, dri
         start: posture before the first pose, shape (n_joints,) [rad].
         positions: shape (n, 3) [m].
         quaternions: tool_to_base, shape (n, 4).
-        drift: posture that the self-motion approaches gradually, up to the last pose, shape (n_joints,) [rad]; None:
-            there is no self-motion.
+        drift: posture that the arm gradually approaches until the last pose, by joint motions that do not move the
+            tool (self-motion), shape (n_joints,) [rad]; None: there is no self-motion.
 
     Returns:
         Shape (n, n_joints) [rad]. If a pose is out of reach, its posture is the nearest one that was found.

@@ -78,7 +78,7 @@ def sew_angle(
 
     Raises:
         UnknownNameError: when the convention is not known.
-        InputError: when the points are not of three coordinates.
+        InputError: when a point does not have three coordinates.
     """
     return np.asarray(sew_derivatives(shoulder, elbow, wrist, convention=convention).angle, dtype=float)
 
@@ -86,7 +86,7 @@ def sew_angle(
 def sew_derivatives(
     shoulder: ArrayLike, elbow: ArrayLike, wrist: ArrayLike, *, convention: str = "stereographic"
 ) -> SewAngle:
-    """Return the angle of :func:`sew_angle`, with the same arguments, and its derivatives by the three points."""
+    """Return the SEW angle and its derivatives by the three points; the arguments are those of :func:`sew_angle`."""
     formula = _formula(convention)
     points = [np.asarray(point, dtype=float) for point in (shoulder, elbow, wrist)]
     if any(point.shape[-1:] != (3,) for point in points):

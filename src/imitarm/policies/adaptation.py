@@ -100,7 +100,7 @@ def adapt(
         tool_radius: the tool as one sphere of this radius about its tip [m]; 0 for a point.
         tool_spheres: the tool as spheres that contain it: rows x y z r in the tool's frame, shape (m, 4) [m]. The
             spheres rotate with the tool's learned orientation.
-        arm: the arm with its tool. The path of its joints is planned, and every moving part of the arm keeps the
+        arm: the arm with its tool. A joint path of the arm is planned, on which every moving part of the arm keeps the
             clearance. The links stay at least 12 mm apart, and the motion is slowed down where the limits of the arm
             require it.
         clearance: required distance from the tool, or from the whole arm, to every obstacle [m].
@@ -114,7 +114,7 @@ def adapt(
             rotation is always 0. The default is two standard deviations of the demonstrated rotation, and 0 if no
             orientation was learned.
         goal_tilt: largest rotation of the tool of ``arm`` away from the learned rotation at the goal [rad]; used only
-            if the arm is not clear at the goal without it.
+            if the arm, with the learned rotation, does not keep the clearance at the goal.
         allowance: additional clearance for the tracking errors of the robot, used if a path with this larger clearance
             is found [m].
 

@@ -47,25 +47,25 @@ def fingerprint(arm: ArmModel) -> int:
 
 
 class Supervisor:
-    r"""Lets one remote client move a robot while it sends valid commands, and checks every command.
+    r"""Checks every command, and lets one remote client move a robot as long as the client sends valid commands.
 
     The supervisor always has one of four statuses:
 
-    * ``stopped``: the robot holds its position, and commands are ignored. An ENABLE with the challenge of this stop
-      changes the status to ``following``.
+    * ``stopped``: the robot holds its position, and commands are ignored. Every stop generates a new random number,
+      the challenge. An ENABLE message that contains this number changes the status to ``following``.
     * ``following``: the robot moves to the newest commanded positions. If no valid command arrives for 0.1 s, the
-      status becomes ``slowing``. A STOP changes the status to ``stopped``.
+      status becomes ``slowing``. A STOP message changes the status to ``stopped``.
     * ``slowing``: the robot brakes to rest and holds its position. A valid command changes the status to
       ``following``. If no valid command arrives for 0.5 s, the status becomes ``stopped``.
     * ``fault``: the robot has made a protective stop. Only a restart of the process ends this status.
 
-    The first status is ``stopped``. Every stop generates a new random challenge, so a recorded ENABLE has no effect,
-    and after a restart of the client its user must enable the robot again. The client that enables the robot is its
-    owner until the next stop. Any client may stop the robot.
+    The first status is ``stopped``. Because every stop has a new challenge, a recorded ENABLE has no effect, and after
+    a restart of the client its user must enable the robot again. The client that enables the robot is its owner until
+    the next stop. Any client may stop the robot.
 
     A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this arm,
-    and is within the joints' position and velocity limits. The command must also be near the set-point: no joint may
-    be farther from its set-point than it moves in 0.15 s at full speed.
+    and is within the joints' position and velocity limits. The command must also be near the set-point: for no joint
+    may the two differ by more than the joint moves in 0.15 s at full speed.
 
     Let :math:`q_c` be the commanded position and :math:`\dot q_c` its velocity. The set-point q moves towards
     :math:`q_c` at the following velocity:

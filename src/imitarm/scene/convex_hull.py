@@ -63,7 +63,7 @@ class Polytope:
 
     @classmethod
     def around(cls, points: Array) -> Polytope:
-        """Build from centred points (n, 3) that span a volume."""
+        """Build the hull of points (n, 3) whose mean is the origin and which span a volume."""
         from scipy.spatial import ConvexHull as Qhull  # noqa: PLC0415  slow to import, and few scenes need it
 
         hull = Qhull(points)

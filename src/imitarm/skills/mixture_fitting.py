@@ -4,10 +4,10 @@ The logarithm of a weighted Gaussian is linear in the quadratic features ``phi(z
 
     log pi_k N(z; mu_k, Sigma_k) = theta_k . phi(z)
 
-Therefore, all log-densities are one matrix product, ``theta @ phi``, and all sufficient statistics are a second matrix
-product, ``responsibilities @ phi^T``. There is no loop over components or samples. Written as a symmetric matrix M, the
-statistics of one component are the second moments of ``[1; z]``. The inverse of M contains all parts of ``theta_k``
-(``P = Sigma^-1``)::
+Therefore, one matrix product, ``theta @ phi``, computes all log-densities, and a second matrix product,
+``responsibilities @ phi^T``, all sufficient statistics, without a loop over components or samples. Written as a
+symmetric matrix M, the statistics of one component are the second moments of ``[1; z]``. The inverse of M contains all
+parts of ``theta_k`` (``P = Sigma^-1``)::
 
     M = [1     mu^T             ]     M^-1 = [1 + mu^T P mu   -mu^T P]     det M = det Sigma
         [mu    Sigma + mu mu^T  ]            [-P mu            P     ]
@@ -214,7 +214,7 @@ def responsibilities_by_segments(features: Array, column: Array, numbers: Sequen
     Args:
         features: :func:`quadratic_features` of the standardised samples, shape (F, n).
         column: times of the samples, shape (n,).
-        numbers: numbers of segments; for each number K in it, the time is divided into K segments.
+        numbers: values of K; there is one division of the time for each value.
 
     Returns:
         Responsibilities of 0 or 1, shape (K, n), in the order of time, for each K. If there are few samples or gaps in
@@ -339,11 +339,11 @@ def try_numbers_of_components(
 ) -> tuple[Candidate, ...]:
     """Evaluate several numbers of components.
 
-    For each number, the fit to all demonstrations and the fits without one demonstration run together, as rows of the
-    same matrix products. Only a subset of the samples is used; the longer the path, the more samples are used. For a
-    pure rotation, errors are computed for a point 100 mm from the axis. The search stops when four consecutive numbers
-    of components do not reduce the held-out error by 0.5 %, and one of the numbers meets both conditions of
-    :func:`choose`.
+    For each number, one fit uses all demonstrations, and each of the other fits leaves out one demonstration. These
+    fits run together, as rows of the same matrix products. Only a subset of the samples is used; the longer the
+    path, the more samples are used. For a pure rotation, errors are computed for a point 100 mm from the axis. The
+    search stops when four consecutive numbers of components do not reduce the held-out error by 0.5 %, and one of the
+    numbers meets both conditions of :func:`choose`.
 
     Args:
         tables: samples [t, x, y, z, ...] of each demonstration, over the same span of time.

@@ -127,7 +127,7 @@ class Grid:
         return cls(view, *(np.arange(low[i], high[i] + step, step) for i in range(2)))
 
     def distance_to(self, obstacle: Obstacle, depths: Array) -> Array:
-        """Return the smallest distance over ``depths`` from each grid point to an obstacle, shape (rows, columns) [m].
+        """Return each grid point's distance to an obstacle, at the nearest of the depths, shape (rows, columns) [m].
 
         ``depths`` are coordinates along the line of sight. The grid points with distance 0 form an outline of the
         obstacle: with one depth, of its cross-section; with many depths, of its projection.

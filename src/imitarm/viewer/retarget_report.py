@@ -103,8 +103,8 @@ class MethodResult:
         tables: further tables for the tab of this method.
         notes: remarks about this run for the reader, one sentence each.
         caption: one sentence that describes the method.
-        clock: for each sample of the run, the corresponding time in the recording of the person, from the first
-            skeleton on, shape (n,) [s]; None if both times are equal.
+        clock: for each sample of the run, the corresponding time in the person's recording, counted from the first
+            skeleton, shape (n,) [s]; None if this time is equal to the sample's own time.
     """
 
     name: str

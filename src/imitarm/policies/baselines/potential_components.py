@@ -4,8 +4,8 @@ The module uses the same gradient descent for two potentials. Let ``d`` be the d
 component's ellipse, ``n`` the outward normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the
 obstacle.
 
-* ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The last term does not depend on the
-  position, so it drops out of the force, and the spread has no effect.
+* ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The term ``exp(sigma^2)`` does
+  not depend on the position, so it drops out of the force, and the spread has no effect.
 * ``mapf``: a dimensionless potential with the effect that the thesis describes in words:
   ``U = 1/2 eta s d_th^2 (1/rho - 1)^2`` with ``rho = d / d_th``. The gain ``s = exp((sigma(n)^2 - median) / max)``
   pushes components with a large spread farther than components with a small spread. Here, ``median`` and ``max`` are
@@ -114,10 +114,11 @@ def push_components(
 
 
 class PotentialField(PathAdapter):
-    """The thesis's method: push components away from obstacles; the result is evaluated by the same certificate.
+    """The thesis's method: push components away from obstacles.
 
-    The tool is represented by one sphere about its tip that contains all spheres of the tool. Obstacles are assumed to
-    stay at their poses at time 0.
+    The resulting path is evaluated by the same certificate as a path of the method ``certified``. The tool is
+    represented by one sphere about its tip that contains all spheres of the tool. Obstacles are assumed to stay at
+    their poses at time 0.
 
     Args:
         force: a name in ``FORCES``.
