@@ -27,7 +27,7 @@ from typing import IO
 from imitarm.errors import ImitarmError, InputError, TaskFailedError
 
 VARIABLE = "IMITARM_MEDIAPIPE_PYTHON"
-"""Environment variable that can name a Python interpreter with MediaPipe, instead of one in :func:`folders`."""
+"""Environment variable with the path of a Python that has MediaPipe; if it is set, :func:`folders` is not searched."""
 
 VERSION = "0.10.21"
 VERSIONS = ((3, 9), (3, 12))  # versions of Python for which it exists
@@ -174,8 +174,8 @@ class LineProcess:
     Args:
         command: command with all its arguments.
         keep: largest number of unread lines to store.
-        newest: what happens when ``keep`` unread lines are stored. True: the oldest unread line is dropped, but never
-            the program's first line. False: the program waits until a line is read.
+        newest: what happens when the number of stored unread lines reaches ``keep``. True: the oldest unread line is
+            dropped, but never the program's first line. False: the program waits until a line is read.
         chatter: regular expression for lines on standard error that :meth:`ended` leaves out.
 
     Raises:

@@ -69,7 +69,7 @@ def length_unit_that_fits(limb: float) -> str | None:
     """Return the unit of length in which a limb has a plausible length; None when no unit fits.
 
     Args:
-        limb: number that a file gives for the length of an upper arm or a forearm, and that is not plausible in metres.
+        limb: length of an upper arm or a forearm as a number in a file; read in metres, the number is not plausible.
     """
     low, high = PLAUSIBLE_LIMB
     fits = [name for name, unit in _LENGTH_UNITS.items() if low <= limb * unit <= high]
@@ -83,8 +83,8 @@ def axes_that_fit(positions: Array) -> tuple[str, str] | None:
     """Return what is wrong with the axes of positions (n, 25, 3), and the axes to use; None when the axes are correct.
 
     The axes are correct when the spine points up (y) and the trunk is in front of the sensor (z above 0). If several
-    axes are correct, the function proposes axes in which the person also faces the sensor, so that the right shoulder
-    has a larger x than the left shoulder. Right-handed axes are preferred to left-handed axes.
+    choices of axes satisfy these conditions, the function proposes axes in which the person also faces the sensor, so
+    that the right shoulder has a larger x than the left shoulder. Right-handed axes are preferred to left-handed axes.
     """
     spine = _median(_mean(positions[:, _UPPER]) - _mean(positions[:, _LOWER]))
     trunk = _median(_mean(positions[:, _TRUNK]))

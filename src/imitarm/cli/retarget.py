@@ -366,7 +366,7 @@ def suggestion(
     fitted: bool,
     pace: float,
 ) -> str:
-    """Return which options to try if the tool did not follow its target, the most promising first; else an empty text.
+    """If the tool did not follow its target, return the options to try, the most promising first; else an empty text.
 
     Args:
         tracking: tracking result of the run.

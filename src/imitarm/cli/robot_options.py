@@ -80,5 +80,5 @@ def load_optional_robot(arguments: argparse.Namespace) -> ArmModel | None:
 
 
 def robot_files(arguments: argparse.Namespace) -> list[tuple[str, str | None]]:
-    """Return the options that may name an input file, with their values, so that no output overwrites such a file."""
+    """Return the options that may name an input file, with their values; no output may overwrite such a file."""
     return [("--robot", arguments.robot), ("--tool", arguments.tool)]

@@ -82,7 +82,7 @@ class RawDemonstration:
     quaternions whose length is not one. ``lint`` checks the raw demonstration instead, so that it can list all faults.
 
     Attributes:
-        source: name of the file and, if needed, of the part in it.
+        source: name of the file; if the file contains several demonstrations, also which of them this is.
         times: time stamps in any order, shape (n,) [s].
         positions: positions of the tool in the base frame, shape (n, 3) [m]; None when only joints were recorded.
         quaternions: quaternions wxyz, not necessarily of length one, shape (n, 4); None when not recorded.
@@ -290,7 +290,7 @@ class RawDemonstration:
 
 
 def check_arm_model(arm: object, what: str) -> None:
-    """Raise InputError if ``arm`` is neither an ArmModel nor None; this does not import the slow module of ArmModel."""
+    """Raise InputError if ``arm`` is neither an ArmModel nor None, without the slow import of ArmModel."""
     if arm is not None and not hasattr(arm, "tool_path"):
         raise InputError(f"{what} must be an ArmModel, got {arm!r:.60}; load it with ArmModel.load('sawyer')")
 

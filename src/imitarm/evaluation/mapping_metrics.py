@@ -132,7 +132,7 @@ class MappingMetrics:
 
     @property
     def limit_violations(self) -> int:
-        """Number of frames that exceed a position limit, plus the same for velocity and for acceleration limits."""
+        """Sum of ``position_violations``, ``velocity_violations`` and ``acceleration_violations``."""
         return self.position_violations + self.velocity_violations + self.acceleration_violations
 
 

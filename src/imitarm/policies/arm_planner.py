@@ -1,4 +1,4 @@
-r"""A joint path on which the whole arm keeps its clearance, close to a given displacement of the learned path.
+r"""Joint paths on which the whole arm keeps its clearance, found by improving a displacement of the learned path.
 
 Three sets of numbers describe the motion: the displacements :math:`\Delta` of the components of the learned path, a
 rotation of the tool away from the learned rotation (the *tilt* :math:`\tau`), and the self-motion :math:`\psi`, which
@@ -9,10 +9,10 @@ Near a joint path q(t), a small change of these numbers changes the joint positi
           + N(t)\,B_\psi(t)\,\delta\psi
 
 Here :math:`J^+` is the right inverse of the tool's Jacobian, and N is a basis of its null space. To first order, every
-distance between a part of the arm and an obstacle changes linearly. In each round, a quadratic program finds the
-smallest displacement and tilt for which all linearised distances reach the required clearance and the joints stay
-within their limits. Inverse kinematics then brings the tool exactly to its poses. The next round begins with this joint
-path; the rounds end when all distances reach the required clearance.
+distance between a part of the arm and an obstacle changes linearly with these numbers. In each round, a quadratic
+program finds the smallest displacement and tilt for which all linearised distances reach the required clearance and the
+joints stay within their limits. Inverse kinematics then brings the tool exactly to its poses. The next round begins
+with this joint path; the rounds end when all distances reach the required clearance.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def splines(times: Array, n_knots: int, *, first: bool, last: bool) -> Array:
 
     Args:
         times: n increasing times [s].
-        n_knots: evenly spaced knots between the first and the last time.
+        n_knots: number of evenly spaced knots from the first to the last time.
         first: whether to include the first spline; without it, all splines are 0 at the start.
         last: whether to include the last spline; without it, all splines are 0 at the end.
     """
@@ -118,7 +118,7 @@ class ArmPlanner:
         allowed: directions in which components may move.
         smoothness: weight of the squared jerk of the displacement (see ``style_scale``).
         free_start: whether the self-motion may change the posture at the start.
-        tilted_goal: whether the tool may be tilted at the goal, where ``max_tilt`` is then the limit too.
+        tilted_goal: whether the tool may be tilted at the goal; if so, ``max_tilt`` limits the tilt at the goal too.
 
     Attributes:
         coarse: indices of the few samples that are planned first, before all samples, shape (k,).
@@ -336,7 +336,7 @@ JOINT_LIMIT = SELF - 1
 TILT_LIMIT = SELF - 2
 """Stands for the limit of the tool's tilt where an obstacle's index is expected."""
 TILT_LEVER = 0.05
-"""[m/rad] A tilt beyond its limit is compared with a missing clearance by this factor."""
+"""[m/rad] Factor that converts the amount by which a tilt exceeds its limit to a missing clearance."""
 
 
 @dataclass(frozen=True, eq=False)

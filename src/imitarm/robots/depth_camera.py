@@ -19,7 +19,7 @@ class DepthCamera:
     The images are exact, without noise, and the same on every machine.
 
     Args:
-        robot: robot whose world, including the arm, the camera sees.
+        robot: robot; the camera sees the world of this robot, including the arm.
         intrinsics: the camera.
         pose: camera_to_base for a fixed camera; camera_to_tool for a camera that is mounted on the tool. The
             camera's frame has x to the right of the image, y down and z forward.

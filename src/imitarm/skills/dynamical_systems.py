@@ -264,9 +264,9 @@ class MovingTarget:
     def plan(self, gains: Gains, step: float) -> PlannedSteps | None:
         """Return the plan of a whole motion in steps of length ``step`` [fraction of the duration], or None.
 
-        The target does not depend on the state, so a plan can be computed once and used in all steps. A moving goal
-        gives a new target at every step, and a plan for a target that is used only once would be a waste. The first
-        call with a step length therefore returns None, and the second call computes the plan.
+        The target does not depend on the state, so a plan can be computed once and used in all steps. If the goal
+        moves, the target changes at every step, and a plan that is used only once would be a waste. The first call with
+        a step length therefore returns None, and the second call computes the plan.
         """
         if step not in self._plans:
             self._plans[step] = None

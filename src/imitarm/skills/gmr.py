@@ -399,7 +399,7 @@ class GMR:
 def samples_of(
     demonstrations: Sequence[Demonstration | Trajectory],
 ) -> tuple[list[Array], RotationReference | None, float]:
-    """Return the samples of each demonstration as a table, with times from the first sample to the median duration.
+    """Return the samples of each demonstration as a table, with times scaled to run from 0 to the median duration.
 
     Rotations, when all demonstrations have them, become rotation vectors from a common reference.
 

@@ -87,7 +87,7 @@ class Player:
 
 @dataclass(frozen=True)
 class Tab:
-    """One tab: ``anchor``, unique in the page, ``title``, and ``content`` for the template."""
+    """One tab: ``anchor`` (unique in the page), ``title``, and ``content`` for the template."""
 
     anchor: str
     title: str
@@ -112,7 +112,7 @@ def render(
         header: header of the page.
         data: the numbers on the page in SI units, ready for JSON; a button on the page saves them.
         data_name: name of the file to which the reader saves ``data``.
-        provenance: facts by name that are needed to repeat the run; a value that is a mapping becomes a separate card.
+        provenance: facts that are needed to repeat the run, by name; a value that is a mapping becomes a separate card.
         words: explanations of the technical terms on the page.
         shared: beginning and end of every 3-D player, see :func:`shared_players`; None without players.
         context: further data for the template.

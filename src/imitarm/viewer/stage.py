@@ -31,7 +31,7 @@ class Camera:
 
     @classmethod
     def around(cls, points: ArrayLike, *, direction: ArrayLike = _VIEW, aspect: float = 16 / 9) -> Camera:
-        """Return the nearest camera in ``direction`` from which all ``points`` (n, 3) [m] are visible.
+        """Return a camera in ``direction``, as near as possible while all ``points`` (n, 3) [m] are visible.
 
         Args:
             points: points in the world frame that must be visible.
@@ -136,7 +136,7 @@ class Mover:
         }
 
     def show(self, frame: int) -> None:
-        """Send the attributes of a frame that differ from the previous frame; the first frame is not sent."""
+        """Send those attributes of a frame that differ from the previous frame's; the first frame is not sent."""
         for name, values in self._poses.items():
             if self._changed[name][frame - 1]:
                 setattr(self._handle, name, bool(values[frame]) if values.ndim == 1 else values[frame])
@@ -150,7 +150,7 @@ def node_name(kind: str, *names: object) -> str:
 def lit(rgba: Sequence[float], *, linear: bool = False) -> tuple[float, float, float]:
     """Return the colour that looks like ``rgba`` under viser's lights, which are brighter than those of MuJoCo.
 
-    The colours of viser's batched meshes must be ``linear`` RGB; those of single meshes must be sRGB.
+    Set ``linear`` for viser's batched meshes, whose colours must be linear RGB; those of single meshes must be sRGB.
     """
     srgb = np.asarray(rgba[:3], dtype=float)
     light = _EXPOSURE * np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
