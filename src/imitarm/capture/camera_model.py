@@ -99,7 +99,8 @@ class SkeletonCamera:
       and 1 % of the frames show nobody.
     * Dropouts: for each arm, a dropout begins ``dropout`` times per second on average and lasts 2 to 20 frames. During
       a dropout, the arm is inferred (with three times the error), the arm is lost, or the whole person is lost.
-    * Occlusion: the joints of a forearm behind the torso, and an elbow behind the hand of the same arm, are inferred.
+    * Occlusion: when a forearm is behind the torso, its joints are inferred; when an elbow is behind the hand of the
+      same arm, the elbow is inferred.
     * Hand states: occasionally, the state of a hand is wrong for one or two frames.
 
     Args:

@@ -23,10 +23,10 @@ class PersonFilter(SkeletonSource):
     """Selects one person from a source that may deliver several persons.
 
     The filter follows the first person who appears, and ignores everybody else. The filter follows another person only
-    after the first person has been out of view for more than ``patience`` on the source's clock. When the filter
-    selects another person, every retargeter has already stopped, and starts again with the new person. A camera that
-    tracks only one person at a time may give two successive persons the same number. The filter therefore also ignores
-    a person who appears at a position that the followed person cannot have reached by walking.
+    after the first person has been out of view for more than ``patience`` on the source's clock. By that time, every
+    retargeter has already stopped; it starts again with the new person. A camera that tracks only one person at a time
+    may give two successive persons the same number. The filter therefore also ignores a person who appears at a
+    position that the followed person cannot have reached by walking.
 
     Args:
         source: the source to filter.
@@ -155,16 +155,18 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     Let :math:`l, r` be the positions of a left and a right joint, and :math:`l', r'` their positions in the previous
     frame, a time t earlier.
 
-    Left and right are swapped back if the swap shortens the motion since the previous frame by more than the limbs can
-    have moved in the time t, which gives the inequality
+    If the joints appear to have moved far since the previous frame, but much less far with left and right exchanged,
+    the camera has probably swapped them. They are swapped back if the difference is larger than the motion that is
+    possible in the time t:
 
     .. math:: \sum_j |l_j - l'_j| + |r_j - r'_j| > \sum_j |l_j - r'_j| + |r_j - l'_j| + n\,\max(0.15, v t)
 
     The sums run over the n pairs of joints that are visible in both frames. The inequality is first evaluated for
     shoulders and hips, with v = 0.5 m/s; if it holds, the whole body is swapped back. The inequality is then evaluated
-    with v = 4 m/s, first for elbows and hands together, and if it does not hold, for the hands alone. If it holds, only
-    these joints are swapped back. Hands that touch are too close to each other to satisfy the inequality, so they are
-    not swapped. If one joint of a pair is lost, only the other joint is used.
+    with v = 4 m/s for elbows and hands together; if it holds, elbows and hands are swapped back. Otherwise it is
+    evaluated for the hands alone; if it holds, only the hands are swapped back. Hands that touch are too close to each
+    other to satisfy the inequality, so they are not swapped. If one joint of a pair is lost, only the other joint is
+    used.
 
     Args:
         skeleton: skeleton as the camera reports it.

@@ -99,8 +99,8 @@ def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[Recordi
         The skeletons, and the issues found while reading.
 
     Raises:
-        FileFormatError: when a complete file was cut off later, the file has another format version, or a line is not a
-            skeleton; the message names file and line.
+        FileFormatError: when a file that had been completed was cut off afterwards, the file has another format
+            version, or a line is not a skeleton; the message names file and line.
     """
     unfinished = _is_unfinished(content)
     torn = unfinished and not content.endswith(b"\n")
@@ -307,8 +307,8 @@ class MotionCapture:
     def load(cls, path: str | Path, *, to_body: ArrayLike | None = None) -> MotionCapture:
         """Read markers of a right arm from a file of tab-separated values in millimetres.
 
-        The wrist is the midpoint of the markers ``hand_left`` and ``hand_right``. These markers are at the end of the
-        hand that is next to the forearm.
+        The wrist is the midpoint of the markers ``hand_left`` and ``hand_right``. These two markers are on the hand, at
+        its end next to the forearm.
 
         Args:
             path: the file.

@@ -83,8 +83,8 @@ class Arrival(NamedTuple):
 
     Attributes:
         waited: time between exposure and sending [s].
-        queued: time between sending and receiving [s]; for a sender on another machine, only the excess over the
-            shortest such time within the last one to two minutes.
+        queued: time between sending and receiving [s]; for a sender on another machine, this time minus the shortest
+            such time of the last one to two minutes.
         received_ns: time of receiving, on this machine's clock [ns].
     """
 
@@ -131,7 +131,7 @@ class UdpSource(SkeletonSource):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> UdpSource:
-        """Listen on the port, and optionally the address, that a user wrote after the colon.
+        """Listen on the port, or the address and port, that follow ``udp:`` in a user's argument.
 
         Raises:
             InputError: when the port is not a number or is used by another program, or the address does not belong to

@@ -60,7 +60,7 @@ def run_scene(
         tool_radius: radius of the tool for drawing [m].
         tool_spheres: spheres of the tool for drawing, instead of ``tool_radius``: rows x, y, z, radius, shape (m,
             4) [m].
-        demonstrations: aligned demonstrations, from which the deviation of the measured motion is computed.
+        demonstrations: aligned demonstrations; the measured motion is compared with them.
         evaluate: success test of the task; it returns the rollout with success and reason.
         caption: one sentence that describes the scene.
         progress: function called with the fraction of the motion that is done, 0 to 1.

@@ -1,7 +1,7 @@
 """Read demonstrations: the function ``read``, its options, and the registry of readers.
 
 The first reader in ``READERS`` that recognises the content of a file converts the file to a
-:class:`~imitarm.demonstrations.raw.RawDemonstration`. If all its numbers are valid, the raw demonstration becomes a
+:class:`~imitarm.demonstrations.raw.RawDemonstration`. A raw demonstration whose numbers are all valid becomes a
 :class:`~imitarm.trajectory.Demonstration`.
 """
 
@@ -41,7 +41,7 @@ _HEAD = 65536  # bytes of a file that a reader sees before it says whether it re
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Options for facts that a file may not state itself, such as units.
+    """Options for facts that some files do not state, such as units.
 
     Attributes:
         units: unit of lengths, a key of ``LENGTH_UNITS``; None: as the file says, else m.

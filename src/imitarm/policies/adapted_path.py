@@ -27,8 +27,8 @@ class Adaptation:
         means: centres of the components before they moved, shape (n_components, 3) [m].
         covariances: position covariances of the components, shape (n_components, 3, 3) [m^2].
         responsibilities: responsibilities of each component for each sample, shape (n, n_components).
-        divided: whether the learned components were too wide for this scene; if so, the arrays above describe more,
-            narrower components.
+        divided: whether the learned components were too wide for this scene; if so, the arrays above describe a larger
+            number of narrower components.
         tolerance: covariance of the demonstrations along the path, shape (n, 3, 3) [m^2].
         min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without
             obstacles.
@@ -48,8 +48,8 @@ class Adaptation:
         joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned. Between
             two samples the joints move linearly.
         tilt: largest rotation of the tool away from the learned rotation [rad].
-        approach: motion of the joints to the first posture of ``joints``, which is executed first; None if the arm is
-            there already.
+        approach: motion of the arm from its start posture to the first posture of ``joints``, to be executed before the
+            path; None if the start posture is already the first posture.
     """
 
     nominal: Trajectory

@@ -33,9 +33,9 @@ _MAX_PROBES = 12  # points measured on a segment whose bound is too low; the bra
 
 @dataclass(frozen=True, eq=False)
 class ClosePoints:
-    """Points between two samples at which a sphere of the tool is closer to an obstacle than required.
+    """Points of a path, between its samples, at which a sphere of the tool is closer to an obstacle than required.
 
-    At the two samples themselves, the sphere is not too close.
+    At the samples before and after such a point, the sphere is not too close.
 
     Attributes:
         pair: index of the pair of a sphere and an obstacle, shape (m,).
@@ -75,8 +75,8 @@ class ToolAmongObstacles:
         offsets: for each obstacle, an array of shape (n_spheres, n, 3) [m]. The array contains, for each sample, the
             vectors from the tip to the centres of the spheres, minus the obstacle's displacement since time 0, in the
             base frame. The entry is None when all its vectors are zero.
-        bows: largest distance of a centre from the straight line between two samples while the tool rotates, shape
-            (n_spheres, n - 1) [m].
+        bows: for each segment between two samples, how far the rotation of the tool can move the centre of a sphere
+            away from the straight line between the centre's positions at the two samples, shape (n_spheres, n - 1) [m].
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -162,8 +162,9 @@ class ToolAmongObstacles:
     def exits(self, pair: int, points: Array, directions: Array, target: float, tolerance: float) -> Array:
         """Return how far points must move along directions to leave the inflated obstacle.
 
-        Newton's method starts from outside. Because the signed distance along a ray is convex, the computed
-        displacement decreases to the largest root and never passes this root.
+        The inflated obstacle contains all points at which the pair's distance is below ``target``. Newton's method
+        starts beyond it. Because the signed distance along a ray is convex, the computed displacement decreases towards
+        the last crossing of the inflated obstacle's surface, and never passes this crossing.
 
         Args:
             pair: index of the pair.
@@ -235,10 +236,10 @@ class PathClearance:
         """Bound the distance from below on each segment of the path.
 
         Let ``f`` be a convex function on a segment of length L, with slope a at the start and b at the end. Then ``f(s)
-        >= max(f0 + a s, f1 - b (L - s))``. The minimum of this bound over s is at an end of the segment or at the
-        crossing of the two lines. The tip moves straight between two samples. While the tool rotates by ``angle``, a
-        sphere's centre that is not at the tip deviates from the straight line by at most ``|offset| (1 - cos(angle /
-        2))``. This largest deviation is subtracted from the bound of the distance.
+        >= max(f0 + a s, f1 - b (L - s))``. The minimum of this bound over s is at an end of the segment, or where the
+        two terms of the maximum are equal. The tip moves straight between two samples. While the tool rotates by
+        ``angle``, a sphere's centre that is not at the tip deviates from the straight line by at most ``|offset| (1 -
+        cos(angle / 2))``. This largest deviation is subtracted from the bound of the distance.
 
         Returns:
             Shape (n_pairs, n - 1) [m].
@@ -261,10 +262,10 @@ class PathClearance:
 
         Near a corner of an obstacle, the bound from the tangents at the two ends of a segment is much too low. The
         distance is therefore measured at the point where the tangents cross. If the distance there is below the
-        clearance, the path really is too close to the obstacle. If it is not, the crossing point replaces one of the
-        two ends of the segment. If the distance still decreases at this point, the point replaces the first end; if the
-        distance increases, the point replaces the last end. The minimum of the distance therefore stays between the two
-        ends, and the bound converges to this minimum.
+        clearance, the path really is too close to the obstacle. Otherwise, this point replaces one of the two ends of
+        the segment: the first end if the distance still decreases at this point, and the last end if the distance
+        increases. The minimum of the distance therefore stays between the two ends, and the bound converges to this
+        minimum.
 
         Args:
             clearance: required clearance [m].

@@ -31,7 +31,8 @@ class GoalPosture:
 
     Attributes:
         joints: joint positions, shape (n_joints,) [rad].
-        tilt: rotation vector from the learned rotation of the tool at the goal, in the base frame, shape (3,) [rad].
+        tilt: rotation vector from the learned rotation of the tool at the goal to its rotation in this posture, in the
+            base frame, shape (3,) [rad].
     """
 
     joints: Array
@@ -54,8 +55,9 @@ class GoalSearch:
 def clear_postures(around: ArmAmongObstacles, goal: Pose, time: float, start: Array, goal_tilt: float) -> GoalSearch:
     """Search for postures in which the tool is at the goal and the whole arm is clear.
 
-    Inverse kinematics from random starts finds postures at the goal, and the self-motion of the arm changes each of
-    them. If none is clear and ``goal_tilt`` is positive, the same is done with the tool tilted.
+    Inverse kinematics from random starts finds postures at the goal. Each posture is then varied by the self-motion of
+    the arm, which does not move the tool. If no posture is clear and ``goal_tilt`` is positive, the same search is made
+    with a tilted tool.
 
     Args:
         around: the arm, its obstacles and the required clearances.

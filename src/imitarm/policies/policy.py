@@ -75,7 +75,7 @@ class Policy(ABC):
         skill: the skill to reproduce.
         tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: its tip.
         clearance: required distance of the tool to every obstacle [m].
-        forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
+        forbidden: directions in which the motion must not leave the learned path, shape (m, 3).
         arm: the arm that will move, for policies that plan its joints; None: not known.
 
     Attributes:
@@ -148,17 +148,18 @@ class ACFRA(Policy):
 
         twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
-    The phase ``s`` therefore waits for a robot that lags, for example at its speed limits or when a hand holds it. The
-    robot returns to the path on the straight line from the tool to its target. Tool and target are both clear of
-    obstacles, and each point of the line is within ``e_0 / 2`` of one of them. If ``e_0`` is the required clearance,
-    the line therefore cuts a corner by at most half of the clearance.
+    The phase ``s`` therefore waits for a robot that lags, for example at its speed limits or when a hand holds it. A
+    robot that has left the path returns to it along the straight line from the tool to its target. The tool and its
+    target are both clear of obstacles, and each point of the line is within ``e_0 / 2`` of the tool or of the target.
+    If ``e_0`` is the required clearance, the line therefore cuts a corner by at most half of the clearance.
 
     Among moving obstacles the plan is valid only at the planned times, so the phase follows the clock and does not
     wait. When the tool is farther than ``e_0 / 2`` from its planned position, the plan is no longer valid: the arm
     brakes and stays at rest.
 
-    Only ``"certified"`` refuses in advance when it can't keep the clearance. The thesis's potential fields (``"mapf"``,
-    ``"literal"``) serve for comparison, so the robot follows their paths even if these paths do not keep the clearance.
+    Only the method ``"certified"`` raises an error in advance when it can't keep the clearance. The thesis's potential
+    fields (``"mapf"``, ``"literal"``) serve for comparison, so the robot follows their paths even if these paths do not
+    keep the clearance.
 
     Args:
         skill: skill to reproduce.
@@ -166,7 +167,7 @@ class ACFRA(Policy):
         tool_radius: radius of one sphere about the tool's tip [m]; use it instead of ``tool_spheres``.
         tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m].
         clearance: required distance of the tool to every obstacle [m].
-        forbidden: directions in which the motion may not leave the learned path, shape (m, 3).
+        forbidden: directions in which the motion must not leave the learned path, shape (m, 3).
         pinned: times at which the path must not move [s].
         arm: the arm with its tool. The policy then plans the joints of the whole arm and follows them, and
             ``tool_radius`` and ``tool_spheres`` are not used. None: only the path of the tool is planned.

@@ -1,7 +1,8 @@
 """Scene files: a goal and obstacles in hand-written YAML (docs/scene.md).
 
-The keys of each shape are its fields, so a shape added to ``OBSTACLES`` can be read and written without further code.
-The reader accepts only plain YAML (numbers, text, lists and mappings) and never executes anything in a file.
+In the file, the keys of an obstacle are the fields of its shape's class, so a shape added to ``OBSTACLES`` can be read
+and written without further code. The reader accepts only plain YAML (numbers, text, lists and mappings) and never
+executes anything in a file.
 """
 
 from __future__ import annotations

@@ -182,12 +182,13 @@ class QuaternionDMP:
     .. math::
         r = \log(R R_y(s)^T), \qquad \tau^2 \ddot r = -K r - D \tau \dot r + \tau^2 c
 
-    Here, c is an external angular acceleration. The logarithm is taken only of ``r``, the rotation from the target,
-    never of the rotation to the goal. Therefore a rotation by 270 degrees, or by three full revolutions, is reproduced
-    as demonstrated. (Formulations that use log(q_goal conj(q)) rotate in the opposite direction beyond 180 degrees.)
-    The target is a normalised cubic spline through quaternions with continuous signs. Another start or goal rotates the
-    target in the base frame, blended by a minimum-jerk profile b: ``exp((1 - b) d_start) exp(b d_goal) R_y``. The
-    rotations ``d_start`` and ``d_goal`` are each at most 180 degrees.
+    Here, c is an external angular acceleration. The logarithm is taken only of ``R R_y^T``, the rotation from the
+    target to ``R``, never of the rotation to the goal. Therefore a rotation by 270 degrees, or by three full
+    revolutions, is reproduced as demonstrated. (Formulations that use log(q_goal conj(q)) rotate in the opposite
+    direction beyond 180 degrees.) The target is a normalised cubic spline through quaternions with continuous signs.
+    For another start or goal, the target is rotated in the base frame by ``d_start`` at the start and by ``d_goal`` at
+    the goal. A minimum-jerk profile b blends these two rotations: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Each of
+    the two is at most 180 degrees.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.

@@ -58,7 +58,7 @@ class Teacher:
 
     @classmethod
     def from_seed(cls, seed: int) -> Teacher:
-        """Draw the person number ``seed``."""
+        """Return a person whose quantities are drawn at random with the seed ``seed``."""
         rng = np.random.default_rng([20240, seed])
         start, dirt, goal = (pose.position for pose in (SweepTask.start, SweepTask.dirt, SweepTask.goal))
         duration = rng.uniform(9.0, 12.0)
