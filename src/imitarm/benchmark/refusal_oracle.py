@@ -1,13 +1,13 @@
-"""An oracle that decides whether a path around the obstacles exists, to check the refusals of ``adapt``.
+"""An oracle that checks refusals of ``adapt``: it decides whether a path around the obstacles exists.
 
-The oracle shares no code with the library's search for a path. The oracle considers displacements of the nominal path
-at many times, called layers. In each layer, displacements are cells of a grid.
+The oracle shares no code with the library's search for a path. The oracle considers many times along the nominal
+path, called layers. In each layer, the possible displacements of the path are the cells of a grid.
 
 The oracle gives one of three answers:
 
-* **impossible**: a proof. A box of positions counts as free if any of its points may be free at any time of an
-  interval. If no chain of free boxes leads from the start to the goal, then no continuous displacement of the path
-  exists.
+* **impossible**: a proof. Positions are grouped into boxes, and times into intervals. A box counts as free if any of
+  its points may be free at any time of an interval. If no chain of free boxes leads from the start to the goal, then no
+  continuous displacement of the path exists.
 * **possible**: a path was found and verified. A cell counts as free if its centre is free. Tangents give a lower bound
   of the distance to the obstacles during moves between neighbouring cells and between layers. Dynamic
   programming finds the chain of free cells with the smallest displacements. A sum of the skill's components is then
@@ -84,7 +84,7 @@ def is_solved(
 
     Args:
         question: the scene and the path.
-        axes: orthonormal basis of the permitted displacements, shape (d, 3); None: from the question.
+        axes: orthonormal basis of the permitted displacements, shape (d, 3); None: ``question.axes()``.
         grids_to_search: reach and cell size [m] of each grid to search; None: all grids.
     """
     axes = question.axes() if axes is None else axes

@@ -36,7 +36,8 @@ class TrueArm:
     """Positions of a person's arm, in the axes of the robot's base.
 
     Attributes:
-        times: times of the samples of the run with which the arm is compared, shape (n,) [s]; non-decreasing.
+        times: time of each position, shape (n,) [s]; non-decreasing. These are the times of the robot's samples in the
+            run that is compared with the person.
         shoulder: position of the shoulder, shape (n, 3) [m].
         elbow: position of the elbow, shape (n, 3) [m].
         wrist: position of the wrist, shape (n, 3) [m].
@@ -57,7 +58,8 @@ class TrueArm:
             truth: function of time that returns the person's skeleton; it is called with increasing times.
             times: times of a run, shape (n,) [s].
             correspondence: correspondence with the side of the arm and the pose of the sensor.
-            start: reading of the person's clock at time 0 of the run, when the first skeleton was measured [s].
+            start: time that is added to the times of the run before ``truth`` is called: the time at which the first
+                skeleton was measured, on the clock of ``truth`` [s].
         """
         t = np.asarray(times, dtype=float)
         return cls.from_points(
@@ -283,9 +285,10 @@ def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods
 
 
 def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) -> Array:
-    """Return the difference between the changes of the robot's and the person's SEW angle since the engagement began.
+    """Return the errors of the robot's SEW angle, the swivel angle of the elbow.
 
-    The SEW angle is the swivel angle of the elbow.
+    An error is the absolute difference between two changes since the engagement began: the change of the robot's angle,
+    and the change of the person's angle.
 
     Args:
         true: the person's arm, in the axes of the base.
@@ -333,7 +336,8 @@ def settling_time(
         stay: time for which the point must stay within ``radius`` [s].
 
     Returns:
-        The time [s], at least 0; nan if the recording shows no such stay of ``stay`` seconds after ``end``.
+        The time [s], at least 0; nan if the point does not stay within ``radius`` for ``stay`` seconds in the recording
+        after ``end``.
     """
     t = np.asarray(times, dtype=float)
     inside = np.linalg.norm(np.asarray(positions, dtype=float) - np.asarray(goal, dtype=float), axis=1) <= radius

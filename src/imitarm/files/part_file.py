@@ -67,15 +67,15 @@ class PartFile:
             raise InputError(f"{self.part}: can't be written: {error.strerror or error}") from error
 
     def finish(self, take: Callable[[Path], bool], *, begin: str = "") -> None:
-        """Write all text to the disk, then make ``PATH`` from ``PATH.part``: by renaming it, or by calling ``take``.
+        """Write all text to the disk, then call ``take``, which makes ``PATH`` from ``PATH.part``.
 
         Calling this method again does nothing.
 
         Args:
             take: function that is called with the path ``part``. The function may create ``PATH`` from ``PATH.part``,
                 and returns whether ``PATH.part`` was renamed. If ``take`` returns False, ``PATH.part`` is removed. If
-                ``take`` returns True, no file is removed: if a file ``PATH.part`` exists at that time, another recorder
-                has created it.
+                ``take`` returns True, no file is removed, because a file ``PATH.part`` that exists after the renaming
+                belongs to another recorder.
             begin: text that replaces the ``begin`` given to the constructor; both must have the same length.
 
         Raises:

@@ -278,7 +278,7 @@ class ArmModel(ArmKinematics):
         return not self._mass_faults
 
     def check_dynamics(self) -> None:
-        """Check that every moving link has a mass and an inertia, which torques and simulation need.
+        """Check that every moving link has the mass and the inertia that are required for torques and simulation.
 
         Raises:
             InputError: if a link lacks its mass or inertia; the message names these links and their lines in the file.

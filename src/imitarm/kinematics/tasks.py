@@ -117,7 +117,7 @@ class PostureTask(NamedTuple):
     weight: float = 1e-4
 
     def drift(self, problem: IKProblem) -> Array:
-        """Return the desired joint velocity, clipped to the box, shape (n_joints,) [rad/s]."""
+        """Return the desired joint velocity, clipped to the limits in ``problem.box``, shape (n_joints,) [rad/s]."""
         gain = finite_number(self.gain, "PostureTask: gain", "1/s")
         drift = gain * (finite_vector(self.q, len(problem.q), "PostureTask: q", "rad") - problem.q)
         return np.minimum(np.maximum(drift, problem.box.lower), problem.box.upper)
@@ -139,11 +139,11 @@ class ElbowTask(NamedTuple):
     .. math:: s = c\,\min(1, 10\sin^2\!\beta)\;\frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
 
     Here, :math:`\psi` is the arm's :func:`~imitarm.kinematics.sew.sew_angle`, :math:`\beta` is the angle at its elbow,
-    and e is the target velocity of the tool's task. The elbow's speed goes to zero as the arm becomes straight, and
-    near the one direction in which the stereographic angle is undefined. From one step to the next, the speed s changes
-    by at most half of the change that the acceleration limits of the joints allow. As long as no limit is active, the
-    task does not affect the tool, whatever its weight. When a limit is active, the weights decide between the tool's
-    task and the elbow task.
+    and e is the target velocity of the tool's task. The elbow's speed goes to zero as the arm becomes straight, and as
+    the wrist approaches the half-line from the shoulder on which the stereographic angle is undefined. From one step to
+    the next, the speed s changes by at most half of the change that the acceleration limits of the joints allow. As
+    long as no limit is active, the task does not affect the tool, whatever its weight. When a limit is active, the
+    weights decide between the tool's task and the elbow task.
 
     Attributes:
         angle: desired SEW angle :math:`\psi_h` [rad].

@@ -194,9 +194,9 @@ class ComponentPath:
         """Return the same path with more, narrower components.
 
         For some scenes, the influence of the Gaussians extends too far, for example near the start or the goal, or in
-        narrow spaces. A divided path has cubic B-splines in time instead of the responsibilities. The B-splines also
-        sum to 1. The first and the last B-spline are left out, because they would move the start and the goal. The
-        knots are closer together near the fixed times.
+        narrow spaces. The returned path therefore has cubic B-splines in time instead of the responsibilities ``h_k``.
+        Like the responsibilities, the B-splines sum to 1. The first and the last B-spline are left out, because they
+        would move the start and the goal. The knots are closer together near the fixed times.
         """
         times, fixed = self.nominal.times, self.fixed_times
         knots = np.concatenate([[times[0]] * 3, _knots(times, fixed), [times[-1]] * 3])

@@ -22,12 +22,14 @@ _CHANGED = 1e-9  # relative change of a velocity above which a limit counts as h
 def limit_velocity(
     limits: JointLimits, q: ArrayLike, previous: ArrayLike, velocity: ArrayLike, dt: float
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return the reachable velocity, nearest to the requested one, from which the joints can still brake in time.
+    """Return the velocity nearest to ``velocity`` that the joints can reach, and from which they can brake in time.
 
     First, all joints are slowed by one factor until none exceeds its maximum velocity, so that the tool keeps its
-    direction. Then each joint is clipped to the box of :class:`~imitarm.kinematics.limits.JointLimits`, evaluated at
-    ``q + previous * dt / 2`` and not at ``q``. The reason is that the box assumes that the set-point moves by
-    ``velocity * dt``, whereas with constant acceleration it moves by ``(previous + velocity) / 2 * dt``.
+    direction. Then the velocity of each joint is clipped to the interval that
+    :class:`~imitarm.kinematics.limits.JointLimits` permits. This interval is computed for the position
+    ``q + previous * dt / 2`` instead of ``q``, because :class:`~imitarm.kinematics.limits.JointLimits` assumes that the
+    set-point moves by ``velocity * dt``, whereas with constant acceleration it moves by
+    ``(previous + velocity) / 2 * dt``.
 
     Args:
         limits: limits of the arm.

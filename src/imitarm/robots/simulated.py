@@ -41,10 +41,10 @@ _GUIDED_DAMPING = 0.05  # [s/rad] damping of a guided joint per rated torque
 class SimulatedRobot(Robot):
     """An arm in a MuJoCo world, with drives that are limited to their rated torques.
 
-    Both kinds of control follow the set-point ``q_d(t)`` and feed gravity, inertia and friction forward (see
-    :class:`Drives`). The kind ``"position"`` is a stiff servo at each joint; ``"torque"`` is the softer computed-torque
-    control. Time advances only within :meth:`move` and :meth:`guide`, and the same commands always give the same
-    motion.
+    There are two kinds of control: ``"position"`` is a stiff servo at each joint, and ``"torque"`` is the softer
+    computed-torque control. Both follow the set-point ``q_d(t)``, with a feed-forward of gravity, inertia and friction
+    (see :class:`Drives`). Time advances only within :meth:`move` and :meth:`guide`, and the same commands always give
+    the same motion.
 
     Attributes:
         model: the compiled world.
@@ -318,7 +318,7 @@ def add_drives(spec: mujoco.MjSpec, arm: ArmModel) -> None:
 
 
 class Drives:
-    """One drive for each joint; every method makes one physics step.
+    """One drive for each joint; ``servo``, ``computed_torque`` and ``free`` each make one physics step.
 
     The set-point has the position ``q_d``, the velocity ``v_d`` and the acceleration ``a_d``. In the equations, ``M``
     is the inertia matrix with the rotors, ``h`` the torques of gravity and Coriolis forces, and ``f`` the torques of

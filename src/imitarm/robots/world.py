@@ -60,7 +60,7 @@ def arm_world(
 
 
 def add_fixtures(spec: mujoco.MjSpec, fixtures: Sequence[Obstacle]) -> None:
-    """Add fixtures as static geoms with their names (without a name: ``fixture/0`` and so on).
+    """Add each fixture as a static geom of the same name; fixtures without a name become ``fixture/0`` and so on.
 
     Args:
         spec: world; changed in place. A fixture is not added when a geom of its name exists.
@@ -177,7 +177,7 @@ class ClearanceGauge:
         self._in_contact: tuple[bytes, set[tuple[int, int]]] = b"", set()  # geoms in contact, and what touching gives
 
     def ignore_present_self_contacts(self, data: mujoco.MjData) -> None:
-        """Ignore the pairs of links that touch now, because the models of neighbouring links overlap in some files."""
+        """From now on, ignore contacts between links that touch now; in some files, neighbouring links overlap."""
         self._by_design = {(first, second) for _, first, second in self._self_contacts(data)}
         self._in_contact = b"", set()
 

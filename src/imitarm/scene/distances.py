@@ -133,7 +133,7 @@ class PackedObstacles:
         return moved
 
     def __getattr__(self, name: str) -> Array:
-        """Compute ``positions`` at the first access after :meth:`after`; raise an error for any unknown attribute."""
+        """Compute ``positions`` when they are first read from a result of :meth:`after`; else raise an error."""
         ahead: tuple[PackedObstacles, float] | None = self.__dict__.get("_ahead")
         if name != "positions" or ahead is None:
             raise AttributeError(f"PackedObstacles has no attribute {name!r}")

@@ -103,15 +103,16 @@ class DMP:
 
     This form replaces thesis Eqs 2.8 to 2.12, which scale the force by g - x_0 and therefore fail for an axis that does
     not move. Because tau is the duration, K and D have no unit. The ``"critical"`` gains have D = 2 sqrt(K). The
-    ``"thesis"`` gains K = 139.26, D = 28 have a damping ratio of 1.186. Equivalently, the spring follows the moving
-    target ``y(s) = g + f(s) + (x_0 - g) s``, which ends at the goal.
+    ``"thesis"`` gains K = 139.26, D = 28 have a damping ratio of 1.186. The first equation can also be read as a spring
+    and damper that follow the moving target ``y(s) = g + f(s) + (x_0 - g) s``, which ends at the goal.
 
     **Fitting** (:func:`~imitarm.skills.dynamical_systems.fit_weights`) is ridge regression on the positions. Measured
     positions are not differentiated, samples may have any times, and the motion reaches the goal at the end of the
     duration.
 
-    **Another start or goal**: let ``p`` be the fraction of the path that has been travelled. This fraction is itself a
-    primitive from 0 to 1, with weights w_p. The argument ``adjustment`` then selects the weights:
+    **Another start or goal**: let ``p`` be the fraction of the path that has been travelled. A second primitive, which
+    moves from 0 to 1 with the weights w_p, computes this fraction. The argument ``adjustment`` then selects the
+    weights:
 
     * ``"progress"``: w + (change of g - x_0) w_p. The change of start and goal is added in proportion to the travelled
       path. The motion therefore rests where the demonstration rests, does not reverse when the distance is halved, and
