@@ -139,7 +139,7 @@ PRINTED_TIME = np.array([22.23, 18.43, 17.72, 19.2, 15.82, 14.21, 13.03, 9.01, 9
 """Execution time of Table 3.1 [s]."""
 
 ME = ("thesis", "modern")
-"""The two methods that represent the thesis method Me: its corrected equations, and the method of this library."""
+"""The two methods that are compared in place of the thesis's method Me: Me with corrected equations, and ``modern``."""
 BASELINES = ("m1", "m2", "m3")
 _TORQUE_FIGURE = Figure("mean_torque", "mean torque [N m]", digits=2)
 _PATH_FIGURE = Figure("path_length", "path [m]", digits=2)

@@ -97,7 +97,8 @@ def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
         start: joint positions at the start, shape (n_joints,) [rad].
 
     Raises:
-        InputError: when no place is found that is far enough from the tool at the start and at the goal.
+        InputError: when no place for an obstacle is found that is far enough from the tool at the start and at the
+            goal.
     """
     rng = np.random.default_rng([31, seed])
     path = skill.generate()

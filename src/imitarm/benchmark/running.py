@@ -36,9 +36,9 @@ def run_all(
 ) -> list[Result]:
     """Run experiments in parallel and return their results in the same order.
 
-    Each result is a separate file in ``folder/runs``, written as soon as the experiment is finished. If there is a
-    saved result of the same configuration and the same code, it is read instead of running the experiment again. The
-    measured values do not depend on ``jobs``.
+    Each result is a separate file in ``folder/runs``, written as soon as the experiment is finished. If a result of the
+    same configuration and the same code was saved earlier, this result is read, and the experiment is not run again.
+    The measured values do not depend on ``jobs``.
 
     Args:
         experiments: the experiments to run.

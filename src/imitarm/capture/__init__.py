@@ -21,6 +21,7 @@ SOURCES: Registry[type[SkeletonSource]] = Registry(
         "azure": "imitarm.capture.kinect:AzureKinectSource",
     },
 )
-"""All sources by name. A user selects a source as ``NAME`` or ``NAME:ARGUMENT``, and a file by its name alone."""
+"""All sources by name. A user selects a source by ``NAME`` or ``NAME:ARGUMENT``; to select a file, the name of the file
+is enough."""
 
 __all__ = ["SOURCES", "Arm", "HandState", "Skeleton", "SkeletonSource", "Tracking"]

@@ -57,7 +57,7 @@ def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIs
 
     Args:
         recording: recording as read or captured.
-        side: side of the arm that a robot is to follow.
+        side: which of the person's arms a robot is to follow, ``"left"`` or ``"right"``.
 
     Raises:
         UnknownNameError: when ``side`` is neither left nor right.

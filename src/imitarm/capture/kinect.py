@@ -214,7 +214,7 @@ class AzureKinectSource(BodyCamera):
     camera's frame (x right, y down, millimetres) to the frame of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK
     does not detect whether a hand is open or closed, so hand states are unknown. Times are on the device's clock.
 
-    When the SDK fails, `pykinect-azure` ends the program, but this class raises an error instead. This class fetches
+    When the SDK fails, this class raises an error, whereas `pykinect-azure` would end the program. This class fetches
     frames with the C functions of the SDK, because these functions distinguish a late frame from a failure.
 
     This class was written from the documentation of the SDKs and has not been tested with a real camera.

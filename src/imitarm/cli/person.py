@@ -136,7 +136,7 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
 
     Args:
         arguments: arguments of the command.
-        side: side of the arm that the robot follows.
+        side: which of the person's arms the robot follows, ``"left"`` or ``"right"``.
 
     Returns:
         The skeletons; the changes and issues, one sentence each; and, if the source is synthetic, the person's true

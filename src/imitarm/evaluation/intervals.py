@@ -28,7 +28,7 @@ class Interval:
     """A mean over persons and its 95 % confidence interval.
 
     Attributes:
-        mean: mean over persons of each person's mean over recordings.
+        mean: mean over persons, where each person is represented by the mean of the person's recordings.
         low: lower end of the interval; nan with fewer than two persons.
         high: upper end.
         persons: number of persons.
@@ -140,7 +140,7 @@ def compare(ours: Values, theirs: Values) -> Comparison:
 def rate_interval(outcomes: Values) -> Interval:
     r"""Return the success rate, averaged over persons, with its 95 % interval.
 
-    The interval is the Wilson interval for :math:`N / D` trials instead of N, because the trials of one person are
+    For N trials, the interval is the Wilson interval for :math:`N / D` trials, because the trials of one person are
     similar (Rao and Scott, Biometrics 1992). :math:`D = 1 + (m - 1) \rho` is the design effect of m trials per person.
     :math:`\rho` is the correlation between trials of one person. The correlation is estimated from the variance of the
     persons' success rates, compared with the variance that chance alone would cause. The estimate from a few persons is

@@ -110,10 +110,10 @@ class Violations:
 
 
 def violations(arm: ArmModel, joints: ArrayLike, dt: float) -> Violations:
-    """Count the frames that exceed a limit, by finite differences of the joint positions; the motion starts at rest.
+    """Count the frames in which a motion that starts at rest exceeds a limit, from finite differences of the positions.
 
     Args:
-        arm: whose limits.
+        arm: the arm whose limits are checked.
         joints: joint positions, shape (n, n_joints) [rad].
         dt: sampling period [s].
     """

@@ -43,7 +43,7 @@ class IKStep:
         velocity: velocity of the joints, shape (n_joints,) [rad/s].
         missing: target velocity minus achieved velocity of each task, in the weighted units of the task.
         limited: whether each joint velocity is at a bound of the box, shape (n_joints,) bool.
-        slack: violation of each row, shape (m,); 0 where the row is satisfied.
+        slack: violation of each row (inequality on the joint velocity), shape (m,); 0 where the row is satisfied.
     """
 
     velocity: Array
@@ -64,12 +64,12 @@ class IKSolver:
     Here, each task has a Jacobian :math:`J_i` and a target :math:`t_i`, and :math:`v_p` is the joint velocity of the
     previous step. The rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite
     price are hard constraints, which are kept whenever the boxes allow it. If the boxes contradict these constraints,
-    the sum of their squared violations, in rad/s along each row, is minimised first, and the tasks have second
-    priority. The other methods accept one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one
+    the sum of the squared violations of the constraints, in rad/s along each row, is minimised first, and the tasks
+    have second priority. The other methods accept one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one
     :class:`~imitarm.kinematics.tasks.PostureTask`, and no limits except boxes. These methods are the following:
 
-    * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9), computes :math:`v = J^T (J J^T+\lambda^2)^{-1} t` in
-      joints scaled by their velocity limits. Let :math:`s_{min}` be the smallest singular value of J, and
+    * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9), computes :math:`v = J^T (J J^T+\lambda^2)^{-1} t` with
+      each joint's velocity measured in units of its limit. Let :math:`s_{min}` be the smallest singular value of J, and
       :math:`d=|t|`. There is no damping (:math:`\lambda=0`) if :math:`s_{min}\ge d`. The damping is
       :math:`\lambda^2=s_{min}(d-s_{min})` if :math:`d/2\le s_{min}<d`, and :math:`\lambda=d/2` if :math:`s_{min}` is
       smaller. This damping keeps the norm of the scaled velocity at most 1.

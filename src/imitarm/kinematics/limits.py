@@ -29,7 +29,7 @@ _SIGN = np.array([[1.0], [-1.0]])
 
 
 class Limit(ABC):
-    """One limit of the joint velocity. To write your own limit, implement this one method in a subclass.
+    """One limit of the joint velocity. To write your own limit, implement the method :meth:`restrict` in a subclass.
 
     Attributes:
         soft: whether the limit returns :class:`Rows` instead of a :class:`Box`; only the solver method ``"qp"`` accepts

@@ -201,7 +201,7 @@ def checked_unit_quaternions(quaternions: ArrayLike, what: str) -> Array:
         what: the name of the argument in messages.
 
     Raises:
-        InputError: if the shape is wrong, or a length is not one within 1e-3.
+        InputError: if the shape is wrong, or a length differs from one by more than 1e-3.
     """
     q = real_array(quaternions, (..., None), what)
     if q.shape[-1] != 4:
@@ -254,8 +254,8 @@ class Pose:
         """Build a pose without checks, to save time in control steps; the caller must not use the arrays afterwards.
 
         Args:
-            position: shape (3,) [m]; from now on read-only.
-            quaternion: unit quaternion wxyz, shape (4,); from now on read-only.
+            position: shape (3,) [m]; the call makes this array read-only.
+            quaternion: unit quaternion wxyz, shape (4,); the call makes this array read-only.
         """
         pose = object.__new__(cls)
         position.setflags(write=False)

@@ -50,8 +50,8 @@ def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array) -> 
     Args:
         arm: the arm with its tool.
         joints: joint positions at the samples, shape (n, n_joints) [rad].
-        parameters: path parameter s of each sample, increasing, shape (n,) [s]. The path is executed in the time s if
-            its rate ds/dt is 1 everywhere.
+        parameters: path parameter s of each sample, increasing, shape (n,) [s]. If the rate ds/dt is 1 everywhere, each
+            sample is reached at the time s.
         fastest: largest allowed rate ds/dt at each sample, shape (n,).
     """
     first = np.gradient(joints, parameters, axis=0)

@@ -8,7 +8,7 @@ The search makes the following attempts in turn. Each attempt keeps more of the 
 4. the path on another side of the obstacle, or farther away from it;
 5. another posture at the start, if the arm can reach it by a clear motion before the motion of the skill begins.
 
-If no attempt succeeds, the reason names the link and the obstacle that are too close in the best attempt, and the time.
+If no attempt succeeds, the reason states which link and obstacle come too close in the best attempt, and when.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class ArmSolution:
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """A motion of the joints before the motion of the skill begins, clear like the plan itself.
+    """A motion of the joints before the motion of the skill begins; it keeps the same clearances as the plan.
 
     Attributes:
         joints: joint positions, shape (m, n_joints) [rad]; between two samples the joints move linearly.
@@ -91,7 +91,7 @@ class ArmTask:
         start: posture at the start, shape (n_joints,) [rad].
         scene: obstacles at time 0, and fixtures.
         clearance: required distance from every moving part of the arm to every obstacle [m].
-        allowed: directions in which components may move.
+        allowed: directions in which components (the parts of the path near an obstacle) may be displaced.
         max_tilt: largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad].
         allowance: ``clearance`` minus the clearance that the safety filter keeps [m].
     """

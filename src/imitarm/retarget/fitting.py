@@ -5,11 +5,12 @@ Only a recording can be fitted, because a live motion is not known in advance. T
 .. math:: p(t) = p_0 + \rho\,(W(t) - W_0)
 
 where :math:`W` is the position of the person's wrist along the axes of the base, :math:`W_0` its position when the
-clutch engages, :math:`p_0` the start position of the tool, and :math:`\rho` the scale. For each scale, the search
-places the middle of the motion at positions near the tool's home position, and then at positions throughout the
-workspace. The scale is reduced until the arm reaches the start and the six outermost points of the motion. At the start
-and at the six outermost points, the tool must have the same orientation as at home. The arm must be away from
-singularities, and its links must keep a minimum distance from each other and from the fixtures on which the arm stands.
+robot begins to follow (the clutch engages), :math:`p_0` the start position of the tool, and :math:`\rho` the scale. For
+each scale, the search places the middle of the motion at positions near the tool's home position, and then at positions
+throughout the workspace. The scale is reduced until the arm reaches the start and the six outermost points of the
+motion. At the start and at the six outermost points, the tool must have the same orientation as at home. The arm must
+be away from singularities, and its links must keep a minimum distance from each other and from the fixtures on which
+the arm stands.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def fit_motion(
         arm: the robot's arm.
         wrist: positions of the person's wrist along the axes of the robot's base, shape (n, 3) [m]; rows with nan are
             skipped.
-        start: position of the person's wrist when the clutch engages, shape (3,) [m].
+        start: position of the person's wrist when the robot begins to follow, shape (3,) [m].
         scale: the largest scale to try.
         fixtures: objects on which the arm stands or works, which it must not touch; None: a floor and a pedestal
             (:func:`~imitarm.scene.standard_fixtures`).

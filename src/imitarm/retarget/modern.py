@@ -50,7 +50,7 @@ class ModernRetargeter(Retargeter):
 
     1. extrapolate the estimate of the person's arm (:class:`~imitarm.retarget.arm_estimator.ArmEstimator`) from its
        last frame with a decaying velocity. After s seconds, the wrist is at :math:`W + v\,\tau(1 - e^{-s/\tau})`, with
-       :math:`\tau` = 50 ms;
+       :math:`\tau` = 50 ms and the wrist's position W and velocity v at the last frame;
     2. compute the tool's target and the twist towards it, :math:`K \log(T_d T^{-1})`, plus a fraction of the hand's
        velocity (feed-forward);
     3. solve a quadratic programme for the joint velocities. The quadratic programme has two tasks: the twist of the

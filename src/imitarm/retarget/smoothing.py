@@ -42,9 +42,9 @@ class OneEuro:
 
     The speed is the norm of the whole velocity vector, so the filter acts equally in all directions. The velocity is
     computed from the difference of two successive measured values. The original filter instead uses the difference
-    between a measured value and the previous smoothed value. The resulting velocity is too large for predictions,
-    because smoothed values lag behind measured values during steady motion. The weight :math:`\alpha` of a value is
-    multiplied by the value's confidence.
+    between a measured value and the previous smoothed value. The velocity of the original filter is too large for
+    predictions, because smoothed values lag behind measured values during steady motion. The weight :math:`\alpha` of a
+    value is multiplied by the value's confidence.
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].

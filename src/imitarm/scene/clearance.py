@@ -135,8 +135,8 @@ class SelfClearance:
     A row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets the distance shrink no faster than exponentially towards the
     required clearance :math:`d_{safe}`. If the distance is below the clearance, the distance must grow, and 25/s
     replaces :math:`\xi` in the row. Every pair of spheres whose distance is less than the clearance plus 6 cm has a row
-    (at most the 64 nearest pairs). In addition, each of the ``n_rows`` nearest pairs of links within 15 cm has a row
-    for its nearest pair of spheres.
+    (at most the 64 nearest pairs). In addition, pairs of links that are less than 15 cm apart (at most the ``n_rows``
+    nearest) have one row each, for their nearest pair of spheres.
 
     Three kinds of pairs are not checked: links that share a joint, links that can't touch within their joint limits
     (:func:`meeting_links`), and pairs of spheres that are nearer to each other than the clearance when the arm is in
@@ -242,7 +242,7 @@ class SelfClearance:
         return gradients, distances - self.clearance
 
     def lower(self, room: Array) -> Array:
-        """Return the least allowed rates (k,) [m/s] of distances that exceed the clearance by ``room`` (k,) [m]."""
+        """Return the least allowed rates (k,) [m/s] of distances; ``room`` (k,) [m] is distance minus clearance."""
         if min(room.tolist(), default=0.0) >= 0.0:  # nearly always
             return -self._gain * room
         return np.where(room < 0.0, -_RETREAT_RATE, -self._gain) * room

@@ -29,7 +29,8 @@ class RhythmicDMPState(NamedTuple):
     ``RhythmicDMP.begin`` creates it and ``RhythmicDMP.step`` advances it.
 
     Attributes:
-        motion: [x; P x'], shape (2, D): position [m], and the rotation vector [rad] where rotation was learned.
+        motion: [x; P x'] with the period P, shape (2, D): position [m], and the rotation vector [rad] where rotation
+            was learned.
         periods: number of periods since the start, phi / (2 pi).
         center: g, shape (D,).
         amplitude: r, the factor by which the learned motion is multiplied.

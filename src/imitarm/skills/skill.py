@@ -35,9 +35,10 @@ class Skill:
     """A motion learned from demonstrations (thesis Chapter 5: GMM, then GMR, then DMP).
 
     A :class:`~imitarm.skills.gmr.GMR` learns the mean motion and its covariance, which shows how much the
-    demonstrations differ at each time. A :class:`~imitarm.skills.dmp.DMP` is trained on the nominal path: it can change
-    the start, the goal and the duration of the motion. The covariance is used as a tolerance: the robot must be precise
-    where the person was precise. A skill is independent of obstacles; policies handle them.
+    demonstrations differ at each time. A :class:`~imitarm.skills.dmp.DMP` is trained on the nominal path (the mean
+    motion with exact start and goal): it can change the start, the goal and the duration of the motion. The covariance
+    is used as a tolerance: the robot must be precise where the person was precise. A skill is independent of obstacles;
+    policies handle them.
 
     The nominal path and the primitive start and end exactly at the means of the demonstrated starts and goals.
 
@@ -57,8 +58,8 @@ class Skill:
         start_: learned start, tool_to_base; its rotation is the identity when no rotation was learned.
         goal_: learned goal, tool_to_base.
         n_demonstrations_: number of demonstrations.
-        fit_quality_: distance to each demonstration, and whether the skill reproduces them; None if the skill's
-            file does not contain it.
+        fit_quality_: distance from the skill's motion to each demonstration, and whether the skill reproduces the
+            demonstrations; None if the skill's file does not contain it.
         provenance_: origin of the skill: ``"imitarm"`` (version that learned it), ``"sources"`` (one per
             demonstration), ``"notes"`` (for example findings of lint), and ``"date"`` if a date was given.
 

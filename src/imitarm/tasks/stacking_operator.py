@@ -358,9 +358,10 @@ class SimulatedOperator:
     *Eye.* About 7 times per second, the person reacts to an :class:`OperatorView` that is ``delay`` old. The observed
     positions have a bias, and noise of about a millimetre. The person extrapolates the observed position by the
     displacement that the hand has commanded since the time of the view, and so expects the gripper at :math:`\hat p =
-    p(t-\delta) + \rho\,(h_{end} - h(t-\delta-\lambda))`. In this equation, :math:`\delta` is ``delay``, and
-    :math:`\rho` and :math:`\lambda` are the scale and the lag that the person expects. The next sub-movement of the
-    hand is :math:`d = g\,(p_{goal}-\hat p)/\rho`. The gain g is below 1 over short distances and 1 over long distances.
+    p(t-\delta) + \rho\,(h_{end} - h(t-\delta-\lambda))`. In this equation, :math:`\delta` is ``delay``, :math:`h_{end}`
+    is the hand's position after all commanded sub-movements, and :math:`\rho` and :math:`\lambda` are the scale and the
+    lag that the person expects. The next sub-movement of the hand is :math:`d = g\,(p_{goal}-\hat p)/\rho`. The gain g
+    is below 1 over short distances and 1 over long distances.
 
     *Plan.* :class:`StackPlan` chooses the goals. The hand closes or opens when the gripper looks aligned to within the
     person's tolerance, which grows as the person becomes impatient. If the gripper misses or loses a cube, or a cube
