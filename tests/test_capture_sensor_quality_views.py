@@ -80,4 +80,4 @@ def test_the_command_prints_every_view_and_every_pair(tmp_path, monkeypatch, cap
     shown = capsys.readouterr().out.splitlines()
     assert shown[0].startswith("video:a.mp4: 40 images, 40 with a person") and "left arm tracked in 100 %" in shown[1]
     assert shown[-1].startswith("video:a.mp4 and video:b.mp4: left raised 1.00 (40)")
-    assert main([]) == 2 and "name one or more" in capsys.readouterr().err
+    assert main([]) == 2 and "give one or more" in capsys.readouterr().err

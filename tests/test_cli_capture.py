@@ -27,7 +27,7 @@ def test_a_recording_is_shown_and_kept(wave, tmp_path, capsys):
     out = tmp_path / "out.csv"
     assert main(["capture", str(wave), "--out", str(out)]) == 0
     text = capsys.readouterr().out
-    for part in ("90", "2.97 s", "30.0 frames a second", "tracked in 100 %", "0 errors, 0 warnings, 0 notes", "wrote"):
+    for part in ("90", "2.97 s", "30.0 frames per second", "tracked in 100 %", "0 errors, 0 warnings, 0 notes", "wrote"):
         assert part in text
     assert all(map(same, read_recording(out).skeletons, read_recording(wave).skeletons))
 
@@ -61,7 +61,7 @@ def test_a_check_that_finds_an_error_is_told_by_the_exit_status(tmp_path, capsys
     SkeletonRecording(skeletons(30, rate=5.0)).save(path)
     assert main(["capture", str(path)]) == 0
     assert main(["capture", str(path), "--check"]) == 2
-    assert "5.0 frames a second" in capsys.readouterr().out
+    assert "5.0 frames per second" in capsys.readouterr().out
 
 
 def test_a_made_up_person_for_some_seconds(tmp_path):

@@ -36,7 +36,7 @@ def test_faults_of_rows_are_left_to_lint(tmp_path):
     (raw,) = read_raw(file)
     assert raw.late().sum() == 1
     assert raw.where(3) == f"{file}, line 12"
-    with pytest.raises(FileFormatError, match="line 12 is not later"):
+    with pytest.raises(FileFormatError, match="line 12: the time is not later"):
         read(file)
 
 

@@ -546,7 +546,7 @@ def test_the_middle_of_the_ranges_is_kept_where_it_is_usable(load):
 )
 def test_sizes_that_no_robot_has_are_refused_with_their_line(load, old, new):
     text = robot(SIX).replace(old, new, 1)
-    with pytest.raises(FileFormatError, match=r"'a_link1' \(line 3\) is .*no robot has"):
+    with pytest.raises(FileFormatError, match=r"'a_link1' \(line 3\) is .*not plausible for a robot"):
         load(text)
 
 

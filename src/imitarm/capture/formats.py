@@ -34,7 +34,7 @@ UNFINISHED = "not closed"
 
 TICK = 1e-7  # [s] time unit of the Kinect SDK
 _KINECT_COLUMNS = 1 + 4 * len(JOINTS)
-_FASTEST_RATE = 1000.0  # [Hz] a table with more frames a second has its times in another unit for certain
+_FASTEST_RATE = 1000.0  # [Hz] a table with more frames per second has its times in another unit for certain
 _MARK = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s*[#%][^\n]*\n)*?\s*[#%]\s*format:\s*" + FORMAT.encode() + rb"\b")
 _WHOLE = re.compile(rb"-?\d{1,20}")
 _LIMBS = [

@@ -154,7 +154,7 @@ def _show(recording: SkeletonRecording, side: str) -> None:
         [
             ("frames", str(len(recording))),
             ("duration", f"{recording.duration:.2f} s"),
-            ("rate", f"{recording.rate:.1f} frames a second"),
+            ("rate", f"{recording.rate:.1f} frames per second"),
             ("persons", f"{len(persons)} ({'number' if len(persons) == 1 else 'numbers'} {numbers})"),
             (f"{side} arm", f"tracked in {100 * tracked:.0f} % of the frames, lost in {100 * lost:.0f} %"),
         ],
