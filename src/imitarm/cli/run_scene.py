@@ -16,7 +16,7 @@ from imitarm.cli.screen import remark, say, show_table
 from imitarm.control_loop.reproduce import Step, reproduce
 from imitarm.demonstrations import Alignment, Finding
 from imitarm.errors import InfeasibleError
-from imitarm.policies import Adaptation, Policy
+from imitarm.policies import Policy
 from imitarm.robots import SimulatedRobot
 from imitarm.safety import SafetyFilter
 from imitarm.skills import Skill
@@ -123,11 +123,6 @@ def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
         details["dirt in the pan"] = f"{100 * rollout.details['swept_fraction']:.0f} %"
     if policy.plan is not None:
         details["largest displacement [σ]"] = f"{policy.plan.deviation:.1f}"
-    if isinstance(policy.plan, Adaptation):
-        whole = policy.plan.joints is not None
-        details["clearance is certified for"] = "every moving part of the arm" if whole else "the tool"
-        if whole:
-            details["largest tilt of the tool"] = f"{np.degrees(policy.plan.tilt):.1f} degrees"
     return details
 
 

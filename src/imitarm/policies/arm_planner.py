@@ -168,10 +168,6 @@ class ArmPlanner:
         tilt[-1] = rotation
         return tilt
 
-    def tilts(self, tilt: Array) -> Array:
-        """Return the rotation of the tool away from the learned one at each sample, shape (n, 3) [rad]."""
-        return np.asarray(self._tilts @ tilt)
-
     def plan(self, displacement: Array, joints: Array, tilt: Array | None = None) -> ArmPlan | None:
         """Improve a displacement and a joint path until the whole arm keeps its clearance.
 

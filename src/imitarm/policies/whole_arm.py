@@ -158,7 +158,7 @@ class _Search:
         learned = nominal.quaternions
         self._quaternions = np.tile(start.quaternion, (len(nominal), 1)) if learned is None else learned
         fixtures = task.scene.fixtures
-        contacts = self._tracked(nominal.positions, None)[::4] if fixtures else None
+        contacts = track(task.arm, task.start, nominal.positions, self._quaternions)[::4] if fixtures else None
         own = links_apart(task.arm)
         self._around = ArmAmongObstacles(
             task.arm, task.scene.obstacles, task.clearance, fixtures=fixtures, contacts=contacts, own=own
@@ -276,9 +276,6 @@ class _Search:
         poses = planner.poses(displacement, tilt, planner.coarse)
         joints = track(self.task.arm, self.task.start, *poses, None if goal is None else goal.joints)
         return _Attempt(planner, displacement, joints, tilt)
-
-    def _tracked(self, positions: Array, goal: Array | None) -> Array:
-        return track(self.task.arm, self.task.start, positions, self._quaternions, goal)
 
     def _sides(self, planner: ArmPlanner) -> list[_Attempt]:
         """Return displacements with which the tool passes the closest place on other sides, each with its joint path.

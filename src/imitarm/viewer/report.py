@@ -259,6 +259,9 @@ def _scene_facts(scene: SceneResult) -> dict[str, Any]:
             "Largest displacement": number(MM * largest, 1, "mm"),
             "Adaptation time": number(MM * a.compute_time, 3, "ms"),
         }
+        if getattr(a, "joints", None) is not None:
+            values["Certified clearance is that of"] = "every moving part of the arm"
+            values["Largest tilt of the tool"] = number(float(np.degrees(getattr(a, "tilt", 0.0))), 1, "degrees")
     if scene.rollout is not None:
         values["Duration of the motion"] = number(scene.rollout.trajectory.duration, 2, "s")
         values["Path length of the tool"] = number(scene.rollout.trajectory.path_length, 3, "m")
