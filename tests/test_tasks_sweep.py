@@ -11,8 +11,8 @@ from imitarm.control_loop.reproduce import reproduce
 from imitarm.demonstrations import align, read
 from imitarm.errors import InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose
+from imitarm.policies import ACFRA, Policy
 from imitarm.policies.adaptation import HORIZONTAL_ONLY
-from imitarm.policies.policy import ACFRA, Policy
 from imitarm.safety import SafetyFilter
 from imitarm.scene import Scene, load_scene, save_scene
 from imitarm.skills import Skill

@@ -3,13 +3,15 @@
 ``POLICIES`` is the registry: to add a policy, write one file and add one line here.
 """
 
+from imitarm.policies.acfra import ACFRA
 from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, adapt
 from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.least_detour import PathAdapter
-from imitarm.policies.policy import ACFRA, Observation, Policy
+from imitarm.policies.path_policy import PathPlan, PathPolicy
+from imitarm.policies.policy import Observation, Policy
 from imitarm.registry import Registry
 
-POLICIES: Registry[type[Policy]] = Registry("policy", "imitarm.policies", {"acfra": "imitarm.policies.policy:ACFRA"})
+POLICIES: Registry[type[Policy]] = Registry("policy", "imitarm.policies", {"acfra": "imitarm.policies.acfra:ACFRA"})
 """All policies by name."""
 
 __all__ = [
@@ -21,6 +23,8 @@ __all__ = [
     "Adaptation",
     "Observation",
     "PathAdapter",
+    "PathPlan",
+    "PathPolicy",
     "Policy",
     "adapt",
 ]

@@ -1,0 +1,138 @@
+"""ACFRA, adaptive collision-free reaching (thesis Chapter 4): adapt the whole learned path, then follow it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InfeasibleError
+from imitarm.kinematics.arm import ArmModel, ArmState
+from imitarm.kinematics.pose import Pose
+from imitarm.policies.adaptation import adapt, adapter_named
+from imitarm.policies.adapted_path import Adaptation
+from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.path_policy import PathPlan, PathPolicy
+from imitarm.scene.scene import Scene
+from imitarm.skills.skill import Skill
+from imitarm.trajectory import Trajectory
+from imitarm.validation import finite_number
+
+Array = NDArray[np.float64]
+
+_ALLOWANCE, _ALLOWANCE_OF_ARM = 2e-3, 5e-3  # [m] usual margin of a plan for the tool, for the whole arm
+_SAME_POSTURE = 1e-4  # [m, rad] the joints are planned from exactly where the arm is
+
+
+class ACFRA(PathPolicy):
+    r"""Adapt the whole path once, then follow it (thesis Chapter 4).
+
+    The constructor decomposes the learned path into components, ``x_0(t)`` and their responsibilities ``h_k(t)``. The
+    method ``reset`` moves the means of those components that are near an obstacle, and raises an error when the
+    clearance can't be kept::
+
+        x(t) = x_0(t) + w(t) sum_k h_k(t) Delta_k
+
+    The window ``w`` is 0 at the start, at the goal and at the pinned times. The method ``step`` follows this path as
+    :class:`~imitarm.policies.path_policy.PathPolicy` describes.
+
+    Only the method ``"certified"`` raises an error in advance when it can't keep the clearance. The thesis's potential
+    fields (``"mapf"``, ``"literal"``) serve for comparison, so the robot follows their paths even if these paths do not
+    keep the clearance.
+
+    Args:
+        skill: skill to reproduce.
+        method: name in :data:`~imitarm.policies.ADAPTERS`.
+        tool_radius: radius of one sphere about the tool's tip [m]; use it instead of ``tool_spheres``.
+        tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m].
+        clearance: required distance of the tool to every obstacle [m].
+        forbidden: directions in which the motion must not leave the learned path, shape (m, 3).
+        pinned: times at which the path must not move [s].
+        arm: the arm with its tool. The policy then plans the joints of the whole arm and follows them, and
+            ``tool_radius`` and ``tool_spheres`` are not used. None: only the path of the tool is planned.
+        max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]; see
+            :func:`~imitarm.policies.adapt`.
+        goal_tilt: largest rotation of the tool of ``arm`` at the goal [rad]; see :func:`~imitarm.policies.adapt`.
+        allowance: additional clearance for the robot's tracking errors, used if a path with this larger clearance is
+            found [m]. The default is 2 mm for a plan of the tool, and 5 mm for a plan of the whole arm.
+        following: ``gain``, ``patience`` and ``arrival`` of :class:`~imitarm.policies.path_policy.PathPolicy`.
+
+    Attributes:
+        adaptation: result of the last adaptation, also if it was refused.
+    """
+
+    def __init__(
+        self,
+        skill: Skill,
+        *,
+        method: str = "certified",
+        tool_radius: float | None = None,
+        tool_spheres: ArrayLike | None = None,
+        clearance: float = 0.02,
+        forbidden: ArrayLike = (),
+        pinned: Sequence[float] = (),
+        arm: ArmModel | None = None,
+        max_tilt: float | None = None,
+        goal_tilt: float = 0.0,
+        allowance: float | None = None,
+        **following: Any,
+    ) -> None:
+        super().__init__(
+            skill, tool_spheres=tool_spheres, clearance=clearance, forbidden=forbidden, arm=arm, **following
+        )
+        self._refuses = adapter_named(method).refuses
+        self._whole_arm = arm is not None and self._refuses
+        self._options: dict[str, Any] = {"method": method, "forbidden": forbidden}
+        if self._whole_arm:
+            self._options |= {"arm": arm, "max_tilt": max_tilt, "goal_tilt": goal_tilt}
+            self._same_start = _SAME_POSTURE
+        else:
+            self._options |= {"tool_radius": tool_radius, "tool_spheres": tool_spheres}
+        self._path = ComponentPath.of_skill(skill, pinned=pinned)
+        usual = _ALLOWANCE_OF_ARM if self._whole_arm else _ALLOWANCE
+        self._allowance = finite_number(
+            usual if allowance is None else allowance, "ACFRA: allowance", "m", at_least=0.0
+        )
+        self.adaptation: Adaptation | None = None
+
+    def plan_motion(self, scene: Scene, start: Pose | None = None, state: ArmState | None = None) -> PathPlan:
+        """Adapt the path to the scene.
+
+        Raises:
+            InfeasibleError: when the clearance can't be kept; the message names the obstacle and the reason.
+        """
+        self.adaptation = found = adapt(
+            self._path.between(self.skill, start, scene.goal),
+            scene,
+            clearance=self.clearance,
+            allowance=self._allowance if self._refuses else 0.0,
+            state=state if self._whole_arm else None,
+            **self._options,
+        )
+        if not found.feasible and self._refuses:
+            raise InfeasibleError(found.reason)
+        trajectory, joints = _with_approach(found, self.arm)
+        displaced = np.linalg.norm(found.trajectory.positions - found.nominal.positions, axis=1)
+        displaced = np.concatenate([np.zeros(len(trajectory) - len(displaced)), displaced])
+        return PathPlan(trajectory, displaced, joints, found.only_on_schedule, found)
+
+    @property
+    def plan(self) -> Adaptation | None:
+        """The result of the last adaptation, for drawing in a report."""
+        return self.adaptation
+
+
+def _with_approach(plan: Adaptation, arm: ArmModel | None) -> tuple[Trajectory, Array | None]:
+    """Return the tool's path and the joints (n, n_joints) of the whole motion, which begins with the approach."""
+    path, joints, approach = plan.trajectory, plan.joints, plan.approach
+    if approach is None or joints is None or arm is None:
+        return path, joints
+    positions, quaternions = arm.tool_path(approach.joints[:-1])  # its last posture is the first one of the plan
+    whole = Trajectory(
+        np.concatenate([approach.times[:-1], approach.times[-1] + path.times]),
+        np.concatenate([positions, path.positions]),
+        None if path.quaternions is None else np.concatenate([quaternions, path.quaternions]),
+    )
+    return whole, np.concatenate([approach.joints[:-1], joints])

@@ -1,0 +1,231 @@
+"""PathPolicy: the base class of policies that plan the whole path of the tool once, then follow it."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.command import Command, Status
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmState
+from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply
+from imitarm.policies.adapted_path import Adaptation
+from imitarm.policies.policy import Observation, Policy
+from imitarm.scene.scene import Scene
+from imitarm.skills.skill import Skill
+from imitarm.trajectory import Trajectory
+from imitarm.validation import finite_number
+
+Array = NDArray[np.float64]
+
+_LEAST_PATIENCE = 5e-3  # [m] no robot follows more closely than this at all times
+_SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learned one is the learned one
+_STANDS = 0.05  # speed of the phase below which the motion is said to wait
+_DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
+
+
+@dataclass(frozen=True, eq=False)
+class PathPlan:
+    """The motion that a :class:`PathPolicy` follows.
+
+    Attributes:
+        trajectory: path of the tool with times, n samples. Without quaternions, the tool keeps its rotation.
+        displaced: distance of each sample from the learned path, shape (n,) [m].
+        joints: joint positions of the arm at the samples, shape (n, n_joints) [rad], linear between them; None if only
+            the tool was planned.
+        only_on_schedule: whether the plan is valid only at the planned times, because an obstacle moves.
+        adaptation: the result of :func:`~imitarm.policies.adapt`, for reports; None if the method computes none.
+    """
+
+    trajectory: Trajectory
+    displaced: Array
+    joints: Array | None = None
+    only_on_schedule: bool = False
+    adaptation: Adaptation | None = None
+
+    @classmethod
+    def beside(cls, nominal: Trajectory, trajectory: Trajectory) -> Self:
+        """Return the plan for a path of the tool; its displacement is measured from ``nominal`` at equal phases."""
+        phase = (trajectory.times - trajectory.times[0]) / trajectory.duration
+        learned, _ = nominal.at(nominal.times[0] + phase * nominal.duration)
+        return cls(trajectory, np.linalg.norm(trajectory.positions - learned, axis=1))
+
+
+class PathPolicy(Policy):
+    r"""Plan the whole path of the tool once, then follow it.
+
+    A subclass implements :meth:`plan_motion`. The method ``reset`` calls it for the observed scene. The method ``step``
+    follows the planned path with the path's velocity plus feedback::
+
+        twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
+
+    The phase ``s`` therefore waits for a robot that lags, for example at its speed limits or when a hand holds it. A
+    robot that has left the path returns to it along the straight line from the tool to its target. The tool and its
+    target are both clear of obstacles, and each point of the line is within ``e_0 / 2`` of the tool or of the target.
+    If ``e_0`` is the required clearance, the line therefore cuts a corner by at most half of the clearance.
+
+    Among moving obstacles a plan may be valid only at the planned times. The phase then follows the clock and does not
+    wait. When the tool is farther than ``e_0 / 2`` from its planned position, such a plan is no longer valid: the arm
+    brakes and stays at rest.
+
+    Args:
+        skill: skill to reproduce.
+        gain: K [1/s].
+        patience: e_0, the position error at which the phase stops [m]; None: the clearance, at least 5 mm.
+        arrival: the motion has arrived when the tool is nearer than this to the end of the path [m].
+        options: arguments of :class:`~imitarm.policies.Policy`.
+
+    Attributes:
+        search_space: options of the constructor that a benchmark may tune: name -> (lowest, highest) value, searched on
+            a logarithmic scale.
+        motion: the plan of the last ``reset``.
+    """
+
+    search_space: ClassVar[Mapping[str, tuple[float, float]]] = {}
+
+    def __init__(
+        self,
+        skill: Skill,
+        *,
+        gain: float = 8.0,
+        patience: float | None = None,
+        arrival: float = 0.003,
+        **options: Any,
+    ) -> None:
+        super().__init__(skill, **options)
+        name = type(self).__name__
+        self._gain = finite_number(gain, f"{name}: gain", "1/s", above=0.0)
+        self._arrival = finite_number(arrival, f"{name}: arrival", "m", above=0.0)
+        self._patience = max(self.clearance, _LEAST_PATIENCE)
+        if patience is not None:
+            self._patience = finite_number(patience, f"{name}: patience", "m", above=0.0)
+        self._same_start = _SAME_PLACE
+        self.motion: PathPlan | None = None
+        self._phase, self._void = 0.0, ""
+
+    @abstractmethod
+    def plan_motion(self, scene: Scene, start: Pose | None = None, state: ArmState | None = None) -> PathPlan:
+        """Plan the whole motion in a scene.
+
+        Args:
+            scene: goal (None: the learned one) and obstacles at the time at which the motion begins.
+            start: pose of the tool at the start; None: the learned start.
+            state: measured state of the arm, for methods that plan its joints.
+
+        Raises:
+            InfeasibleError: when the method knows that it has no solution; the message says why.
+        """
+
+    def reset(self, observation: Observation) -> None:
+        """Plan the path in the observed scene, starting at the measured pose of the tool.
+
+        Raises:
+            InfeasibleError: when the method knows that it has no solution; the message says why.
+        """
+        away = observation.tool_to_base.error_to(self.skill.start_)
+        if not self.skill.gmr_.has_orientation_:
+            away = away[:3]
+        start = None if np.linalg.norm(away) <= self._same_start else observation.tool_to_base
+        self.motion = None
+        self.motion = self.plan_motion(observation.scene.now(observation.time), start, observation.state)
+        path, joints = self.motion.trajectory, self.motion.joints
+        velocity = np.gradient(path.positions, path.times, axis=0)
+        rotation = np.zeros((len(path), 3))
+        if path.quaternions is not None:
+            step = quaternion_multiply(path.quaternions[1:], quaternion_conjugate(path.quaternions[:-1]))
+            rotation[:-1] = quaternion_log(step) / np.diff(path.times)[:, None]
+        self._twists = np.concatenate([velocity, rotation], axis=1)
+        self._joint_velocities = None if joints is None else np.gradient(joints, path.times, axis=0)
+        self._hold = observation.tool_to_base
+        self._began = observation.time
+        self._phase, self._void = 0.0, ""
+
+    @property
+    def plan(self) -> Adaptation | None:
+        """The result of the last adaptation, for drawing in a report; None if the method computes none."""
+        return None if self.motion is None else self.motion.adaptation
+
+    @property
+    def phase(self) -> float:
+        """The phase of the motion, as a time in the planned motion [s]."""
+        return self._phase
+
+    def step(self, observation: Observation, dt: float) -> Command:
+        """Return the command that follows the planned path.
+
+        Raises:
+            InputError: when ``reset`` was not called.
+        """
+        if self.motion is None:
+            raise InputError(f"{type(self).__name__}.step: call reset(observation) first")
+        path = self.motion.trajectory
+        end = float(path.times[-1])
+        on_schedule = self.motion.only_on_schedule
+        if on_schedule:
+            self._phase = min(observation.time - self._began, end)
+        error = observation.tool_to_base.error_to(self._target(path))
+        lag = float(np.linalg.norm(error[:3]))
+        if on_schedule and lag > 0.5 * self._patience:
+            self._void = self._void or (
+                f"the plan is valid only at the planned times, but the tool is {1e3 * lag:.0f} mm from its planned "
+                f"position at {observation.time:.2f} s: the arm brakes; plan again from here"
+            )
+        if self._void:
+            return Command(np.zeros(6), progress=self._phase / end, status=Status.BRAKING, reason=self._void)
+        speed = 1.0 if on_schedule else max(0.0, 1.0 - (lag / self._patience) ** 2)
+        phase = self._phase
+        forward = _at(phase, path.times, self._twists)
+        if self._phase >= end:
+            speed = 0.0
+        elif not on_schedule:
+            self._phase = min(self._phase + speed * dt, end)
+        joints = self._joint_command(self.motion, observation.state.q, phase, speed)
+        return self._command(self.motion, speed * forward + self._gain * error, joints, speed, lag)
+
+    def _joint_command(self, motion: PathPlan, q: Array, phase: float, speed: float) -> Array | None:
+        """Return the joint velocity that follows the planned joints; None when only the tool was planned."""
+        if motion.joints is None or self._joint_velocities is None:
+            return None
+        times = motion.trajectory.times
+        forward = _at(phase, times, self._joint_velocities)
+        return np.asarray(speed * forward + self._gain * (_at(phase, times, motion.joints) - q))
+
+    def _command(self, motion: PathPlan, twist: Array, joints: Array | None, speed: float, lag: float) -> Command:
+        times = motion.trajectory.times
+        end = float(times[-1])
+        progress = self._phase / end
+        if (speed < _STANDS and self._phase < end) or (self._phase >= end and lag > self._arrival):
+            what = "behind its path" if self._phase < end else "from the end of its path"
+            reason = f"the tool is {1e3 * lag:.0f} mm {what}"
+            return Command(twist, joints, progress=progress, status=Status.WAITING, reason=reason)
+        displaced = float(np.interp(self._phase, times, motion.displaced))
+        if displaced > _DISPLACED:
+            reason = f"the path is displaced by {1e3 * displaced:.0f} mm here because of an obstacle"
+            return Command(twist, joints, progress=progress, status=Status.AVOIDING, reason=reason)
+        return Command(twist, joints, progress=progress)
+
+    def _target(self, path: Trajectory) -> Pose:
+        """Return the desired pose at the current phase; without a learned orientation, the tool's rotation is kept."""
+        joints = None if self.motion is None else self.motion.joints
+        if joints is not None and self.arm is not None:  # between samples the joints move linearly
+            return self.arm.tool_pose(_at(self._phase, path.times, joints))
+        positions, quaternions = path.at([self._phase])
+        return Pose(positions[0], self._hold.quaternion if quaternions is None else quaternions[0])
+
+    def finished(self, observation: Observation) -> bool:
+        """Return whether the phase is at its end, and the tool is nearer than ``arrival`` to the end of the path."""
+        if self.motion is None or self._void:
+            return False
+        path = self.motion.trajectory
+        away = np.linalg.norm(observation.tool_to_base.position - path.positions[-1])
+        return self._phase >= path.times[-1] and bool(away < self._arrival)
+
+
+def _at(time: float, times: Array, values: Array) -> Array:
+    """Return the row at ``time``, shape (m,), interpolated linearly between the rows of ``values`` (n, m)."""
+    return np.array([np.interp(time, times, column) for column in values.T])
