@@ -64,6 +64,13 @@ def test_sample_count_is_round_of_duration_over_dt_plus_one() -> None:
         assert done.times[-1] == pytest.approx(duration, abs=1e-12)
 
 
+def test_a_step_may_be_as_long_as_the_motion_but_not_longer() -> None:
+    dmp = DMP(n_basis=5).fit(minimum_jerk(n=50))
+    assert len(dmp.generate(duration=0.3, dt=3 * 0.1)) == 2  # 3 * 0.1 exceeds 0.3 by a rounding error
+    with pytest.raises(InputError, match=r"dt must be at most the duration 0\.3 s"):
+        dmp.generate(duration=0.3, dt=0.31)
+
+
 @pytest.mark.parametrize("adjustment", ["progress", "rotodilatation"])
 def test_half_the_distance_never_goes_backwards(adjustment: str) -> None:
     shown = minimum_jerk()

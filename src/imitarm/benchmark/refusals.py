@@ -38,7 +38,8 @@ class Verdict:
         family: name of the rule by which the obstacles of the scene were placed.
         accepted: whether the library found a feasible adaptation.
         margin: proven lower bound of the distance along an accepted path, minus required clearance [m]; nan if refused.
-        oracle: the oracle's answer to the question whether a path exists; if ``accepted``, "possible" or "undecided".
+        oracle: the oracle's answer to the question whether a path exists. If ``accepted``, the answer is "possible" or
+            "undecided", because the oracle then does not try to prove that no path exists.
         seconds: compute time of the adaptation [s].
     """
 

@@ -228,7 +228,7 @@ def _times(view: _View) -> Iterator[RecordingIssue]:
         message = f"in {count} frames, the time stamp is the same as in the previous frame"
         if back > 0.0:
             message = f"in {count} frames, the time stamp is up to {back:.0f} ms earlier than in the previous frame"
-        yield view.issue("error", "time-backwards", message, "repair drops these frames", i)
+        yield view.issue("error", "time-backwards", message, "repair the recording to drop these frames", i)
     if len(view.times) < _FEW:
         yield view.issue("error", "few-frames", f"{len(view.times)} frames only", "record for longer")
 
@@ -302,7 +302,10 @@ def _frozen(view: _View) -> Iterator[RecordingIssue]:
                     f"in {len(lasting)} periods, the positions of the {what} are exactly the same; "
                     f"the longest period lasts {longest:.2f} s"
                 )
-            remedy = "repair drops these frames, which leaves a gap; record again if you need the motion in the gap"
+            remedy = (
+                "repair the recording to drop these frames, which leaves a gap; record again if you need the motion in "
+                "the gap"
+            )
             yield view.issue("error" if longest > _STOP else "warning", "frozen", message, remedy, first)
             return
     fraction = whole.sum() / len(view.times)
@@ -311,7 +314,9 @@ def _frozen(view: _View) -> Iterator[RecordingIssue]:
         message = (
             f"{100 * fraction:.0f} % of the frames repeat the previous frame: {rate:.1f} different frames per second"
         )
-        yield view.issue("warning", "frozen", message, "repair drops these frames", int(np.argmax(whole)) + 1)
+        yield view.issue(
+            "warning", "frozen", message, "repair the recording to drop these frames", int(np.argmax(whole)) + 1
+        )
 
 
 def _spikes(view: _View) -> Iterator[RecordingIssue]:
@@ -324,7 +329,7 @@ def _spikes(view: _View) -> Iterator[RecordingIssue]:
             f"spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints jump away and "
             f"back, by at most {size[i, joint]:.2f} m ({JOINTS[joints[joint]]})"
         )
-        remedy = "repair marks these joints as lost in these frames"
+        remedy = "repair the recording to mark these joints as lost in these frames"
         severity = _severity_of(joints, spikes)
         yield view.issue(severity, "spike", message, remedy, int(view.later[frames[0]]))
 
@@ -414,7 +419,11 @@ def _sides(view: _View) -> Iterator[RecordingIssue]:
     if view.swapped:
         message = f"left and right are swapped in {len(view.swapped)} frames"
         yield view.issue(
-            "warning", "sides-swapped", message, "repair swaps left and right back in these frames", view.swapped[0]
+            "warning",
+            "sides-swapped",
+            message,
+            "repair the recording to swap left and right back in these frames",
+            view.swapped[0],
         )
     if view.other_axes is not None:
         return

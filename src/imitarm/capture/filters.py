@@ -152,21 +152,24 @@ _DECIDING = _pairs(("shoulder", "hip", "elbow", "wrist"))
 def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     r"""Return the skeleton with left and right assigned as in the previous frame.
 
-    Let :math:`l, r` be the positions of a left and a right joint, and :math:`l', r'` their positions in the previous
-    frame, a time t earlier.
+    If a camera swaps left and right, both sides appear to move far within one frame. Let :math:`l_j, r_j` be the
+    positions of the left and the right joint of pair j, and :math:`l'_j, r'_j` their positions in the previous frame, a
+    time t earlier. Swapping the two joints back shortens their apparent motion by
 
-    If the joints appear to have moved far since the previous frame, but much less far with left and right exchanged,
-    the camera has probably swapped them. They are swapped back if the difference is larger than the motion that is
-    possible in the time t:
+    .. math:: g_j = |l_j - l'_j| + |r_j - r'_j| - |l_j - r'_j| - |r_j - l'_j|
 
-    .. math:: \sum_j |l_j - l'_j| + |r_j - r'_j| > \sum_j |l_j - r'_j| + |r_j - l'_j| + n\,\max(0.15, v t)
+    The joints are swapped back if this length exceeds the threshold :math:`m(v) = \max(0.15, v t)` [m], where v is the
+    largest plausible speed of a joint. Three conditions are tested in this order:
 
-    The sums run over the n pairs of joints that are visible in both frames. The inequality is first evaluated for
-    shoulders and hips, with v = 0.5 m/s; if it holds, the whole body is swapped back. The inequality is then evaluated
-    with v = 4 m/s for elbows and hands together; if it holds, elbows and hands are swapped back. Otherwise it is
-    evaluated for the hands alone; if it holds, only the hands are swapped back. Hands that touch are too close to each
-    other to satisfy the inequality, so they are not swapped. If one joint of a pair is lost, only the other joint is
-    used.
+    1. The whole body is swapped back if :math:`\sum_j g_j > \sum_j m(0.5)` over the pairs of shoulders and hips.
+    2. Elbows, wrists and hands are swapped back if :math:`g_j > m(4)` for the elbows and also for the wrists.
+    3. If condition 2 does not hold, only wrists and hands are swapped back if :math:`g_j > m(4)` for the wrists.
+
+    Conditions 2 and 3 follow the swap of the whole body, if there was one. A joint is used if it is visible, and both
+    joints of its pair were visible in the previous frame. If only one joint of a pair is used, :math:`g_j` contains
+    only the terms of this joint, and the threshold of the pair is halved. Without a usable joint of a pair, condition 1
+    omits the pair, and conditions 2 and 3 do not hold. Hands that touch are too close to each other to satisfy a
+    condition, so they are not swapped.
 
     Args:
         skeleton: skeleton as the camera reports it.

@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help=f"number of the first simulated person; default: {TEST} (0 with --quick). Persons below {TEST} are for "
-        "developing methods, the others for testing them",
+        "developing methods, the other persons for testing them",
     )
     mapping.add_argument(
         "--repeats", type=int, metavar="N", help="closed-loop trials of each person; default: 5 (1 with --quick)"

@@ -171,7 +171,7 @@ def _policy(arguments: argparse.Namespace, skill: Skill, arm: ArmModel, spheres:
             options[name] = math.radians(finite_number(value, option, "degrees", at_least=0.0))
     if arguments.method is not None:
         if arguments.policy != "acfra":
-            raise InputError(f"--method is an option of --policy acfra, not of {arguments.policy}; leave it out")
+            raise InputError(f"--method is an option of --policy acfra, not of {arguments.policy}; leave out --method")
         options["method"] = arguments.method
     return POLICIES[arguments.policy].build(skill, **options)
 

@@ -133,7 +133,8 @@ def compute_alignment(demonstrations: Sequence[Demonstration], *, n: int = 200, 
     if len({one.trajectory.quaternions is None for one in demonstrations}) > 1:
         without = next(one for one in demonstrations if one.trajectory.quaternions is None)
         raise InputError(
-            f"align: some demonstrations have rotations, but {without.source or 'one'} has none; leave it out"
+            f"align: some demonstrations have rotations, but {without.source or 'one'} has none; leave out this "
+            "demonstration"
         )
     kept = [_kept_rows(one) for one in demonstrations]
     trimmed = [_trimmed(one, rows) for one, rows in zip(demonstrations, kept, strict=True)]
@@ -152,7 +153,9 @@ def _kept_rows(demonstration: Demonstration) -> tuple[int, int]:
     motion = demonstration.trajectory
     rows = moving_rows(motion.times, motion.positions, motion.quaternions)
     if rows is None or rows[1] == rows[0]:
-        raise InputError(f"align: {demonstration.source or 'a demonstration'} does not move; leave it out")
+        raise InputError(
+            f"align: {demonstration.source or 'a demonstration'} does not move; leave out this demonstration"
+        )
     return rows
 
 

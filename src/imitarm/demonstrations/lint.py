@@ -139,7 +139,9 @@ def check_idle(motion: ValidRows) -> Iterator[Finding]:
     """Find rest before and after the motion, and recordings in which the tool never moves."""
     rows = moving_rows(motion.times, motion.positions, motion.quaternions)
     if rows is None:
-        yield motion.finding("error", "still", "the tool does not move", "leave it out, or check units and columns")
+        yield motion.finding(
+            "error", "still", "the tool does not move", "check units and columns, or leave out this demonstration"
+        )
         return
     enough = max(_IDLE, _IDLE_FRACTION * motion.duration)
     head, tail = motion.times[rows[0]], motion.duration - motion.times[rows[1]]
@@ -230,7 +232,9 @@ def check_kinds(motions: Sequence[ValidRows]) -> Iterator[Finding]:
     count = f"of {len(motions)} demonstrations have"
     if any(rotations) and not all(rotations):
         message = f"{sum(rotations)} {count} rotations, but this one has no rotations"
-        yield motions[rotations.index(False)].finding("error", "mixed-rotations", message, "leave it out")
+        yield motions[rotations.index(False)].finding(
+            "error", "mixed-rotations", message, "leave out this demonstration"
+        )
     if any(joints) and not all(joints):
         message = f"{sum(joints)} {count} joints, but this one has no joints"
         yield motions[joints.index(False)].finding(
@@ -332,7 +336,7 @@ def _backwards(paths: Array, size: float, motions: Sequence[ValidRows], scale: _
     differs = forward[:, typical] > max(scale.smallest, _DIFFERENT * size)
     for i in np.flatnonzero((backward < 0.5 * forward)[:, typical] & differs):
         message = f"runs in the opposite direction to {motions[typical].name}"
-        yield int(i), message, "direction", "leave it out, or learn a separate skill for each direction"
+        yield int(i), message, "direction", "leave out this demonstration, or learn a separate skill for each direction"
 
 
 def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: _Scale) -> Iterator[_Odd]:
@@ -354,7 +358,7 @@ def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: 
                     f"{verb} at {percent:.0f} % of the path of {motions[whole[0]].name}, which is "
                     f"{scale.factor * apart[i, whole[0]]:.0f} {scale.unit} from the {end} of that path"
                 )
-                yield i, message, "incomplete", "leave it out, or record the whole motion again"
+                yield i, message, "incomplete", "leave out this demonstration, or record the whole motion again"
 
 
 def _aligned(trajectories: Sequence[Trajectory]) -> tuple[Array, Array | None]:
@@ -384,7 +388,10 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
                 f"its rotation differs by up to {degrees:.0f} degrees from the rotation of {name} at the same phase, "
                 "so the mean of both rotations would be meaningless"
             )
-            remedy = "check how the tool was held and the order of the quaternions (wxyz or xyzw), or leave it out"
+            remedy = (
+                "check how the tool was held and the order of the quaternions (wxyz or xyzw), or leave out this "
+                "demonstration"
+            )
             yield motions[odd].finding("error", "two-rotations", message, remedy)
         else:
             kinds.append(("two-rotations", "warning", "rotations", apart, _ROTATIONS_APART, np.degrees(1.0), "degrees"))
@@ -453,7 +460,9 @@ def _outliers(motions: Sequence[ValidRows], positions: Array, rotations: Array |
             f"is {1e3 * distance[center, i]:.0f} mm from the most typical demonstration "
             f"({motions[center].raw.source}), but the typical distance is {1e3 * usual:.0f} mm"
         )
-        yield motions[i].finding("warning", "outlier", message, "check it; leave it out if it shows another motion")
+        yield motions[i].finding(
+            "warning", "outlier", message, "check this demonstration, and leave it out if it shows another motion"
+        )
     if rotations is None:
         return
     angle = _angles(rotations, rotations[center]).mean(axis=1)

@@ -58,8 +58,8 @@ class TrueArm:
             truth: function of time that returns the person's skeleton; it is called with increasing times.
             times: times of a run, shape (n,) [s].
             correspondence: correspondence with the side of the arm and the pose of the sensor.
-            start: time that is added to the times of the run before ``truth`` is called: the time at which the first
-                skeleton was measured, on the clock of ``truth`` [s].
+            start: time at which the first skeleton was measured, on the clock of ``truth`` [s]; it is added to
+                ``times`` before ``truth`` is called.
         """
         t = np.asarray(times, dtype=float)
         return cls.from_points(

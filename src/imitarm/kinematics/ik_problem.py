@@ -52,7 +52,8 @@ class TaskRows(NamedTuple):
     Attributes:
         jacobian: Jacobian of the task, shape (m, n_joints).
         target: target velocity of the task, shape (m,).
-        effort: factor of the cost of joint motion; 1 for full weights, and below 1 for a task with small weights.
+        effort: factor by which the small cost of joint motion is multiplied: 1 for a task with full weights, less for a
+            task with small weights.
     """
 
     jacobian: Array

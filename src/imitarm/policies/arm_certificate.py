@@ -159,7 +159,7 @@ class ArmAmongObstacles:
         return Gaps.joined(path, [pairs.gaps(path, times, reach) for pairs in self._pairs])
 
     def clearance_at(self, path: ArmPath, times: Array, reach: float) -> ArmClearance:
-        """Return the smallest clearance at the samples of a path; its ``room`` is at most ``reach``.
+        """Return the smallest clearance at the samples of a path; a ``room`` above ``reach`` is reported as ``reach``.
 
         Args:
             path: the arm at n samples.

@@ -13,10 +13,11 @@ The algorithm of :func:`find_detour`:
    passes each obstacle on the chosen side.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
    samples.
-4. If the search over sides finds no path, a second search treats all samples together
-   (:mod:`~imitarm.policies.roadmap`), first with the learned components, then with more and narrower ones. If
-   components can move only in a plane, the roadmap is built as soon as the next choice of sides is hardly cheaper than
-   the previous choice. If the roadmap then contains no route, no further choice of sides is tried.
+4. If the search over sides finds no path, a second search treats all samples together. It takes routes from a roadmap
+   (:mod:`~imitarm.policies.roadmap`), and follows each route first with the learned components, then with more and
+   narrower ones. If components can move only in a plane, the roadmap is built earlier: as soon as the next choice of
+   sides costs more than 70 % of the previous choice. Then the roadmap decides: if it contains no route, the search over
+   sides ends, otherwise the search over sides continues.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ _RING = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # directions tried
 _IDENTITY = np.eye(3)
 _OTHERS = ([1, 2], [0, 2], [0, 1])
 _MAX_CHOICES = 4  # of a side, before all times are searched together
-_HARDLY_CHEAPER = 0.7  # times the cost of the choice before
+_HARDLY_CHEAPER = 0.7  # times the cost of the previous choice of sides
 _MAX_ROUTES = 3  # through the roadmap
 _ALMOST = 0.003  # [m] an attempt that lacks less clearance than this is tried again with narrower components
 _MAX_ROWS = 12  # violated samples that vote on a direction; the least detour then respects all of them
@@ -149,7 +150,7 @@ class _SideSearch:
         A second call continues where the first call stopped.
 
         Args:
-            while_cheaper: stop and return None as soon as the next choice is hardly cheaper than the previous choice.
+            while_cheaper: stop and return None as soon as the next choice costs more than 70 % of the previous choice.
         """
         while self._heap:
             if while_cheaper and 0 < self._choices < _MAX_CHOICES and self._heap[0].cost > _HARDLY_CHEAPER * self._cost:

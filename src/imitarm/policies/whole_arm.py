@@ -91,7 +91,7 @@ class ArmTask:
         start: posture at the start, shape (n_joints,) [rad].
         scene: obstacles at time 0, and fixtures.
         clearance: required distance from every moving part of the arm to every obstacle [m].
-        allowed: directions in which components (the parts of the path near an obstacle) may be displaced.
+        allowed: directions in which the components of the path may be displaced.
         max_tilt: largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad].
         allowance: ``clearance`` minus the clearance that the safety filter keeps [m].
     """

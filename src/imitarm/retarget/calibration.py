@@ -313,7 +313,7 @@ class SensorFit:
         if self.suspect is not None:
             lines.append(
                 f"point {self.suspect + 1} does not fit the others (by {100 * self.residuals[self.suspect]:.1f} cm); "
-                "touch it again, or leave it out"
+                "touch this point again, or leave it out"
             )
         elif self.rms > GOOD:
             lines.append(
@@ -430,5 +430,5 @@ def _misfit(k: Array, b: Array, c: Array, rms: float) -> str:
         return f"the robot's points are {ratio:.3g} times as far apart as the sensor's points: give both in metres"
     suspect = _suspect(k, b, c, rms)
     if suspect is not None:
-        return f"point {suspect + 1} does not fit the others: touch it again, or leave it out"
+        return f"point {suspect + 1} does not fit the others: touch this point again, or leave it out"
     return "the points of sensor and robot are not the same points in the same order: touch them again one by one"

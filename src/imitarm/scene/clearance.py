@@ -203,7 +203,7 @@ class SelfClearance:
         return float((np.linalg.norm(centers[self.outer] - centers[self.inner], axis=1) - self.sums).min())
 
     def nearest(self, q: ArrayLike) -> tuple[Indices, Array]:
-        """Return the pairs of spheres that have a row, nearest first.
+        """Return the pairs of spheres that are near enough to have a row in :meth:`rows`, nearest pair first.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].

@@ -273,7 +273,9 @@ def _check_size(key: str, value: Any, where: str) -> None:
     sizes = np.ptp(numbers, axis=0) if key == "points" else np.atleast_1d(numbers)
     smallest = float(sizes.min()) * (2.0 if key in ("radius", "semi_axes") else 1.0)
     if smallest < _SMALLEST * (1.0 - 1e-9):
-        raise InputError(f"{where}: {key} makes it {1e3 * smallest:.3g} mm thick, less than 1 mm; check units")
+        raise InputError(
+            f"{where}: {key} makes the obstacle {1e3 * smallest:.3g} mm thick, less than 1 mm; check units"
+        )
 
 
 def _shape(kind: object, where: str) -> type[Obstacle]:

@@ -41,6 +41,7 @@ Array = NDArray[np.float64]
 Coupling = Callable[[Array, Array], ArrayLike]
 
 MOST_STEPS = 10_000_000  # of a generated motion
+_ROUNDING = 1e-9  # of a duration: ``dt`` may exceed the duration by no more
 _SHORTEST_STEP, _LONGEST_STEP = 1e-100, 100.0  # in durations: the spring's numbers stay finite, and the time to compute
 _state = tuple.__new__  # makes a named tuple without its slower constructor
 
@@ -306,7 +307,7 @@ class DMP:
         Args:
             state: state returned by :meth:`begin` or by the last step.
             dt: [s], above 0.
-            goal: another goal position (3,) [m] from now on, for a goal that moves.
+            goal: new goal position (3,) [m], which applies from this step on; None: the goal stays.
             coupling: function from position (3,) [m] and velocity (3,) [m/s] to an acceleration (3,) [m/s^2] that is
                 added during this step, for example away from an obstacle. If ``coupling`` returns six numbers, the last
                 three are an angular acceleration [rad/s^2].
@@ -382,7 +383,7 @@ class DMP:
             coupling: see :meth:`step`.
 
         Raises:
-            InputError: for the same reasons as :meth:`begin`, and when ``dt`` is 0, negative or longer than twice the
+            InputError: for the same reasons as :meth:`begin`, and when ``dt`` is 0, negative or longer than the
                 duration.
         """
         state = self.begin(start, goal, duration, start_velocity=start_velocity, adjustment=adjustment)
@@ -405,19 +406,19 @@ class DMP:
 
 
 def number_of_steps(duration: float, dt: float, what: str) -> int:
-    """Return ``round(duration / dt)``, at least 1.
+    """Return ``round(duration / dt)``.
 
     Raises:
-        InputError: when ``dt`` [s] is 0, negative or longer than twice the duration, or when there are more than 10
-            million steps.
+        InputError: when ``dt`` [s] is 0, negative or longer than the duration, or when there are more than 10 million
+            steps.
     """
     steps = duration / finite_number(dt, f"{what}: dt", "s", above=0.0)
-    if not 0.5 <= steps <= MOST_STEPS:
+    if not 1.0 - _ROUNDING <= steps <= MOST_STEPS:
         raise InputError(
             f"{what}: dt must be at most the duration {duration:g} s and give at most {MOST_STEPS:,} steps, "
             f"got {dt!r} s"
         )
-    return max(1, round(steps))
+    return round(steps)
 
 
 def _position(value: Pose | ArrayLike | None, default: Array, what: str) -> Array:

@@ -269,7 +269,7 @@ class _StackRun:
 class IdealFollower(Retargeter):
     """A retargeter that moves the tool to its target by inverse kinematics, without filters or corrections.
 
-    The retargeter assumes that every skeleton is exact. With an :func:`ideal_camera`, the robot's tool moves like a
+    This retargeter assumes that every skeleton is exact. With an :func:`ideal_camera`, the robot's tool moves like a
     tool in the person's own hand, with a lag of a few hundredths of a second. The benchmark uses this retargeter to
     record simulated people, and then gives the same recordings to every retargeter.
     """

@@ -72,10 +72,10 @@ class ClockOffsetEstimator:
     An unconfirmed sample is rejected as a false time stamp in two cases:
 
     * Two datagrams that arrive later have an earlier time stamp, although a sender's clock never goes back.
-    * The datagrams before and after the sample agree with the confirmed minimum. Before the sample arrived, three
-      datagrams had given samples near this minimum. After it, three datagrams that arrive over a period of at least
-      ``max_age`` have a delay of at most ``max_age`` relative to this minimum. This case applies only while at most
-      four samples are unconfirmed. If more samples are unconfirmed, they come from a queue of delayed datagrams.
+    * The datagrams before and after the sample agree with the confirmed minimum: three earlier datagrams gave samples
+      near this minimum, and three later datagrams, which arrive over a period of at least ``max_age``, have a delay of
+      at most ``max_age`` relative to this minimum. This case applies only while at most four samples are unconfirmed,
+      because more unconfirmed samples are a sign that all other datagrams were delayed in a queue.
 
     Args:
         max_age: longest accepted delay [ns].
@@ -97,7 +97,7 @@ class ClockOffsetEstimator:
     def too_early(self, offset: int, sent: int, now: int) -> bool:
         """Return whether a time stamp lies more than ``10 * max_age`` in the future.
 
-        The sample of a datagram from the future is used only if the next datagram has a still later time stamp.
+        The sample of such a datagram is used only if the next datagram has an even later time stamp.
 
         Args:
             offset: time of receiving minus time stamp [ns].

@@ -20,8 +20,8 @@ STAGES = {
     "retarget": "from the start of the control step to the computed command",
     "send": "from the computed command to its sending",
     "robot": "from sending the command to its receipt by the robot process",
-    "apply": "from receipt by the robot process to applying the command",
-    "total": "total, from exposure to applying the command",
+    "apply": "from receipt by the robot process to execution of the command",
+    "total": "total, from exposure to execution of the command",
 }
 """Processing stages of a skeleton, in order, with the interval that each stage covers.
 

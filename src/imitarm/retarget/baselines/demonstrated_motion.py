@@ -101,7 +101,9 @@ class DemonstratedMotion:
 def engagements(
     frames: Iterable[Skeleton], correspondence: Correspondence, rule: EngagementRule
 ) -> Iterator[tuple[ArmEstimate, ...]]:
-    """For each engagement in a recording, yield its estimates of the person's arm, of which there are at least two.
+    """For each engagement in a recording, yield the estimates of the person's arm.
+
+    Engagements with fewer than two estimates are left out.
 
     Args:
         frames: frames in order of time.
