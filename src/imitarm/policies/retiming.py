@@ -20,13 +20,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_path import ArmPath
+from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles
 
 Array = NDArray[np.float64]
+
+SELF_CLEARANCE = 0.012
+"""Planned distance between links of the arm that do not share a joint [m]."""
 
 _VELOCITY, _ACCELERATION, _TORQUE = 0.95, 0.9, 0.9  # fractions of the limits that are used
 _HALVINGS = 40
 _NO_EFFECT = 1e-9  # a coefficient smaller than this does not limit a
 _SLOWEST = 1e-6  # squared speed below which the path counts as blocked
+_FILTER_SELF, _FILTER_MARGIN = 0.01, 1e-3  # [m] that the safety filter keeps between links; that it adds to a clearance
+_APPROACH_RATE, _SELF_RATE = 5.4, 4.5  # [1/s] distances shrink no faster than this times what is left; the filter: 6, 5
+_REACH = 0.15  # [m] pairs farther apart than the clearance and this do not slow the motion
+_CREEP = 1e-3  # [m/s] closing speed that is always allowed, so that the motion goes on
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +88,34 @@ def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array) -> 
     if len(slow):
         return Timing(np.array(parameters - parameters[0]), int(slow[0]), -1)
     return Timing(np.concatenate([[0.0], np.cumsum(np.diff(parameters) / means)]))
+
+
+def safe_rates(around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Array, allowance: float) -> Array:
+    """Return the largest rate ds/dt at each sample at which no distance shrinks faster than the safety filter allows.
+
+    Args:
+        around: the arm, its obstacles and the required clearances.
+        path: the arm at n samples.
+        times: path parameter s of each sample, increasing, shape (n,) [s].
+        clock: time at which each sample is compared with the places of the obstacles, shape (n,) [s].
+        allowance: required clearance minus the clearance that the safety filter keeps [m].
+
+    Returns:
+        Shape (n,), at most 1.
+    """
+    speed = np.linalg.norm(np.gradient(path.centers, times, axis=0), axis=2)
+    gaps = around.gaps(path, clock, min(2.0 * float(speed.max(initial=0.0)) / _SELF_RATE, _REACH))
+    own = gaps.obstacle == SELF
+    margin = np.where(own, SELF_CLEARANCE - _FILTER_SELF, max(allowance - _FILTER_MARGIN, 0.0))
+    rate = np.where(own, _SELF_RATE, _APPROACH_RATE)
+    allowed = np.maximum(rate * (np.maximum(gaps.room, 0.0) + margin) + gaps.drift, _CREEP)
+    # A distance shrinks at most as fast as the sphere moves; that of two spheres at most twice as fast.
+    closing = np.flatnonzero(allowed < 2.0 * speed[gaps.sample, gaps.sphere])
+    velocity = np.gradient(path.joints, times, axis=0)[gaps.sample[closing]]
+    approach = np.maximum(-np.einsum("kj,kj->k", gaps.rates(closing), velocity), 1e-9)
+    fastest = np.ones(len(path))
+    np.minimum.at(fastest, gaps.sample[closing], allowed[closing] / approach)
+    return fastest
 
 
 def _limits(arm: ArmModel, joints: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:

@@ -30,18 +30,14 @@ from imitarm.policies.arm_planner import JOINT_LIMIT, TILT_LEVER, TILT_LIMIT, Ar
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.goal_postures import GoalPosture, GoalSearch, clear_postures
 from imitarm.policies.least_detour import SMOOTHNESS, AllowedDirections, Detour
-from imitarm.policies.retiming import Timing, retimed
+from imitarm.policies.retiming import SELF_CLEARANCE, Timing, retimed, safe_rates
 from imitarm.scene.clearance import SelfClearance
 from imitarm.scene.scene import Scene
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-SELF_CLEARANCE = 0.012  # [m] planned between links
-_FILTER_SELF, _FILTER_MARGIN = 0.01, 1e-3  # [m] that the safety filter keeps between links; that it adds to a clearance
-_APPROACH_RATE, _SELF_RATE = 5.4, 4.5  # [1/s] distances shrink no faster than this times what is left; the filter: 6, 5
-_REACH = 0.15  # [m] pairs farther apart than the clearance and this do not slow the motion
-_SLOWEST = 1e-3  # [m/s] closing speed that is always allowed, so that the motion goes on
+_REACH = 0.15  # [m] largest clearance that is reported
 _RETIMINGS = 4  # among moving obstacles
 _VIAS, _VIA_SPREAD = 60, 0.6  # random via postures of an approach; their standard deviation [rad]
 _LEG_STEP, _LEG_SPEED = 0.05, 0.4  # [rad] between samples of an approach; fraction of the largest speed
@@ -331,18 +327,7 @@ class _Search:
 
         Each sample is compared with the places of the obstacles at its time in ``clock``.
         """
-        speed = np.linalg.norm(np.gradient(path.centers, times, axis=0), axis=2)
-        gaps = self._around.gaps(path, clock, min(2.0 * float(speed.max(initial=0.0)) / _SELF_RATE, _REACH))
-        own = gaps.obstacle == SELF
-        margin = np.where(own, SELF_CLEARANCE - _FILTER_SELF, max(self.task.allowance - _FILTER_MARGIN, 0.0))
-        rate = np.where(own, _SELF_RATE, _APPROACH_RATE)
-        allowed = np.maximum(rate * (np.maximum(gaps.room, 0.0) + margin) + gaps.drift, _SLOWEST)
-        # A distance shrinks at most as fast as the sphere moves; that of two spheres at most twice as fast.
-        closing = np.flatnonzero(allowed < 2.0 * speed[gaps.sample, gaps.sphere])
-        velocity = np.gradient(path.joints, times, axis=0)[gaps.sample[closing]]
-        approach = np.maximum(-np.einsum("kj,kj->k", gaps.rates(closing), velocity), 1e-9)
-        fastest = np.ones(len(path))
-        np.minimum.at(fastest, gaps.sample[closing], allowed[closing] / approach)
+        fastest = safe_rates(self._around, path, times, clock, self.task.allowance)
         return retimed(self.task.arm, path.joints, times, fastest)
 
     def named(self, found: ArmClearance) -> str:
