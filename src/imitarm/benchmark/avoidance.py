@@ -18,10 +18,10 @@ from imitarm.benchmark.families import (
     Case,
     covered_end,
     narrow_gap,
-    s_shaped_demonstrations,
     sparse_clutter,
 )
 from imitarm.benchmark.tables import Table
+from imitarm.benchmark.teachers import s_shaped_demonstrations
 from imitarm.evaluation.intervals import wilson_interval
 from imitarm.policies.adaptation import ADAPTERS, adapt
 from imitarm.policies.adapted_path import Adaptation

@@ -13,19 +13,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_to_matrix
 from imitarm.policies.adaptation import HORIZONTAL_ONLY, NOT_DOWN
 from imitarm.scene import Box, Capsule, Cone, ConvexHull, Cylinder, Ellipsoid, Obstacle, Scene, Sphere
-from imitarm.trajectory import Demonstration, Trajectory
 
 Array = NDArray[np.float64]
 
 TOOL_RADIUS = 0.03  # [m]
 CLEARANCE = 0.02  # [m] required of every method
-_DURATION = 4.0  # [s]
 _FREE_ENDS = 0.08  # [m] no obstacle is nearer to start or goal than this
 _APART = 0.16  # [m] between the centres of sparse obstacles
 _OFF_PATH = 0.015  # [m] standard deviation of an obstacle's centre about the path
+_TRIES = 20_000  # of an obstacle, before its path counts as too short
 _WALL = 2.0  # [m] length of a wall that can't be passed at its outer end
 
 
@@ -44,34 +44,9 @@ class Case:
     solvable: bool
 
 
-def s_shaped_demonstrations(*, planar: bool, n_demonstrations: int = 8, seed: int = 0) -> list[Demonstration]:
-    """Make demonstrations of an S-shaped reach of 0.6 m, precise at both ends and variable between them.
-
-    Args:
-        planar: whether to keep the height constant, as in a task on a table.
-        n_demonstrations: how many.
-        seed: seed of the differences between the demonstrations.
-    """
-    rng = np.random.default_rng([1, seed])
-    times = np.linspace(0.0, _DURATION, 200)
-    u = times / _DURATION
-    pace = 10 * u**3 - 15 * u**4 + 6 * u**5  # minimum jerk
-    demonstrations = []
-    for i in range(n_demonstrations):
-        a, b, c = rng.normal(size=3)
-        loose = np.sin(np.pi * pace)
-        x = 0.6 * pace
-        y = (0.10 + 0.015 * a) * np.sin(2 * np.pi * pace) + 0.02 * b * loose
-        z = np.full_like(x, 0.10) if planar else 0.30 + 0.05 * loose + 0.015 * c * loose
-        wobble = 0.0005 * rng.normal(size=(4, 3)) * ([1, 1, 0] if planar else [1, 1, 1])
-        ripple = np.stack([np.sin((k + 2) * np.pi * u) for k in range(4)], axis=1) @ wobble
-        trajectory = Trajectory(times, np.stack([x, y, z], axis=1) + ripple)
-        demonstrations.append(Demonstration(trajectory, task="s-shaped reach", source=f"seed {seed}, number {i}"))
-    return demonstrations
-
-
 SIMPLE = ("sphere", "box")  # the shapes with the simplest distances
 KINDS = (*SIMPLE, "capsule", "cylinder", "ellipsoid", "convex hull")
+ALL_KINDS = (*KINDS, "cone")
 
 
 class _Draft(NamedTuple):
@@ -111,6 +86,8 @@ def _draft(rng: np.random.Generator, centre: Array, planar: bool, kinds: tuple[s
             return Box(pose, 2.0 * half)
         if kind == "cylinder":
             return Cylinder(pose, radius, 4.0 * half[2])
+        if kind == "cone":
+            return Cone(pose, radius, 4.0 * half[2])
         if kind == "ellipsoid":
             return Ellipsoid(pose, half)
         along = pose.rotation[:, 0] * half[0]
@@ -120,7 +97,7 @@ def _draft(rng: np.random.Generator, centre: Array, planar: bool, kinds: tuple[s
 
 
 def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, kinds: tuple[str, ...] = KINDS) -> Case:
-    """Families S1 and S3: obstacles of all shapes on the path, far apart.
+    """Make a scene of obstacles of all shapes on the path, far apart.
 
     The scene is solvable, because a path can go around each obstacle.
 
@@ -132,10 +109,31 @@ def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, ki
         kinds: names of the shapes from which obstacles are chosen.
     """
     rng = np.random.default_rng([11, n_obstacles, planar, seed])
+    chosen = obstacles_apart(rng, path, n_obstacles, planar=planar, kinds=kinds)
+    return Case(Scene(None, chosen), HORIZONTAL_ONLY if planar else (), True)
+
+
+def obstacles_apart(
+    rng: np.random.Generator, path: Array, n_obstacles: int, *, planar: bool, kinds: tuple[str, ...] = KINDS
+) -> tuple[Obstacle, ...]:
+    """Place obstacles on a path, far from one another, from the start and from the goal.
+
+    Args:
+        rng: source of the random numbers.
+        path: nominal path, shape (n, 3) [m].
+        n_obstacles: how many.
+        planar: whether the obstacles stand upright, at the height of the path.
+        kinds: names of the shapes from which obstacles are chosen.
+
+    Raises:
+        InputError: when the path is too short for so many obstacles.
+    """
     ends, free = path[[0, -1]], TOOL_RADIUS + _FREE_ENDS
     chosen: list[Obstacle] = []
     centres: list[Array] = []
-    while len(chosen) < n_obstacles:
+    for _ in range(_TRIES):
+        if len(chosen) == n_obstacles:
+            return tuple(chosen)
         off = _OFF_PATH * rng.normal(size=3) * ([1.0, 1.0, 0.0] if planar else [1.0, 1.0, 1.0])
         centre = path[rng.integers(len(path))] + off
         draft = _draft(rng, centre, planar, kinds)
@@ -153,11 +151,11 @@ def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, ki
         elif rng.random() < 0.02:  # painted into a corner: begin again
             chosen.clear()
             centres.clear()
-    return Case(Scene(None, tuple(chosen)), HORIZONTAL_ONLY if planar else (), True)
+    raise InputError(f"no place for {n_obstacles} obstacles on the path; choose fewer, or the skill of a longer path")
 
 
 def narrow_gap(seed: int, path: Array, *, solvable: bool) -> Case:
-    """Family S4: a wall across a planar path with one gap, 5 to 30 mm wider or narrower than necessary.
+    """Make a wall across a planar path with one gap, 5 to 30 mm wider or narrower than necessary.
 
     Args:
         seed: number of the scene.
@@ -167,26 +165,39 @@ def narrow_gap(seed: int, path: Array, *, solvable: bool) -> Case:
     rng = np.random.default_rng([14, solvable, seed])
     need = 2.0 * (TOOL_RADIUS + CLEARANCE)
     slack = rng.uniform(0.005, 0.03)
-    width = need + slack if solvable else need - slack
+    walls = wall_with_gap(rng, path, need + slack if solvable else need - slack)
+    return Case(Scene(None, walls), HORIZONTAL_ONLY, solvable)
+
+
+def wall_with_gap(
+    rng: np.random.Generator, path: Array, width: float, *, shift: float = 0.04, height: float = 0.3
+) -> tuple[Box, Box]:
+    """Make a wall across the middle of a path, in two halves with a gap between them.
+
+    The wall is so long that the path can't go around it.
+
+    Args:
+        rng: source of the random numbers.
+        path: nominal path, shape (n, 3) [m].
+        width: width of the gap [m].
+        shift: the centre of the gap is at most so far from the path [m].
+        height: height of the wall [m].
+    """
     middle = path[len(path) // 2]
     ahead = path[len(path) // 2 + 5] - path[len(path) // 2 - 5]
     heading = np.array([0.0, 0.0, np.arctan2(ahead[1], ahead[0])])
     across = quaternion_to_matrix(quaternion_exp(heading))[:, 1]
-    centre = middle + rng.uniform(-0.04, 0.04) * across
-    thick = rng.uniform(0.02, 0.05)
-    walls = [
-        Box(
-            Pose(centre + side * 0.5 * (width + _WALL) * across, quaternion_exp(heading)),
-            np.array([thick, _WALL, 0.3]),
-            name=name,
-        )
+    centre = middle + rng.uniform(-shift, shift) * across
+    size = np.array([rng.uniform(0.02, 0.05), _WALL, height])
+    left, right = (
+        Box(Pose(centre + side * 0.5 * (width + _WALL) * across, quaternion_exp(heading)), size, name=name)
         for side, name in ((1.0, "left wall"), (-1.0, "right wall"))
-    ]
-    return Case(Scene(None, tuple(walls)), HORIZONTAL_ONLY, solvable)
+    )
+    return left, right
 
 
 def covered_end(seed: int, path: Array, *, planar: bool) -> Case:
-    """Family S6: an obstacle covers the start or the goal, so the scene must be refused.
+    """Make a scene in which an obstacle covers the start or the goal, so that it must be refused.
 
     Args:
         seed: number of the scene.
@@ -194,13 +205,17 @@ def covered_end(seed: int, path: Array, *, planar: bool) -> Case:
         planar: whether the path must stay in its plane.
     """
     rng = np.random.default_rng([16, planar, seed])
-    end = path[0] if rng.random() < 0.5 else path[-1]
+    obstacle = covering_sphere(rng, path[0] if rng.random() < 0.5 else path[-1], planar=planar)
+    return Case(Scene(None, (obstacle,)), HORIZONTAL_ONLY if planar else (), False)
+
+
+def covering_sphere(rng: np.random.Generator, point: Array, *, planar: bool) -> Sphere:
+    """Make a sphere that covers ``point`` (3,) [m], or leaves the tool there less than the required clearance."""
     radius = rng.uniform(0.02, 0.05)
     direction = rng.normal(size=3) * ([1.0, 1.0, 0.0] if planar else [1.0, 1.0, 1.0])
     direction /= np.linalg.norm(direction)
-    gap = rng.uniform(-radius, 0.9 * CLEARANCE)  # from swallowing the end to leaving too little
-    obstacle = Sphere(end + direction * max(0.0, gap + TOOL_RADIUS + radius), radius)
-    return Case(Scene(None, (obstacle,)), HORIZONTAL_ONLY if planar else (), False)
+    gap = rng.uniform(-radius, 0.9 * CLEARANCE)  # from swallowing the point to leaving too little
+    return Sphere(point + direction * max(0.0, gap + TOOL_RADIUS + radius), radius)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,9 @@ path, called layers. In each layer, the possible displacements of the path are t
 
 The oracle gives one of three answers:
 
-* **impossible**: a proof. Positions are grouped into boxes, and times into intervals. A box counts as free if any of
-  its points may be free at any time of an interval. If no chain of free boxes leads from the start to the goal, then no
-  continuous displacement of the path exists.
+* **impossible**: a proof. Either an obstacle covers a point that must not move. Or no chain of free boxes leads from
+  the start to the goal: positions are grouped into boxes, and times into intervals, and a box counts as free if any of
+  its points may be free at any time of an interval. Then no continuous displacement of the path exists.
 * **possible**: a path was found and verified. A cell counts as free if its centre is free. Tangents give a lower bound
   of the distance to the obstacles during moves between neighbouring cells and between layers. Dynamic
   programming finds the chain of free cells with the smallest displacements. A sum of the skill's components is then
@@ -30,7 +30,15 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark.refusal_proof import MAX_DISPLACEMENT, Question, grids, halves, is_impossible, separation
+from imitarm.benchmark.refusal_proof import (
+    MAX_DISPLACEMENT,
+    Question,
+    covers_fixed_point,
+    grids,
+    halves,
+    is_impossible,
+    separation,
+)
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -65,7 +73,7 @@ def answer(question: Question) -> Answer:
     nearest = int(np.argmin(np.linalg.norm(question.spheres[:, :3], axis=1)))
     part = replace(question, spheres=question.spheres[[nearest]])
     boxes, searches = grids(part, axes), _SEARCH_GRIDS[len(axes)]
-    if is_impossible(part, next(boxes)):
+    if covers_fixed_point(question) or is_impossible(part, next(boxes)):
         return Answer.IMPOSSIBLE
     if is_solved(question, axes, searches[:1]):
         return Answer.POSSIBLE

@@ -98,6 +98,18 @@ def separation(question: Question, times: Array, positions: Array) -> float:
     return lowest - question.clearance
 
 
+def covers_fixed_point(question: Question) -> bool:
+    """Return whether an obstacle is too close to the tool at a fixed time, where the path may not be displaced."""
+    times = np.asarray(question.fixed_times)
+    tip, relative = question.at(times)
+    for obstacle in question.obstacles:
+        points = tip + relative - times[:, None] * obstacle.velocity
+        needed = question.clearance + question.spheres[:, 3, None]
+        if np.any(obstacle.signed_distance(points) < needed - _ROUNDING):
+            return True
+    return False
+
+
 @dataclass(frozen=True, eq=False)
 class _Cells:
     """A regular grid of equal boxes that fills a region of positions.

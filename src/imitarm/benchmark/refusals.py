@@ -16,6 +16,7 @@ from imitarm.benchmark.avoidance import learn
 from imitarm.benchmark.families import RANDOM_FAMILIES, RandomScene, random_scene
 from imitarm.benchmark.refusal_oracle import Answer, answer, is_solved
 from imitarm.benchmark.refusal_proof import Question, separation
+from imitarm.benchmark.static_scenes import StaticCase
 from imitarm.benchmark.tables import Table
 from imitarm.demonstrations import align, read
 from imitarm.evaluation.intervals import wilson_interval
@@ -70,7 +71,7 @@ def scene_for(skill: Skill, seed: int) -> RandomScene:
     return random_scene(seed, path, skill.duration_, rotates=skill.gmr_.has_orientation_)
 
 
-def question_of(skill: Skill, case: RandomScene) -> Question:
+def question_of(skill: Skill, case: RandomScene | StaticCase) -> Question:
     """Return a scene in the form that the oracle uses."""
     path = ComponentPath.of_skill(skill, n_samples=case.n_samples, pinned=case.pinned)
     forbidden = np.array(case.forbidden, dtype=float).reshape(-1, 3)
@@ -85,8 +86,8 @@ def question_of(skill: Skill, case: RandomScene) -> Question:
     )
 
 
-def adapted(skill: Skill, case: RandomScene) -> Adaptation:
-    """Adapt a skill to a random scene."""
+def adapted(skill: Skill, case: RandomScene | StaticCase) -> Adaptation:
+    """Adapt a skill to a scene."""
     return adapt(
         skill,
         case.scene,

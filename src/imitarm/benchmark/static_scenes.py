@@ -1,0 +1,260 @@
+"""Static scenes of ``imitarm benchmark static``: families of obstacles, each of which makes avoidance hard in its way.
+
+| family | obstacles | known by construction |
+|---|---|---|
+| S1 | sparse: 1 or 2 spheres and boxes on the path | solvable |
+| S2 | dense: 4 to 8 spheres and boxes on and beside the path | - |
+| S3 | mixed: 1 to 3 obstacles of all shapes on the path | solvable |
+| S4 | a wall with a gap, 1.2 to 3 times as wide as the tool | solvable, or not |
+| S5 | a trap: three boxes in the shape of a U that opens towards the path, 5 to 20 cm deep | solvable |
+| S6 | an obstacle over the start, the goal or a contact point | not solvable |
+
+In every scene that is not of S6, the tool would touch an obstacle on the learned path.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.benchmark.families import (
+    ALL_KINDS,
+    CLEARANCE,
+    SIMPLE,
+    TOOL_RADIUS,
+    covering_sphere,
+    obstacles_apart,
+    random_obstacle,
+    wall_with_gap,
+)
+from imitarm.benchmark.teachers import demonstrations_by, s_shaped_reach
+from imitarm.demonstrations import align
+from imitarm.errors import InputError, UnknownNameError
+from imitarm.kinematics.pose import Pose, quaternion_exp
+from imitarm.policies.adaptation import HORIZONTAL_ONLY
+from imitarm.scene import Box, Obstacle, Scene
+from imitarm.skills.gmm import DegenerateAxisWarning
+from imitarm.skills.skill import Skill
+from imitarm.trajectory import Demonstration
+
+Array = NDArray[np.float64]
+Directions = tuple[tuple[float, float, float], ...]
+
+SPLITS = {"train": (0, 1000), "validation": (1000, 1200), "test": (2000, 4000)}  # seeds [first, end)
+PATH_SAMPLES = 400  # of the learned path, on which obstacles are placed
+BLOCKED = 0.003  # [m] depth to which the tool would enter an obstacle on the learned path
+
+_FREE = TOOL_RADIUS + CLEARANCE + 0.01  # [m] from start and goal to the obstacles
+_DRAWS = 500  # of a scene, before its path counts as too short
+_SPREAD_DENSE = 0.06  # [m] standard deviation of an obstacle's centre about the path, in dense scenes
+_SKEW = 0.15  # [rad] standard deviation of the angle between a trap and the path
+_TIGHT = 0.002  # [m] gaps that are wider than necessary by less than this are for the oracle to judge
+_MIDDLE = 0.3, 0.7  # fractions of the path between which a contact point or a trap is
+
+
+@dataclass(frozen=True, eq=False)
+class StaticCase:
+    """One static scene around the path of a skill, which a method must solve or refuse.
+
+    Attributes:
+        family: name of the family, one of :data:`FAMILIES`.
+        dimension: 2 when the path may only be displaced horizontally, else 3.
+        seed: number of the scene.
+        skill: the skill whose path is blocked.
+        scene: the obstacles; start and goal are the learned ones.
+        tool_spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
+        clearance: required [m].
+        forbidden: directions in which the path must not be displaced.
+        pinned: times at which the path must not be displaced, because the tool meets something there [s].
+        must_refuse: whether no path exists, where the construction of the scene tells; else None.
+        n_samples: number of samples along the path.
+    """
+
+    family: str
+    dimension: int
+    seed: int
+    skill: Skill
+    scene: Scene
+    tool_spheres: Array
+    clearance: float
+    forbidden: Directions
+    pinned: tuple[float, ...]
+    must_refuse: bool | None
+    n_samples: int = 200
+
+
+class _Placed(NamedTuple):
+    """Obstacles, with what their construction tells."""
+
+    obstacles: tuple[Obstacle, ...]
+    must_refuse: bool | None
+    contact: float | None = None  # fraction of the duration
+
+
+_Place = Callable[[np.random.Generator, Array, bool], _Placed]  # random numbers, path (n, 3), whether planar
+
+
+@lru_cache(maxsize=16)
+def reaching_skill(dimension: int, teachers: int = 1) -> Skill:
+    """Learn the S-shaped reach from several teachers, with 8 components."""
+    return _learned(align(demonstrations_by(s_shaped_reach(planar=dimension == 2), teachers)), n_components=8)
+
+
+def _learned(demonstrations: list[Demonstration], n_components: int) -> Skill:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DegenerateAxisWarning)  # a planar motion has no spread in z, on purpose
+        return Skill(n_components).fit(demonstrations)
+
+
+def learned_path(skill: Skill, n: int = PATH_SAMPLES) -> Array:
+    """Return ``n`` positions along the nominal path of a skill, shape (n, 3) [m]."""
+    return skill.nominal(np.linspace(0.0, skill.duration_, n)).positions
+
+
+def static_case(family: str, dimension: int, seed: int, *, teachers: int = 1, skill: Skill | None = None) -> StaticCase:
+    """Return one static scene; the same arguments give the same scene on every machine.
+
+    Args:
+        family: one of :data:`FAMILIES`.
+        dimension: 2 when the path may only be displaced horizontally, else 3.
+        seed: number of the scene; :data:`SPLITS` says what it may be used for.
+        teachers: number of teachers from whom the skill was learned.
+        skill: another skill, for the families in :data:`ANY_SKILL`.
+
+    Raises:
+        UnknownNameError: when there is no such family.
+        InputError: when an argument is out of range, or the path of ``skill`` is too short for the obstacles.
+    """
+    if family not in FAMILIES:
+        raise UnknownNameError.among("family of static scenes", family, FAMILIES)
+    if dimension not in (2, 3) or seed < 0:
+        raise InputError(f"static_case: dimension must be 2 or 3 and seed at least 0, got {dimension} and {seed}")
+    if skill is not None and family not in ANY_SKILL:
+        raise InputError(
+            f"static_case: scenes of {family} are made for its own skill; with skill=..., choose one of "
+            f"{', '.join(ANY_SKILL)}"
+        )
+    rng = np.random.default_rng([int(family[1:]), dimension, seed])
+    own = reaching_skill(dimension, teachers) if skill is None else skill
+    path = learned_path(own)
+    placed = _blocking(_PLACERS[family], rng, path, dimension == 2)
+    known = placed.must_refuse if skill is None or placed.must_refuse else None  # another path may come back
+    return StaticCase(
+        family,
+        dimension,
+        seed,
+        own,
+        Scene(None, placed.obstacles),
+        np.array([[0.0, 0.0, 0.0, TOOL_RADIUS]]),
+        CLEARANCE,
+        HORIZONTAL_ONLY if dimension == 2 else (),
+        () if placed.contact is None else (placed.contact * own.duration_,),
+        known,
+    )
+
+
+def _blocking(place: _Place, rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+    """Draw scenes until the tool would enter an obstacle on the path, and start and goal are free, except in S6."""
+    for _ in range(_DRAWS):
+        placed = place(rng, path, planar)
+        scene = Scene(None, placed.obstacles)
+        if placed.contact is not None or place is _over_a_point:
+            return placed
+        blocked = float(np.min(scene.clearance(path))) < TOOL_RADIUS - BLOCKED
+        if blocked and float(np.min(scene.clearance(path[[0, -1]]))) >= _FREE:
+            return placed
+    raise InputError("no scene blocks the path and leaves its ends free; choose the skill of a longer path")
+
+
+def _sparse(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+    return _Placed(obstacles_apart(rng, path, int(rng.integers(1, 3)), planar=planar, kinds=SIMPLE), False)
+
+
+def _mixed(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+    return _Placed(obstacles_apart(rng, path, int(rng.integers(1, 4)), planar=planar, kinds=ALL_KINDS), False)
+
+
+def _dense(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+    """Obstacles about the path, which may overlap; those that cover start or goal are drawn again."""
+    made: list[Obstacle] = []
+    n = int(rng.integers(4, 9))
+    for _ in range(_DRAWS):
+        aside = _SPREAD_DENSE * rng.normal(size=3) * ([1.0, 1.0, 0.0] if planar else [1.0, 1.0, 1.0])
+        obstacle = random_obstacle(rng, path[rng.integers(len(path))] + aside, planar=planar, kinds=SIMPLE)
+        if obstacle.signed_distance(path[[0, -1]]).min() >= _FREE:
+            made.append(obstacle)
+        if len(made) == n:
+            break
+    return _Placed(tuple(made), None)
+
+
+def _gap(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+    """A wall with a gap; in 3-D, the gap is a window that is at least as high as it is wide."""
+    width = 2.0 * TOOL_RADIUS * rng.uniform(1.2, 3.0)
+    walls = wall_with_gap(rng, path, width, shift=0.15, height=0.3 if planar else 2.0)
+    slack = width - 2.0 * (TOOL_RADIUS + CLEARANCE)
+    must_refuse = None if 0.0 <= slack < _TIGHT else bool(slack < 0.0)
+    if planar:
+        return _Placed(walls, must_refuse)
+    height, level = rng.uniform(1.0, 2.0) * width, path[len(path) // 2, 2] + rng.uniform(-0.1, 0.1)
+    left, right = walls
+    centre, quaternion = 0.5 * (left.pose.position + right.pose.position), left.pose.quaternion
+    sills = [
+        Box(
+            Pose(np.array([centre[0], centre[1], level + side * 0.5 * (height + 1.0)]), quaternion),
+            np.array([left.size[0], width, 1.0]),
+            name=name,
+        )
+        for side, name in ((1.0, "lintel"), (-1.0, "sill"))
+    ]
+    return _Placed((*walls, *sills), must_refuse)
+
+
+def _trap(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+    """Three boxes in the shape of a U, into which the path leads; the hull of the U leaves start and goal free."""
+    at = int(rng.uniform(*_MIDDLE) * len(path))
+    ahead = path[at + 5] - path[at - 5]
+    yaw = np.arctan2(ahead[1], ahead[0]) + rng.normal(0.0, _SKEW)
+    frame = Pose(path[at], quaternion_exp(np.array([0.0, 0.0, yaw])))
+    depth, thick = rng.uniform(0.05, 0.20), rng.uniform(0.01, 0.03)
+    inside, height = 2.0 * TOOL_RADIUS * rng.uniform(1.2, 2.5), 0.3 if planar else rng.uniform(0.1, 0.3)
+
+    def box(name: str, x: float, y: float, length: float, width: float) -> Box:
+        return Box(Pose(frame.apply([x, y, 0.0]), frame.quaternion), np.array([length, width, height]), name=name)
+
+    outside, aside = inside + 2.0 * thick, 0.5 * (inside + thick)
+    boxes = (
+        box("bottom", 0.5 * thick, 0.0, thick, outside),
+        box("left arm", -0.5 * depth, aside, depth, thick),
+        box("right arm", -0.5 * depth, -aside, depth, thick),
+    )
+    hull = box("hull", 0.5 * (thick - depth), 0.0, depth + thick, outside)
+    return _Placed(boxes if hull.signed_distance(path[[0, -1]]).min() >= _FREE else (), False)
+
+
+def _over_a_point(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+    """An obstacle over the start, the goal or a contact point."""
+    where = int(rng.integers(3))
+    contact = float(rng.uniform(*_MIDDLE)) if where == 2 else None
+    sample = round((len(path) - 1) * (0.0, 1.0, contact or 0.0)[where])
+    if contact is not None:
+        contact = sample / (len(path) - 1)
+    return _Placed((covering_sphere(rng, path[sample], planar=planar),), True, contact)
+
+
+_PLACERS: dict[str, _Place] = {
+    "S1": _sparse,
+    "S2": _dense,
+    "S3": _mixed,
+    "S4": _gap,
+    "S5": _trap,
+    "S6": _over_a_point,
+}
+FAMILIES: tuple[str, ...] = tuple(_PLACERS)
+ANY_SKILL = ("S1", "S2", "S3", "S6")
