@@ -54,7 +54,7 @@ _FREE = TOOL_RADIUS + CLEARANCE + 0.01  # [m] from start and goal to the obstacl
 _DRAWS = 500  # of a scene, before its path counts as too short
 _SPREAD_DENSE = 0.06  # [m] standard deviation of an obstacle's centre about the path, in dense scenes
 _SKEW = 0.15  # [rad] standard deviation of the angle between a trap and the path
-_TIGHT = 0.002  # [m] gaps that are wider than necessary by less than this are for the oracle to judge
+_TIGHT = 0.002  # [m] a gap with less than this to spare counts as neither solvable nor unsolvable
 _MIDDLE = 0.3, 0.7  # fractions of the path between which a contact point or a trap is
 
 
