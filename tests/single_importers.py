@@ -2,7 +2,8 @@
 
 ``python tests/single_importers.py`` prints the rows of the table "Modules with a single importer, and why" in
 docs/architecture.md. Imports by name count, and so do members of a registry, which are written ``"module:attribute"``.
-Modules directly in the package are left out.
+Modules directly in the package are left out. The last line gives two counts: the modules that are separate on purpose
+(members of a registry, or exported by their folder), and all others.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "architecture.md"
 HEADING = "## Modules with a single importer, and why"
+ON_PURPOSE = ("member of a registry", "exported by its folder")
+"""First words of the reasons of modules that have one importer on purpose."""
 
 
 def modules(source: Path) -> dict[str, Path]:
@@ -66,12 +69,24 @@ def table_rows(page: Path = PAGE) -> dict[str, tuple[str, str]]:
     return rows
 
 
+def fragments(page: Path = PAGE) -> list[str]:
+    """Return the modules of the table that are neither members of a registry nor exported by their folder."""
+    return [module for module, (_, reason) in table_rows(page).items() if not reason.startswith(ON_PURPOSE)]
+
+
+def summary(page: Path = PAGE) -> str:
+    """Return a sentence with the number of modules in the table of the page, of each of the two kinds."""
+    n, others = len(table_rows(page)), len(fragments(page))
+    return f"{n} modules: {n - others} are members of a registry or exported by their folder, {others} are not"
+
+
 def main() -> None:
-    """Print a row of the table for every such module, with the reason that the page gives."""
+    """Print a row of the table for every such module, with the reason that the page gives, and the two counts."""
     reasons = {module: reason for module, (_, reason) in table_rows().items()}
     for module, importer in single_importers().items():
         short = (module.removeprefix("imitarm."), importer.removeprefix("imitarm."))
         print(f"| `{short[0]}` | `{short[1]}` | {reasons.get(short[0], 'not given yet')} |")
+    print(summary())
 
 
 if __name__ == "__main__":

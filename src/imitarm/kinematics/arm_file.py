@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from imitarm.errors import FileFormatError, InputError, UnknownNameError
 from imitarm.files.xml_tree import XmlElement, read_xml
-from imitarm.kinematics.arm_file_checks import check_file, check_key_lengths, check_units
 from imitarm.kinematics.arm_joints import (
     arm_end,
     chain_to,
@@ -26,7 +25,7 @@ from imitarm.kinematics.arm_joints import (
     read_limits,
     take_keyframe,
 )
-from imitarm.kinematics.arm_meshes import find_meshes
+from imitarm.kinematics.arm_xml import check_file, check_key_lengths, check_units, find_meshes
 from imitarm.kinematics.spheres import COLLISION_GROUP
 
 Array = NDArray[np.float64]
