@@ -15,7 +15,7 @@ from imitarm.cli.outputs import check_outputs
 from imitarm.cli.reading import add_reading_arguments, as_options, read_and_lint, show_findings
 from imitarm.cli.robot_options import load_optional_robot, robot_files
 from imitarm.cli.screen import remark, say, show_table, working
-from imitarm.demonstrations import Alignment, compute_alignment, files_of
+from imitarm.demonstrations import Alignment, compute_alignment, files_of, group_by_path
 from imitarm.demonstrations.align import METHODS
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.skills import FitQuality, PoorFitWarning, Skill
@@ -39,6 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     add_reading_arguments(parser)
     parser.add_argument("--repair", action="store_true", help="drop rows with invalid numbers or times")
+    parser.add_argument(
+        "--each-path",
+        action="store_true",
+        help="if the demonstrations take different paths between the same ends, learn one skill from each group and "
+        "number the skill files",
+    )
     parser.add_argument(
         "--allow-errors", action="store_true", help="learn and write the skill even if the checks find errors"
     )
@@ -78,20 +84,42 @@ def run(arguments: argparse.Namespace) -> int:
     arm = load_optional_robot(arguments)
     raw, findings = read_and_lint(arguments, arm, task=arguments.task, repair=arguments.repair)
     show_findings(raw, findings, every=arguments.all)
-    if any(finding.severity == "error" for finding in findings) and not arguments.allow_errors:
+    ignored = {"two-paths"} if arguments.each_path else set()
+    if not arguments.allow_errors and any(f.severity == "error" and f.code not in ignored for f in findings):
         raise InputError("not learned: fix the errors above (--repair drops invalid rows, --allow-errors ignores them)")
     try:
         demonstrations = [one.demonstration(arm) for one in raw]
     except InputError as error:
         raise InputError(as_options(str(error))) from error
+    groups = group_by_path(demonstrations) if arguments.each_path else [demonstrations]
+    outputs = _numbered(arguments.out, len(groups))
+    check_outputs([("--out", out) for out in outputs], inputs, force=arguments.force)
+    notes = [str(finding) for finding in findings if finding.code not in ignored]
+    learned = [_learn(group, arguments, notes) for group in groups]  # all of them before one is written
+    for skill, out in zip(learned, outputs, strict=True):
+        skill.save(out)
+        say(f"wrote {out}")
+    return 0
+
+
+def _numbered(out: Path, n: int) -> list[Path]:
+    """Return the names of ``n`` skill files: ``out`` itself, or ``out`` with -1, -2 and so on before its suffix."""
+    return [out] if n == 1 else [out.with_stem(f"{out.stem}-{i + 1}") for i in range(n)]
+
+
+def _learn(demonstrations: list[Demonstration], arguments: argparse.Namespace, notes: list[str]) -> Skill:
+    """Align demonstrations, learn a skill from them, and print how well it reproduces them.
+
+    Raises:
+        TaskFailedError: when the skill does not reproduce the motion.
+    """
     with working("aligning"):
         n = arguments.samples if arguments.samples is not None else _samples_needed(demonstrations)
         alignment = compute_alignment(demonstrations, n=n, method=arguments.align)
     with working("learning: choosing the number of components"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        notes = [str(finding) for finding in findings] + alignment.notes()
         skill = Skill(arguments.components).fit(
-            alignment.demonstrations, notes=notes, date=datetime.now(UTC).date().isoformat()
+            alignment.demonstrations, notes=notes + alignment.notes(), date=datetime.now(UTC).date().isoformat()
         )
     for message in dict.fromkeys(str(w.message) for w in caught if not issubclass(w.category, PoorFitWarning)):
         remark(f"warning: {message}")
@@ -105,9 +133,7 @@ def run(arguments: argparse.Namespace) -> int:
         if not arguments.allow_errors:
             raise TaskFailedError(f"no skill was written: {problem}; to write it anyway, use --allow-errors")
         remark(f"warning: {problem}")
-    skill.save(arguments.out)
-    say(f"wrote {arguments.out}")
-    return 0
+    return skill
 
 
 def _samples_needed(demonstrations: Sequence[Demonstration]) -> int:

@@ -32,6 +32,7 @@ EPILOG = """\
 examples:
   imitarm reproduce sweep.json --robot sawyer --tool brush --keep-height
   imitarm reproduce pour.json --robot panda --tool gripper --scene bottles.yaml --report pour.html
+  imitarm reproduce left.json --alternative right.json --robot panda --scene bottles.yaml
   imitarm reproduce pour.json --robot panda --scene bottles.yaml --clearance 30 --goal 40 -30 25
 
 The arm is simulated with its inertias and limits.
@@ -52,6 +53,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     avoid = parser.add_argument_group("avoidance")
     avoid.add_argument(
         "--policy", choices=POLICIES, default="acfra", help="policy that reproduces the skill; default: acfra"
+    )
+    avoid.add_argument(
+        "--alternative",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="SKILL",
+        help="skill of another demonstrated path of the same task (see 'imitarm learn --each-path'); acfra follows the "
+        "path that needs the smallest displacement; may be repeated",
     )
     avoid.add_argument("--method", choices=ADAPTERS, help="how acfra adapts the path; default: certified")
     avoid.add_argument(
@@ -109,6 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     inputs = [
         ("SKILL", arguments.skill),
+        *(("--alternative", file) for file in arguments.alternative),
         ("--scene", arguments.scene),
         *robot_files(arguments),
     ]
@@ -173,6 +184,10 @@ def _policy(arguments: argparse.Namespace, skill: Skill, arm: ArmModel, spheres:
         if arguments.policy != "acfra":
             raise InputError(f"--method is an option of --policy acfra, not of {arguments.policy}; leave out --method")
         options["method"] = arguments.method
+    if arguments.alternative:
+        if arguments.policy != "acfra":
+            raise InputError(f"--alternative is an option of --policy acfra, not of {arguments.policy}; leave it out")
+        options["alternatives"] = [Skill.load(file) for file in arguments.alternative]
     return POLICIES[arguments.policy].build(skill, **options)
 
 

@@ -5,6 +5,7 @@ and ``align`` trims and re-times them so that a skill can be learned. File forma
 """
 
 from imitarm.demonstrations.align import Alignment, align, compute_alignment
+from imitarm.demonstrations.groups import group_by_path
 from imitarm.demonstrations.lint import lint
 from imitarm.demonstrations.raw import Finding, RawDemonstration
 from imitarm.demonstrations.reading import READERS, Reader, ReadOptions, files_of, read, read_raw
@@ -19,6 +20,7 @@ __all__ = [
     "align",
     "compute_alignment",
     "files_of",
+    "group_by_path",
     "lint",
     "read",
     "read_raw",

@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.demonstrations.align import (
-    barycentre_warps,
-    features,
     moving_rows,
     noise_level,
     rotation_paths,
@@ -26,6 +24,7 @@ from imitarm.demonstrations.align import (
     turns,
 )
 from imitarm.demonstrations.arm_checks import check_arm
+from imitarm.demonstrations.groups import LEAST_GAP, aligned_paths, largest_distances, split_paths, two_groups
 from imitarm.demonstrations.raw import (
     RAW_CHECKS,
     SEVERITIES,
@@ -38,7 +37,7 @@ from imitarm.demonstrations.raw import (
 from imitarm.demonstrations.reading import LENGTH_UNITS
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_log, quaternion_multiply
-from imitarm.trajectory import Demonstration, Trajectory
+from imitarm.trajectory import Demonstration
 from imitarm.validation import sequence
 
 if TYPE_CHECKING:
@@ -64,12 +63,9 @@ _OUTLIER_RATIO = 3.0  # times as far from the medoid as is usual
 _OUTLIER_SPREADS = 6.0  # and so many robust standard deviations farther
 _OUTLIER_DISTANCE = 0.02  # [m] and at least so far
 _OUTLIER_ANGLE = 0.2  # [rad] likewise
-_APART = 0.02  # [m] smallest difference between demonstrations that is reported
 _ENDS_APART = 0.25  # of the size of the motion, likewise of starts and goals
-_PATHS_APART = 0.2  # of the size of the motion, likewise of paths between the same ends
 _ROTATIONS_APART = 0.6  # [rad] likewise of rotations
 _OPPOSED = np.pi / 2.0  # [rad] rotations farther apart have no useful mean
-_GROUP_RATIO = 2.5  # two groups are so many times farther apart than neighbours within a group
 _SHORT = {"goal": 0.12, "start": 0.2}  # fraction of the motion that an incomplete demonstration lacks, at least
 _DIFFERENT = 0.1  # of the size of the motion: smallest mean distance between a motion and a reversed one
 _ROTATED = 0.1  # [rad] smallest difference between demonstrations that only rotate
@@ -282,7 +278,7 @@ def check_agreement(motions: Sequence[ValidRows]) -> Iterator[Finding]:
     trajectories = [one for motion in motions if (one := motion.moving_part()) is not None]
     if len(trajectories) < len(motions) or len(motions) < 2:
         return
-    scale = _Scale(1e3, "mm", _APART)
+    scale = _Scale(1e3, "mm", LEAST_GAP)
     paths = np.stack([_by_length(one.positions) for one in trajectories])
     size = float(np.median(np.linalg.norm(np.ptp(paths, axis=1), axis=1)))
     if size < _FLAT:  # the tool only rotates
@@ -299,7 +295,7 @@ def check_agreement(motions: Sequence[ValidRows]) -> Iterator[Finding]:
             yield motions[i].finding("error", code, message, remedy)
     rest = [i for i in range(len(motions)) if i not in odd]
     if len(rest) >= 2:
-        positions, rotations = _aligned([trajectories[i] for i in rest])
+        positions, rotations = aligned_paths([trajectories[i] for i in rest])
         yield from _groups([motions[i] for i in rest], positions, rotations, size)
         if len(rest) >= _FEWEST:
             yield from _outliers([motions[i] for i in rest], positions, rotations)
@@ -361,23 +357,13 @@ def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: 
                 yield i, message, "incomplete", "leave out this demonstration, or record the whole motion again"
 
 
-def _aligned(trajectories: Sequence[Trajectory]) -> tuple[Array, Array | None]:
-    """Return aligned positions (m, n, 3) and quaternions (m, n, 4), or None if a motion has no quaternions."""
-    if any(one.quaternions is None for one in trajectories):
-        trajectories = [Trajectory(one.times, one.positions) for one in trajectories]
-    warps = barycentre_warps(features(trajectories), n_iterations=4)
-    warped = [one.at(warp * one.duration) for one, warp in zip(trajectories, warps, strict=True)]
-    rotations = [q for _, q in warped if q is not None]
-    return np.stack([p for p, _ in warped]), np.stack(rotations) if rotations else None
-
-
 def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | None, size: float) -> Iterator[Finding]:
     """Find demonstrations that form two groups, which differ in start, goal, path from start to goal, or rotation."""
     between = to_common_ends(positions)
     kinds: list[tuple[str, Severity, str, Array, float, float, str]] = [
-        ("ends", "warning", "starts", _largest(positions[:, :1]), _ENDS_APART * size, 1e3, "mm"),
-        ("ends", "warning", "goals", _largest(positions[:, -1:]), _ENDS_APART * size, 1e3, "mm"),
-        ("two-paths", "error", "paths between the same ends", _largest(between), _PATHS_APART * size, 1e3, "mm"),
+        ("ends", "warning", "starts", largest_distances(positions[:, :1]), _ENDS_APART * size, 1e3, "mm"),
+        ("ends", "warning", "goals", largest_distances(positions[:, -1:]), _ENDS_APART * size, 1e3, "mm"),
+        ("two-paths", "error", "paths between the same ends", largest_distances(between), size, 1e3, "mm"),
     ]
     if rotations is not None:
         apart = np.stack([_angles(rotations, q).max(axis=1) for q in rotations])
@@ -396,7 +382,10 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
         else:
             kinds.append(("two-rotations", "warning", "rotations", apart, _ROTATIONS_APART, np.degrees(1.0), "degrees"))
     for code, severity, what, distance, floor, factor, unit in kinds:
-        split = _split(distance, floor if unit == "degrees" else max(_APART, floor))
+        if code == "two-paths":
+            split = split_paths(distance, size)
+        else:
+            split = two_groups(distance, floor if unit == "degrees" else max(LEAST_GAP, floor))
         if split is None:
             continue
         group, gap = split
@@ -409,39 +398,10 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
         yield motions[few[0]].finding(severity, code, message, remedy)
 
 
-def _largest(paths: Array) -> Array:
-    """Return for each pair of paths (m, n, 3) the largest distance between them at equal times, shape (m, m)."""
-    return np.stack([np.linalg.norm(paths - path, axis=2).max(axis=1) for path in paths])
-
-
 def _angles(rotations: Array, reference: Array) -> Array:
     """Return the angles between quaternions (m, n, 4) and reference quaternions (n, 4), shape (m, n) [rad]."""
     back = quaternion_conjugate(reference)
     return np.stack([np.linalg.norm(quaternion_log(quaternion_multiply(q, back)), axis=1) for q in rotations])
-
-
-def _split(distance: Array, floor: float) -> tuple[NDArray[np.bool_], float] | None:
-    """Divide m demonstrations into two groups by their distances (m, m); return None when there is only one group.
-
-    The result is a mask (m,) that selects one group, and the gap between the two groups. The gap is the longest edge of
-    the minimum spanning tree of the demonstrations. There are two groups only if the gap exceeds ``floor``, and the
-    second longest edge either is several times shorter or exceeds ``floor`` too. If it is several times shorter,
-    demonstrations within a group are much closer together than the groups.
-    """
-    m = len(distance)
-    nearest, inside, links = distance[0].copy(), np.arange(m) == 0, []
-    while not inside.all():
-        new = int(np.argmin(np.where(inside, np.inf, nearest)))
-        links.append(float(nearest[new]))
-        inside[new] = True
-        nearest = np.minimum(nearest, distance[new])
-    links.sort()
-    if links[-1] <= floor or (m > 2 and links[-1] <= _GROUP_RATIO * links[-2] and not links[-2] > floor):
-        return None
-    group = np.arange(m) == 0
-    for _ in range(m):
-        group = (distance[group] < links[-1]).any(axis=0)
-    return group, links[-1]
 
 
 def _names(motions: Sequence[ValidRows], which: NDArray[np.int64]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from imitarm.policies.path_policy import PathPlan, PathPolicy
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
 from imitarm.trajectory import Trajectory
-from imitarm.validation import finite_number
+from imitarm.validation import finite_number, sequence
 
 Array = NDArray[np.float64]
 
@@ -42,8 +43,13 @@ class ACFRA(PathPolicy):
     fields (``"mapf"``, ``"literal"``) serve for comparison, so the robot follows their paths even if these paths do not
     keep the clearance.
 
+    Demonstrations may take several different paths, of which each has a skill of its own (see
+    :func:`~imitarm.demonstrations.group_by_path`). The policy then adapts each of these paths between the same start
+    and goal, and follows the feasible path with the smallest displacement in standard deviations of its demonstrations.
+
     Args:
         skill: skill to reproduce.
+        alternatives: skills of the other demonstrated paths of the same task.
         method: name in :data:`~imitarm.policies.ADAPTERS`.
         tool_radius: radius of one sphere about the tool's tip [m]; use it instead of ``tool_spheres``.
         tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m].
@@ -67,6 +73,7 @@ class ACFRA(PathPolicy):
         self,
         skill: Skill,
         *,
+        alternatives: Sequence[Skill] = (),
         method: str = "certified",
         tool_radius: float | None = None,
         tool_spheres: ArrayLike | None = None,
@@ -90,7 +97,8 @@ class ACFRA(PathPolicy):
             self._same_start = _SAME_POSTURE
         else:
             self._options |= {"tool_radius": tool_radius, "tool_spheres": tool_spheres}
-        self._path = ComponentPath.of_skill(skill, pinned=pinned)
+        self._skills = [skill, *sequence(alternatives, Skill, "ACFRA: alternatives")]
+        self._paths = [ComponentPath.of_skill(one, pinned=pinned) for one in self._skills]
         usual = _ALLOWANCE_OF_ARM if self._whole_arm else _ALLOWANCE
         self._allowance = finite_number(
             usual if allowance is None else allowance, "ACFRA: allowance", "m", at_least=0.0
@@ -103,20 +111,43 @@ class ACFRA(PathPolicy):
         Raises:
             InfeasibleError: when the clearance can't be kept; the message names the obstacle and the reason.
         """
-        self.adaptation = found = adapt(
-            self._path.between(self.skill, start, scene.goal),
-            scene,
-            clearance=self.clearance,
-            allowance=self._allowance if self._refuses else 0.0,
-            state=state if self._whole_arm else None,
-            **self._options,
-        )
+        self.adaptation = found = self._best(scene, start, state)
         if not found.feasible and self._refuses:
             raise InfeasibleError(found.reason)
         trajectory, joints = _with_approach(found, self.arm)
         displaced = np.linalg.norm(found.trajectory.positions - found.nominal.positions, axis=1)
         displaced = np.concatenate([np.zeros(len(trajectory) - len(displaced)), displaced])
         return PathPlan(trajectory, displaced, joints, found.only_on_schedule, found)
+
+    def _best(self, scene: Scene, start: Pose | None, state: ArmState | None) -> Adaptation:
+        """Return the feasible adaptation with the smallest deviation, or that of the skill itself if none is."""
+        found = self._adapted(0, scene, start, state)
+        if found.feasible and not found.moved.any():
+            return found
+        best = found
+        for i in range(1, len(self._paths)):
+            other = self._adapted(i, scene, start, state)
+            if other.feasible and (not best.feasible or other.deviation < best.deviation):
+                best = other
+        if not best.feasible and len(self._paths) > 1:
+            reason = f"{best.reason}; none of the {len(self._paths) - 1} alternative paths is clear either"
+            return replace(best, reason=reason)
+        return best
+
+    def _adapted(self, i: int, scene: Scene, start: Pose | None, state: ArmState | None) -> Adaptation:
+        goal = scene.goal
+        if i > 0:  # all paths have the ends of the skill itself
+            start = self.skill.start_ if start is None else start
+            goal = self.skill.goal_ if goal is None else goal
+            scene = replace(scene, goal=goal)
+        return adapt(
+            self._paths[i].between(self._skills[i], start, goal),
+            scene,
+            clearance=self.clearance,
+            allowance=self._allowance if self._refuses else 0.0,
+            state=state if self._whole_arm else None,
+            **self._options,
+        )
 
     @property
     def plan(self) -> Adaptation | None:
