@@ -50,7 +50,7 @@ def literal_potential(distance: np.ndarray) -> np.ndarray:
 
 
 def modified_potential(distance: np.ndarray) -> np.ndarray:
-    """METHODS D.2.2 with eta = 1."""
+    """The corrected potential with eta = 1 (docs/avoidance.md, section 10)."""
     variance = SIGMA**2
     gain = np.clip(np.exp((variance - np.median(variance)) / variance.max()), 0.25, 4.0)
     return 0.5 * gain * INFLUENCE_DISTANCE**2 * (INFLUENCE_DISTANCE / distance - 1.0) ** 2

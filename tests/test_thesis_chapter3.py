@@ -101,7 +101,7 @@ def test_equation_3_9_bounds_the_norm_and_not_each_joint() -> None:
 
 
 def test_with_the_small_angle_the_speed_is_no_longer_bounded() -> None:
-    """Half the least singular value off the threshold: up to 1.5 times the bound, at s = 2 d / 3 (METHODS A.8)."""
+    """Half the least singular value off the threshold: up to 1.5 times the bound, at s = 2 d / 3."""
     d, s = 1.0, np.linspace(1e-3, 1.5, 3000)
     threshold = np.maximum(d - 0.5 * s, 0.0)
     damping = np.where(s >= threshold, 0.0, np.where(s >= threshold / 2, s * (threshold - s), threshold**2 / 4))
