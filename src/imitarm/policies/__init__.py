@@ -11,7 +11,16 @@ from imitarm.policies.path_policy import PathPlan, PathPolicy
 from imitarm.policies.policy import Observation, Policy
 from imitarm.registry import Registry
 
-POLICIES: Registry[type[Policy]] = Registry("policy", "imitarm.policies", {"acfra": "imitarm.policies.acfra:ACFRA"})
+POLICIES: Registry[type[Policy]] = Registry(
+    "policy",
+    "imitarm.policies",
+    {
+        "acfra": "imitarm.policies.acfra:ACFRA",
+        "apf": "imitarm.policies.baselines.apf:APF",
+        "dmp-steering": "imitarm.policies.baselines.dmp_steering:DMPSteering",
+        "dmp-potential": "imitarm.policies.baselines.dmp_potential:DMPPotential",
+    },
+)
 """All policies by name."""
 
 __all__ = [

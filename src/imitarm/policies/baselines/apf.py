@@ -1,0 +1,150 @@
+"""APF: follow the forces of the classical artificial potential field from the start to the goal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InfeasibleError
+from imitarm.policies.baselines.baseline_policy import BaselinePolicy, ToolGaps
+from imitarm.policies.baselines.potential_field import (
+    attractive_force,
+    attractive_potential,
+    repulsive_force,
+    repulsive_potential,
+)
+from imitarm.policies.component_path import quintic_step
+from imitarm.scene.scene import Scene
+from imitarm.skills.skill import Skill
+from imitarm.trajectory import Trajectory
+from imitarm.validation import finite_number
+
+Array = NDArray[np.float64]
+
+_STEP = 0.01  # [s]
+_LONGEST = 2.0  # durations of the learned motion
+_ARRIVED = 5e-4  # [m] from the goal
+_START = 0.1  # of the duration: the motion starts from rest during this part
+_HALVINGS = 12  # of a step that would increase the potential
+
+
+class APF(BaselinePolicy):
+    r"""Classical artificial potential field (Khatib 1986; thesis 2.2.5, Eqs 2.15-2.22).
+
+    The tool moves with the velocity ``F_a + F_r`` of :mod:`~imitarm.policies.baselines.potential_field`, from the start
+    to the goal. The learned path is not used: only its ends, its mean speed (which scales the attraction) and its
+    largest speed (which limits the velocity). The distance ``d`` is that of the tool's sphere, minus the required
+    clearance. A step that would increase the potential is halved, so that the tool does not oscillate between two
+    obstacles; among obstacles at rest, the potential never increases.
+
+    **Known failure.** The sum of the forces is also zero at local minima of the potential, for example in front of an
+    obstacle that stands between the tool and the goal, or beside a goal that is near an obstacle. The tool then stops,
+    and this method refuses: it can't leave the minimum.
+
+    Args:
+        skill: skill that gives start, goal and speed.
+        repulsion: k [m^4/s].
+        influence: d_0 [m].
+        cap: rho_c [m].
+        speed: speed far from goal and obstacles, divided by the mean speed of the learned motion; the attraction eta is
+            this speed divided by ``cap``.
+        options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
+    """
+
+    search_space: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "repulsion": (1e-8, 1e-4),
+        "influence": (0.02, 0.2),
+        "cap": (0.02, 0.2),
+    }
+
+    def __init__(
+        self,
+        skill: Skill,
+        *,
+        repulsion: float = 1e-6,
+        influence: float = 0.05,
+        cap: float = 0.05,
+        speed: float = 1.5,
+        **options: Any,
+    ) -> None:
+        super().__init__(skill, **options)
+        self.repulsion = finite_number(repulsion, "APF: repulsion", "m^4/s", at_least=0.0)
+        self.influence = finite_number(influence, "APF: influence", "m", above=0.0)
+        self.cap = finite_number(cap, "APF: cap", "m", above=0.0)
+        self.speed = finite_number(speed, "APF: speed", above=0.0)
+
+    def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
+        """Return the path along the forces, from the start of ``nominal`` to its goal.
+
+        Raises:
+            InfeasibleError: when the tool stops in a local minimum, or does not arrive within twice the duration.
+        """
+        x, duration = nominal.positions[0].copy(), nominal.duration
+        speeds = np.linalg.norm(np.diff(nominal.positions, axis=0), axis=1) / np.diff(nominal.times)
+        stiffness = self.speed * max(nominal.path_length / duration, 1e-6) / self.cap
+        field = _Field(self, gaps, nominal.positions[-1], stiffness, moving=not scene.packed.still)
+        path = [x]
+        for k in range(round(_LONGEST * duration / _STEP)):
+            time = k * _STEP
+            if time >= _START * duration and np.linalg.norm(x - field.goal) < _ARRIVED:
+                break
+            distance, normal = field.distances(x, time)
+            force = field.force(x, distance, normal)
+            most = float(speeds.max()) * float(quintic_step((time + _STEP) / (_START * duration)))
+            step = force * (_STEP * min(1.0, most / max(float(np.linalg.norm(force)), 1e-12)))
+            step = field.downhill(x, step, distance, time)
+            if not field.moving and not step.any():
+                break
+            x = np.asarray(x + step)
+            path.append(x)
+        away = float(np.linalg.norm(x - field.goal))
+        if away >= _ARRIVED:
+            where = "after twice the learned duration" if field.moving else "in a local minimum of the potential"
+            raise InfeasibleError(
+                f"APF: the tool stops {1e3 * away:.0f} mm from the goal, at {np.round(x, 3).tolist()} m, {where}; "
+                f"choose another repulsion or influence, or another policy"
+            )
+        return np.linspace(0.0, _STEP * (len(path) - 1), len(path)), np.stack(path)
+
+
+class _Field(NamedTuple):
+    """The potential of one scene, with the parameters of one policy."""
+
+    policy: APF
+    gaps: ToolGaps
+    goal: Array
+    stiffness: float
+    moving: bool
+
+    def distances(self, x: Array, time: float) -> tuple[Array, Array]:
+        """Return the distances (n,) [m] beyond the required clearance, and their gradients (n, 3)."""
+        if self.moving:
+            gap, normal = self.gaps.gaps_and_normals(x[None], [time])
+            return gap[:, 0] - self.policy.clearance, normal[:, 0]
+        gap, normal = self.gaps.gaps_and_normals(x)
+        return gap - self.policy.clearance, normal
+
+    def force(self, x: Array, distance: Array, normal: Array) -> Array:
+        """Return the force, shape (3,) [m/s]; the repulsion has no part in a forbidden direction."""
+        repulsion = repulsive_force(distance, normal, self.policy.repulsion, self.policy.influence)
+        return attractive_force(x, self.goal, self.stiffness, self.policy.cap) + self.policy.allowed(repulsion)
+
+    def potential(self, x: Array, distance: Array) -> float:
+        """Return the potential at ``x``, whose distances to the obstacles are given."""
+        repulsive = repulsive_potential(distance, self.policy.repulsion, self.policy.influence)
+        return attractive_potential(x, self.goal, self.stiffness, self.policy.cap) + repulsive
+
+    def downhill(self, x: Array, step: Array, distance: Array, time: float) -> Array:
+        """Halve a step until it does not increase the potential at ``time``; return 0 if no step is short enough."""
+        if np.min(distance, initial=np.inf) > self.policy.influence + float(np.linalg.norm(step)):
+            return step
+        now = self.potential(x, distance)
+        for _ in range(_HALVINGS):
+            there = x + step
+            if self.potential(there, self.distances(there, time)[0]) <= now:
+                return step
+            step = 0.5 * step
+        return np.zeros(3)

@@ -1,0 +1,178 @@
+"""The motion of a primitive to which an avoidance method adds a coupling term."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InfeasibleError
+from imitarm.policies.baselines.baseline_policy import BaselinePolicy, ToolGaps
+from imitarm.scene.distances import PackedObstacles
+from imitarm.scene.scene import Scene
+from imitarm.skills.dynamical_systems import DECAY, propagator, targets_by_step
+from imitarm.skills.skill import Skill
+from imitarm.trajectory import Trajectory
+from imitarm.validation import finite_number
+
+Array = NDArray[np.float64]
+
+GAP_FLOOR = 0.005  # [m] shorter distances count as this one
+_STEP = 0.01  # [s]
+_LONGEST = 2.0  # durations
+_ARRIVED, _NEAR = 1e-3, 5e-3  # [m] from the goal: the motion ends; after the longest time, the goal counts as reached
+_SLOW = 0.1  # of the mean speed: the motion ends
+
+
+class MotionState(NamedTuple):
+    """State of the motion, and the obstacles as seen from the tool.
+
+    Velocities are multiplied by the duration T, as in the equation of a primitive (``tau x' = v`` with tau = T).
+
+    Attributes:
+        position: x, shape (3,) [m].
+        velocity: v = T x', shape (3,) [m].
+        phase: s, from 1 at the start to 0.01 after the duration.
+        fraction: time divided by the duration.
+        distance: distance from the tool to each obstacle, minus the required clearance; at least 5 mm, shape (n,) [m].
+        reach: distance from the tool's tip to the closest point of each obstacle; at least 5 mm, shape (n,) [m].
+        normal: outward normals at the closest points, shape (n, 3); the closest point is ``x - reach normal``.
+        relative: v minus the velocity of the closest point times T, shape (n, 3) [m].
+    """
+
+    position: Array
+    velocity: Array
+    phase: float
+    fraction: float
+    distance: Array
+    reach: Array
+    normal: Array
+    relative: Array
+
+
+class CoupledMotion(BaselinePolicy):
+    r"""Base class of the baselines that add a coupling term ``Phi`` to the equation of a primitive.
+
+    The equation is::
+
+        T^2 x'' = K (y(s) - x) - D T x' + Phi,        |Phi| <= T^2 a_max
+
+    The spring follows the target ``y(s)`` of the skill's primitive, with the skill's own gains K and D. T is the
+    duration. The spring is integrated exactly in steps of 10 ms, during which ``Phi`` is constant. The motion ends at
+    the goal, but not before the learned duration. A method whose tool is not within 5 mm of the goal after twice the
+    duration refuses.
+
+    A subclass implements :meth:`term`. A part of ``Phi`` in a forbidden direction is removed. The limit ``a_max`` is
+    not part of any of the methods. It keeps a term that grows without bound near an obstacle from throwing the tool
+    away within one step.
+
+    Args:
+        skill: skill to reproduce.
+        max_acceleration: a_max [m/s^2].
+        options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
+    """
+
+    def __init__(self, skill: Skill, *, max_acceleration: float = 10.0, **options: Any) -> None:
+        super().__init__(skill, **options)
+        name = type(self).__name__
+        self._limit = finite_number(max_acceleration, f"{name}: max_acceleration", "m/s^2", above=0.0)
+
+    @abstractmethod
+    def term(self, state: MotionState) -> Array:
+        """Return the coupling term Phi at a state, the sum over all obstacles, shape (3,) [m]."""
+
+    def target(self, nominal: Trajectory, fractions: Array) -> Array:
+        """Return the target of the spring, shape (n, 3) [m].
+
+        Args:
+            nominal: the learned path between the start and the goal of this motion.
+            fractions: times divided by the duration, shape (n,).
+        """
+        begun = self.skill.dmp_.begin(nominal.positions[0], nominal.positions[-1])
+        return begun.target.at(np.exp(-DECAY * fractions))
+
+    def start_velocity(self) -> Array:
+        """Return v = T x' at the start, shape (3,) [m]."""
+        return self.skill.dmp_.start_velocity_ * self.skill.duration_
+
+    def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
+        """Return the motion of the primitive with its coupling term.
+
+        Raises:
+            InfeasibleError: when the tool is not within 5 mm of the goal after twice the duration.
+        """
+        surroundings = Surroundings(gaps, scene.packed, self.clearance, nominal.duration)
+        return self._integrate(nominal, surroundings)
+
+    def _integrate(self, nominal: Trajectory, surroundings: Surroundings) -> tuple[Array, Array]:
+        T, goal = nominal.duration, nominal.positions[-1]
+        n = max(1, round(T / _STEP))
+        one = propagator(self.skill.dmp_.gains_, 1.0 / n, self.skill.dmp_.n_basis)
+        n_steps = round(_LONGEST * n)
+        targets = self.target(nominal, np.linspace(0.0, _LONGEST, 2 * one.n_parts * n_steps + 1))
+        drives = one.drive @ np.moveaxis(targets_by_step(one, targets), 0, 1)
+        z = np.stack([nominal.positions[0], self.start_velocity()])
+        path, limit, slow = [z[0]], self._limit * T * T, _SLOW * nominal.path_length
+        for k in range(n_steps):
+            if k >= n and np.linalg.norm(z[0] - goal) < _ARRIVED and np.linalg.norm(z[1]) <= slow:
+                break
+            phi = self.allowed(self.term(surroundings.state(z, k / n)))
+            size = float(np.sqrt(phi.dot(phi)))
+            if size > limit:
+                phi = phi * (limit / size)
+            z = one.transition.dot(z) + drives[k] + one.push[:, None] * phi
+            path.append(z[0])
+        away = float(np.linalg.norm(z[0] - goal))
+        if away > _NEAR:
+            raise InfeasibleError(
+                f"{type(self).__name__}: the tool is still {1e3 * away:.0f} mm from the goal after twice the learned "
+                f"duration; choose another gain, or another policy"
+            )
+        return np.linspace(0.0, T * (len(path) - 1) / n, len(path)), np.stack(path)
+
+
+class Surroundings:
+    """The obstacles of one scene, as seen from the tool during a motion.
+
+    Args:
+        gaps: distances to the obstacles.
+        packed: the obstacles at time 0.
+        clearance: required clearance [m].
+        duration: T [s].
+    """
+
+    def __init__(self, gaps: ToolGaps, packed: PackedObstacles, clearance: float, duration: float) -> None:
+        self._gaps, self._packed = gaps, packed
+        self._clearance, self._duration = clearance, duration
+
+    def state(self, z: Array, fraction: float) -> MotionState:
+        """Return the state for position and velocity ``z`` = [x; T x'] (2, 3) at a fraction of the duration."""
+        x, v = z
+        if self._packed.still:
+            gap, normal = self._gaps.gaps_and_normals(x)
+            relative = np.broadcast_to(v, normal.shape)
+        else:
+            gap, normal = self._gaps.gaps_and_normals(x[None], [fraction * self._duration])
+            gap, normal = gap[:, 0], normal[:, 0]
+            closest = x - (gap + self._gaps.radius)[:, None] * normal
+            relative = v - self._duration * self._velocities(closest, fraction * self._duration)
+        return MotionState(
+            x,
+            v,
+            float(np.exp(-DECAY * fraction)),
+            fraction,
+            np.maximum(gap - self._clearance, GAP_FLOOR),
+            np.maximum(gap + self._gaps.radius, GAP_FLOOR),
+            normal,
+            relative,
+        )
+
+    def _velocities(self, points: Array, time: float) -> Array:
+        """Return the velocity of one point of each obstacle, shape (n, 3) [m/s]."""
+        packed = self._packed
+        if not packed.rotating:
+            return packed.velocities
+        arm = points - packed.positions - time * packed.velocities
+        return packed.velocities + np.cross(packed.angular_velocities, arm)

@@ -1,0 +1,72 @@
+r"""The classical artificial potential field: attraction to the goal, repulsion from obstacles (thesis Eqs 2.15-2.22).
+
+Let ``rho = |x - g|`` be the distance to the goal, and ``d`` the distance to the closest point of an obstacle, with the
+gradient ``n``. The potentials, and the forces as their negative gradients, are::
+
+    U_a = 1/2 eta rho^2                         F_a = -eta (x - g)                         if rho <= rho_c
+    U_a = eta rho_c (rho - rho_c / 2)           F_a = -eta rho_c (x - g) / rho             otherwise
+    U_r = 1/2 k (1/d - 1/d_0)^2                 F_r = k (1/d - 1/d_0) d^-2 n               if d <= d_0, else 0
+
+The cap ``rho_c`` limits the attraction far from the goal. The repulsion grows without bound at the surface of an
+obstacle. Below the floor ``d_f``, the force therefore keeps its value at ``d_f``, and the potential is continued as a
+straight line, so that the force is the negative gradient everywhere, also inside an obstacle.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+DISTANCE_FLOOR = 0.005  # [m] d_f: below this distance the repulsion is constant
+
+
+def attractive_potential(position: Array, goal: Array, stiffness: float, cap: float) -> float:
+    """Return U_a (Eq 2.15, with a cap).
+
+    Args:
+        position: x, shape (3,) [m].
+        goal: g, shape (3,) [m].
+        stiffness: eta.
+        cap: rho_c, the distance beyond which the attraction is constant [m].
+    """
+    rho = float(np.linalg.norm(position - goal))
+    return 0.5 * stiffness * rho**2 if rho <= cap else stiffness * cap * (rho - 0.5 * cap)
+
+
+def attractive_force(position: Array, goal: Array, stiffness: float, cap: float) -> Array:
+    """Return F_a, shape (3,) (Eq 2.17, as a vector towards the goal and with a cap).
+
+    The arguments are those of :func:`attractive_potential`.
+    """
+    away = position - goal
+    rho = float(np.linalg.norm(away))
+    return np.asarray(away * (-stiffness * min(1.0, cap / max(rho, 1e-12))))
+
+
+def repulsive_potential(distance: Array, gain: float, influence: float) -> float:
+    """Return the sum of U_r over the obstacles (Eqs 2.18 and 2.21).
+
+    Args:
+        distance: d, distance to the closest point of each obstacle, negative inside, shape (n,) [m].
+        gain: k.
+        influence: d_0, the distance beyond which an obstacle does not repel [m].
+    """
+    d = np.clip(distance, DISTANCE_FLOOR, influence)
+    step = 1.0 / d - 1.0 / influence
+    slope = step / d**2
+    return float(gain * np.sum(0.5 * step**2 + slope * (d - np.minimum(distance, influence))))
+
+
+def repulsive_force(distance: Array, normal: Array, gain: float, influence: float) -> Array:
+    """Return the sum of F_r over the obstacles, shape (3,) (Eqs 2.19 and 2.22).
+
+    Args:
+        distance: d, shape (n,) [m].
+        normal: n, the gradients of the distances, shape (n, 3).
+        gain: k.
+        influence: d_0 [m].
+    """
+    d = np.clip(distance, DISTANCE_FLOOR, influence)
+    return np.asarray((gain * (1.0 / d - 1.0 / influence) / d**2) @ normal)
