@@ -413,7 +413,7 @@ def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
             if _STEPS[0] <= step * factor <= _STEPS[1]
         ]
         minutes = (times[-1] - times[0]) / 60.0
-        message = f"samples are {step:.4g} s apart, {minutes:.4g} min in all; the unit is probably not the second"
+        message = f"samples are {step:.4g} s apart, and the motion lasts {minutes:.4g} min; are the times in seconds?"
         remedy = f"read it with {' or '.join(fits)}" if fits else "check which column holds the time, and its unit"
         yield raw.finding("error", "time-units", message, remedy)
 

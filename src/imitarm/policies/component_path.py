@@ -120,7 +120,7 @@ class ComponentPath:
         """Return this decomposed path of ``skill``, moved to another start or goal.
 
         Args:
-            skill: the skill from which this path was decomposed.
+            skill: the skill whose path was decomposed.
             start: start of the motion; None: the learned start.
             goal: end of the motion; None: the learned goal.
         """

@@ -371,7 +371,7 @@ class SimulatedOperator:
 
     Args:
         seed: seed of the person and the habits.
-        repeat: number of the run of this person, which seeds the differences between runs.
+        repeat: number of this person's run. Different numbers make the runs of one person differ.
         scale: the ratio of robot motion to hand motion, as the person expects it.
 
     Attributes:

@@ -129,7 +129,7 @@ class SceneResult:
 
     @property
     def tool(self) -> Array:
-        """Spheres that contained the tool in the plan: rows of x, y, z, radius in the tool frame, shape (m, 4) [m]."""
+        """Spheres that covered the tool in the plan: rows of x, y, z, radius in the tool frame, shape (m, 4) [m]."""
         if self.tool_spheres is None:
             return np.array([[0.0, 0.0, 0.0, self.tool_radius]])
         return np.asarray(self.tool_spheres, dtype=float).reshape(-1, 4)

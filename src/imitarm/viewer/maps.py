@@ -129,8 +129,8 @@ class Grid:
     def distance_to(self, obstacle: Obstacle, depths: Array) -> Array:
         """Return each grid point's distance to an obstacle, at the nearest of the depths, shape (rows, columns) [m].
 
-        ``depths`` are coordinates along the line of sight. The grid points with distance 0 form an outline of the
-        obstacle: with one depth, of its cross-section; with many depths, of its projection.
+        ``depths`` are coordinates along the line of sight. The grid points with distance 0 form an outline: with
+        one depth, the outline of the obstacle's cross-section; with many depths, the outline of its projection.
         """
         points = np.empty((len(depths), len(self.up), len(self.across), 3))
         points[..., self.view.across] = self.across

@@ -111,7 +111,7 @@ def render(
         template: file in ``templates/`` that extends ``page.html``.
         header: header of the page.
         data: the numbers on the page in SI units, ready for JSON; a button on the page saves them.
-        data_name: name of the file to which the reader saves ``data``.
+        data_name: file name under which the browser saves ``data``.
         provenance: facts that are needed to repeat the run, by name; a value that is a mapping becomes a separate card.
         words: explanations of the technical terms on the page.
         shared: beginning and end of every 3-D player, see :func:`shared_players`; None without players.
