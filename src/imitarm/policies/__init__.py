@@ -19,6 +19,8 @@ POLICIES: Registry[type[Policy]] = Registry(
         "apf": "imitarm.policies.baselines.apf:APF",
         "dmp-steering": "imitarm.policies.baselines.dmp_steering:DMPSteering",
         "dmp-potential": "imitarm.policies.baselines.dmp_potential:DMPPotential",
+        "barrier": "imitarm.policies.baselines.barrier:Barrier",
+        "modulation": "imitarm.policies.baselines.modulation:Modulation",
     },
 )
 """All policies by name."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,6 +61,22 @@ class ToolGaps:
         return distance - self.radius, normal
 
 
+def allowed_axes(forbidden: Array) -> tuple[Array, Array]:
+    """Return the space in which a path may be displaced.
+
+    Args:
+        forbidden: directions in which the path must not be displaced, unit rows (m, 3).
+
+    Returns:
+        An orthonormal basis of the directions that are not forbidden both ways, as columns, shape (3, d), and the
+        remaining forbidden directions in this basis, shape (m', d).
+    """
+    both = np.any(forbidden @ forbidden.T < -1.0 + 1e-9, axis=1)
+    _, size, basis = np.linalg.svd(np.concatenate([np.zeros((1, 3)), forbidden[both]]))
+    axes = basis[np.count_nonzero(size > 1e-9) :].T
+    return axes, forbidden[~both] @ axes
+
+
 class BaselinePolicy(PathPolicy):
     """Base class of the baselines that plan the path of the tool, from the same learned path and the same gaps.
 
@@ -68,7 +85,13 @@ class BaselinePolicy(PathPolicy):
     Args:
         skill: skill to reproduce.
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
+
+    Attributes:
+        predicts: whether the planned path avoids moving obstacles where they will be at the planned times. Such a plan
+            is followed on schedule.
     """
+
+    predicts: ClassVar[bool] = False
 
     def __init__(self, skill: Skill, **options: Any) -> None:
         super().__init__(skill, **options)
@@ -104,7 +127,8 @@ class BaselinePolicy(PathPolicy):
         quaternions = None
         if nominal.quaternions is not None:
             _, quaternions = nominal.at(nominal.times[0] + times / times[-1] * nominal.duration)
-        return PathPlan.beside(nominal, Trajectory(times, positions, quaternions))
+        plan = PathPlan.beside(nominal, Trajectory(times, positions, quaternions))
+        return replace(plan, only_on_schedule=self.predicts and not scene.packed.still)
 
     def allowed(self, vectors: Array) -> Array:
         """Return forces or velocities, shape (..., 3), without their parts in forbidden directions."""

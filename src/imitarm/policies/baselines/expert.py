@@ -28,7 +28,7 @@ import daqp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.policies.baselines.baseline_policy import ToolGaps
+from imitarm.policies.baselines.baseline_policy import ToolGaps, allowed_axes
 from imitarm.trajectory import Trajectory
 from imitarm.validation import finite_array, finite_number
 
@@ -101,11 +101,8 @@ class _Problem(NamedTuple):
     @classmethod
     def of(cls, nominal: Trajectory, gaps: ToolGaps, clearance: float, forbidden: Array) -> _Problem:
         times = nominal.times[0] + np.linspace(0.0, nominal.duration, N_SAMPLES)
-        unit = forbidden / np.linalg.norm(forbidden, axis=1, keepdims=True)
-        both = np.any(unit @ unit.T < -1.0 + 1e-9, axis=1)
-        _, size, basis = np.linalg.svd(np.concatenate([np.zeros((1, 3)), unit[both]]))
-        axes = basis[np.count_nonzero(size > 1e-9) :].T
-        return cls(nominal.at(times)[0], times - times[0], gaps, clearance, axes, unit[~both] @ axes)
+        axes, one_sided = allowed_axes(forbidden / np.linalg.norm(forbidden, axis=1, keepdims=True))
+        return cls(nominal.at(times)[0], times - times[0], gaps, clearance, axes, one_sided)
 
     def gaps_at(self, path: Array) -> tuple[Array, Array]:
         """Return the gaps (n_obstacles, 100) and normals (n_obstacles, 100, 3) of a path."""

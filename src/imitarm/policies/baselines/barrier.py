@@ -1,0 +1,85 @@
+"""A control barrier function as the only avoidance: the velocity filter of Ames et al. (2019)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.policies.baselines.velocity_field import Surroundings, VelocityField
+from imitarm.skills.skill import Skill
+from imitarm.validation import finite_number
+
+Array = NDArray[np.float64]
+
+_UNBOUNDED = 1e30  # daqp's infinity
+_SOLVED = 1  # daqp's exit flag of an optimal solution
+_SOFT = 1e6  # weight of the squared violation, if no velocity meets all inequalities
+
+
+def nearest_velocity(desired: Array, rows: Array, lower: Array) -> Array:
+    """Return the velocity nearest to ``desired`` with ``rows @ v >= lower``.
+
+    One violated row that alone decides has the closed form ``v = u + a (b - a . u) / |a|^2``. Otherwise a quadratic
+    program is solved. If no velocity meets all rows, the sum of the squared violations is least.
+
+    Args:
+        desired: u, shape (d,) [m/s].
+        rows: a, shape (n, d).
+        lower: b, shape (n,) [m/s].
+    """
+    missing = lower - rows @ desired
+    if not len(missing) or missing.max() <= 0.0:
+        return desired
+    worst = int(np.argmax(missing))
+    a = rows[worst]
+    v = desired + a * missing[worst] / max(float(a @ a), 1e-12)
+    if np.all(rows @ v >= lower - 1e-9):
+        return v
+    n, d = rows.shape
+    upper = np.full(n, _UNBOUNDED)
+    sense = np.zeros(n, dtype=np.intc)
+    v, _, flag, _ = daqp.solve(np.eye(d), -desired, np.ascontiguousarray(rows), upper, lower.copy(), sense)
+    if flag == _SOLVED:
+        return np.asarray(v)
+    soft = np.ascontiguousarray(np.hstack([rows, np.eye(n)]))
+    weights = np.diag(np.concatenate([np.ones(d), np.full(n, _SOFT)]))
+    linear = np.concatenate([-desired, np.zeros(n)])
+    sense[:] = 0
+    v, _, flag, _ = daqp.solve(weights, linear, soft, upper, lower.copy(), sense)
+    return np.asarray(v)[:d] if flag == _SOLVED else np.zeros(d)
+
+
+class Barrier(VelocityField):
+    r"""Follow the learned path by the nearest velocity that keeps the clearance.
+
+    With the gap ``h_o`` beyond the required clearance, the outward normal ``n_o`` and the velocity ``v_o`` of the
+    obstacle's closest point, the velocity solves::
+
+        min |v - u|^2   s.t.   n_o . (v - v_o) >= -gamma h_o   for every obstacle o
+
+    ``h_o >= 0`` then holds at all times if it holds at the start: ``dh_o/dt = n_o . (v - v_o) >= -gamma h_o``. For
+    convex obstacles this is also true for time steps up to ``1 / gamma``, because the gap is a convex function of the
+    position. The filter looks only one step ahead: where the desired velocity points straight at an obstacle, the tool
+    stops in front of it.
+
+    Args:
+        skill: skill to reproduce.
+        gamma: how fast the tool may use up the gap [1/s].
+        options: arguments of :class:`~imitarm.policies.baselines.velocity_field.VelocityField`.
+    """
+
+    search_space: ClassVar[Mapping[str, tuple[float, float]]] = {**VelocityField.search_space, "gamma": (0.5, 30.0)}
+
+    def __init__(self, skill: Skill, *, gamma: float = 5.0, **options: Any) -> None:
+        super().__init__(skill, **options)
+        self.gamma = finite_number(gamma, "Barrier: gamma", "1/s", above=0.0)
+
+    def velocity(self, desired: Array, around: Surroundings, limits: Array) -> Array:
+        """Return the nearest velocity that keeps all gaps and all one-sided forbidden directions."""
+        rows = np.concatenate([around.normal, -self.one_sided])
+        approach = np.sum(around.normal * around.velocity, axis=1) - around.drift - self.gamma * around.gap
+        return nearest_velocity(desired, rows, np.concatenate([approach, -limits]))

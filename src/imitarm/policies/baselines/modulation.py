@@ -1,0 +1,106 @@
+"""Modulation of a dynamical system (Khansari-Zadeh and Billard 2012; Huber, Billard and Slotine 2019)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.policies.baselines.velocity_field import Surroundings, VelocityField
+from imitarm.skills.skill import Skill
+from imitarm.validation import finite_number
+
+Array = NDArray[np.float64]
+
+_LEAST_SLOPE = 0.3  # of the reference direction along the normal: a flatter one divides by nearly nothing
+_TINY = 1e-12
+
+
+def modulated(desired: Array, around: Surroundings, *, reactivity: float = 1.0, reach: float = 1.0) -> Array:
+    r"""Return the modulated velocity.
+
+    For one obstacle with velocity ``v_o``, outward normal ``n`` and reference direction ``r`` (from the obstacle's
+    centre to the tool), the modulation changes the eigenvalues of the relative velocity::
+
+        v = M (u - v_o) + v_o,   M = E diag(1 - q, 1 + q, 1 + q) E^-1,   E = [r, e_1, e_2],   e_i . n = 0
+        q = Gamma^(-1 / reactivity),   Gamma = (1 + gap / (reach size))^2
+
+    ``Gamma`` is 1 where the gap is 0, so that the tool does not move along the normal there. For a sphere with
+    ``reach`` and ``reactivity`` 1, ``Gamma`` is the squared distance from the centre in radii and the field is that of
+    the potential flow about the sphere's circles. A tool that is already too close may move away freely.
+
+    For several obstacles, the norms and the directions of the velocities are averaged with the weights ``w_o =
+    prod_(i != o) (Gamma_i - 1)``, normalised to the sum 1. A direction is represented by its angle from ``u``.
+
+    Args:
+        desired: u, shape (d,) [m/s].
+        around: the obstacles.
+        reactivity: larger values act from farther away.
+        reach: scale of the obstacles' sizes.
+
+    Returns:
+        Shape (d,) [m/s].
+    """
+    if not len(around.gap):
+        return desired
+    gamma = (1.0 + np.maximum(around.gap, 0.0) / (reach * around.size)) ** 2
+    q = gamma ** (-1.0 / reactivity)
+    normal, reference = _unit(around.normal), _unit(around.outward)
+    short = np.sum(reference * normal, axis=1) < _LEAST_SLOPE
+    reference = np.where(short[:, None], normal, reference)
+    relative = desired - around.velocity
+    along = np.sum(relative * normal, axis=1) / np.maximum(np.sum(reference * normal, axis=1), _TINY)
+    leaving = (around.gap <= 0.0) & (along > 0.0)
+    tangential = relative - along[:, None] * reference
+    stretched = np.where(leaving, 1.0, 1.0 - q)[:, None] * along[:, None] * reference + (1.0 + q)[:, None] * tangential
+    return _weighted(desired, stretched + around.velocity, 1.0 / np.maximum(gamma - 1.0, _TINY))
+
+
+def _weighted(desired: Array, velocities: Array, weights: Array) -> Array:
+    """Return the mean of velocities (n, d): of their norms, and of their angles from the desired velocity."""
+    if len(velocities) == 1:
+        return velocities[0]
+    weights = weights / weights.sum()
+    speeds = np.linalg.norm(velocities, axis=1)
+    ahead = _unit(desired[None])[0]
+    directions = _unit(velocities)
+    cosine = directions @ ahead
+    angles = np.arccos(np.clip(cosine, -1.0, 1.0))
+    angle = (weights * angles) @ _unit(directions - cosine[:, None] * ahead)
+    size = float(np.linalg.norm(angle))
+    turned = np.cos(size) * ahead + np.sinc(size / np.pi) * angle
+    return float(weights @ speeds) * turned
+
+
+def _unit(vectors: Array) -> Array:
+    """Return vectors (n, d) scaled to length 1; a zero vector stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), _TINY)
+
+
+class Modulation(VelocityField):
+    """Follow the learned path by a velocity that flows around obstacles, see :func:`modulated`.
+
+    Args:
+        skill: skill to reproduce.
+        reactivity: larger values act from farther away.
+        reach: scale of the obstacles' sizes.
+        options: arguments of :class:`~imitarm.policies.baselines.velocity_field.VelocityField`.
+    """
+
+    search_space: ClassVar[Mapping[str, tuple[float, float]]] = {
+        **VelocityField.search_space,
+        "reactivity": (0.3, 5.0),
+        "reach": (0.1, 3.0),
+    }
+
+    def __init__(self, skill: Skill, *, reactivity: float = 1.0, reach: float = 1.0, **options: Any) -> None:
+        super().__init__(skill, **options)
+        self.reactivity = finite_number(reactivity, "Modulation: reactivity", above=0.0)
+        self.reach = finite_number(reach, "Modulation: reach", above=0.0)
+
+    def velocity(self, desired: Array, around: Surroundings, limits: Array) -> Array:
+        """Return the modulated velocity."""
+        del limits
+        return modulated(desired, around, reactivity=self.reactivity, reach=self.reach)

@@ -1,0 +1,143 @@
+"""Base class of the baselines that change a desired velocity near obstacles, and move the tool with the result."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.policies.baselines.baseline_policy import BaselinePolicy, ToolGaps, allowed_axes
+from imitarm.scene.distances import PackedObstacles
+from imitarm.scene.scene import Scene
+from imitarm.skills.skill import Skill
+from imitarm.trajectory import Trajectory
+from imitarm.validation import finite_number
+
+Array = NDArray[np.float64]
+
+_LONGEST = 3.0  # times the learned duration: then the motion is given up where it is
+_ARRIVED = 1e-3  # [m] from the goal
+_FASTEST = 1.5  # times the highest speed of the learned path: limit of the desired velocity
+_LARGEST_SIZE = 0.3  # [m] of an obstacle without bounds, such as a table
+
+
+class Surroundings(NamedTuple):
+    """The obstacles as seen from the tool, in the d directions in which the tool may be displaced.
+
+    Attributes:
+        gap: distance of the tool to each obstacle less the required clearance, shape (n,) [m].
+        normal: outward normals, shape (n, d); shorter than 1 if part of a normal lies in a forbidden direction.
+        velocity: velocity of each obstacle at its closest point, shape (n, d) [m/s].
+        drift: speed along each normal that the tool has in forbidden directions, shape (n,) [m/s].
+        outward: vectors from the centres of the obstacles to the tool, shape (n, d) [m]; the normal for a half-space.
+        size: radius of a sphere that contains the obstacle, plus the tool's radius and the clearance, shape (n,) [m].
+    """
+
+    gap: Array
+    normal: Array
+    velocity: Array
+    drift: Array
+    outward: Array
+    size: Array
+
+
+class VelocityField(BaselinePolicy):
+    r"""Let the tool follow a point that moves along the learned path, with a velocity that respects obstacles.
+
+    The desired velocity ``u`` follows the point ``x_0(s)``; the point waits for a tool that lags::
+
+        u = r dx_0/ds + k (x_0(s) - x),     ds/dt = r = 1 / (1 + |x_0(s) - x| / e_0)
+
+    The norm of ``u`` is limited to 1.5 times the highest speed of the learned path. A subclass implements
+    :meth:`velocity`, which changes ``u`` near obstacles, and the tool moves with ``dx/dt = velocity(u)``. The motion
+    ends at the goal, or after three times the learned duration. Moving obstacles move with their present velocity.
+
+    Args:
+        skill: skill to reproduce.
+        pull: k, stiffness of the path [1/s].
+        slack: e_0, the distance at which the point has half of its speed [m].
+        options: arguments of :class:`~imitarm.policies.baselines.baseline_policy.BaselinePolicy`.
+    """
+
+    predicts = True
+    search_space: ClassVar[Mapping[str, tuple[float, float]]] = {"pull": (1.0, 20.0), "slack": (0.01, 0.3)}
+
+    def __init__(self, skill: Skill, *, pull: float = 4.0, slack: float = 0.05, **options: Any) -> None:
+        super().__init__(skill, **options)
+        name = type(self).__name__
+        self.pull = finite_number(pull, f"{name}: pull", "1/s", above=0.0)
+        self.slack = finite_number(slack, f"{name}: slack", "m", above=0.0)
+        self.axes, self.one_sided = allowed_axes(self._forbidden)
+
+    @abstractmethod
+    def velocity(self, desired: Array, around: Surroundings, limits: Array) -> Array:
+        """Return the velocity of the tool.
+
+        Args:
+            desired: desired velocity in the allowed directions, shape (d,) [m/s].
+            around: the obstacles.
+            limits: largest velocity in each direction ``self.one_sided``, shape (m,) [m/s]. A result that exceeds a
+                limit is reduced to it.
+        """
+
+    def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
+        """Return the path of the tool that follows the velocity field."""
+        n = len(nominal)
+        times = np.linspace(0.0, nominal.duration, n)
+        dt = float(times[1])
+        learned, _ = nominal.at(nominal.times[0] + times)
+        fastest = _FASTEST * float(np.linalg.norm(np.diff(learned, axis=0), axis=1).max()) / dt
+        forbidden_part = np.eye(3) - self.axes @ self.axes.T
+        x, phase = learned[0], 0.0
+        path = [x]
+        for step in range(int(_LONGEST * n)):
+            target = _at(phase, learned)
+            away = target - x
+            distance = float(np.linalg.norm(away))
+            if phase >= n - 1 and distance < _ARRIVED:
+                break
+            rate = 1.0 / (1.0 + distance / self.slack)
+            ahead = min(phase + rate, n - 1.0)
+            forward = (_at(ahead, learned) - target) / dt
+            desired = forward + self.pull * away
+            desired *= min(1.0, fastest / max(float(np.linalg.norm(desired)), 1e-12))
+            fixed = forbidden_part @ desired
+            around = self._surroundings(x, step * dt, fixed, gaps, scene.packed)
+            limits = self.one_sided @ (self.axes.T @ (forward + away / dt))
+            v = self.velocity(desired @ self.axes, around, limits)
+            for f, limit in zip(self.one_sided, limits, strict=True):
+                v = v - max(float(f @ v) - limit, 0.0) * f
+            x = x + dt * (fixed + self.axes @ v)
+            path.append(x)
+            phase = ahead
+        return np.linspace(0.0, dt * (len(path) - 1), len(path)), np.stack(path)
+
+    def _surroundings(
+        self, x: Array, time: float, fixed: Array, gaps: ToolGaps, packed: PackedObstacles
+    ) -> Surroundings:
+        """Return the obstacles at a time, seen from the tip at ``x``, which moves with ``fixed`` in any case."""
+        gap, normal = gaps.gaps_and_normals(x[None, None], np.array([time]))
+        gap, normal = gap[:, 0, 0], normal[:, 0, 0]
+        outward = x - (packed.positions + time * packed.velocities)
+        closest = outward - (gap + gaps.radius)[:, None] * normal
+        velocity = packed.velocities
+        if packed.rotating:
+            velocity = velocity + np.cross(packed.angular_velocities, closest)
+        bounded = np.isfinite(packed.radii)
+        return Surroundings(
+            gap - self.clearance,
+            normal @ self.axes,
+            velocity @ self.axes,
+            normal @ fixed,
+            np.where(bounded[:, None], outward, normal) @ self.axes,
+            np.where(bounded, packed.radii, _LARGEST_SIZE) + gaps.radius + self.clearance,
+        )
+
+
+def _at(index: float, rows: Array) -> Array:
+    """Return the row at a fractional index, interpolated linearly."""
+    i = min(int(index), len(rows) - 2)
+    return np.asarray(rows[i] + (index - i) * (rows[i + 1] - rows[i]))
