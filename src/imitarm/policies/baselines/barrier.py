@@ -9,7 +9,7 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.policies.baselines.velocity_field import Surroundings, VelocityField
+from imitarm.policies.baselines.velocity_field import NearObstacles, VelocityField
 from imitarm.skills.skill import Skill
 from imitarm.validation import finite_number
 
@@ -78,7 +78,7 @@ class Barrier(VelocityField):
         super().__init__(skill, **options)
         self.gamma = finite_number(gamma, "Barrier: gamma", "1/s", above=0.0)
 
-    def velocity(self, desired: Array, around: Surroundings, limits: Array) -> Array:
+    def velocity(self, desired: Array, around: NearObstacles, limits: Array) -> Array:
         """Return the nearest velocity that keeps all gaps and all one-sided forbidden directions."""
         rows = np.concatenate([around.normal, -self.one_sided])
         approach = np.sum(around.normal * around.velocity, axis=1) - around.drift - self.gamma * around.gap

@@ -74,6 +74,8 @@ class CoupledMotion(BaselinePolicy):
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
     """
 
+    predicts = True
+
     def __init__(self, skill: Skill, *, max_acceleration: float = 10.0, **options: Any) -> None:
         super().__init__(skill, **options)
         name = type(self).__name__

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.policies.baselines.velocity_field import Surroundings, VelocityField
+from imitarm.policies.baselines.velocity_field import NearObstacles, VelocityField
 from imitarm.skills.skill import Skill
 from imitarm.validation import finite_number
 
@@ -18,7 +18,7 @@ _LEAST_SLOPE = 0.3  # of the reference direction along the normal: a flatter one
 _TINY = 1e-12
 
 
-def modulated(desired: Array, around: Surroundings, *, reactivity: float = 1.0, reach: float = 1.0) -> Array:
+def modulated(desired: Array, around: NearObstacles, *, reactivity: float = 1.0, reach: float = 1.0) -> Array:
     r"""Return the modulated velocity.
 
     For one obstacle with velocity ``v_o``, outward normal ``n`` and reference direction ``r`` (from the obstacle's
@@ -100,7 +100,7 @@ class Modulation(VelocityField):
         self.reactivity = finite_number(reactivity, "Modulation: reactivity", above=0.0)
         self.reach = finite_number(reach, "Modulation: reach", above=0.0)
 
-    def velocity(self, desired: Array, around: Surroundings, limits: Array) -> Array:
+    def velocity(self, desired: Array, around: NearObstacles, limits: Array) -> Array:
         """Return the modulated velocity."""
         del limits
         return modulated(desired, around, reactivity=self.reactivity, reach=self.reach)

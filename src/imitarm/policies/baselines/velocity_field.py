@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.errors import InfeasibleError
 from imitarm.policies.baselines.baseline_policy import BaselinePolicy, ToolGaps, allowed_axes
 from imitarm.scene.distances import PackedObstacles
 from imitarm.scene.scene import Scene
@@ -18,13 +19,13 @@ from imitarm.validation import finite_number
 
 Array = NDArray[np.float64]
 
-_LONGEST = 3.0  # times the learned duration: then the motion is given up where it is
-_ARRIVED = 1e-3  # [m] from the goal
+_LONGEST = 2.0  # durations
+_ARRIVED, _NEAR = 1e-3, 5e-3  # [m] from the goal: the motion ends; after the longest time, the goal counts as reached
 _FASTEST = 1.5  # times the highest speed of the learned path: limit of the desired velocity
 _LARGEST_SIZE = 0.3  # [m] of an obstacle without bounds, such as a table
 
 
-class Surroundings(NamedTuple):
+class NearObstacles(NamedTuple):
     """The obstacles as seen from the tool, in the d directions in which the tool may be displaced.
 
     Attributes:
@@ -53,7 +54,7 @@ class VelocityField(BaselinePolicy):
 
     The norm of ``u`` is limited to 1.5 times the highest speed of the learned path. A subclass implements
     :meth:`velocity`, which changes ``u`` near obstacles, and the tool moves with ``dx/dt = velocity(u)``. The motion
-    ends at the goal, or after three times the learned duration. Moving obstacles move with their present velocity.
+    ends at the goal. A method whose tool is not within 5 mm of the goal after twice the learned duration refuses.
 
     Args:
         skill: skill to reproduce.
@@ -73,7 +74,7 @@ class VelocityField(BaselinePolicy):
         self.axes, self.one_sided = allowed_axes(self._forbidden)
 
     @abstractmethod
-    def velocity(self, desired: Array, around: Surroundings, limits: Array) -> Array:
+    def velocity(self, desired: Array, around: NearObstacles, limits: Array) -> Array:
         """Return the velocity of the tool.
 
         Args:
@@ -84,7 +85,11 @@ class VelocityField(BaselinePolicy):
         """
 
     def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
-        """Return the path of the tool that follows the velocity field."""
+        """Return the path of the tool that follows the velocity field.
+
+        Raises:
+            InfeasibleError: when the tool is not within 5 mm of the goal after twice the duration.
+        """
         n = len(nominal)
         times = np.linspace(0.0, nominal.duration, n)
         dt = float(times[1])
@@ -105,7 +110,7 @@ class VelocityField(BaselinePolicy):
             desired = forward + self.pull * away
             desired *= min(1.0, fastest / max(float(np.linalg.norm(desired)), 1e-12))
             fixed = forbidden_part @ desired
-            around = self._surroundings(x, step * dt, fixed, gaps, scene.packed)
+            around = self._obstacles(x, step * dt, fixed, gaps, scene.packed)
             limits = self.one_sided @ (self.axes.T @ (forward + away / dt))
             v = self.velocity(desired @ self.axes, around, limits)
             for f, limit in zip(self.one_sided, limits, strict=True):
@@ -113,11 +118,15 @@ class VelocityField(BaselinePolicy):
             x = x + dt * (fixed + self.axes @ v)
             path.append(x)
             phase = ahead
+        away_from_goal = float(np.linalg.norm(learned[-1] - x))
+        if away_from_goal > _NEAR:
+            raise InfeasibleError(
+                f"{type(self).__name__}: the tool is still {1e3 * away_from_goal:.0f} mm from the goal after twice the "
+                f"learned duration; choose other options, or another policy"
+            )
         return np.linspace(0.0, dt * (len(path) - 1), len(path)), np.stack(path)
 
-    def _surroundings(
-        self, x: Array, time: float, fixed: Array, gaps: ToolGaps, packed: PackedObstacles
-    ) -> Surroundings:
+    def _obstacles(self, x: Array, time: float, fixed: Array, gaps: ToolGaps, packed: PackedObstacles) -> NearObstacles:
         """Return the obstacles at a time, seen from the tip at ``x``, which moves with ``fixed`` in any case."""
         gap, normal = gaps.gaps_and_normals(x[None, None], np.array([time]))
         gap, normal = gap[:, 0, 0], normal[:, 0, 0]
@@ -127,7 +136,7 @@ class VelocityField(BaselinePolicy):
         if packed.rotating:
             velocity = velocity + np.cross(packed.angular_velocities, closest)
         bounded = np.isfinite(packed.radii)
-        return Surroundings(
+        return NearObstacles(
             gap - self.clearance,
             normal @ self.axes,
             velocity @ self.axes,
