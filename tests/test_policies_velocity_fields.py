@@ -166,7 +166,7 @@ def test_velocity_fields_keep_forbidden_directions_and_meet_moving_obstacles_on_
 
 def test_a_barrier_alone_stops_in_front_of_a_wall_across_the_path_and_refuses():
     wall = Scene(None, [HalfSpace(PATH[200], PATH[0] - PATH[-1])])
-    with pytest.raises(InfeasibleError, match="Barrier: the tool is still .* from the goal"):
+    with pytest.raises(InfeasibleError, match=r"Barrier: the tool is still .* from the goal"):
         Barrier(SKILL, tool_spheres=TOOL).plan_motion(wall)
 
 
