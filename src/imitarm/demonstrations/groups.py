@@ -110,8 +110,8 @@ def two_groups(
         distance: distances between the demonstrations, shape (m, m).
         floor: smallest gap between groups, in the unit of ``distance``.
         ratio: smallest ratio of the longest edge to the second longest.
-        others_too: whether the ratio does not matter if the second longest edge also exceeds ``floor``, because there
-            are more than two groups then.
+        others_too: whether to ignore ``ratio`` if the second longest edge also exceeds ``floor``; there are then more
+            than two groups.
 
     Returns:
         A mask that selects one group, shape (m,), and the gap between the groups.
