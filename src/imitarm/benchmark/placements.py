@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,18 +18,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.benchmark.families import random_obstacle
+from imitarm.benchmark.placement_results import (
+    PlacementResult,
+    Run,
+    Setup,
+    append_result,
+    load_results,
+    repaired,
+)
+from imitarm.benchmark.provenance import code_version
 from imitarm.benchmark.tables import Table
 from imitarm.control_loop import reproduce
 from imitarm.errors import InfeasibleError, InputError, UnreachableError
 from imitarm.evaluation.intervals import wilson_interval
+from imitarm.evaluation.path_style import path_style
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.policies import POLICIES
+from imitarm.policies.component_path import TOLERANCE_FLOOR, ComponentPath
+from imitarm.policies.whole_arm import links_apart
 from imitarm.robots import SimulatedRobot
 from imitarm.safety import SafetyFilter
 from imitarm.scene import Obstacle, Scene
 from imitarm.skills import Skill
+from imitarm.trajectory import Rollout, Trajectory
 
 Array = NDArray[np.float64]
 
@@ -45,46 +58,6 @@ _SPREAD = 0.02  # [m] standard deviation of an obstacle's centre about the path
 _FREE_ENDS = 0.01  # [m] beyond the clearance, that an obstacle leaves to the tool at start and goal
 _TRIES = 200
 LATE = 1.5  # times the duration of the skill
-
-
-@dataclass(frozen=True)
-class Setup:
-    """A skill and the arm that reproduces it.
-
-    Attributes:
-        skill: path of the skill file.
-        robot: name of an arm, or the path of its file.
-        tool: name of a tool, or the path of its file; None for no tool.
-    """
-
-    skill: str
-    robot: str
-    tool: str | None
-
-
-@dataclass(frozen=True)
-class PlacementResult:
-    """Result of one policy in one placement.
-
-    Attributes:
-        policy: its name.
-        setup: the skill and the arm.
-        seed: seed of the placement.
-        outcome: one of :data:`OUTCOMES`.
-        clearance: smallest measured distance from arm and tool to an obstacle [m]; nan if the arm did not move.
-        duration: duration of the motion divided by the duration of the skill; nan if the arm did not move.
-        planning: computing time until the policy accepted or refused the scene [s].
-        reason: explanation of the outcome.
-    """
-
-    policy: str
-    setup: Setup
-    seed: int
-    outcome: str
-    clearance: float
-    duration: float
-    planning: float
-    reason: str
 
 
 def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
@@ -147,25 +120,61 @@ def run_placement(policy: str, setup: Setup, seed: int, max_tilt: float | None =
     robot = SimulatedRobot(arm, scene=scene, q=start)
     spheres = arm.tool_spheres if skill.gmr_.has_orientation_ else [[0.0, 0.0, 0.0, arm.tool_radius]]
     decides = POLICIES[policy].build(skill, tool_spheres=spheres, clearance=CLEARANCE, arm=arm, max_tilt=max_tilt)
-    began, planned = time.perf_counter(), [np.nan]
-
-    def on_step(_step: object) -> None:
-        if np.isnan(planned[0]):
-            planned[0] = time.perf_counter() - began
-
+    watch = _Stopwatch()
     safety = SafetyFilter(arm, dt=_DT, clearance=CLEARANCE)
+    rollout: Rollout | None = None
     try:
         rollout = reproduce(
-            decides, robot, scene.at, dt=_DT, safety=safety, timeout=_PATIENCE * skill.duration_, on_step=on_step
+            decides, robot, scene.at, dt=_DT, safety=safety, timeout=_PATIENCE * skill.duration_, on_step=watch.stop
+        )
+        outcome, reason = (
+            _outcome(rollout.success, rollout.reason, bool(rollout.details.get("contacts"))),
+            rollout.reason,
         )
     except InfeasibleError as refusal:
-        spent = time.perf_counter() - began
-        return PlacementResult(policy, setup, seed, "refused", np.nan, np.nan, spent, str(refusal))
-    duration = rollout.trajectory.duration / skill.duration_
-    outcome = _outcome(rollout.success, rollout.reason, bool(rollout.details.get("contacts")))
+        watch.stop()
+        outcome, reason = "refused", str(refusal)
+    measured: dict[str, float] = {}
+    if outcome == "arrived" and rollout is not None:
+        measured = asdict(path_style(rollout.trajectory, *_demonstrated(setup)))
     return PlacementResult(
-        policy, setup, seed, outcome, float(rollout.min_clearance), duration, planned[0], rollout.reason
+        policy,
+        setup,
+        seed,
+        outcome,
+        clearance=np.nan if rollout is None else float(rollout.min_clearance),
+        duration=np.nan if rollout is None else rollout.trajectory.duration / skill.duration_,
+        planning=watch.time,
+        reason=reason,
+        max_tilt=max_tilt,
+        computing=watch.computing,
+        code=code_version(),
+        **measured,
     )
+
+
+class _Stopwatch:
+    """Time [s] and processor time [s] from its construction to the first call of ``stop``."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter(), time.process_time()
+        self.time = self.computing = np.nan
+
+    def stop(self, _step: object = None) -> None:
+        if np.isnan(self.time):
+            self.time, self.computing = time.perf_counter() - self._began[0], time.process_time() - self._began[1]
+
+
+@lru_cache(maxsize=8)
+def _demonstrated(setup: Setup) -> tuple[Trajectory, Array]:
+    """Return the mean of the demonstrations with rotations, n samples, and its covariances (n, 3, 3) [m^2]."""
+    skill, arm, start = _prepared(setup)
+    path = ComponentPath.of_skill(skill)
+    mean = path.nominal
+    if mean.quaternions is None:  # the tool keeps the rotation that it has at the start
+        held = np.tile(arm.tool_pose(start).quaternion, (len(mean), 1))
+        mean = Trajectory(mean.times, mean.positions, held)
+    return mean, path.tolerance + TOLERANCE_FLOOR**2 * np.eye(3)
 
 
 def _outcome(success: bool, reason: str, contact: bool) -> str:
@@ -188,6 +197,7 @@ def _prepared(setup: Setup) -> tuple[Skill, ArmModel, Array]:
         start = find_posture(arm, Pose(end.position, end.quaternion if skill.gmr_.has_orientation_ else rotation))
     except UnreachableError as error:
         raise InputError(f"{setup.skill}: {error}; choose another robot for this skill") from error
+    links_apart(arm)  # is computed once for each arm, which no policy should be charged for
     return skill, arm, start
 
 
@@ -198,6 +208,8 @@ def run_placements(
     *,
     max_tilt: float | None = None,
     jobs: int = 1,
+    out: Path | None = None,
+    reuse: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[PlacementResult]:
     """Run every policy in every placement; the results do not depend on the number of processes.
@@ -208,26 +220,37 @@ def run_placements(
         seeds: seeds of the placements.
         max_tilt: largest rotation of the tool away from the learned rotation [rad]; None: the policy's default.
         jobs: processes.
+        out: file to which each result is appended as one line of JSON as soon as it is known. A result of the same
+            run and the same code that the file already contains is not measured again. None: results are not saved.
+        reuse: whether to use results in ``out`` even if another version of the code measured them.
         progress: function called with the number of finished placements and the total number.
 
     Raises:
-        InputError: when a skill or an arm can't be loaded, or several processes are requested without joblib.
+        InputError: when a skill or an arm can't be loaded, ``out`` can't be written, or several processes are requested
+            without joblib.
+        FileFormatError: when ``out`` contains something else.
     """
-    work = [(policy, setup, seed, max_tilt) for setup in setups for seed in seeds for policy in policies]
-    done: list[PlacementResult] = []
+    work = [Run(policy, setup, seed, max_tilt) for setup in setups for seed in seeds for policy in policies]
+    known: dict[Run, PlacementResult] = {}
+    if out is not None and out.exists():
+        repaired(out)
+        known = {t: found for t, found in load_results([out]).items() if reuse or found.code == code_version()}
+    left = [run for run in work if run not in known]
     with contextlib.ExitStack() as stack:
         results: Iterable[PlacementResult]
         if jobs == 1:
-            results = (run_placement(*one) for one in work)
+            results = (run_placement(*run) for run in left)
         else:
             joblib = _joblib()
             pool = stack.enter_context(joblib.Parallel(n_jobs=jobs, return_as="generator"))
-            results = pool(joblib.delayed(run_placement)(*one) for one in work)
-        for result in results:
-            done.append(result)
+            results = pool(joblib.delayed(run_placement)(*run) for run in left)
+        for done, result in enumerate(results, len(work) - len(left) + 1):
+            known[result.run] = result
+            if out is not None:
+                append_result(out, result)
             if progress is not None:
-                progress(len(done), len(work))
-    return done
+                progress(done, len(work))
+    return [known[run] for run in work]
 
 
 def _joblib() -> Any:

@@ -12,10 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from imitarm.benchmark import avoidance, placements, real_motions, refusals
+from imitarm.benchmark import avoidance, placement_comparison, placements, real_motions, refusals
 from imitarm.benchmark.experiment import METHODS, Result
 from imitarm.benchmark.mapping import MappingBenchmark, tables, write_tables
 from imitarm.benchmark.mapping_tables import TEST, Results
+from imitarm.benchmark.placement_results import Setup, load_results
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.refusal_oracle import Answer
@@ -38,11 +39,13 @@ examples:
   imitarm benchmark avoidance --seeds 200
   imitarm benchmark placements --skill pour.json --robot panda --tool gripper --seeds 100
   imitarm benchmark placements --skill pour.json shelf.json --robots sawyer panda --tool gripper --jobs 2
+  imitarm benchmark placements --policies acfra rrt-connect --max-tilt 30 --out placements.jsonl
+  imitarm benchmark comparison placements.jsonl
   imitarm benchmark people recordings person.mp4
   imitarm benchmark refusals --scenes 1000
 
-'mapping' saves each result in the folder --out.
-If it was interrupted, the same command continues where it stopped.
+'mapping' saves each result in the folder --out, and 'placements' in the file --out.
+If one of them was interrupted, the same command continues where it stopped.
 """
 
 
@@ -142,12 +145,32 @@ def _add_placements(parsers: Any) -> None:
     placed.add_argument(
         "--list", action="store_true", help="also list each placement in which a policy did not reach the goal"
     )
+    placed.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="append each result to this file (JSON lines); results that are already in it are not measured again",
+    )
+    placed.add_argument(
+        "--reuse", action="store_true", help="use results in --out even if another version of the code measured them"
+    )
     add_robot_options(placed)
     _add_fill(placed)
     placed.add_argument(
         "--max-tilt", type=float, metavar="DEG", help="largest tilt of the tool; default: as in the demonstrations"
     )
     placed.set_defaults(benchmark=_placements)
+    compared = parsers.add_parser(
+        "comparison", help="compare a policy with others in the placements that the others solve, from saved results"
+    )
+    compared.add_argument(
+        "results", type=Path, nargs="+", metavar="RESULTS", help="files that 'placements --out' wrote"
+    )
+    compared.add_argument(
+        "--policy", choices=POLICIES, default="acfra", metavar="NAME", help="policy to compare; default: acfra"
+    )
+    _add_fill(compared)
+    compared.set_defaults(benchmark=_comparison)
 
 
 def _add_fill(parser: argparse.ArgumentParser) -> None:
@@ -252,13 +275,15 @@ def _placements(arguments: argparse.Namespace) -> int:
     """Run the placements benchmark and print its table."""
     if arguments.seeds < 1 or arguments.first < 0 or arguments.jobs < 1:
         raise InputError("--seeds and --jobs must be at least 1, and --first at least 0")
+    if arguments.out is not None and arguments.skill is None:
+        raise InputError("--out needs --skill, because the skill that is used without --skill is not a file")
     place = _place(arguments, "placements")
     with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
         if arguments.skill is None:
             setups = [placements.packaged_setup(Path(folder))]
         else:
             robots = arguments.robots or [arguments.robot]
-            setups = [placements.Setup(str(skill), arm, arguments.tool) for skill in arguments.skill for arm in robots]
+            setups = [Setup(str(skill), arm, arguments.tool) for skill in arguments.skill for arm in robots]
         task = bar.add_task("reproducing", total=None)
         results = placements.run_placements(
             arguments.policies,
@@ -266,13 +291,24 @@ def _placements(arguments: argparse.Namespace) -> int:
             range(arguments.first, arguments.first + arguments.seeds),
             max_tilt=None if arguments.max_tilt is None else math.radians(arguments.max_tilt),
             jobs=arguments.jobs,
+            out=arguments.out,
+            reuse=arguments.reuse,
             progress=lambda done, of: bar.update(task, completed=done, total=of),
         )
-    _report([placements.placement_table(results)], place, [code_version()])
+    _report([placements.placement_table(results)], place, [result.code for result in results])
     for result in results if arguments.list else []:
         if result.outcome != "arrived":
             where = f"{Path(result.setup.skill).stem}, {result.setup.robot}, seed {result.seed}"
             say(f"{result.policy}, {where}: {result.outcome}: {result.reason}")
+    return 0
+
+
+def _comparison(arguments: argparse.Namespace) -> int:
+    """Print what saved results of placements say about a policy and its baselines."""
+    place = _place(arguments, "comparison")
+    results = list(load_results(arguments.results).values())
+    tables_found = placement_comparison.comparison_tables(results, arguments.policy)
+    _report(tables_found, place, [result.code for result in results])
     return 0
 
 

@@ -21,6 +21,8 @@ POLICIES: Registry[type[Policy]] = Registry(
         "dmp-potential": "imitarm.policies.baselines.dmp_potential:DMPPotential",
         "barrier": "imitarm.policies.baselines.barrier:Barrier",
         "modulation": "imitarm.policies.baselines.modulation:Modulation",
+        "rrt-connect": "imitarm.policies.baselines.joint_planner:RRTConnect",
+        "rrt-connect-tilt": "imitarm.policies.baselines.joint_planner:TiltLimitedRRTConnect",
     },
 )
 """All policies by name."""

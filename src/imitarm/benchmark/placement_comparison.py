@@ -1,0 +1,158 @@
+"""Compare a policy with baselines in the placements that they solve: acceptance, planning time, path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from imitarm.benchmark.placement_results import PlacementResult, Setup
+from imitarm.benchmark.tables import Table
+from imitarm.errors import InputError
+from imitarm.evaluation.intervals import wilson_interval
+
+_STYLE_NOTE = (
+    "Planning times are processor times until a policy accepts or refuses, for all placements; the other columns count "
+    "the motions that arrived, as the simulated arm executed them. RMSE and deviation compare an executed path with "
+    "the mean of the demonstrations as curves (200 points evenly spaced along the arc, matched by dynamic time "
+    "warping), because a planner's timing is its own. Deviation: largest Mahalanobis distance along the path, with the "
+    "covariance of GMR plus (5 mm)² in every direction. Tilt: largest rotation of the tool from the learned rotation "
+    "at the nearest point of the learned path. Tilt limit 'default': for acfra and rrt-connect-tilt two standard "
+    "deviations of the demonstrated rotation, for rrt-connect none."
+)
+_PAIR_NOTE = (
+    "Each row counts the placements that the baseline solves: it arrives, and keeps its clearance. Accepted and "
+    "solved: by {policy}, in these placements (Wilson's 95 % interval). Planning time: ratio of the medians over these "
+    "placements, refusals included. RMSE and deviation: ratio of the medians over the placements that both solve."
+)
+_RMSE_TARGET, _DEVIATION_TARGET = 0.7, 0.5
+
+
+class Variant(NamedTuple):
+    """A policy with a limit of the tilt [rad]; None: the default of the policy."""
+
+    policy: str
+    max_tilt: float | None
+
+    @property
+    def limit(self) -> str:
+        """The limit of the tilt as text."""
+        return "default" if self.max_tilt is None else f"{np.degrees(self.max_tilt):.0f}°"
+
+
+Place = tuple[Setup, int]
+"""A setup and a seed, which determine a placement."""
+
+
+def comparison_tables(results: Iterable[PlacementResult], policy: str = "acfra") -> list[Table]:
+    """Return a table of all variants of all policies, and a table that compares one policy with the others in pairs.
+
+    Args:
+        results: results of any policies in any placements.
+        policy: name of the policy that is compared with all others.
+
+    Raises:
+        InputError: when there is no result of this policy, or of no other policy.
+    """
+    variants: dict[Variant, dict[Place, PlacementResult]] = {}
+    for result in results:
+        place = result.setup, result.seed
+        variants.setdefault(Variant(result.policy, result.max_tilt), {})[place] = result
+    own = [variant for variant in variants if variant.policy == policy]
+    baselines = [variant for variant in variants if variant.policy != policy]
+    if not own or not baselines:
+        raise InputError(f"comparison: needs results of {policy!r} and of another policy; run the placements with both")
+    rows = [_style_row(variant, list(variants[variant].values())) for variant in variants]
+    pairs = [_pair_row(a, variants[a], b, variants[b]) for a in own for b in baselines]
+    titles = (
+        "policy",
+        "tilt limit",
+        "placements>",
+        "arrived",
+        "RMSE, median [mm]>",
+        "largest deviation, median [σ]>",
+        "largest tilt, median [°]>",
+        "planning, median [ms]>",
+        "planning, 99th percentile [ms]>",
+    )
+    return [
+        Table("Executed paths beside the mean of the demonstrations", titles, tuple(rows), _STYLE_NOTE),
+        Table(
+            f"{policy} in the placements that a baseline solves",
+            (
+                f"tilt limit of {policy}",
+                "baseline",
+                "its tilt limit",
+                "solved by the baseline>",
+                "accepted of these",
+                "solved of these",
+                "ratio of planning times (target: below 1)",
+                f"ratio of RMSE (target: at most {_RMSE_TARGET:g})",
+                f"ratio of deviations (target: at most {_DEVIATION_TARGET:g})",
+            ),
+            tuple(row for row in pairs if row is not None),
+            _PAIR_NOTE.format(policy=policy),
+        ),
+    ]
+
+
+def _style_row(variant: Variant, results: Sequence[PlacementResult]) -> tuple[str, ...]:
+    arrived = [result for result in results if result.arrived]
+    times = [1e3 * result.computing for result in results]
+    return (
+        variant.policy,
+        variant.limit,
+        str(len(results)),
+        _share(len(arrived), len(results)),
+        _median(arrived, lambda result: 1e3 * result.rmse),
+        _median(arrived, lambda result: result.deviation),
+        _median(arrived, lambda result: float(np.degrees(result.tilt))),
+        f"{np.median(times):.0f}",
+        f"{np.percentile(times, 99):.0f}",
+    )
+
+
+def _pair_row(
+    own: Variant,
+    of_own: dict[Place, PlacementResult],
+    baseline: Variant,
+    of_baseline: dict[Place, PlacementResult],
+) -> tuple[str, ...] | None:
+    """Return the comparison of two variants; None if the baseline solved no placement that both had."""
+    pairs = [(of_own[place], other) for place, other in of_baseline.items() if other.arrived and place in of_own]
+    if not pairs:
+        return None
+    both = [pair for pair in pairs if pair[0].arrived]
+    return (
+        own.limit,
+        baseline.policy,
+        baseline.limit,
+        str(len(pairs)),
+        _share(sum(one.accepted for one, _ in pairs), len(pairs)),
+        _share(len(both), len(pairs)),
+        _ratio(pairs, lambda result: result.computing),
+        _ratio(both, lambda result: result.rmse),
+        _ratio(both, lambda result: result.deviation),
+    )
+
+
+def _median(results: Sequence[PlacementResult], measure: Callable[[PlacementResult], float]) -> str:
+    return f"{np.median([measure(result) for result in results]):.1f}" if results else "-"
+
+
+def _ratio(
+    pairs: Sequence[tuple[PlacementResult, PlacementResult]], measure: Callable[[PlacementResult], float]
+) -> str:
+    """Return the ratio of the medians of a measure."""
+    if not pairs:
+        return "-"
+    one, other = (float(np.median([measure(pair[k]) for pair in pairs])) for k in (0, 1))
+    return f"{one / other:.2f}" if other > 0.0 else "-"
+
+
+def _share(count: int, of: int) -> str:
+    if not of:
+        return "-"
+    low, high = wilson_interval(count, of)
+    return f"{count} ({100 * count / of:.1f} %, {100 * low:.1f} to {100 * high:.1f})"

@@ -1,0 +1,118 @@
+"""Saved placements: nothing is measured twice, a killed run goes on, and comparisons come from the saved lines."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from imitarm import InputError, cli
+from imitarm.benchmark import placements
+from imitarm.benchmark.placement_comparison import comparison_tables
+from imitarm.benchmark.placement_results import PlacementResult, Setup, append_result, load_results, repaired
+from imitarm.benchmark.tables import END
+from imitarm.errors import FileFormatError
+
+SETUP = Setup("skill.json", "panda", None)
+
+
+def result(policy="acfra", seed=0, outcome="arrived", max_tilt=None, **values):
+    found = PlacementResult(policy, SETUP, seed, outcome, 0.03, 1.0, 0.1, "", max_tilt, code="here")
+    return replace(found, **({"computing": 0.1, "rmse": 0.05, "deviation": 4.0, "tilt": 0.1} | values))
+
+
+def pretended(monkeypatch):
+    ran = []
+
+    def run_placement(policy, setup, seed, max_tilt=None):
+        ran.append((policy, seed))
+        return replace(result(policy, seed), setup=setup, max_tilt=max_tilt, code=placements.code_version())
+
+    monkeypatch.setattr(placements, "run_placement", run_placement)
+    return ran
+
+
+def test_results_are_read_as_they_were_saved(tmp_path):
+    file = tmp_path / "results.jsonl"
+    refused = result(outcome="refused", clearance=math.nan, rmse=math.nan, reason='no "way"')
+    saved = [refused, result(seed=1, max_tilt=0.5), result("other", seed=1)]
+    for one in saved:
+        append_result(file, one)
+    found = list(load_results([file]).values())
+    assert found[1:] == saved[1:]
+    assert math.isnan(found[0].rmse)
+    assert found[0].max_tilt is None
+    assert found[0].reason == refused.reason
+    assert "NaN" not in file.read_text()
+    append_result(file, result(rmse=0.01))
+    assert load_results([file])[refused.run].rmse == 0.01  # the last line counts
+
+
+def test_a_killed_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    file, ran = tmp_path / "results.jsonl", pretended(monkeypatch)
+    first = placements.run_placements(["acfra", "other"], [SETUP], range(2), out=file)
+    assert len(ran) == 4
+    with file.open("a") as text:
+        text.write('{"policy": "acf')
+    again = placements.run_placements(["acfra", "other"], [SETUP], range(3), out=file)
+    assert ran[4:] == [("acfra", 2), ("other", 2)]
+    assert again[:4] == first
+    assert len(load_results([file])) == 6
+    placements.run_placements(["acfra"], [SETUP], range(3), max_tilt=0.5, out=file)
+    assert len(ran) == 9  # another limit is another run
+
+
+def test_results_of_other_code_are_used_only_on_request(tmp_path, monkeypatch):
+    file, ran = tmp_path / "results.jsonl", pretended(monkeypatch)
+    append_result(file, result())
+    placements.run_placements(["acfra"], [SETUP], range(1), out=file, reuse=True)
+    assert not ran
+    placements.run_placements(["acfra"], [SETUP], range(1), out=file)
+    assert len(ran) == 1
+
+
+@pytest.mark.parametrize("line", ["no JSON", "[1]", '{"policy": 3}'])
+def test_what_is_not_a_result_is_rejected_with_its_line(tmp_path, line):
+    file = tmp_path / "results.jsonl"
+    append_result(file, result())
+    with file.open("a") as text:
+        text.write(line + "\n")
+    with pytest.raises(FileFormatError, match="line 2"):
+        load_results([file])
+    with pytest.raises(InputError, match="can't be read"):
+        load_results([tmp_path / "none.jsonl"])
+    repaired(tmp_path / "none.jsonl")
+    with pytest.raises(InputError, match="can't be saved"):
+        append_result(tmp_path / "no folder" / "results.jsonl", result())
+
+
+def test_pairs_count_only_what_the_baseline_solves():
+    results = [
+        *(result(seed=seed) for seed in range(4)),
+        replace(result(seed=4, outcome="refused", computing=0.4), rmse=math.nan),
+        *(result("baseline", seed, computing=0.2, rmse=0.1, deviation=10.0) for seed in range(2, 5)),
+        replace(result("baseline", 1, "refused"), rmse=math.nan),
+        result("baseline", 99),  # acfra was not run there
+    ]
+    style, pairs = comparison_tables(results)
+    assert [row[2] for row in style.rows] == ["5", "5"]
+    (row,) = pairs.rows
+    assert row[:4] == ("default", "baseline", "default", "3")
+    assert row[4].startswith("2 (66.7 %")
+    assert row[6:] == ("0.50", "0.50", "0.40")
+    with pytest.raises(InputError, match="another policy"):
+        comparison_tables(results[:4])
+
+
+def test_the_comparison_is_printed_from_files_and_put_into_a_document(tmp_path, capsys):
+    file, document = tmp_path / "results.jsonl", tmp_path / "doc.md"
+    document.write_text(f"before\n<!-- imitarm benchmark comparison -->\n{END}\nafter\n")
+    for one in (result(max_tilt=math.radians(30)), result("rrt-connect")):
+        append_result(file, one)
+    assert cli.main(["benchmark", "comparison", str(file), "--fill", str(document)]) == 0
+    assert "acfra in the placements that a baseline solves" in capsys.readouterr().out
+    assert "| 30° | rrt-connect | default | 1 |" in document.read_text()
+    assert cli.main(["benchmark", "comparison", str(tmp_path / "none")]) == 2
+    assert cli.main(["benchmark", "placements", "--out", str(file)]) == 2
+    assert "--out needs --skill" in capsys.readouterr().err
