@@ -42,11 +42,11 @@ def test_the_demo_does_the_main_job(tmp_path, capsys):
 
 def test_a_demo_that_fails_says_so_by_its_status(tmp_path, monkeypatch, capsys):
     """Where no path is found, the exit status tells."""
-    monkeypatch.setattr("imitarm.cli.demo.SCENES", ("two_boxes",))
     monkeypatch.setattr("imitarm.cli.demo.write_report", lambda report, path: path)
     monkeypatch.setattr("imitarm.policies.arm_planner.ArmPlanner.plan", lambda *_: None)  # no path is found
-    assert main(["demo", "--out", str(tmp_path)]) == 1
-    assert "can't move its tool along the path" in " ".join(capsys.readouterr().out.split())
+    assert main(["demo", "--out", str(tmp_path), "--scenes", "T1", "two_boxes"]) == 1  # one scene, by both its names
+    out = " ".join(capsys.readouterr().out.split())
+    assert "can't move its tool along the path" in out and "of 1 scenes" in out
 
 
 def test_a_demo_folder_that_cannot_be_made_is_bad_input(tmp_path, capsys):
@@ -64,7 +64,7 @@ def test_the_demo_replaces_no_file_unasked(tmp_path, monkeypatch, capsys, name):
     message = capsys.readouterr().err
     assert f"{name}: already exists" in message and "--force" in message
     assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "mine"
-    monkeypatch.setattr("imitarm.cli.demo.SCENES", ())
+    monkeypatch.setattr("imitarm.cli.demo.DEMO_SCENES", ())
     assert main(["demo", "--out", str(tmp_path), "--force"]) in {0, 1}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "results.json", "skill.json"]
     assert (tmp_path / name).read_text() != "mine"

@@ -17,7 +17,7 @@ from imitarm.errors import InputError
 from imitarm.files.document import write_text
 from imitarm.policies import ACFRA, ADAPTERS, HORIZONTAL_ONLY
 from imitarm.skills import Skill
-from imitarm.tasks.sweep import DEMONSTRATIONS, SCENES, SweepTask
+from imitarm.tasks.sweep import DEMONSTRATIONS, NUMBERED_SCENES, SCENES, SweepTask
 from imitarm.trajectory import Demonstration
 from imitarm.viewer import Report, SceneResult, as_data, write_report
 
@@ -26,14 +26,18 @@ examples:
   imitarm demo
   imitarm demo --out results --method mapf
   imitarm demo --out demo_7 --seed 7
+  imitarm demo --out thesis --scenes T1 T2 T3 T4 T5 T6 T7 T8
 
 The package contains eight demonstrations of a sweep, in which a synthetic teacher guides the simulated Sawyer by hand.
 The command checks and aligns the demonstrations, and learns a skill from them.
-The command then reproduces the skill without obstacles and in four scenes with obstacles.
+The command then reproduces the skill without obstacles and in four scenes with obstacles, or in the scenes of --scenes.
+T1 to T8 are eight scenes with two to four obstacles, modelled on the eight tasks of the thesis (Table 4.1).
 The command writes skill.json, report.html (opens offline in any browser) and results.json to FOLDER.
 The command replaces existing files only with --force.
 The exit status is 1 if a scene fails or the arm touches an obstacle.
 """
+
+DEMO_SCENES = ("free", "two_boxes", "tall_and_low", "boxes_and_cone", "cone_first")
 
 _SUMMARY = (
     "A Sawyer learns from eight demonstrations to sweep crumbs into a dustpan. The Sawyer then sweeps "
@@ -49,6 +53,10 @@ _CAPTIONS = {
     "tall_and_low": "A tall and a low box stand on opposite sides of the learned path.",
     "boxes_and_cone": "A box and a cone stand on the learned path, and a tall box narrows the space around them.",
     "cone_first": "A cone and a box stand on the learned path, and a large box narrows the space around them.",
+    "box_and_cone": "A flat box and a cone stand on the learned path, one in front of the crumbs and one behind them.",
+    "three_boxes": "Two boxes stand on the learned path, and a large box narrows the space beside the second one.",
+    "two_boxes_two_cones": "A box and a cone stand on the learned path, and another pair narrows the space there.",
+    "three_boxes_and_cone": "A box and a cone stand on the learned path, with a box on the other side of each of them.",
 }
 
 
@@ -60,6 +68,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed for the positions of the crumbs; default: 0")
     parser.add_argument(
         "--method", choices=ADAPTERS, default="certified", help="method that adapts the path; default: certified"
+    )
+    parser.add_argument(
+        "--scenes",
+        nargs="+",
+        choices=(*SCENES, *NUMBERED_SCENES),
+        metavar="NAME",
+        help=f"scenes to sweep: {', '.join(SCENES)}, or T1 to T8; default: {', '.join(DEMO_SCENES)}",
     )
     parser.add_argument("--force", action="store_true", help="replace existing files")
 
@@ -78,8 +93,9 @@ def run(arguments: argparse.Namespace) -> int:
     skill_file, page_file, results_file = (folder / name for name in ("skill.json", "report.html", "results.json"))
     check_outputs([("--out", path) for path in (skill_file, page_file, results_file)], [], force=arguments.force)
     task = SweepTask(seed=arguments.seed)
+    names = dict.fromkeys(NUMBERED_SCENES.get(name, name) for name in arguments.scenes or DEMO_SCENES)
     with progress_bar() as progress:
-        whole = progress.add_task("learning", total=len(SCENES) + 2.0)
+        whole = progress.add_task("learning", total=len(names) + 2.0)
         arm = task.arm()
         shown = packaged_demonstrations()
         findings = lint(shown, arm=arm)
@@ -88,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
         skill.save(skill_file)
         progress.advance(whole)
         results = [
-            _sweep(task, name, skill, alignment.demonstrations, arguments.method, progress, whole) for name in SCENES
+            _sweep(task, name, skill, alignment.demonstrations, arguments.method, progress, whole) for name in names
         ]
         progress.update(whole, description="writing the report")
         report = Report(

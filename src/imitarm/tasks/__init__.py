@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from imitarm.tasks.stack import StackTask
-from imitarm.tasks.sweep import DEMONSTRATIONS, SCENES, SweepTask
+from imitarm.tasks.sweep import DEMONSTRATIONS, NUMBERED_SCENES, SCENES, SweepTask
 
 TASKS: dict[str, type[SweepTask] | type[StackTask]] = {"stack": StackTask, "sweep": SweepTask}
 
-__all__ = ["DEMONSTRATIONS", "SCENES", "TASKS", "StackTask", "SweepTask"]
+__all__ = ["DEMONSTRATIONS", "NUMBERED_SCENES", "SCENES", "TASKS", "StackTask", "SweepTask"]

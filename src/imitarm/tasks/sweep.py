@@ -1,4 +1,4 @@
-"""SweepTask: sweep dirt on a table into a dustpan, around obstacles (thesis Figs 4.5 to 4.8)."""
+"""SweepTask: sweep dirt on a table into a dustpan, around obstacles (thesis Figs 4.5 to 4.8, Table 4.1)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,13 @@ from imitarm.trajectory import Rollout, Trajectory
 Array = NDArray[np.float64]
 
 DEMONSTRATIONS = Path(__file__).parent / "data" / "sweep"  # one CSV file for each demonstration
-SCENES = ("free", "two_boxes", "tall_and_low", "boxes_and_cone", "cone_first")
+SCENES = (
+    "free",
+    *("two_boxes", "tall_and_low", "box_and_cone"),
+    *("boxes_and_cone", "cone_first", "three_boxes"),
+    *("two_boxes_two_cones", "three_boxes_and_cone"),
+)
+NUMBERED_SCENES = {f"T{i}": name for i, name in enumerate(SCENES) if i}  # eight tasks, as in thesis Table 4.1
 
 TABLE_CENTER, TABLE_SIZE = (0.66, 0.0), (0.72, 1.36, 0.04)  # [m] its top is at height 0
 HOVER = 0.003  # [m] the bristles' tips above the table
@@ -87,13 +93,14 @@ class SweepTask:
 
     @staticmethod
     def scene(name: str) -> Scene:
-        """Return the packaged scene ``name``, one of :data:`SCENES`.
+        """Return the packaged scene ``name``, one of :data:`SCENES`; or "T1" to "T8", as the thesis numbers its tasks.
 
         Raises:
             UnknownNameError: when there is no such scene.
         """
+        name = NUMBERED_SCENES.get(name, name)
         if name not in SCENES:
-            raise UnknownNameError.among("scene", name, SCENES)
+            raise UnknownNameError.among("scene", name, (*SCENES, *NUMBERED_SCENES))
         scene = Scene() if name == "free" else load_scene(DEMONSTRATIONS / "scenes" / f"{name}.yaml")
         table = HalfSpace(np.zeros(3), name="table")
         return replace(scene, fixtures=(table, *standard_fixtures()))
