@@ -7,11 +7,14 @@ import pytest
 
 from imitarm.benchmark.refusal_oracle import Answer, answer
 from imitarm.benchmark.refusals import adapted, question_of
-from imitarm.benchmark.static_scenes import ANY_SKILL, FAMILIES, SPLITS, reaching_skill, static_case
-from imitarm.benchmark.teachers import demonstrations_by, s_shaped_reach
+from imitarm.benchmark.static_scenes import ANY_SKILL, FAMILIES, SPLITS, learned_skill, static_case
 from imitarm.demonstrations import align
 from imitarm.errors import InputError, UnknownNameError
+from imitarm.scene import Scene
 from imitarm.skills import Skill
+from imitarm.tasks.habits import demonstrations_by, s_shaped_reach
+from imitarm.tasks.open_box import BOARDS
+from imitarm.tasks.sweep import SweepTask
 
 BOTH = [(family, dimension) for family in FAMILIES for dimension in (2, 3)]
 BLOCKED = [(family, dimension) for family, dimension in BOTH if family != "S6"]
@@ -133,6 +136,43 @@ def test_a_trap_is_open_towards_the_path(dimension):
         assert case.scene.clearance(inside - np.linspace(0.0, 0.5, 200)[:, None] * axis).min() > 0.0
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_eight_seeds_in_a_row_are_the_eight_sweeping_tasks(dimension):
+    for seed in range(2000, 2016):
+        case = static_case("S7", dimension, seed)
+        packaged = SweepTask.scene(f"T{1 + seed % 8}")
+        assert [o.name for o in case.scene.obstacles] == [o.name for o in packaged.obstacles]
+        assert len(case.scene.obstacles) == (2, 2, 2, 3, 3, 3, 4, 4)[seed % 8]
+        for obstacle, original in zip(case.scene.obstacles, packaged.obstacles, strict=True):
+            assert obstacle.bounds()[0, 2] == pytest.approx(0.0, abs=1e-9)
+            assert np.linalg.norm(obstacle.pose.position - original.pose.position) < 0.05
+        [time] = case.pinned
+        at_dirt = case.skill.nominal([0.0, time, case.skill.duration_]).positions[1]
+        assert np.linalg.norm(at_dirt - SweepTask.dirt.position) < 0.005
+        assert case.tool_spheres[0, 3] == SweepTask.tool_radius
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_goal_is_in_the_box_and_only_obstacles_are_on_the_path(dimension):
+    for case in cases("S9", dimension):
+        boards, obstacles = case.scene.obstacles[:5], case.scene.obstacles[5:]
+        assert [board.name for board in boards] == list(BOARDS)
+        assert 1 <= len(obstacles) <= 3
+        path = case.skill.nominal(np.linspace(0.0, case.skill.duration_, 400)).positions
+        assert Scene(None, boards).clearance(path).min() > 0.03 + case.clearance
+        bounds = np.array([board.bounds() for board in boards])
+        low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+        assert np.all((low < path[-1]) & (path[-1] < high))
+
+
+@pytest.mark.parametrize("family", ["S2", "S7", "S9"])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_most_scenes_without_a_known_answer_have_a_path(family, dimension):
+    found = cases(family, dimension)
+    assert all(case.must_refuse is None for case in found)
+    assert sum(adapted(case.skill, case).feasible for case in found) >= 10
+
+
 def test_a_trap_is_upright_and_in_2d_only_horizontal_displacements_are_allowed():
     case = static_case("S5", 2, 2000)
     assert case.forbidden == ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
@@ -159,7 +199,7 @@ def test_wrong_arguments_are_named():
     with pytest.raises(InputError, match="dimension must be 2 or 3"):
         static_case("S1", 4, 0)
     with pytest.raises(InputError, match="scenes of S4 are made for its own skill"):
-        static_case("S4", 2, 0, skill=reaching_skill(2))
+        static_case("S4", 2, 0, skill=learned_skill("S4", 2))
     short = Skill(4).fit(
         [
             d.with_trajectory(d.trajectory.with_positions(0.1 * d.trajectory.positions), None)
@@ -176,7 +216,7 @@ def test_the_splits_share_no_seed():
 
 
 def test_skills_of_one_three_and_ten_teachers_differ_and_are_learned_once():
-    skills = [reaching_skill(3, teachers) for teachers in (1, 3, 10)]
+    skills = [learned_skill("S1", 3, teachers) for teachers in (1, 3, 10)]
     assert [skill.n_demonstrations_ for skill in skills] == [8, 24, 80]
     assert static_case("S1", 3, 5, teachers=3).skill is skills[1]
     times = np.linspace(0.0, 1.0, 50)

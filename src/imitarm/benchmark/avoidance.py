@@ -21,12 +21,12 @@ from imitarm.benchmark.families import (
     sparse_clutter,
 )
 from imitarm.benchmark.tables import Table
-from imitarm.benchmark.teachers import s_shaped_demonstrations
 from imitarm.evaluation.intervals import wilson_interval
 from imitarm.policies.adaptation import ADAPTERS, adapt
 from imitarm.policies.adapted_path import Adaptation
 from imitarm.skills.gmm import DegenerateAxisWarning
 from imitarm.skills.skill import Skill
+from imitarm.tasks.habits import s_shaped_demonstrations
 
 Array = NDArray[np.float64]
 

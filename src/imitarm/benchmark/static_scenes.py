@@ -8,15 +8,20 @@
 | S4 | a wall with a gap, 1.2 to 3 times as wide as the tool | solvable, or not |
 | S5 | a trap: three boxes in the shape of a U that opens towards the path, 5 to 20 cm deep | solvable |
 | S6 | an obstacle over the start, the goal or a contact point | not solvable |
+| S7 | the sweep around 2 to 4 boxes and cones: the scenes T1 to T8 with small changes | - |
+| S9 | reach into an open box, with 1 to 3 obstacles on the path | - |
 
-In every scene that is not of S6, the tool would touch an obstacle on the learned path.
+S1 to S6 are scenes around an S-shaped reach, S7 around the sweep of :class:`~imitarm.tasks.sweep.SweepTask`, and S9
+around the reach of :class:`~imitarm.tasks.open_box.OpenBoxTask`. Scenes for the whole arm (S8) are in
+:mod:`imitarm.benchmark.placements`. In every scene that is not of S6, the tool would touch an obstacle on
+the learned path.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -33,15 +38,17 @@ from imitarm.benchmark.families import (
     random_obstacle,
     wall_with_gap,
 )
-from imitarm.benchmark.teachers import demonstrations_by, s_shaped_reach
 from imitarm.demonstrations import align
 from imitarm.errors import InputError, UnknownNameError
-from imitarm.kinematics.pose import Pose, quaternion_exp
-from imitarm.policies.adaptation import HORIZONTAL_ONLY
+from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
+from imitarm.policies.adaptation import HORIZONTAL_ONLY, NOT_DOWN
 from imitarm.scene import Box, Obstacle, Scene
+from imitarm.scene.obstacle import PosedObstacle
 from imitarm.skills.gmm import DegenerateAxisWarning
 from imitarm.skills.skill import Skill
-from imitarm.trajectory import Demonstration
+from imitarm.tasks.habits import Motion, demonstrations_by, s_shaped_reach
+from imitarm.tasks.open_box import OpenBoxTask
+from imitarm.tasks.sweep import NUMBERED_SCENES, SweepTask
 
 Array = NDArray[np.float64]
 Directions = tuple[tuple[float, float, float], ...]
@@ -50,11 +57,15 @@ SPLITS = {"train": (0, 1000), "validation": (1000, 1200), "test": (2000, 4000)} 
 PATH_SAMPLES = 400  # of the learned path, on which obstacles are placed
 BLOCKED = 0.003  # [m] depth to which the tool would enter an obstacle on the learned path
 
-_FREE = TOOL_RADIUS + CLEARANCE + 0.01  # [m] from start and goal to the obstacles
+_FREE = 0.01  # [m] beyond the required clearance, that obstacles leave to the tool at points that must not move
+_FREE_ENDS = TOOL_RADIUS + CLEARANCE + _FREE  # [m] likewise, for the tool of the reach
+_COMPONENTS = 8  # of a skill
 _DRAWS = 500  # of a scene, before its path counts as too short
 _SPREAD_DENSE = 0.06  # [m] standard deviation of an obstacle's centre about the path, in dense scenes
 _SKEW = 0.15  # [rad] standard deviation of the angle between a trap and the path
 _TIGHT = 0.002  # [m] a gap with less than this to spare counts as neither solvable nor unsolvable
+_MOVED, _ROTATED = 0.008, 0.1  # [m], [rad] standard deviations of the obstacles of a sweep from those of its scene
+_BEFORE_BOX = 0.7  # fraction of the path before the box, on which obstacles stand
 _MIDDLE = 0.3, 0.7  # fractions of the path between which a contact point or a trap is
 
 
@@ -93,23 +104,40 @@ class _Placed(NamedTuple):
     """Obstacles, with what their construction tells."""
 
     obstacles: tuple[Obstacle, ...]
-    must_refuse: bool | None
+    must_refuse: bool | None = None
     contact: float | None = None  # fraction of the duration
 
 
-_Place = Callable[[np.random.Generator, Array, bool], _Placed]  # random numbers, path (n, 3), whether planar
+_Place = Callable[[np.random.Generator, Array, bool, int], _Placed]  # random numbers, path (n, 3), planar, seed
 
 
-@lru_cache(maxsize=16)
-def reaching_skill(dimension: int, teachers: int = 1) -> Skill:
-    """Learn the S-shaped reach from several teachers, with 8 components."""
-    return _learned(align(demonstrations_by(s_shaped_reach(planar=dimension == 2), teachers)), n_components=8)
+class _Family(NamedTuple):
+    """A family of scenes: which motion is blocked, and how its obstacles are placed."""
+
+    place: _Place
+    motion: Callable[[bool], Motion]  # the argument: whether it is planar
+    any_skill: bool = False  # whether the obstacles can be placed on any path
+    tool_radius: float = TOOL_RADIUS  # [m]
+    forbidden: Directions = ()  # in 3-D
+    solvable: bool = True  # whether start, goal and contact point are free
 
 
-def _learned(demonstrations: list[Demonstration], n_components: int) -> Skill:
+@lru_cache(maxsize=32)
+def learned_skill(family: str, dimension: int, teachers: int = 1) -> Skill:
+    """Learn the motion of a family of scenes from several teachers, with 8 components.
+
+    Args:
+        family: one of :data:`FAMILIES`; families with the same motion have the same skill.
+        dimension: 2 or 3.
+        teachers: number of teachers, with eight demonstrations each.
+    """
+    planar = dimension == 2
+    first = next(name for name, other in _FAMILIES.items() if other.motion is _FAMILIES[family].motion)
+    if first != family:
+        return learned_skill(first, dimension, teachers)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DegenerateAxisWarning)  # a planar motion has no spread in z, on purpose
-        return Skill(n_components).fit(demonstrations)
+        return Skill(_COMPONENTS).fit(align(demonstrations_by(_FAMILIES[family].motion(planar), teachers)))
 
 
 def learned_path(skill: Skill, n: int = PATH_SAMPLES) -> Array:
@@ -141,9 +169,9 @@ def static_case(family: str, dimension: int, seed: int, *, teachers: int = 1, sk
             f"{', '.join(ANY_SKILL)}"
         )
     rng = np.random.default_rng([int(family[1:]), dimension, seed])
-    own = reaching_skill(dimension, teachers) if skill is None else skill
-    path = learned_path(own)
-    placed = _blocking(_PLACERS[family], rng, path, dimension == 2)
+    its = _FAMILIES[family]
+    own = learned_skill(family, dimension, teachers) if skill is None else skill
+    placed = _blocking(its, rng, learned_path(own), dimension == 2, seed)
     known = placed.must_refuse if skill is None or placed.must_refuse else None  # another path may come back
     return StaticCase(
         family,
@@ -151,50 +179,51 @@ def static_case(family: str, dimension: int, seed: int, *, teachers: int = 1, sk
         seed,
         own,
         Scene(None, placed.obstacles),
-        np.array([[0.0, 0.0, 0.0, TOOL_RADIUS]]),
+        np.array([[0.0, 0.0, 0.0, its.tool_radius]]),
         CLEARANCE,
-        HORIZONTAL_ONLY if dimension == 2 else (),
+        HORIZONTAL_ONLY if dimension == 2 else its.forbidden,
         () if placed.contact is None else (placed.contact * own.duration_,),
         known,
     )
 
 
-def _blocking(place: _Place, rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
-    """Draw scenes until the tool would enter an obstacle on the path, and start and goal are free, except in S6."""
+def _blocking(family: _Family, rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
+    """Draw scenes until the tool would enter an obstacle on the path, and the points that must not move are free."""
     for _ in range(_DRAWS):
-        placed = place(rng, path, planar)
-        scene = Scene(None, placed.obstacles)
-        if placed.contact is not None or place is _over_a_point:
+        placed = family.place(rng, path, planar, seed)
+        if not family.solvable:
             return placed
-        blocked = float(np.min(scene.clearance(path))) < TOOL_RADIUS - BLOCKED
-        if blocked and float(np.min(scene.clearance(path[[0, -1]]))) >= _FREE:
+        scene = Scene(None, placed.obstacles)
+        fixed = [0, -1, *(() if placed.contact is None else (round(placed.contact * (len(path) - 1)),))]
+        blocked = float(np.min(scene.clearance(path))) < family.tool_radius - BLOCKED
+        if blocked and float(np.min(scene.clearance(path[fixed]))) >= family.tool_radius + CLEARANCE + _FREE:
             return placed
     raise InputError("no scene blocks the path and leaves its ends free; choose the skill of a longer path")
 
 
-def _sparse(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+def _sparse(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
     return _Placed(obstacles_apart(rng, path, int(rng.integers(1, 3)), planar=planar, kinds=SIMPLE), False)
 
 
-def _mixed(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+def _mixed(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
     return _Placed(obstacles_apart(rng, path, int(rng.integers(1, 4)), planar=planar, kinds=ALL_KINDS), False)
 
 
-def _dense(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+def _dense(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
     """Obstacles about the path, which may overlap; those that cover start or goal are drawn again."""
     made: list[Obstacle] = []
     n = int(rng.integers(4, 9))
     for _ in range(_DRAWS):
         aside = _SPREAD_DENSE * rng.normal(size=3) * ([1.0, 1.0, 0.0] if planar else [1.0, 1.0, 1.0])
         obstacle = random_obstacle(rng, path[rng.integers(len(path))] + aside, planar=planar, kinds=SIMPLE)
-        if obstacle.signed_distance(path[[0, -1]]).min() >= _FREE:
+        if obstacle.signed_distance(path[[0, -1]]).min() >= _FREE_ENDS:
             made.append(obstacle)
         if len(made) == n:
             break
     return _Placed(tuple(made), None)
 
 
-def _gap(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+def _gap(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
     """A wall with a gap; in 3-D, the gap is a window that is at least as high as it is wide."""
     width = 2.0 * TOOL_RADIUS * rng.uniform(1.2, 3.0)
     walls = wall_with_gap(rng, path, width, shift=0.15, height=0.3 if planar else 2.0)
@@ -216,7 +245,7 @@ def _gap(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
     return _Placed((*walls, *sills), must_refuse)
 
 
-def _trap(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+def _trap(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
     """Three boxes in the shape of a U, into which the path leads; the hull of the U leaves start and goal free."""
     at = int(rng.uniform(*_MIDDLE) * len(path))
     ahead = path[at + 5] - path[at - 5]
@@ -235,10 +264,10 @@ def _trap(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
         box("right arm", -0.5 * depth, -aside, depth, thick),
     )
     hull = box("hull", 0.5 * (thick - depth), 0.0, depth + thick, outside)
-    return _Placed(boxes if hull.signed_distance(path[[0, -1]]).min() >= _FREE else (), False)
+    return _Placed(boxes if hull.signed_distance(path[[0, -1]]).min() >= _FREE_ENDS else (), False)
 
 
-def _over_a_point(rng: np.random.Generator, path: Array, planar: bool) -> _Placed:
+def _over_a_point(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
     """An obstacle over the start, the goal or a contact point."""
     where = int(rng.integers(3))
     contact = float(rng.uniform(*_MIDDLE)) if where == 2 else None
@@ -248,13 +277,50 @@ def _over_a_point(rng: np.random.Generator, path: Array, planar: bool) -> _Place
     return _Placed((covering_sphere(rng, path[sample], planar=planar),), True, contact)
 
 
-_PLACERS: dict[str, _Place] = {
-    "S1": _sparse,
-    "S2": _dense,
-    "S3": _mixed,
-    "S4": _gap,
-    "S5": _trap,
-    "S6": _over_a_point,
+def _sweep(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
+    """One of the scenes T1 to T8, each obstacle moved and rotated a little; the path must not move at the dirt."""
+    scene = SweepTask.scene(list(NUMBERED_SCENES)[seed % len(NUMBERED_SCENES)])
+    made: list[Obstacle] = []
+    for obstacle in scene.obstacles:
+        turn = quaternion_exp(np.array([0.0, 0.0, rng.normal(0.0, _ROTATED)]))
+        shift = _MOVED * rng.normal(size=3) * [1.0, 1.0, 0.0]
+        assert isinstance(obstacle, PosedObstacle)
+        pose = obstacle.pose
+        made.append(replace(obstacle, pose=Pose(pose.position + shift, quaternion_multiply(turn, pose.quaternion))))
+    at = int(np.argmin(np.linalg.norm(path - SweepTask.dirt.position, axis=1)))
+    return _Placed(tuple(made), contact=at / (len(path) - 1))
+
+
+def _reach(planar: bool) -> Motion:
+    return s_shaped_reach(planar=planar)
+
+
+def _sweep_motion(planar: bool) -> Motion:
+    return SweepTask.motion()
+
+
+def _box_motion(planar: bool) -> Motion:
+    return OpenBoxTask.motion(planar=planar)
+
+
+def _open_box(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
+    """The box, and obstacles on the path to it."""
+    boards, n = OpenBoxTask.box(planar=planar), int(rng.integers(1, 4))
+    if planar:
+        before = path[: round(_BEFORE_BOX * len(path))]
+        return _Placed((*boards, *obstacles_apart(rng, before, n, planar=True, kinds=ALL_KINDS)))
+    return _Placed((*boards, *OpenBoxTask.obstacles(rng, n, path)))
+
+
+_FAMILIES: dict[str, _Family] = {
+    "S1": _Family(_sparse, _reach, any_skill=True),
+    "S2": _Family(_dense, _reach, any_skill=True),
+    "S3": _Family(_mixed, _reach, any_skill=True),
+    "S4": _Family(_gap, _reach),
+    "S5": _Family(_trap, _reach),
+    "S6": _Family(_over_a_point, _reach, any_skill=True, solvable=False),
+    "S7": _Family(_sweep, _sweep_motion, tool_radius=SweepTask.tool_radius, forbidden=NOT_DOWN),
+    "S9": _Family(_open_box, _box_motion, forbidden=NOT_DOWN),
 }
-FAMILIES: tuple[str, ...] = tuple(_PLACERS)
-ANY_SKILL = ("S1", "S2", "S3", "S6")
+FAMILIES: tuple[str, ...] = tuple(_FAMILIES)
+ANY_SKILL = tuple(name for name, family in _FAMILIES.items() if family.any_skill)

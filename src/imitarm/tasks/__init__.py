@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from imitarm.tasks.open_box import OpenBoxTask
 from imitarm.tasks.stack import StackTask
 from imitarm.tasks.sweep import DEMONSTRATIONS, NUMBERED_SCENES, SCENES, SweepTask
 
-TASKS: dict[str, type[SweepTask] | type[StackTask]] = {"stack": StackTask, "sweep": SweepTask}
+TASKS: dict[str, type[SweepTask] | type[StackTask] | type[OpenBoxTask]] = {
+    "open_box": OpenBoxTask,
+    "stack": StackTask,
+    "sweep": SweepTask,
+}
 
-__all__ = ["DEMONSTRATIONS", "NUMBERED_SCENES", "SCENES", "TASKS", "StackTask", "SweepTask"]
+__all__ = ["DEMONSTRATIONS", "NUMBERED_SCENES", "SCENES", "TASKS", "OpenBoxTask", "StackTask", "SweepTask"]

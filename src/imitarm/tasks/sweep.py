@@ -18,6 +18,7 @@ from imitarm.kinematics.pose import Pose
 from imitarm.robots.simulated import Control, SimulatedRobot
 from imitarm.robots.world import arm_world
 from imitarm.scene import HalfSpace, Scene, load_scene, standard_fixtures
+from imitarm.tasks.habits import Motion, along
 from imitarm.trajectory import Rollout, Trajectory
 
 Array = NDArray[np.float64]
@@ -109,6 +110,30 @@ class SweepTask:
     def scenes(cls) -> Mapping[str, Scene]:
         """Return all packaged scenes by name, the scene without obstacles first."""
         return {name: cls.scene(name) for name in SCENES}
+
+    @classmethod
+    def motion(cls) -> Motion:
+        """Return the sweep as teachers with habits show it: over the dirt into the pan, at constant height.
+
+        The motion is precise at the start, at the dirt and at the goal. Between them, teachers bend it to the left or
+        to the right.
+        """
+        start, dirt, goal = (pose.position for pose in (cls.start, cls.dirt, cls.goal))
+        at_dirt = float((dirt - start)[1] / (goal - start)[1])
+        x = np.polynomial.Polynomial.fit([0.0, at_dirt, 1.0], [start[0], dirt[0], goal[0]], 2)
+
+        def halves(p: Array) -> tuple[Array, Array]:
+            before, after = np.clip(p / at_dirt, 0.0, 1.0), np.clip((p - at_dirt) / (1.0 - at_dirt), 0.0, 1.0)
+            return np.sin(np.pi * before) ** 2, np.sin(np.pi * after) ** 2
+
+        return Motion(
+            "sweep",
+            curve=lambda p: np.stack([x(p), start[1] + p * (goal - start)[1], np.full_like(p, start[2])], axis=1),
+            bend=lambda p: along(0, 0.04 * (halves(p)[0] - halves(p)[1])),
+            spread=lambda p: np.stack([along(0, 0.012 * half) for half in halves(p)]),
+            free=(1.0, 1.0, 0.0),
+            duration=10.0,
+        )
 
     def dirt_time(self, trajectory: Trajectory) -> float:
         """Return the time at which ``trajectory`` is nearest to the dirt [s].

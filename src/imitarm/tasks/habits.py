@@ -29,18 +29,18 @@ class Motion:
 
     A demonstration of the motion is the curve
 
-    .. math:: x(p) = c(p) + (k - 1 + 0.15\, a)\, b(p) + l(p) (o + S^T \beta) + \text{wobble}
+    .. math:: x(p) = c(p) + (k - 1 + 0.15\, a)\, b(p) + \sum_{i=1}^2 (o_i + \beta_i)\, s_i(p) + \text{wobble}
 
-    Here, c is the ideal curve, b the part of it that a teacher with the curvature k exaggerates, l(p) the looseness,
-    o the offset of the teacher, and S the spread between repeats. The random numbers a and :math:`\beta` differ from
-    one repeat to the next.
+    Here, c is the ideal curve, b a bend that a teacher with a curvature k above 1 exaggerates, o the offset of the
+    teacher, and :math:`s_i` the spread between repeats. The random numbers a and :math:`\beta` differ from one repeat
+    to the next.
 
     Attributes:
         name: name of the task.
-        curve: ideal positions (n, 3) [m] at progress (n,).
-        bend: part of ``curve`` that curves away from the straight path (n, 3) [m] at progress (n,).
-        loose: how much teachers may differ at progress (n,), between 0 (precise) and 1.
-        spread: displacements by one standard deviation between repeats, shape (2, 3) [m].
+        curve: ideal positions, shape (n, 3) [m], at progress (n,).
+        bend: displacement by which a bend is exaggerated when k is 2, shape (n, 3) [m], at progress (n,).
+        spread: two displacements of one standard deviation, shape (2, n, 3) [m], at progress (n,); 0 where the motion
+            must be precise.
         free: axes along which the hand may wobble (1) or not (0), shape (3,).
         duration: duration without any habit [s].
     """
@@ -48,9 +48,8 @@ class Motion:
     name: str
     curve: Callable[[Array], Array]
     bend: Callable[[Array], Array]
-    loose: Callable[[Array], Array]
-    spread: Array
-    free: Array
+    spread: Callable[[Array], Array]
+    free: tuple[float, float, float]
     duration: float = 4.0
 
 
@@ -66,7 +65,7 @@ class Habits:
         eagerness: e, positive when the teacher is fast at first and slow towards the goal.
         hesitation: h, positive when the teacher is slow in the middle.
         curvature: factor k of the bends; above 1, the teacher exaggerates them.
-        offset: displacement where the motion is loose, in units of the motion's spread, shape (2,).
+        offset: displacement in units of the motion's spread, shape (2,).
         noise: standard deviation of the wobble [m].
     """
 
@@ -111,14 +110,22 @@ def s_shaped_reach(*, planar: bool) -> Motion:
         z = np.full_like(p, 0.10) if planar else 0.30 + 0.05 * np.sin(np.pi * p)
         return np.stack([0.6 * p, 0.10 * np.sin(2.0 * np.pi * p), z], axis=1)
 
+    def spread(p: Array) -> Array:
+        loose = np.sin(np.pi * p)
+        return np.stack([along(1, 0.02 * loose), along(2, (0.0 if planar else 0.015) * loose)])
+
     return Motion(
         "s-shaped reach",
         curve,
-        bend=lambda p: np.stack([0.0 * p, 0.10 * np.sin(2.0 * np.pi * p), 0.0 * p], axis=1),
-        loose=lambda p: np.sin(np.pi * p),
-        spread=np.array([[0.0, 0.02, 0.0], [0.0, 0.0, 0.0 if planar else 0.015]]),
-        free=np.array([1.0, 1.0, 0.0 if planar else 1.0]),
+        bend=lambda p: along(1, 0.10 * np.sin(2.0 * np.pi * p)),
+        spread=spread,
+        free=(1.0, 1.0, 0.0 if planar else 1.0),
     )
+
+
+def along(axis: int, values: Array) -> Array:
+    """Return displacements (n, 3) along one axis, for the components ``values`` (n,)."""
+    return np.eye(3)[axis] * values[:, None]
 
 
 def demonstrate(
@@ -135,14 +142,14 @@ def demonstrate(
     """
     u = np.linspace(0.0, 1.0, _SAMPLES)
     p = habits.progress(u)
-    curve, bend, loose = motion.curve(p), motion.bend(p), motion.loose(p)[:, None]
+    curve, bend, spread = motion.curve(p), motion.bend(p), motion.spread(p)
     waves = np.stack([np.sin((k + 2) * np.pi * u) for k in range(_WAVES)], axis=1)
     demonstrations = []
     for i in range(n_demonstrations):
         a, *beta = rng.normal(size=3)
-        aside = (np.array(habits.offset) + beta) @ motion.spread
-        wobble = habits.noise * rng.normal(size=(_WAVES, 3)) * motion.free
-        positions = curve + (habits.curvature - 1.0 + _UNEVEN * a) * bend + loose * aside + waves @ wobble
+        aside = np.tensordot(np.array(habits.offset) + beta, spread, axes=1)
+        wobble = habits.noise * rng.normal(size=(_WAVES, 3)) * np.array(motion.free)
+        positions = curve + (habits.curvature - 1.0 + _UNEVEN * a) * bend + aside + waves @ wobble
         trajectory = Trajectory(motion.duration * habits.pace * u, positions)
         demonstrations.append(Demonstration(trajectory, task=motion.name, source=f"{source}, number {i}"))
     return demonstrations

@@ -7,11 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imitarm.benchmark.static_scenes import reaching_skill
-from imitarm.benchmark.teachers import Habits, demonstrations_by, s_shaped_demonstrations, s_shaped_reach
+from imitarm.benchmark.static_scenes import learned_skill
 from imitarm.errors import InputError
+from imitarm.tasks.habits import Habits, demonstrations_by, s_shaped_demonstrations, s_shaped_reach
+from imitarm.tasks.open_box import OpenBoxTask
+from imitarm.tasks.sweep import SweepTask
 
-MOTIONS = [s_shaped_reach(planar=True), s_shaped_reach(planar=False)]
+MOTIONS = [
+    *(s_shaped_reach(planar=planar) for planar in (True, False)),
+    *(OpenBoxTask.motion(planar=planar) for planar in (True, False)),
+    SweepTask.motion(),
+]
 
 
 @given(st.integers(0, 10_000))
@@ -42,12 +48,25 @@ def test_demonstrations_start_and_end_where_the_motion_does_and_are_precise_ther
 
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_what_must_not_move_does_not_move(motion):
-    held = motion.free == 0.0
+    held = np.array(motion.free) == 0.0
     p = np.linspace(0.0, 1.0, 50)
-    assert not motion.spread[:, held].any()
+    assert not motion.spread(p)[:, :, held].any()
     assert not motion.bend(p)[:, held].any()
     for demonstration in demonstrations_by(motion, 3):
-        assert not np.ptp(demonstration.trajectory.positions, axis=0)[held].any()
+        assert np.all(np.ptp(demonstration.trajectory.positions, axis=0)[held] < 1e-15)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_bends_and_spread_leave_start_and_goal_where_they_are(motion):
+    ends = np.array([0.0, 1.0])
+    np.testing.assert_allclose(motion.bend(ends), 0.0, atol=1e-12)
+    np.testing.assert_allclose(motion.spread(ends), 0.0, atol=1e-12)
+
+
+def test_every_teacher_of_the_sweep_meets_the_dirt():
+    for demonstration in demonstrations_by(SweepTask.motion(), 10):
+        away = np.linalg.norm(demonstration.trajectory.positions - SweepTask.dirt.position, axis=1)
+        assert away.min() < 0.008
 
 
 def test_repeats_of_one_teacher_are_more_alike_than_demonstrations_of_different_teachers():
@@ -75,7 +94,7 @@ def test_one_teacher_passes_on_his_habits_and_ten_teachers_do_not(dimension):
     ideal = s_shaped_reach(planar=dimension == 2).curve(np.linspace(0.0, 1.0, 2000))
     errors = []
     for teachers in (1, 3, 10):
-        skill = reaching_skill(dimension, teachers)
+        skill = learned_skill("S1", dimension, teachers)
         path = skill.nominal(np.linspace(0.0, skill.duration_, 200)).positions
         errors.append(np.linalg.norm(path[:, None] - ideal, axis=2).min(axis=1).mean())
     assert errors[2] < errors[1] < errors[0]
