@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import rankdata
 
-from imitarm.benchmark.teachers import demonstrations_by, s_shaped_reach
 from imitarm.demonstrations import align, read
 from imitarm.kinematics.pose import Pose
 from imitarm.policies import HORIZONTAL_ONLY, adapt
@@ -16,6 +15,7 @@ from imitarm.policies.baselines.potential_components import INFLUENCE_DISTANCE, 
 from imitarm.policies.component_path import ComponentPath
 from imitarm.scene import Box, Scene, Sphere
 from imitarm.skills import Skill
+from imitarm.tasks.habits import demonstrations_by, s_shaped_reach
 from imitarm.tasks.sweep import DEMONSTRATIONS, SweepTask
 from test_thesis_claims import METHODS, TABLE_4_1
 
