@@ -54,7 +54,7 @@ def moving_state(rng, *, spin=(0.0, 0.0, 0.0)):
     ]
     scene = Scene(None, obstacles)
     surroundings = Surroundings(ToolGaps(scene, TOOL), scene.packed, 0.02, 2.0)
-    return surroundings.state(np.stack([1.5 * rng.normal(size=3), rng.normal(size=3)]), 0.3), scene
+    return surroundings.state(np.stack([1.5 * rng.normal(size=3), rng.normal(size=3)]), 0.3, np.zeros(3)), scene
 
 
 def test_without_a_term_it_is_the_motion_of_the_primitive():

@@ -19,6 +19,7 @@ POLICIES: Registry[type[Policy]] = Registry(
         "apf": "imitarm.policies.baselines.apf:APF",
         "dmp-steering": "imitarm.policies.baselines.dmp_steering:DMPSteering",
         "dmp-potential": "imitarm.policies.baselines.dmp_potential:DMPPotential",
+        "gmm-dmp": "imitarm.policies.baselines.gmm_dmp:GMMDMP",
         "barrier": "imitarm.policies.baselines.barrier:Barrier",
         "modulation": "imitarm.policies.baselines.modulation:Modulation",
         "rrt-connect": "imitarm.policies.baselines.joint_planner:RRTConnect",

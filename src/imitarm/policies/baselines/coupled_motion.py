@@ -22,8 +22,8 @@ Array = NDArray[np.float64]
 GAP_FLOOR = 0.005  # [m] shorter distances count as this one
 _STEP = 0.01  # [s]
 _LONGEST = 2.0  # durations
-_ARRIVED, _NEAR = 1e-3, 5e-3  # [m] from the goal: the motion ends; after the longest time, the goal counts as reached
-_SLOW = 0.1  # of the mean speed: the motion ends
+_ARRIVED, _SLOW = 1e-3, 0.1  # [m] from the goal, and fraction of the mean speed: the motion ends
+_NEAR, _STILL = 5e-3, 5e-4  # [m] from the goal, and within a quarter of the duration: likewise, beside an obstacle
 
 
 class MotionState(NamedTuple):
@@ -36,6 +36,7 @@ class MotionState(NamedTuple):
         velocity: v = T x', shape (3,) [m].
         phase: s, from 1 at the start to 0.01 after the duration.
         fraction: time divided by the duration.
+        learned: position of the nominal path at this time, shape (3,) [m].
         distance: distance from the tool to each obstacle, minus the required clearance; at least 5 mm, shape (n,) [m].
         reach: distance from the tool's tip to the closest point of each obstacle; at least 5 mm, shape (n,) [m].
         normal: outward normals at the closest points, shape (n, 3); the closest point is ``x - reach normal``.
@@ -46,6 +47,7 @@ class MotionState(NamedTuple):
     velocity: Array
     phase: float
     fraction: float
+    learned: Array
     distance: Array
     reach: Array
     normal: Array
@@ -100,27 +102,25 @@ class CoupledMotion(BaselinePolicy):
         return self.skill.dmp_.start_velocity_ * self.skill.duration_
 
     def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
-        """Return the motion of the primitive with its coupling term.
+        """Return the motion of the spring with its coupling term.
 
         Raises:
             InfeasibleError: when the tool is not within 5 mm of the goal after twice the duration.
         """
-        surroundings = Surroundings(gaps, scene.packed, self.clearance, nominal.duration)
-        return self._integrate(nominal, surroundings)
-
-    def _integrate(self, nominal: Trajectory, surroundings: Surroundings) -> tuple[Array, Array]:
         T, goal = nominal.duration, nominal.positions[-1]
+        surroundings = Surroundings(gaps, scene.packed, self.clearance, T)
         n = max(1, round(T / _STEP))
         one = propagator(self.skill.dmp_.gains_, 1.0 / n, self.skill.dmp_.n_basis)
         n_steps = round(_LONGEST * n)
         targets = self.target(nominal, np.linspace(0.0, _LONGEST, 2 * one.n_parts * n_steps + 1))
         drives = one.drive @ np.moveaxis(targets_by_step(one, targets), 0, 1)
+        learned = nominal.at(np.minimum(nominal.times[0] + T / n * np.arange(n_steps), nominal.times[-1]))[0]
         z = np.stack([nominal.positions[0], self.start_velocity()])
-        path, limit, slow = [z[0]], self._limit * T * T, _SLOW * nominal.path_length
+        path, limit = [z[0]], self._limit * T * T
         for k in range(n_steps):
-            if k >= n and np.linalg.norm(z[0] - goal) < _ARRIVED and np.linalg.norm(z[1]) <= slow:
+            if k >= n and _has_arrived(path, z[1], goal, n // 4, _SLOW * nominal.path_length):
                 break
-            phi = self.allowed(self.term(surroundings.state(z, k / n)))
+            phi = self.allowed(self.term(surroundings.state(z, k / n, learned[k])))
             size = float(np.sqrt(phi.dot(phi)))
             if size > limit:
                 phi = phi * (limit / size)
@@ -133,6 +133,14 @@ class CoupledMotion(BaselinePolicy):
                 f"duration; choose another gain, or another policy"
             )
         return np.linspace(0.0, T * (len(path) - 1) / n, len(path)), np.stack(path)
+
+
+def _has_arrived(path: list[Array], velocity: Array, goal: Array, quarter: int, slow: float) -> bool:
+    """Return whether the tool is at the goal and slow, or near the goal and at rest for a quarter of the duration."""
+    away = float(np.linalg.norm(path[-1] - goal))
+    if away < _ARRIVED:
+        return float(np.linalg.norm(velocity)) <= slow
+    return away < _NEAR and float(np.max(np.abs(path[-1] - np.stack(path[-quarter - 1 :])))) < _STILL
 
 
 class Surroundings:
@@ -149,8 +157,11 @@ class Surroundings:
         self._gaps, self._packed = gaps, packed
         self._clearance, self._duration = clearance, duration
 
-    def state(self, z: Array, fraction: float) -> MotionState:
-        """Return the state for position and velocity ``z`` = [x; T x'] (2, 3) at a fraction of the duration."""
+    def state(self, z: Array, fraction: float, learned: Array) -> MotionState:
+        """Return the state for position and velocity ``z`` = [x; T x'] (2, 3) at a fraction of the duration.
+
+        ``learned`` is the position of the nominal path at this time, shape (3,) [m].
+        """
         x, v = z
         if self._packed.still:
             gap, normal = self._gaps.gaps_and_normals(x)
@@ -165,6 +176,7 @@ class Surroundings:
             v,
             float(np.exp(-DECAY * fraction)),
             fraction,
+            learned,
             np.maximum(gap - self._clearance, GAP_FLOOR),
             np.maximum(gap + self._gaps.radius, GAP_FLOOR),
             normal,
