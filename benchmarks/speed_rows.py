@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import arm_rows
 import ik_rows
 import retarget_rows
 import transmission_rows
@@ -313,6 +314,7 @@ ROWS: tuple[Callable[[], Row], ...] = (
     rollout,
     avoidance_of_one,
     avoidance_of_three,
+    *arm_rows.ROWS,
     *ik_rows.ROWS,
     *retarget_rows.ROWS,
     *transmission_rows.ROWS,

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import arm_rows
 import checkouts
 import ik_rows
 import retarget_rows
@@ -192,7 +193,7 @@ def test_a_checkout_that_can_not_be_loaded_is_reported(tmp_path: Path) -> None:
 
 def test_every_row_is_run_says_what_it_does_and_has_a_name_of_its_own() -> None:
     rows = speed_rows.ROWS
-    assert {*ik_rows.ROWS, *retarget_rows.ROWS, *transmission_rows.ROWS} <= set(rows)
+    assert {*arm_rows.ROWS, *ik_rows.ROWS, *retarget_rows.ROWS, *transmission_rows.ROWS} <= set(rows)
     assert all(make.__doc__ for make in rows)
     assert len({make.__name__ for make in rows}) == len(rows)
 

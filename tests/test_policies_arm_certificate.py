@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from imitarm import ArmModel, Box, HalfSpace, InputError, Pose, Sphere
 from imitarm.benchmark.families import random_obstacle
 from imitarm.kinematics.arm_path import ArmPath
-from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles, bows
+from imitarm.policies.arm_certificate import ArmAmongObstacles, bows
+from imitarm.policies.arm_pairs import SELF
 from imitarm.scene.clearance import SelfClearance
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
@@ -85,7 +86,7 @@ def test_rates_and_drift_equal_finite_differences(name):
     around = ArmAmongObstacles(arm, obstacles, 0.0, own=own)
     q, t = path.joints[3:4], times[3:4]
     gaps = around.gaps(ArmPath.of(arm, q), t, 0.3)
-    rates = gaps.rates(np.arange(len(gaps)))
+    rates, drift = gaps.rates(np.arange(len(gaps)))
     assert {SELF, 0, 1} <= set(gaps.obstacle.tolist())
 
     def rooms(joints, time):
@@ -102,7 +103,7 @@ def test_rates_and_drift_equal_finite_differences(name):
         wrong = np.abs(rates[:, j] - differences) > 1e-5
         assert wrong.mean() < 0.01  # distances have kinks at edges
     differences = (rooms(q, t + step) - rooms(q, t - step)) / (2.0 * step)
-    assert (np.abs(gaps.drift - differences) > 1e-5).mean() < 0.01
+    assert (np.abs(drift - differences) > 1e-5).mean() < 0.01
 
 
 def test_a_segment_that_passes_through_an_obstacle_between_two_far_samples_is_found():
@@ -146,3 +147,23 @@ def test_a_rotating_obstacle_is_replaced_by_what_contains_it():
     assert ArmAmongObstacles(arm, [turning], 0.02).clearance_of(path, times).room < 0.0
     with pytest.raises(InputError, match="rotates"):
         ArmAmongObstacles(arm, [HalfSpace([0, 0, -1], angular_velocity=[1, 0, 0])], 0.02)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_near_pairs_are_all_pairs_that_are_near_however_fast_the_arm_moves(name):
+    arm, own = ARMS[name], OWN[name]
+    for seed in range(6):
+        path, _, obstacles = random_scene(arm, seed)
+        path = ArmPath.of(arm, np.linspace(path.joints[0], path.joints[-1], (8, 30, 200)[seed % 3]))
+        times, around = np.linspace(0.0, 1.0, len(path)), ArmAmongObstacles(arm, obstacles, 0.02, own=own)
+        together, alone = around.gaps(path, times, 0.05), around.gaps(path, times, 0.05, connected=False)
+        keys = [
+            sorted(zip(*(getattr(gaps, key).tolist() for key in ("source", "sample", "pair", "room")), strict=True))
+            for gaps in (together, alone)
+        ]
+        assert keys[0] == keys[1]
+        assert len(keys[0]) > 0
+        for i, obstacle in enumerate(obstacles):
+            centers = path.centers - times[:, None, None] * obstacle.velocity
+            room = obstacle.signed_distance(centers) - arm.cover.radii - 0.02
+            assert (room < 0.05).sum() == (together.obstacle == i).sum()

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError
 from imitarm.kinematics.arm_file import ArmFile, compiled, read_arm, without_geoms
 from imitarm.kinematics.arm_kinematics import ArmKinematics
+from imitarm.kinematics.joint_chain import JointChain
 from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_multiply, rotate
 from imitarm.kinematics.spheres import SphereCover
 from imitarm.validation import finite_number, finite_vector, flag, instance, text
@@ -95,6 +96,7 @@ class ArmModel(ArmKinematics):
         tool_radius: radius of the cylinder about the tool's axis that contains the tool's head [m]; 0 without a tool.
         sphere_bodies: name of the body of each sphere of :meth:`collision_spheres`.
         cover: the spheres of :meth:`collision_spheres`.
+        chain: kinematics and dynamics of many postures at once.
         landmarks: shoulder, elbow and wrist, from sites of these names in the file; None if the file has none.
         notes: assumptions about values that the file does not define, and joints that are not part of the arm.
     """
@@ -109,6 +111,7 @@ class ArmModel(ArmKinematics):
     tool_radius: float
     sphere_bodies: tuple[str, ...]
     cover: SphereCover
+    chain: JointChain
     notes: tuple[str, ...]
 
     @classmethod
@@ -190,6 +193,7 @@ class ArmModel(ArmKinematics):
             self.tool_to_flange = self.forward_kinematics(self.home).inverse() @ self.tool_pose(self.home)
         self.cover = SphereCover(whole, model, file.joints)
         self.sphere_bodies = self.cover.bodies
+        self.chain = JointChain(model, self.at(self.home).data, self.cover, self.home, self._tool)
         self._sealed = True
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import ROTATION_LENGTH
+from imitarm.kinematics.joint_chain import Placed, cross
 from imitarm.kinematics.pose import (
     matrix_to_quaternion,
     quaternion_conjugate,
@@ -20,6 +23,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 REACHED = 1e-6  # [m, rad] error of a pose that counts as reached
+_TRACKED = 1e-4  # [m, rad] error of a tracked pose
 _DAMPING = 1e-3  # [m/rad] of the inverses, near singular postures
 _NEWTON_STEPS = 6
 _LOST = 1.0  # [m, rad] an error beyond which Newton's method is given up
@@ -35,22 +39,14 @@ class ArmPath:
         joints: joint positions, shape (n, n_joints) [rad].
         positions: positions of the tool's tip in the base frame, shape (n, 3) [m].
         quaternions: rotations tool_to_base, wxyz, shape (n, 4).
-        centers: centres of the spheres that cover the moving links and the tool (``ArmModel.cover``), in the base
-            frame, shape (n, m, 3) [m].
-        axes: unit vectors along the axes of the joints in the base frame, shape (n, n_joints, 3).
-        anchors: a point on the axis of each joint in the base frame, shape (n, n_joints, 3) [m].
-        rotations: rotation matrices link_to_base, shape (n, n_joints + 1, 3, 3): first of the base, then, for each
-            joint, of the link that the joint moves.
+        placed: the joints and links (``JointChain.placed``).
     """
 
     arm: ArmModel
     joints: Array
     positions: Array
     quaternions: Array
-    centers: Array
-    axes: Array
-    anchors: Array
-    rotations: Array
+    placed: Placed
 
     @classmethod
     def of(cls, arm: ArmModel, joints: Array) -> ArmPath:
@@ -60,28 +56,24 @@ class ArmPath:
             arm: the arm with its tool.
             joints: joint positions, shape (n, n_joints) [rad].
         """
-        cover, site, n = arm.cover, arm.site("tool"), len(joints)
-        data = arm.at(joints[0]).data
-        rotations, origins = np.empty((n, *data.xmat.shape)), np.empty((n, *data.xpos.shape))
-        axes, anchors = np.empty((n, *data.xaxis.shape)), np.empty((n, *data.xanchor.shape))
-        tips, tip_rotations = np.empty((n, 3)), np.empty((n, 9))
-        for i, q in enumerate(joints):
-            data = arm.at(q).data
-            rotations[i], origins[i] = data.xmat, data.xpos
-            axes[i], anchors[i] = data.xaxis, data.xanchor
-            tips[i], tip_rotations[i] = data.site_xpos[site], data.site_xmat[site]
-        rotations = rotations.reshape(n, -1, 3, 3)
-        base = np.broadcast_to(np.eye(3), (n, 1, 3, 3))
-        return cls(
-            arm,
-            joints,
-            tips,
-            matrix_to_quaternion(tip_rotations.reshape(n, 3, 3)),
-            cover.placed(rotations, origins),
-            axes[:, cover.joints],
-            anchors[:, cover.joints],
-            np.concatenate([base, rotations[:, cover.carriers]], axis=1),
-        )
+        placed = arm.chain.placed(joints)
+        tips, rotations = arm.chain.tips(placed)
+        return cls(arm, joints, tips, matrix_to_quaternion(rotations), placed)
+
+    @cached_property
+    def centers(self) -> Array:
+        """Centres of the spheres that cover the moving links and the tool (``ArmModel.cover``), (n, m, 3) [m]."""
+        return self.arm.chain.spheres(self.placed)
+
+    @property
+    def axes(self) -> Array:
+        """Unit vectors along the axes of the joints in the base frame, shape (n, n_joints, 3)."""
+        return self.placed.axes
+
+    @property
+    def anchors(self) -> Array:
+        """A point on the axis of each joint in the base frame, shape (n, n_joints, 3) [m]."""
+        return self.placed.anchors
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -89,13 +81,48 @@ class ArmPath:
     def tool_jacobians(self) -> Array:
         """Return the Jacobian of the tool's tip in each posture, linear rows first, shape (n, 6, n_joints)."""
         jacobians = np.empty((len(self), 6, self.joints.shape[1]))
-        jacobians[:, :3] = np.swapaxes(_cross(self.axes, self.positions[:, None] - self.anchors), 1, 2)
+        jacobians[:, :3] = np.swapaxes(cross(self.axes, self.positions[:, None] - self.anchors), 1, 2)
         jacobians[:, 3:] = np.swapaxes(self.axes, 1, 2)
         slides = self.arm.cover.slides
         if slides.any():
             jacobians[:, :3, slides] = np.swapaxes(self.axes[:, slides], 1, 2)
             jacobians[:, 3:, slides] = 0.0
         return jacobians
+
+    def speeds(self, velocity: Array) -> Array:
+        """Return bounds of the speeds of all spheres of each link, in the frames of the links before it.
+
+        Args:
+            velocity: joint velocities, shape (n, n_joints) [rad/s].
+
+        Returns:
+            Shape (n, n_joints, n_joints) [m/s]; first the index of the link, which is that of the last joint that moves
+            it, then the number of joints that move the frame.
+        """
+        parts = self._reaches * np.abs(velocity)[:, None]
+        return np.asarray(np.cumsum(parts[..., ::-1], axis=2)[..., ::-1])
+
+    @cached_property
+    def travel(self) -> Array:
+        """Bounds of the way of all spheres of each link from one posture to the next one.
+
+        The joints move linearly. Meanwhile a sphere may be farther from an axis than in both postures, by at most half
+        of the way that the joints between them move it.
+
+        The shape is (n - 1, n_joints, n_joints) [m]; see :meth:`speeds`.
+        """
+        steps = np.abs(np.diff(self.joints, axis=0))
+        travel = np.maximum(self._reaches[:-1], self._reaches[1:])
+        way = np.zeros(travel.shape[:2])
+        for j in range(travel.shape[2] - 1, -1, -1):
+            moves = slice(j, None)  # the links behind the joint
+            way[:, moves] += steps[:, j, None] * (travel[:, moves, j] + 0.5 * way[:, moves])
+            travel[:, :, j] = way
+        return travel
+
+    @cached_property
+    def _reaches(self) -> Array:
+        return self.arm.chain.reaches(self.placed)
 
     def sphere_speeds(self, sample: Index, sphere: Index, directions: Array) -> Array:
         """Return each sphere's speed along its direction per unit speed of each joint, shape (k, n_joints) [m/rad].
@@ -107,7 +134,7 @@ class ArmPath:
         """
         axes = self.axes[sample]
         arms = self.centers[sample, sphere][:, None] - self.anchors[sample]
-        speeds = np.einsum("kji,ki->kj", _cross(axes, arms), directions)
+        speeds = np.einsum("kji,ki->kj", cross(axes, arms), directions)
         slides = self.arm.cover.slides
         if slides.any():
             speeds[:, slides] = np.einsum("kji,ki->kj", axes[:, slides], directions)
@@ -124,7 +151,7 @@ class ArmPath:
             sphere: index of the sphere, shape (k,).
         """
         arms = self.centers[sample, sphere][:, None] - self.anchors[sample]
-        across = _cross(self.axes[sample], arms)
+        across = cross(self.axes[sample], arms)
         radii = np.sqrt(np.einsum("kji,kji->kj", across, across))
         slides = self.arm.cover.slides
         if slides.any():
@@ -210,21 +237,26 @@ def track(arm: ArmModel, start: Array, positions: Array, quaternions: Array, dri
             tool (self-motion), shape (n_joints,) [rad]; None: there is no self-motion.
 
     Returns:
-        Shape (n, n_joints) [rad]. If a pose is out of reach, its posture is the nearest one that was found.
+        Shape (n, n_joints) [rad]. The tool is within 0.1 mm and 0.1 mrad of its poses; :meth:`ArmPath.moved_to` moves
+        it there exactly. If a pose is out of reach, its posture is the nearest one that was found.
     """
     site = arm.site("tool")
     joints, q = np.empty((len(positions), arm.n_joints)), np.array(start, dtype=float)
+    weights, damping = _WEIGHTS[:, None], _DAMPING**2 * np.eye(6)
+    error, rotation, back = np.empty(6), np.empty(4), np.empty(4)
     for i, (position, quaternion) in enumerate(zip(positions, quaternions, strict=True)):
         for attempt in range(_NEWTON_STEPS + 2):
             memory = arm.at(q)
-            now = memory.site_pose(site)
-            rotation = quaternion_log(quaternion_multiply(quaternion, quaternion_conjugate(now.quaternion)))
-            error = np.concatenate([position - now.position, rotation])
+            np.subtract(position, memory.data.site_xpos[site], out=error[:3])
+            mujoco.mju_mat2Quat(back, memory.data.site_xmat[site])
+            mujoco.mju_negQuat(back, back)
+            mujoco.mju_mulQuat(rotation, quaternion, back)
+            mujoco.mju_quat2Vel(error[3:], rotation, 1.0)
             pulled = drift is not None and attempt == 0 and i > 0
-            if np.abs(error).max() < REACHED and not pulled:
+            if not pulled and np.abs(error).max() < _TRACKED:
                 break
-            weighted = _WEIGHTS[:, None] * memory.site_jacobian(site)
-            inverse = np.linalg.solve(weighted @ weighted.T + _DAMPING**2 * np.eye(6), weighted).T
+            weighted = weights * memory.site_jacobian(site)
+            inverse = np.linalg.solve(weighted @ weighted.T + damping, weighted).T
             step = inverse @ (_WEIGHTS * error)
             if drift is not None and pulled:
                 away = (drift - q) / (len(positions) - i)
@@ -232,12 +264,3 @@ def track(arm: ArmModel, start: Array, positions: Array, quaternions: Array, dri
             q = q + step
         joints[i] = q
     return joints
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return cross products over the last axis; faster than np.cross for small arrays."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    x, y, z = (a[..., i] for i in range(3))
-    u, v, w = (b[..., i] for i in range(3))
-    out[..., 0], out[..., 1], out[..., 2] = y * w - z * v, z * u - x * w, x * v - y * u
-    return out

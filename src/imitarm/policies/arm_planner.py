@@ -27,7 +27,8 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from imitarm.kinematics.arm_path import ArmPath, right_inverses, self_motions
 from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply
-from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles, ArmClearance, Gaps
+from imitarm.policies.arm_certificate import ArmAmongObstacles, ArmClearance, lowest_of
+from imitarm.policies.arm_pairs import SELF, Gaps
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.least_detour import UNBOUNDED, AllowedDirections, style_scale
 
@@ -203,7 +204,10 @@ class ArmPlanner:
         best: ArmPlan | None = None
         since, margin, calmed = 0, _MARGIN, 0
         for _ in range(rounds + 1):
-            plan = self._evaluated(path, displacement, tilt, samples)
+            gaps = None
+            if len(samples) < len(self.times):
+                gaps = self.around.gaps(path, self.clock[samples], _REACH)
+            plan = self._evaluated(path, displacement, tilt, samples, gaps)
             since = 0 if best is None or plan.clearance.room > best.clearance.room + _PROGRESS else since + 1
             if best is None or _rank(plan) > _rank(best):
                 best = plan
@@ -211,7 +215,7 @@ class ArmPlanner:
                 calmed += 1
             if (plan.clearance.room >= 0.0 and (plan.speed <= _CALM or calmed > _CALMING)) or since > _PATIENCE:
                 break
-            gaps = self.around.gaps(path, self.clock[samples], _REACH)
+            gaps = self.around.gaps(path, self.clock[samples], _REACH) if gaps is None else gaps
             if plan.complete and plan.clearance.room < 0.0 and gaps.room.min(initial=1.0) >= 0.0:
                 margin += _MARGIN - plan.clearance.room  # only between the samples the arm is too near
             step = self._step(path, gaps, displacement, tilt, samples, margin)
@@ -222,15 +226,15 @@ class ArmPlanner:
         assert best is not None
         return best
 
-    def _evaluated(self, path: ArmPath, displacement: Array, tilt: Array, samples: Index) -> ArmPlan:
-        """Return a plan with its smallest clearance at ``samples``; if these are all samples, also between samples."""
-        complete = len(samples) == len(self.times)
+    def _evaluated(self, path: ArmPath, displacement: Array, tilt: Array, samples: Index, gaps: Gaps | None) -> ArmPlan:
+        """Return a plan with its smallest clearance: at the samples (``gaps``), or on the whole path (None)."""
+        complete = gaps is None
         beyond = np.minimum(path.joints - self.arm.lower, self.arm.upper - path.joints)
         sample, joint = np.unravel_index(int(np.argmin(beyond)), beyond.shape)
-        if complete:
+        if gaps is None:
             lowest = self.around.clearance_of(path, self.clock)
         else:
-            lowest = self.around.clearance_at(path, self.clock[samples], _REACH)
+            lowest = lowest_of(gaps, _REACH)
             lowest = replace(lowest, sample=int(samples[lowest.sample]))
         if beyond[sample, joint] < min(lowest.room, 0.0):
             lowest = ArmClearance(float(beyond[sample, joint]), JOINT_LIMIT, int(joint), -1, int(samples[sample]))
@@ -277,7 +281,7 @@ class ArmPlanner:
         local = _Local(self, samples, right_inverses(jacobians), self_motions(jacobians))
         now = np.concatenate([displacement.ravel(), tilt.ravel(), np.zeros(local.n_self)])
         chosen = _chosen(gaps)
-        rows = local.rows(gaps.sample[chosen], gaps.rates(chosen))
+        rows = local.rows(gaps.sample[chosen], gaps.rates(chosen)[0])
         parts, lower = [rows], [margin - gaps.room[chosen] + rows @ now]
         for sign, away in ((1.0, path.joints - self.arm.lower), (-1.0, self.arm.upper - path.joints)):
             at, joint = np.nonzero(away < _NEAR_LIMIT)

@@ -125,7 +125,7 @@ class _Sweep:
         """Return the clear ones of several postures, shape (k, n_joints) [rad]."""
         usable = np.abs(path.errors_to(*poses)).max(axis=1) < _REACHED
         usable &= ((path.joints >= self._arm.lower) & (path.joints <= self._arm.upper)).all(axis=1)
-        gaps = self._around.gaps(path, np.full(len(path), self._time), 0.0)
+        gaps = self._around.gaps(path, np.full(len(path), self._time), 0.0, connected=False)
         room = np.zeros(len(path))
         np.minimum.at(room, gaps.sample, gaps.room)
         best = int(np.argmax(np.where(usable, room, -np.inf)))

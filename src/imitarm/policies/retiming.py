@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_path import ArmPath
-from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles
+from imitarm.policies.arm_certificate import ArmAmongObstacles, Shrinking
+from imitarm.policies.arm_pairs import SELF
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,7 @@ SELF_CLEARANCE = 0.012
 
 _VELOCITY, _ACCELERATION, _TORQUE = 0.95, 0.9, 0.9  # fractions of the limits that are used
 _HALVINGS = 40
+_ROUNDING = 1e-9
 _NO_EFFECT = 1e-9  # a coefficient smaller than this does not limit a
 _SLOWEST = 1e-6  # squared speed below which the path counts as blocked
 _FILTER_SELF, _FILTER_MARGIN = 0.01, 1e-3  # [m] that the safety filter keeps between links; that it adds to a clearance
@@ -53,7 +55,7 @@ class Timing:
     joint: int = -1
 
 
-def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array) -> Timing:
+def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array, *, path: ArmPath | None = None) -> Timing:
     """Return the shortest execution times of a path within the limits of an arm, from rest to rest.
 
     Args:
@@ -62,10 +64,11 @@ def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array) -> 
         parameters: path parameter s of each sample, increasing, shape (n,) [s]. If the rate ds/dt is 1 everywhere, each
             sample is reached at the time s.
         fastest: largest allowed rate ds/dt at each sample, shape (n,).
+        path: the arm in these postures, if it is known already.
     """
     first = np.gradient(joints, parameters, axis=0)
     second = np.gradient(first, parameters, axis=0)
-    of_a, of_b, bound = _limits(arm, joints, first, second)
+    of_a, of_b, bound = _limits(ArmPath.of(arm, joints) if path is None else path, first, second)
     static = bound.min(axis=1)
     if static.min() < 0.0:  # the weight of the arm alone exceeds a torque
         sample = int(np.flatnonzero(static < 0.0)[0])
@@ -74,14 +77,7 @@ def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array) -> 
         most = (_VELOCITY * arm.max_velocity / np.abs(first)).min(axis=1)
     most = np.minimum(most, fastest) ** 2
     step = 2.0 * np.diff(parameters)
-    n = len(joints)
-    reachable = np.zeros(n)
-    for i in range(n - 2, -1, -1):
-        reachable[i] = _largest(of_a[i], of_b[i], bound[i], float(most[i]), float(step[i]), float(reachable[i + 1]))
-    b = np.zeros(n)
-    for i in range(n - 1):
-        high = _interval(of_a[i], of_b[i], bound[i], float(b[i]))[1]
-        b[i + 1] = min(max(b[i] + high * step[i], 0.0), reachable[i + 1])
+    b = _squared_speeds(of_a[:-1] / step[:, None], of_b[:-1], bound[:-1], most)
     speeds = np.sqrt(b)
     means = 0.5 * (speeds[1:] + speeds[:-1])
     slow = np.flatnonzero(means <= _SLOWEST)
@@ -103,64 +99,105 @@ def safe_rates(around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Ar
     Returns:
         Shape (n,), at most 1.
     """
-    speed = np.linalg.norm(np.gradient(path.centers, times, axis=0), axis=2)
-    gaps = around.gaps(path, clock, min(2.0 * float(speed.max(initial=0.0)) / _SELF_RATE, _REACH))
+    velocity = np.gradient(path.joints, times, axis=0)
+    obstacles = Shrinking(_APPROACH_RATE, max(allowance - _FILTER_MARGIN, 0.0), _REACH)
+    links = Shrinking(_SELF_RATE, SELF_CLEARANCE - _FILTER_SELF, _REACH)
+    gaps = around.closing(path, clock, velocity, obstacles, links)
     own = gaps.obstacle == SELF
-    margin = np.where(own, SELF_CLEARANCE - _FILTER_SELF, max(allowance - _FILTER_MARGIN, 0.0))
-    rate = np.where(own, _SELF_RATE, _APPROACH_RATE)
-    allowed = np.maximum(rate * (np.maximum(gaps.room, 0.0) + margin) + gaps.drift, _CREEP)
-    # A distance shrinks at most as fast as the sphere moves; that of two spheres at most twice as fast.
-    closing = np.flatnonzero(allowed < 2.0 * speed[gaps.sample, gaps.sphere])
-    velocity = np.gradient(path.joints, times, axis=0)[gaps.sample[closing]]
-    approach = np.maximum(-np.einsum("kj,kj->k", gaps.rates(closing), velocity), 1e-9)
+    rate, margin, _ = (np.where(own, a, b) for a, b in zip(links, obstacles, strict=True))
+    rates, drift = gaps.rates(np.arange(len(gaps)))
+    allowed = np.maximum(rate * (np.maximum(gaps.room, 0.0) + margin) + drift, _CREEP)
+    approach = np.maximum(-np.einsum("kj,kj->k", rates, velocity[gaps.sample]), 1e-9)
     fastest = np.ones(len(path))
-    np.minimum.at(fastest, gaps.sample[closing], allowed[closing] / approach)
+    np.minimum.at(fastest, gaps.sample, allowed / approach)
     return fastest
 
 
-def _limits(arm: ArmModel, joints: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
+def _squared_speeds(of_a: Array, of_b: Array, bound: Array, most: Array) -> Array:
+    """Return the largest squared speeds at n samples, from rest to rest, shape (n,).
+
+    Two neighbouring squared speeds, b and then c, are allowed if ``of_a * (c - b) + of_b * b <= bound`` in all m rows
+    and if neither exceeds ``most``. These pairs (b, c) form a convex polygon that contains (0, 0). Its upper limit of b
+    as a function of c is the smallest of several straight lines. It rises up to some ``turn`` and falls from there.
+
+    Args:
+        of_a: coefficients at all samples but the last one, shape (n - 1, m).
+        of_b: shape (n - 1, m).
+        bound: not negative, shape (n - 1, m).
+        most: largest squared speed at each sample, shape (n,).
+    """
+    of_b = of_b - of_a
+    limits = of_b > _NO_EFFECT
+    divisor = np.where(limits, of_b, 1.0)
+    level = np.where(limits, bound / divisor, np.inf)
+    fall = np.where(limits, of_a / divisor, 0.0)
+    turn = _turns(of_a, of_b, bound, most, level, fall)
+    most = np.append(np.minimum(most[:-1], (level - fall * turn[:, None]).min(axis=1)), 0.0)
+    low, high = _ranges(level, fall, most[:-1])
+    before, after = most.tolist(), 0.0
+    for i, (most_c, a, b) in reversed(list(enumerate(zip(turn.tolist(), low.tolist(), high.tolist(), strict=True)))):
+        c = min(after, most_c)
+        if not a <= c <= b:
+            before[i] = max(float((level[i] - fall[i] * c).min()), 0.0)
+        after = before[i]
+    limits = of_a > _NO_EFFECT
+    divisor = np.where(limits, of_a, 1.0)
+    level, fall = np.where(limits, bound / divisor, np.inf), np.where(limits, of_b / divisor, 0.0)
+    low, high = _ranges(level, fall, np.array(before[1:]))
+    speeds, now = [0.0], 0.0
+    for i, (a, b) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
+        now = before[i + 1] if a <= now <= b else max(float((level[i] - fall[i] * now).min()), 0.0)
+        speeds.append(now)
+    return np.array(speeds)
+
+
+def _ranges(level: Array, fall: Array, least: Array) -> tuple[Array, Array]:
+    """Return the ranges of x in which ``level - fall * x`` is at least ``least`` in all columns; shapes (n,)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = (level - least[:, None]) / fall
+    low = np.where(fall < 0.0, crossing, -np.inf).max(axis=1)
+    high = np.where(fall > 0.0, crossing, np.inf).min(axis=1)
+    never = ((fall == 0.0) & (level < least[:, None])).any(axis=1)
+    return np.where(never, np.inf, low), high
+
+
+def _turns(of_a: Array, of_b: Array, bound: Array, most: Array, level: Array, fall: Array) -> Array:
+    """Return the c at which the upper limit of b is largest, at most ``most`` of the next sample, shape (n - 1,)."""
+    turn = most[1:].copy()
+    low, high = np.zeros(len(turn)), turn.copy()
+    rows = np.arange(len(turn))
+    for _ in range(_HALVINGS):
+        c = turn[rows, None]
+        lines = level[rows] - fall[rows] * c
+        active = lines.argmin(axis=1)
+        here = np.arange(len(rows))
+        upper = np.minimum(lines[here, active], most[rows])
+        falling = (fall[rows, active] > 0.0) & (lines[here, active] < most[rows])
+        # Beyond the last c that has an allowed b, the lower limits of b exceed the upper one.
+        falling |= (of_a[rows] * c + of_b[rows] * np.maximum(upper, 0.0)[:, None] > bound[rows] + _ROUNDING).any(axis=1)
+        falling |= upper < 0.0
+        low[rows], high[rows] = np.where(falling, low[rows], turn[rows]), np.where(falling, turn[rows], high[rows])
+        rows = rows[low[rows] < high[rows] * (1.0 - _ROUNDING)]
+        if not len(rows):
+            break
+        turn[rows] = 0.5 * (low[rows] + high[rows])
+    return low
+
+
+def _limits(path: ArmPath, first: Array, second: Array) -> tuple[Array, Array, Array]:
     """Return the coefficients of m limits ``of_a * a + of_b * b <= bound`` at each sample, each of shape (n, m)."""
+    arm = path.arm
     of_a, of_b, room = [first], [second], [np.broadcast_to(_ACCELERATION * arm.max_acceleration, first.shape)]
     upper, lower = list(room), list(room)
     if np.isfinite(arm.max_torque).any() and arm.has_dynamics:
-        zero = np.zeros(arm.n_joints)
-        weight = np.array([arm.inverse_dynamics(q, zero, zero) for q in joints])
-        of_a.append(np.array([arm.inverse_dynamics(q, zero, d) for q, d in zip(joints, first, strict=True)]) - weight)
-        moved = [arm.inverse_dynamics(q, d, dd) for q, d, dd in zip(joints, first, second, strict=True)]
-        of_b.append(np.array(moved) - weight)
+        none = np.zeros_like(first)
+        motions = np.stack([none, none, first]), np.stack([none, first, second])
+        weight, accelerating, moving = arm.chain.torques(path.placed, *motions)
+        of_a.append(accelerating - weight)
+        of_b.append(moving - weight)
         upper.append(_TORQUE * arm.max_torque - weight)
         lower.append(_TORQUE * arm.max_torque + weight)
     a, b = np.concatenate(of_a, axis=1), np.concatenate(of_b, axis=1)
     bound = np.concatenate([*upper, *lower], axis=1)
     a, b = np.concatenate([a, -a], axis=1), np.concatenate([b, -b], axis=1)
     return a, b, np.where(np.isfinite(bound), bound, 1e12)
-
-
-def _interval(of_a: Array, of_b: Array, bound: Array, b: float) -> tuple[float, float]:
-    """Return the smallest and the largest acceleration ``a`` that the limits allow at the squared speed ``b``."""
-    room = bound - of_b * b
-    up, down = of_a > _NO_EFFECT, of_a < -_NO_EFFECT
-    if (room[~(up | down)] < 0.0).any():
-        return 1.0, -1.0
-    high = float((room[up] / of_a[up]).min(initial=1e9))
-    low = float((room[down] / of_a[down]).max(initial=-1e9))
-    return low, high
-
-
-def _largest(of_a: Array, of_b: Array, bound: Array, most: float, step: float, after: float) -> float:
-    """Return the largest squared speed ``b``, at most ``most``, from which the path can continue.
-
-    The limits must allow an acceleration that leads to a squared speed in [0, ``after``] at the next sample.
-    """
-
-    def works(b: float) -> bool:
-        low, high = _interval(of_a, of_b, bound, b)
-        return max(low, -b / step) <= min(high, (after - b) / step)
-
-    if works(most):
-        return most
-    low, high = 0.0, most
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if works(middle) else (low, middle)
-    return low

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_path import ArmPath, track
 from imitarm.kinematics.pose import Pose
-from imitarm.policies.arm_certificate import SELF, ArmAmongObstacles, ArmClearance
+from imitarm.policies.arm_certificate import ArmAmongObstacles, ArmClearance
+from imitarm.policies.arm_pairs import SELF
 from imitarm.policies.arm_planner import JOINT_LIMIT, TILT_LEVER, TILT_LIMIT, ArmPlan, ArmPlanner
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.goal_postures import GoalPosture, GoalSearch, clear_postures
@@ -161,7 +162,7 @@ class _Search:
         )
         self.start = self._around.clearance_at(ArmPath.of(task.arm, task.start[None]), np.zeros(1), _REACH)
         self._moving = any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
-        self._first: ArmClearance | None = None
+        self._first: _Attempt | None = None
         self._worst: ArmClearance | None = None
         self._goals: GoalSearch | None = None
 
@@ -172,9 +173,7 @@ class _Search:
         """
         learned, detour = self._planner(self._components), self.detour.displacement
         begin = self._followed(learned, detour)
-        first = ArmPath.of(self.task.arm, begin.joints)
-        self._first = self._around.clearance_at(first, learned.clock[learned.coarse], _REACH)
-        self._first = replace(self._first, sample=int(learned.coarse[self._first.sample]))
+        self._first = begin
         yield begin
         path = self._components.nominal
         goal, end = Pose(path.positions[-1], self._quaternions[-1]), float(self._times[-1])
@@ -328,7 +327,7 @@ class _Search:
         Each sample is compared with the places of the obstacles at its time in ``clock``.
         """
         fastest = safe_rates(self._around, path, times, clock, self.task.allowance)
-        return retimed(self.task.arm, path.joints, times, fastest)
+        return retimed(self.task.arm, path.joints, times, fastest, path=path)
 
     def named(self, found: ArmClearance) -> str:
         """Return a text that names the two objects that are too close and their distance, or a joint at its limit."""
@@ -356,7 +355,7 @@ class _Search:
         """Return why no plan was found."""
         if best is None:
             return f"{self.task.arm.name} can't move its tool along the path: move the path nearer to the arm"
-        first = "" if self._first is None else f"on the path planned for the tool alone, {self._placed(self._first)}; "
+        first = f"on the path planned for the tool alone, {self._placed(self._on_first_path())}; "
         if self._goals is not None and not self._goals.found:
             best_posture = self._goals.best
             nearest = "" if best_posture is None else f" (in the best posture, {self.named(best_posture)})"
@@ -369,6 +368,13 @@ class _Search:
             f"({first}in the best attempt, {self._placed(best.clearance)}): move the obstacle, "
             "allow a larger tilt of the tool (max_tilt), or require a smaller clearance"
         )
+
+    def _on_first_path(self) -> ArmClearance:
+        """Return the smallest clearance on the path that was planned for the tool alone."""
+        assert self._first is not None
+        planner, path = self._first.planner, ArmPath.of(self.task.arm, self._first.joints)
+        found = self._around.clearance_at(path, self._times[planner.coarse], _REACH)
+        return replace(found, sample=int(planner.coarse[found.sample]))
 
     def _placed(self, found: ArmClearance) -> str:
         return f"{self.named(found)} at {self._times[min(found.sample, len(self._times) - 1)]:.2f} s"

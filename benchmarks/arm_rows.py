@@ -1,0 +1,104 @@
+"""What ``make bench`` times of planning for the whole arm, against planning for the tool alone in the same scenes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from imitarm import Adaptation, ArmModel, Pose, Scene, Skill, adapt, find_posture
+from imitarm.benchmark.placements import placement
+from imitarm.kinematics.arm import ArmState
+from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply
+from imitarm.trajectory import Demonstration, Trajectory
+from timing import Row
+
+_SCENES = 8  # of each arm, with three obstacles each
+_TILT = np.deg2rad(30.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """A skill of one arm, and a scene with three obstacles on its path."""
+
+    skill: Skill
+    arm: ArmModel
+    state: ArmState
+    scene: Scene
+
+    def whole_arm(self) -> Adaptation:
+        return adapt(self.skill, self.scene, arm=self.arm, state=self.state, max_tilt=_TILT)
+
+    def tool_alone(self) -> Adaptation:
+        start = self.arm.tool_pose(self.state.q)
+        return adapt(self.skill, self.scene, tool_spheres=self.arm.tool_spheres, start=start)
+
+
+def _carrying(arm: ArmModel) -> Skill:
+    """Return a skill of 6 s that carries the tool to the side and turns it, learned from motions from home."""
+    home, rng = arm.tool_pose(arm.home), np.random.default_rng(0)
+    u = np.linspace(0.0, 1.0, 150)
+    rise, arch = u**3 * (10.0 - 15.0 * u + 6.0 * u * u), np.sin(np.pi * u) ** 2
+    shown = []
+    for _ in range(6):
+        across = np.array([0.02, 0.45, -0.05]) + 0.01 * rng.normal(size=3)
+        positions = home.position + np.outer(rise, across) + np.outer(arch, [0.0, 0.0, 0.1 + 0.01 * rng.normal()])
+        turn = quaternion_exp(np.outer(rise, [0.0, 0.0, 0.6 + 0.05 * rng.normal()]))
+        rotations = quaternion_multiply(turn, np.tile(home.quaternion, (len(u), 1)))
+        shown.append(Demonstration(Trajectory(6.0 * u, positions, rotations), task="carry"))
+    return Skill(8).fit(shown)
+
+
+@lru_cache
+def _cases() -> tuple[_Case, ...]:
+    """Return the first scenes of each arm in which both kinds of planning find a plan."""
+    cases = []
+    for name in ("sawyer", "panda"):
+        arm, seed, found = ArmModel.load(name, tool="gripper"), 2, 0  # every third seed has three obstacles
+        skill = _carrying(arm)
+        start = find_posture(arm, Pose(skill.start_.position, skill.start_.quaternion))
+        state = ArmState(start, np.zeros(arm.n_joints), np.zeros(arm.n_joints), 0.0)
+        while found < _SCENES:
+            case = _Case(skill, arm, state, placement(skill, arm, seed, start))
+            seed += 3
+            if case.tool_alone().feasible and case.whole_arm().feasible:
+                cases.append(case)
+                found += 1
+    return tuple(cases)
+
+
+def _median(call: Callable[[_Case], Any]) -> Callable[[], float]:
+    """Return a function that returns the median time of a call over all scenes [s]."""
+
+    def seconds(case: _Case) -> float:
+        begin = time.process_time()
+        call(case)
+        return time.process_time() - begin
+
+    return lambda: float(np.median([seconds(case) for case in _cases()]))
+
+
+def whole_arm() -> Row:
+    """A plan of the whole arm among three obstacles, against a plan of the tool alone; median of 16 scenes."""
+
+    def check() -> tuple[bool, str]:
+        least = min(case.whole_arm().certified_clearance for case in _cases())
+        return least >= 0.02, f"certified clearance at least {1e3 * least:.2f} mm (20 mm required)"
+
+    return Row(
+        "whole-arm plan, 3 obstacles (16 scenes)",
+        _median(_Case.whole_arm),
+        _median(_Case.tool_alone),
+        "plan of the tool alone",
+        cost=3.0,
+        check=check,
+        repeats=9,
+        self_timed=True,
+    )
+
+
+ROWS = (whole_arm,)
