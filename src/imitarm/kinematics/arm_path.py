@@ -107,7 +107,7 @@ class ArmPath:
         """Bounds of the way of all spheres of each link from one posture to the next one.
 
         The joints move linearly. Meanwhile a sphere may be farther from an axis than in both postures, by at most half
-        of the way that the joints between them move it.
+        of its path due to the joints between them.
 
         The shape is (n - 1, n_joints, n_joints) [m]; see :meth:`speeds`.
         """
