@@ -111,7 +111,12 @@ class ArmAmongObstacles:
         found = []
         for pairs in self._pairs:
             limit = np.full((len(path), pairs.n_groups), reach)
-            found.append((pairs, pairs.near(path, times, limit, pairs.travel(path, times) if connected else None)))
+            found.append(
+                (
+                    pairs,
+                    pairs.near(path, times, limit, pairs.travel(path, times) if connected and len(path) > 1 else None),
+                )
+            )
         return Gaps.of(path, times, found)
 
     def closing(self, path: ArmPath, times: Array, velocity: Array, obstacles: Shrinking, links: Shrinking) -> Gaps:
