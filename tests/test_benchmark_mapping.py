@@ -6,7 +6,7 @@ import re
 import pytest
 
 from imitarm.benchmark.experiment import LIVE, MAIN, METHODS
-from imitarm.benchmark.mapping import CAMERAS, MappingBenchmark, tables, write_tables
+from imitarm.benchmark.mapping import CAMERAS, MappingBenchmark, run_all, tables, write_tables
 from imitarm.benchmark.mapping_comparisons import COMPARED
 from imitarm.benchmark.mapping_report import mapping_report_html
 from imitarm.benchmark.mapping_tables import (
@@ -14,7 +14,7 @@ from imitarm.benchmark.mapping_tables import (
     Results,
 )
 from imitarm.benchmark.recordings import CAPTURED
-from imitarm.benchmark.running import run_all
+from imitarm.benchmark.running import Workers
 from imitarm.errors import InputError, UnknownNameError
 
 MEASURED = sorted({figure.name for figure in COMPARED} - {"limit_violations", "mean_torque"})
@@ -65,7 +65,7 @@ def small(tmp_path_factory):
     benchmark = MappingBenchmark(
         people=2, first=0, repeats=1, methods=("modern", "m3"), kinds=("inside", "edge"), seconds=4.0, live=False
     )
-    return folder, Results(run_all(benchmark.experiments(), folder, jobs=1))
+    return folder, Results(run_all(benchmark.experiments(), folder, Workers(1)))
 
 
 @pytest.mark.slow

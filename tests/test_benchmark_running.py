@@ -12,14 +12,16 @@ from pathlib import Path
 import pytest
 
 from imitarm.benchmark.experiment import LIVE, METHODS, Experiment, Result
+from imitarm.benchmark.mapping import run_all
 from imitarm.benchmark.provenance import code_version
-from imitarm.benchmark.running import run_all
+from imitarm.benchmark.running import Workers
 from imitarm.errors import FileFormatError, InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.retarget import RETARGETERS
 
 SHORT = 4.0
 ONE = Experiment("inside", "m3", seconds=SHORT)
+ALONE = Workers(1)
 
 
 def stamps(folder):
@@ -60,16 +62,16 @@ def test_a_foreign_file_is_no_result(tmp_path, content):
 def test_what_was_run_is_not_run_again(tmp_path):
     wanted = [ONE, replace(ONE, method="modern")]
     told = []
-    first = run_all(wanted, tmp_path, jobs=1, on_done=lambda done, of: told.append((done, of)))
+    first = run_all(wanted, tmp_path, ALONE, on_done=lambda done, of: told.append((done, of)))
     assert told == [(0, 2), (1, 2), (2, 2)]
     before = stamps(tmp_path)
     assert len(list((tmp_path / "recordings").iterdir())) == 1  # one for both
     told.clear()
-    again = run_all(wanted, tmp_path, jobs=1, on_done=lambda done, of: told.append((done, of)))
+    again = run_all(wanted, tmp_path, ALONE, on_done=lambda done, of: told.append((done, of)))
     assert told == [(2, 2)]
     assert stamps(tmp_path) == before
     assert [without_clock(r) for r in first] == [without_clock(r) for r in again]
-    run_all(wanted[:1], tmp_path, jobs=1, fresh=True)
+    run_all(wanted[:1], tmp_path, ALONE, fresh=True)
     assert stamps(tmp_path) != before
 
 
@@ -81,27 +83,27 @@ def test_another_configuration_has_another_file(tmp_path):
 def test_a_result_of_other_code_is_read_only_when_that_is_asked_for(tmp_path):
     saved = Result(ONE, "commit of long ago", {"engaged_fraction": 2.0}, "", 1.0)
     saved.save(tmp_path / "runs")
-    (reused,) = run_all([ONE], tmp_path, jobs=1, reuse=True)
+    (reused,) = run_all([ONE], tmp_path, ALONE, reuse=True)
     assert (reused.code, reused.value("engaged_fraction")) == ("commit of long ago", 2.0)
-    (done,) = run_all([ONE], tmp_path, jobs=1)
+    (done,) = run_all([ONE], tmp_path, ALONE)
     assert done.code == code_version() and done.value("engaged_fraction") <= 1.0
     before = stamps(tmp_path)
-    run_all([ONE], tmp_path, jobs=1)
+    run_all([ONE], tmp_path, ALONE)
     assert stamps(tmp_path) == before
 
 
 def test_a_damaged_result_is_run_again(tmp_path):
-    run_all([ONE], tmp_path, jobs=1)
+    run_all([ONE], tmp_path, ALONE)
     path = Result.path(tmp_path / "runs", ONE)
     whole = json.loads(path.read_text())
     path.write_text(path.read_text()[:200])
-    (done,) = run_all([ONE], tmp_path, jobs=1)
+    (done,) = run_all([ONE], tmp_path, ALONE)
     assert json.loads(path.read_text())["values"] == whole["values"]
     assert done.failure == ""
 
 
 def test_a_task_that_cant_be_done_is_a_result_that_says_why(tmp_path):
-    (done,) = run_all([Experiment("captured", "m3", data=str(tmp_path))], tmp_path, jobs=1)
+    (done,) = run_all([Experiment("captured", "m3", data=str(tmp_path))], tmp_path, ALONE)
     assert "--data" in done.failure
     assert not done.values
 
@@ -114,9 +116,9 @@ def test_an_interrupted_benchmark_goes_on_where_it_was(tmp_path, how):
         "import signal, sys\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # what runs in the background may ignore it
         "from imitarm.benchmark.experiment import Experiment\n"
-        "from imitarm.benchmark.running import run_all\n"
+        "from imitarm.benchmark.running import Workers\n"
         "if __name__ == '__main__':\n"
-        "    run_all([Experiment('inside', 'm3', seed=s, seconds=4.0) for s in range(8)], sys.argv[1], jobs=2)\n"
+        "    run_all([Experiment('inside', 'm3', seed=s, seconds=4.0) for s in range(8)], sys.argv[1], Workers(2))\n"
     )
     program = tmp_path / "program.py"
     program.write_text(script)
@@ -135,7 +137,7 @@ def test_an_interrupted_benchmark_goes_on_where_it_was(tmp_path, how):
     found = {Result.load(path).experiment.seed for path in kept}
     other = next(s for s in range(8) if s not in found)
     wanted = [Experiment("inside", "m3", seed=s, seconds=4.0) for s in (*found, other)]
-    results = run_all(wanted, out, jobs=1)
+    results = run_all(wanted, out, ALONE)
     assert all(r.failure == "" for r in results)
     after = stamps(out)
     assert all(after[path.name] == before[path.name] for path in kept)
@@ -143,12 +145,12 @@ def test_an_interrupted_benchmark_goes_on_where_it_was(tmp_path, how):
 
 def test_results_do_not_depend_on_the_number_of_jobs_or_the_backend(tmp_path):
     wanted = [ONE, replace(ONE, seed=1)]
-    alone = run_all(wanted, tmp_path / "a", jobs=1)
+    alone = run_all(wanted, tmp_path / "a", ALONE)
     for folder, jobs, backend in (("b", 2, "loky"), ("c", 2, "threading")):
-        found = run_all(wanted, tmp_path / folder, jobs=jobs, backend=backend)
+        found = run_all(wanted, tmp_path / folder, Workers(jobs, backend))
         assert [without_clock(r) for r in alone] == [without_clock(r) for r in found]
     with pytest.raises(InputError, match="nowhere"):
-        run_all(wanted, tmp_path / "d", backend="nowhere")
+        run_all(wanted, tmp_path / "d", Workers(backend="nowhere"))
 
 
 def test_a_folder_that_cant_be_is_refused(tmp_path):

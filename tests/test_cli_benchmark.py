@@ -63,7 +63,7 @@ def test_a_reports_folder_is_made_before_the_work_or_the_work_is_not_begun(tmp_p
     monkeypatch.chdir(tmp_path)
     begun = []
 
-    def run_all(experiments, folder, **_):
+    def run_all(experiments, folder, *_, **__):
         begun.append((len(experiments), (tmp_path / "out" / "pages").is_dir(), folder.name))
         raise TaskFailedError("far enough")
 

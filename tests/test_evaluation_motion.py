@@ -10,6 +10,7 @@ from imitarm.evaluation.execution import execute_within_limits
 from imitarm.evaluation.motion import (
     ArmMotion,
     jerk_rms,
+    log_dimensionless_jerk,
     path_length,
     spectral_arc_length,
     violations,
@@ -141,3 +142,13 @@ def test_what_is_executed_breaks_no_limit_and_arrives(seed, size):
     found = violations(ARM, done, DT)
     assert (found.position, found.velocity, found.acceleration) == (0, 0, 0)
     np.testing.assert_allclose(done[-1], goal, atol=0.02)
+
+
+def test_the_jerk_of_a_minimum_jerk_motion_is_its_closed_form_at_every_scale():
+    u = np.linspace(0.0, 1.0, 4001)
+    shape = 10 * u**3 - 15 * u**4 + 6 * u**5
+    for length, duration in ((1.0, 1.0), (0.3, 7.0)):
+        x = length * shape[:, None] * [0.6, 0.0, 0.8]
+        found = log_dimensionless_jerk(x, duration / 4000)
+        assert found == pytest.approx(-np.log(720.0 / 1.875**2), abs=2e-3)
+    assert np.isnan(log_dimensionless_jerk(np.zeros((10, 3)), 0.1))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from imitarm.benchmark.experiment import LIVE, MAIN, METHODS, REPLAYS, Experiment, plain, write_text
+from imitarm.benchmark.experiment import LIVE, MAIN, METHODS, REPLAYS, Experiment, Result, plain, write_text
 from imitarm.benchmark.mapping_comparisons import better_methods_table, claims_table, comparison_table, printed_table
 from imitarm.benchmark.mapping_tables import (
     TEST,
@@ -20,10 +22,13 @@ from imitarm.benchmark.mapping_tables import (
     success_table,
     torque_table,
 )
+from imitarm.benchmark.provenance import code_version
 from imitarm.benchmark.recordings import CAPTURED, KINDS
+from imitarm.benchmark.running import OnDone, Store, Workers, in_parallel, run_experiments
 from imitarm.benchmark.tables import Table
-from imitarm.errors import InputError
+from imitarm.errors import FileFormatError, ImitarmError, InputError
 
+_RUNS, _RECORDINGS = "runs", "recordings"
 CAMERAS = 8  # simulated cameras before the captured arm, which is that of one person
 
 
@@ -93,6 +98,94 @@ class MappingBenchmark:
                 if method in MAIN
             ]
         return found
+
+
+class ResultFolder(Store[Experiment, Result]):
+    """A folder with one file for each result.
+
+    Args:
+        folder: the folder; created if missing.
+        reuse: whether a result of another version of the code is valid.
+
+    Raises:
+        InputError: when the folder can't be written to.
+    """
+
+    def __init__(self, folder: Path, *, reuse: bool = False) -> None:
+        self.folder, self.reuse = folder, reuse
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"{folder.parent}: results can't be saved there ({error.strerror}); name another folder"
+            ) from error
+
+    def known(self, experiments: Sequence[Experiment]) -> dict[Experiment, Result]:
+        """Return the saved results; results that are unreadable or (without ``reuse``) of other code are left out."""
+        return {e: found for e in experiments if (found := self._kept(e)) is not None}
+
+    def save(self, experiment: Experiment, outcome: Result) -> Result:
+        """Write one file, and return the result as it is read from the file."""
+        return Result.load(outcome.save(self.folder))
+
+    def _kept(self, experiment: Experiment) -> Result | None:
+        path = Result.path(self.folder, experiment)
+        try:
+            found = Result.load(path) if path.exists() else None
+        except FileFormatError:
+            return None
+        return found if found is not None and (self.reuse or found.code == code_version()) else None
+
+
+def run_all(
+    experiments: Sequence[Experiment],
+    folder: str | Path,
+    workers: Workers | None = None,
+    *,
+    fresh: bool = False,
+    reuse: bool = False,
+    on_done: OnDone | None = None,
+) -> list[Result]:
+    """Run experiments in parallel and return their results in the same order.
+
+    Each result is a separate file in ``folder/runs``, written as soon as the experiment is finished. If a result of the
+    same configuration and the same code was saved earlier, this result is read, and the experiment is not run again.
+    The measured values do not depend on ``workers``.
+
+    Args:
+        experiments: the experiments to run.
+        folder: folder for results and recordings; created if missing.
+        workers: processes that run the experiments; None: one for each processor.
+        fresh: whether to ignore saved results and run all experiments again.
+        reuse: whether to use saved results of the same configuration even if another version of the code produced them;
+            each result names the version.
+        on_done: function called with the progress.
+
+    Raises:
+        InputError: when the folder can't be written to, or the backend does not exist.
+        TaskFailedError: when a worker process ended unexpectedly; finished results are kept.
+        KeyboardInterrupt: after Ctrl-C; finished results are kept.
+    """
+    place = Path(folder)
+    store = ResultFolder(place / _RUNS, reuse=reuse)
+    known = {} if fresh else store.known(experiments)
+    # recordings first, so that methods share the files
+    firsts = {e.plan: e for e in experiments if e.task in REPLAYS and e not in known}
+    for _ in in_parallel(partial(_make_recording, place / _RECORDINGS), list(firsts.values()), workers):
+        pass
+    return run_experiments(
+        experiments, partial(_run, place / _RECORDINGS), store, workers, fresh=fresh, on_done=on_done
+    )
+
+
+def _make_recording(folder: Path, experiment: Experiment) -> None:
+    """Make the recording of an experiment; an error is ignored here, because the experiment reports it later."""
+    with contextlib.suppress(ImitarmError):
+        experiment.recording(folder)
+
+
+def _run(folder: Path, experiment: Experiment) -> Result:
+    return experiment.run(folder)
 
 
 _TORQUES = {

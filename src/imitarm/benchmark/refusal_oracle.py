@@ -66,29 +66,44 @@ class Answer(Enum):
 
 def answer(question: Question) -> Answer:
     """Decide whether a path exists."""
+    return decide(question)[0]
+
+
+def decide(question: Question) -> tuple[Answer, Array | None]:
+    """Decide whether a path exists, and return the answer with the positions (n, 3) [m] of the path, if one was found.
+
+    The path has the times of ``question.nominal``.
+    """
     axes = question.axes()
     if not len(axes):  # nothing may move
-        return Answer.POSSIBLE if is_solved(question, axes) else Answer.IMPOSSIBLE
+        only = solution(question, axes)
+        return (Answer.IMPOSSIBLE if only is None else Answer.POSSIBLE), only
     # What is impossible for a part of the tool is impossible for all of it; the part next to the tip is the quickest.
     nearest = int(np.argmin(np.linalg.norm(question.spheres[:, :3], axis=1)))
     part = replace(question, spheres=question.spheres[[nearest]])
     boxes, searches = grids(part, axes), _SEARCH_GRIDS[len(axes)]
     if covers_fixed_point(question) or is_impossible(part, next(boxes)):
-        return Answer.IMPOSSIBLE
-    if is_solved(question, axes, searches[:1]):
-        return Answer.POSSIBLE
+        return Answer.IMPOSSIBLE, None
+    if (found := solution(question, axes, searches[:1])) is not None:
+        return Answer.POSSIBLE, found
     if any(is_impossible(part, cells) for cells in boxes):
-        return Answer.IMPOSSIBLE
-    if is_solved(question, axes, searches[1:]):
-        return Answer.POSSIBLE
+        return Answer.IMPOSSIBLE, None
+    if (found := solution(question, axes, searches[1:])) is not None:
+        return Answer.POSSIBLE, found
     whole = grids(question, axes) if len(question.spheres) > 1 else ()
-    return Answer.IMPOSSIBLE if any(is_impossible(question, cells) for cells in whole) else Answer.UNDECIDED
+    impossible = any(is_impossible(question, cells) for cells in whole)
+    return (Answer.IMPOSSIBLE if impossible else Answer.UNDECIDED), None
 
 
-def is_solved(
+def is_solved(question: Question) -> bool:
+    """Return whether a path is found and verified."""
+    return solution(question) is not None
+
+
+def solution(
     question: Question, axes: Array | None = None, grids_to_search: Sequence[tuple[float, float]] | None = None
-) -> bool:
-    """Return whether a path is found and verified.
+) -> Array | None:
+    """Return the positions (n, 3) [m] of a path that was found and verified; None if no path is found.
 
     Args:
         question: the scene and the path.
@@ -97,14 +112,14 @@ def is_solved(
     """
     axes = question.axes() if axes is None else axes
     if separation(question, question.nominal.times, question.nominal.positions) >= -1e-9:
-        return True
+        return question.nominal.positions
     if not len(axes):
-        return False
+        return None
     for reach, h in _SEARCH_GRIDS[len(axes)] if grids_to_search is None else grids_to_search:
         chain = _chain(question, axes, reach, h)
-        if chain is not None and _fits(question, axes, chain):
-            return True
-    return False
+        if chain is not None and (found := _fits(question, axes, chain)) is not None:
+            return found
+    return None
 
 
 def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Array, Array] | None:
@@ -338,13 +353,17 @@ def _neighbours(
                 yield other, bool(sides[axis][min(cell, other)])
 
 
-def _fits(question: Question, axes: Array, chain: tuple[Array, Array]) -> bool:
-    """Return whether a sum of components, or of hat functions, can follow a chain and keep the required clearance."""
+def _fits(question: Question, axes: Array, chain: tuple[Array, Array]) -> Array | None:
+    """Return a path (n, 3) [m] that follows a chain, as a sum of components or of hat functions; None if there is none.
+
+    The path keeps the required clearance.
+    """
     times = question.nominal.times
     wanted = np.stack([np.interp(times, chain[0], column) for column in chain[1].T], axis=1)
-    return any(
-        _fit(question, axes, basis, wanted) for basis in (question.basis, _hats(question, 4), _hats(question, 1))
-    )
+    for basis in (question.basis, _hats(question, 4), _hats(question, 1)):
+        if (found := _fit(question, axes, basis, wanted)) is not None:
+            return found
+    return None
 
 
 def _hats(question: Question, every: int) -> Array:
@@ -362,8 +381,12 @@ def _hats(question: Question, every: int) -> Array:
     return np.asarray(hats[:, [i for i, j in enumerate(ordered) if j not in fixed]])
 
 
-def _fit(question: Question, axes: Array, basis: Array, wanted: Array) -> bool:
-    """Fit displacements (n, 3) by least squares, constrained by tangents of the distances, and verify the result."""
+def _fit(question: Question, axes: Array, basis: Array, wanted: Array) -> Array | None:
+    """Fit displacements (n, 3) by least squares, constrained by tangents of the distances.
+
+    Returns:
+        The positions of the path, shape (n, 3) [m]; None if the path does not keep the clearance and the limits.
+    """
     times = question.nominal.times
     d, m = len(axes), basis.shape[1]
     tip, relative = question.at(times)
@@ -388,7 +411,7 @@ def _fit(question: Question, axes: Array, basis: Array, wanted: Array) -> bool:
             weight, np.append(linear, 0.0), np.ascontiguousarray(slack_rows), np.full(len(lower), 1e30), lower
         )
         if flag != 1:
-            return False
+            return None
         here = basis @ (np.asarray(x)[:size].reshape(m, d) @ axes)
         for f in question.forbidden:
             unit = f / np.linalg.norm(f)
@@ -396,9 +419,9 @@ def _fit(question: Question, axes: Array, basis: Array, wanted: Array) -> bool:
         if separation(question, times, tip + here) >= 0.0:
             longest = np.linalg.norm(np.diff(tip + here, axis=0), axis=1).max()
             inside = np.linalg.norm(here, axis=1).max() <= MAX_DISPLACEMENT
-            return bool(inside and longest <= MAX_STEP_RATIO * steps.max())
+            return np.asarray(tip + here) if inside and longest <= MAX_STEP_RATIO * steps.max() else None
         extra = np.concatenate([extra, _close_points(question, times, tip, relative, here)])
-    return False
+    return None
 
 
 def _tangent_rows(

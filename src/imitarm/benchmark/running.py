@@ -1,138 +1,271 @@
-"""Run many experiments in parallel; each result is saved immediately, so an interrupted benchmark can be continued."""
+"""Run many experiments in parallel; each result is saved immediately, so an interrupted benchmark can be continued.
+
+The experiments of every benchmark run here. A benchmark supplies the function that runs one experiment, and a store
+that saves results. Only the main process saves results. Therefore the processes that run the experiments may be on
+other machines, and need no common folder.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import itertools
 import os
+import queue
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from imitarm.benchmark.experiment import REPLAYS, Experiment, Result
 from imitarm.benchmark.provenance import code_version
-from imitarm.errors import FileFormatError, ImitarmError, InputError, TaskFailedError
+from imitarm.errors import InputError, TaskFailedError
 
-LOCAL = "loky"
-"""Backend of joblib: processes of this machine."""
-_RUNS, _RECORDINGS = "runs", "recordings"
+LOCAL, DASK = "loky", "dask"
+"""Two backends: processes of this machine (by joblib), and the workers of a Dask scheduler."""
+_CONNECT = 10.0  # [s] until a scheduler must answer
+_SILENCE = 5.0  # [s] between two checks whether the scheduler is still there
+_AHEAD = 3  # experiments that each worker of a scheduler has waiting
+_RESUME = "start the benchmark again; valid results are kept"
+
+Work = TypeVar("Work", bound=Hashable)
+Outcome = TypeVar("Outcome")
 
 OnDone = Callable[[int, int], None]
 """Type of a function that is called with the number of finished experiments and the total number."""
 
 
-def run_all(
-    experiments: Sequence[Experiment],
-    folder: str | Path,
-    *,
-    jobs: int | None = None,
-    fresh: bool = False,
-    reuse: bool = False,
-    backend: str = LOCAL,
-    on_done: OnDone | None = None,
-) -> list[Result]:
-    """Run experiments in parallel and return their results in the same order.
+class Store(ABC, Generic[Work, Outcome]):
+    """The place where a benchmark keeps its results."""
 
-    Each result is a separate file in ``folder/runs``, written as soon as the experiment is finished. If a result of the
-    same configuration and the same code was saved earlier, this result is read, and the experiment is not run again.
-    The measured values do not depend on ``jobs``.
+    @abstractmethod
+    def known(self, experiments: Sequence[Work]) -> dict[Work, Outcome]:
+        """Return the valid saved results of these experiments."""
+
+    @abstractmethod
+    def save(self, experiment: Work, outcome: Outcome) -> Outcome:
+        """Save one result, so that :meth:`known` finds either the whole result or nothing.
+
+        Returns:
+            The result as :meth:`known` would return it.
+
+        Raises:
+            OSError: when the result can't be written.
+        """
+
+
+@dataclass(frozen=True)
+class Workers:
+    """The processes that run experiments.
+
+    Attributes:
+        jobs: number of processes; None: one for each processor; 1: only this process. Not used with Dask.
+        backend: :data:`LOCAL`, :data:`DASK`, or another backend of joblib.
+        scheduler: address of the Dask scheduler, such as ``tcp://10.0.0.1:8786``; only for :data:`DASK`.
+
+    Raises:
+        InputError: when there is a scheduler without the backend for it, or the reverse.
+    """
+
+    jobs: int | None = None
+    backend: str = LOCAL
+    scheduler: str = ""
+
+    def __post_init__(self) -> None:
+        if self.backend == DASK and not self.scheduler:
+            raise InputError(
+                "backend 'dask' needs the address of a scheduler (--scheduler tcp://HOST:8786); start one with 'dask "
+                "scheduler', and workers with 'dask worker ADDRESS'"
+            )
+        if self.scheduler and self.backend != DASK:
+            raise InputError(f"--scheduler is for --backend dask, not for {self.backend!r}")
+
+
+def run_experiments(
+    experiments: Sequence[Work],
+    run: Callable[[Work], Outcome],
+    store: Store[Work, Outcome],
+    workers: Workers | None = None,
+    *,
+    fresh: bool = False,
+    on_done: OnDone | None = None,
+) -> list[Outcome]:
+    """Run the experiments that have no saved result, and return all results in the order of the experiments.
+
+    The results do not depend on ``workers``.
 
     Args:
         experiments: the experiments to run.
-        folder: folder for results and recordings; created if missing.
-        jobs: number of processes; None: one for each processor; 1: only this process.
+        run: function that runs one experiment; other processes must be able to import it.
+        store: where results are saved.
+        workers: processes that run the experiments; None: one for each processor.
         fresh: whether to ignore saved results and run all experiments again.
-        reuse: whether to use saved results of the same configuration even if another version of the code produced them;
-            each result names the version.
-        backend: a backend of joblib: ``"loky"`` (local processes), or one whose workers see the same folder, such as
-            ``"dask"`` or ``"ray"``.
         on_done: function called with the progress.
 
     Raises:
-        InputError: when the folder can't be written to, or the backend does not exist.
-        TaskFailedError: when a worker process ended unexpectedly; finished results are kept.
+        InputError: when the backend does not exist.
+        TaskFailedError: when a process or the scheduler ended unexpectedly, or a result can't be saved; finished
+            results are kept.
         KeyboardInterrupt: after Ctrl-C; finished results are kept.
     """
-    place = _prepared(folder)
-    known = {} if fresh else {e: found for e in experiments if (found := _kept(place, e, reuse)) is not None}
-    missing = [e for e in experiments if e not in known]
-    total, done = len(experiments), len(known)
+    known = {} if fresh else store.known(experiments)
+    missing = [e for e in dict.fromkeys(experiments) if e not in known]
+    total, done = len(experiments), sum(e in known for e in experiments)
     report = on_done if on_done is not None else _ignore
     report(done, total)
-    if not missing:
-        return [known[e] for e in experiments]
-    workers, common = max(min(jobs or os.cpu_count() or 1, len(missing)), 1), (str(place), code_version(), os.getpid())
-    firsts = {e.plan: e for e in missing if e.task in REPLAYS}  # recordings first, so that methods share the files
-    for _ in _parallel(_make, [(e, *common) for e in firsts.values()], backend, workers):
-        pass
-    for experiment in _parallel(_run, [(e, *common) for e in missing], backend, workers):
-        done += 1
-        report(done, total)
-        known[experiment] = Result.load(Result.path(place / _RUNS, experiment))
+    with contextlib.closing(in_parallel(run, missing, workers)) as finished:
+        for experiment, outcome in finished:
+            try:
+                known[experiment] = store.save(experiment, outcome)
+            except OSError as error:
+                full = error.errno in {errno.ENOSPC, errno.EDQUOT}
+                raise TaskFailedError(
+                    f"a result can't be saved ({error.strerror or error}); "
+                    f"{'free some space, then' if full else 'remove the cause, then'} {_RESUME}"
+                ) from error
+            done += 1
+            report(done, total)
     return [known[e] for e in experiments]
 
 
-def _prepared(folder: str | Path) -> Path:
-    place = Path(folder)
-    try:
-        (place / _RUNS).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{place}: results can't be saved there ({error.strerror}); name another folder") from error
-    return place
+def in_parallel(
+    function: Callable[[Work], Outcome], works: Sequence[Work], workers: Workers | None = None
+) -> Generator[tuple[Work, Outcome], None, None]:
+    """Call a function for each experiment, in parallel; yield each with its result as soon as it is available.
+
+    Raises:
+        InputError: when the backend does not exist.
+        TaskFailedError: when a worker process ended unexpectedly.
+    """
+    if not works:
+        return
+    using = workers if workers is not None else Workers()
+    if using.backend == DASK:
+        yield from _by_dask(function, works, using.scheduler)
+    else:
+        yield from _by_joblib(function, works, using)
 
 
-def _kept(place: Path, experiment: Experiment, reuse: bool) -> Result | None:
-    """Return the saved result; None if it is missing, unreadable or (without ``reuse``) produced by other code."""
-    path = Result.path(place / _RUNS, experiment)
-    try:
-        found = Result.load(path) if path.exists() else None
-    except FileFormatError:
-        return None
-    return found if found is not None and (reuse or found.code == code_version()) else None
-
-
-Job = tuple[Experiment, str, str, int]
-"""The data of one job: the experiment, the folder, the version of the code, and the parent process."""
-
-
-def _make(job: Job) -> Experiment:
-    """Make the recording of an experiment; an error is ignored here, because the experiment reports it later."""
-    experiment, folder, _, parent = job
-    _end_with(parent)
-    with contextlib.suppress(ImitarmError):
-        experiment.recording(Path(folder) / _RECORDINGS)
-    return experiment
-
-
-def _run(job: Job) -> Experiment:
-    experiment, folder, version, parent = job
-    _end_with(parent)
-    if code_version() != version:
-        raise TaskFailedError(
-            "the code was changed while the benchmark ran; start the benchmark again; valid results are kept"
-        )
-    experiment.run(Path(folder) / _RECORDINGS).save(Path(folder) / _RUNS)
-    return experiment
-
-
-def _parallel(
-    function: Callable[[Job], Experiment], jobs: Sequence[Job], backend: str, workers: int
-) -> Iterator[Experiment]:
-    """Call a function for each job, in parallel, and yield each result as soon as it is available."""
+def _by_joblib(
+    function: Callable[[Work], Outcome], works: Sequence[Work], workers: Workers
+) -> Generator[tuple[Work, Outcome], None, None]:
     import joblib  # noqa: PLC0415  (takes long to import)
 
+    n = max(min(workers.jobs or os.cpu_count() or 1, len(works)), 1)
+    job = joblib.delayed(_Job(function, code_version(), os.getpid()))
     try:
-        pool: Any = joblib.Parallel(workers, backend=backend, batch_size=1, return_as="generator_unordered")
-        yield from pool(joblib.delayed(function)(job) for job in jobs)
+        pool: Any = joblib.Parallel(n, backend=workers.backend, batch_size=1, return_as="generator_unordered")
+        outcomes = pool(job(work) for work in works)
+        try:
+            for outcome in outcomes:  # noqa: UP028 ("yield from" would close the pool before its warning is off)
+                yield outcome
+        finally:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # that jobs are given up, which is intended
+                outcomes.close()
     except BrokenProcessPool as error:
-        raise TaskFailedError(
-            f"a worker process ended unexpectedly ({error}); start the benchmark again; valid results are kept"
-        ) from error
+        raise TaskFailedError(f"a worker process ended unexpectedly ({error}); {_RESUME}") from error
     except (ValueError, ImportError) as error:
-        raise InputError(f"backend {backend!r}: {error}") from error
+        raise InputError(f"backend {workers.backend!r}: {error}") from error
+
+
+def _by_dask(
+    function: Callable[[Work], Outcome], works: Sequence[Work], address: str
+) -> Generator[tuple[Work, Outcome], None, None]:
+    """Run the jobs on the workers of a Dask scheduler.
+
+    Joblib also has a backend for Dask. It is not used, because it returns the jobs of a lost scheduler as if they were
+    results.
+    """
+    distributed = _distributed()
+    try:
+        client = distributed.Client(address, timeout=_CONNECT, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError(
+            f"--scheduler {address}: no Dask scheduler answers there ({error}); start one with 'dask scheduler'"
+        ) from error
+    try:
+        if not client.ncores():
+            raise TaskFailedError(f"the scheduler at {address} has no workers; start some with 'dask worker {address}'")
+        yield from _submitted(client, _Job(function, code_version(), 0), works, distributed)
+    finally:
+        client.close(timeout=2.0)
+
+
+def _submitted(client: Any, job: _Job[Work, Outcome], works: Sequence[Work], dask: Any) -> Iterator[Any]:
+    """Keep a few jobs waiting for each worker, and yield their results.
+
+    Raises:
+        TaskFailedError: when the scheduler or all workers are lost.
+    """
+    finished: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    waiting, pending = iter(works), set()
+
+    def submit(n: int) -> None:
+        for work in itertools.islice(waiting, n):
+            future = client.submit(job, work, pure=False)
+            pending.add(future)
+            future.add_done_callback(finished.put)
+
+    submit(_AHEAD * max(sum(client.ncores().values()), 1))
+    while pending:
+        try:
+            future = finished.get(timeout=_SILENCE)
+        except queue.Empty:
+            future = None
+        if client.status != "running" or (future is not None and future.status in {"lost", "cancelled"}):
+            raise TaskFailedError(f"the connection to the Dask scheduler was lost; {_RESUME}")
+        if future is None:
+            if not client.ncores():
+                raise TaskFailedError(f"the Dask scheduler has no workers any more; {_RESUME}")
+            continue
+        pending.discard(future)
+        try:
+            yield future.result()
+        except dask.KilledWorker as error:
+            raise TaskFailedError(f"a worker of the Dask scheduler ended unexpectedly ({error}); {_RESUME}") from error
+        submit(1)
+
+
+def _distributed() -> Any:
+    try:
+        import distributed  # noqa: PLC0415 (an extra)
+    except ImportError as error:
+        raise InputError(
+            "--backend dask needs the package distributed, which is not installed; install it with: pip install "
+            "'imitarm[dask]'"
+        ) from error
+    return distributed
+
+
+@dataclass(frozen=True)
+class _Job(Generic[Work, Outcome]):
+    """Run one experiment in a worker.
+
+    Attributes:
+        function: function that runs the experiment.
+        version: version of the code that the worker must have.
+        parent: process that started the worker; 0: the worker is not ours.
+    """
+
+    function: Callable[[Work], Outcome]
+    version: str
+    parent: int
+
+    def __call__(self, work: Work) -> tuple[Work, Outcome]:
+        """Return the experiment and its result."""
+        if self.parent:
+            _end_with(self.parent)
+        if code_version() != self.version:
+            raise TaskFailedError(
+                f"a worker has another version of the code ({code_version()}) than the benchmark ({self.version}); use "
+                f"the same code everywhere, and do not change it while the benchmark runs; then {_RESUME}"
+            )
+        return work, self.function(work)
 
 
 @lru_cache(maxsize=1)

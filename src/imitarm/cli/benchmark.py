@@ -14,13 +14,13 @@ from typing import Any
 
 from imitarm.benchmark import avoidance, placement_comparison, placements, real_motions, refusals
 from imitarm.benchmark.experiment import METHODS, Result
-from imitarm.benchmark.mapping import MappingBenchmark, tables, write_tables
+from imitarm.benchmark.mapping import MappingBenchmark, run_all, tables, write_tables
 from imitarm.benchmark.mapping_tables import TEST, Results
 from imitarm.benchmark.placement_results import Setup, load_results
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.refusal_oracle import Answer
-from imitarm.benchmark.running import LOCAL, run_all
+from imitarm.benchmark.running import LOCAL, Workers
 from imitarm.benchmark.tables import Place, Table
 from imitarm.cli.outputs import check_outputs, same_place
 from imitarm.cli.robot_options import add_robot_options
@@ -92,8 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument(
         "--reuse", action="store_true", help="use saved results of the same configuration even if other code made them"
     )
-    mapping.add_argument("--jobs", type=int, metavar="N", help="number of processes; default: one for each processor")
-    mapping.add_argument("--backend", default=LOCAL, metavar="NAME", help="backend of joblib: loky (local), dask, ray")
+    _add_workers(mapping)
     mapping.set_defaults(benchmark=_mapping)
     other = parsers.add_parser("avoidance", help="measure how often each method keeps its clearance in random scenes")
     other.add_argument(
@@ -173,6 +172,25 @@ def _add_placements(parsers: Any) -> None:
     compared.set_defaults(benchmark=_comparison)
 
 
+def _add_workers(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--jobs", type=int, metavar="N", help="number of processes; default: one for each processor")
+    parser.add_argument(
+        "--backend",
+        default=LOCAL,
+        metavar="NAME",
+        help="loky (processes of this machine), dask (with --scheduler), or another backend of joblib",
+    )
+    parser.add_argument(
+        "--scheduler", default="", metavar="ADDRESS", help="Dask scheduler whose workers run the experiments"
+    )
+
+
+def _workers(arguments: argparse.Namespace) -> Workers:
+    if arguments.jobs is not None and arguments.jobs < 1:
+        raise InputError(f"--jobs must be at least 1, got {arguments.jobs}")
+    return Workers(arguments.jobs, arguments.backend, arguments.scheduler)
+
+
 def _add_fill(parser: argparse.ArgumentParser) -> None:
     text = "put the tables into this document, between the lines '<!-- imitarm benchmark NAME -->' and '<!-- end -->'"
     parser.add_argument("--fill", type=Path, metavar="FILE", help=text)
@@ -206,10 +224,9 @@ def _mapping(arguments: argparse.Namespace) -> int:
         done = run_all(
             experiments,
             folder,
-            jobs=arguments.jobs,
+            _workers(arguments),
             fresh=arguments.fresh,
             reuse=arguments.reuse,
-            backend=arguments.backend,
             on_done=lambda finished, of: bar.update(task, completed=finished, total=of),
         )
     results, versions = Results(done), [result.code for result in done]
@@ -355,7 +372,7 @@ def _configured(arguments: argparse.Namespace) -> MappingBenchmark:
 
 def _command() -> str:
     """Return the command line without file names that apply only to this machine."""
-    words, places = sys.argv[1:], {"--out", "--report", "--fill", "--jobs", "--backend"}
+    words, places = sys.argv[1:], {"--out", "--report", "--fill", "--jobs", "--backend", "--scheduler"}
     kept = [
         w
         for i, w in enumerate(words)
@@ -384,8 +401,7 @@ def _given(value: int | None, otherwise: int) -> int:
 
 def _check(arguments: argparse.Namespace, folder: Path) -> None:
     """Check the options now, because a wrong option would otherwise fail only after the long run."""
-    if arguments.jobs is not None and arguments.jobs < 1:
-        raise InputError(f"--jobs must be at least 1, got {arguments.jobs}")
+    _workers(arguments)
     if arguments.data is not None and not arguments.data.is_dir():
         raise InputError(f"--data {arguments.data}: there is no such folder")
     if folder.exists() and not folder.is_dir():

@@ -173,3 +173,27 @@ def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
         return float("nan")
     steps = np.diff(frequency[: last + 1]) / frequency[last]
     return -float(np.sum(np.hypot(steps, np.diff(size[: last + 1]))))
+
+
+def log_dimensionless_jerk(positions: ArrayLike, dt: float) -> float:
+    r"""Return the smoothness of a motion as its logarithmic dimensionless jerk; the closer to 0, the smoother.
+
+    .. math:: -\ln \left( \frac{T^3}{v_{peak}^2} \int_0^T \lVert \dddot x \rVert^2 \, dt \right)
+
+    The value does not depend on the duration T or on the size of the motion. A minimum-jerk motion has -ln(204.8) =
+    -5.32 (Balasubramanian et al., Journal of NeuroEngineering and Rehabilitation, 2015).
+
+    Args:
+        positions: shape (n, d), evenly spaced in time, n at least 4 [m].
+        dt: sampling period [s].
+
+    Returns:
+        A number without unit; nan for a point that does not move.
+    """
+    x = np.asarray(positions, dtype=float)
+    peak = float((np.linalg.norm(np.diff(x, axis=0), axis=1) / dt).max())
+    if not peak > 0.0:
+        return float("nan")
+    jerk = np.diff(x, 3, axis=0) / dt**3
+    total = float(np.mean(np.sum(jerk * jerk, axis=1))) * dt * (len(x) - 1)
+    return -float(np.log((dt * (len(x) - 1)) ** 3 / peak**2 * total)) if total > 0.0 else float("nan")
