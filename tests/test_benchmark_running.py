@@ -116,6 +116,7 @@ def test_an_interrupted_benchmark_goes_on_where_it_was(tmp_path, how):
         "import signal, sys\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # what runs in the background may ignore it
         "from imitarm.benchmark.experiment import Experiment\n"
+        "from imitarm.benchmark.mapping import run_all\n"
         "from imitarm.benchmark.running import Workers\n"
         "if __name__ == '__main__':\n"
         "    run_all([Experiment('inside', 'm3', seed=s, seconds=4.0) for s in range(8)], sys.argv[1], Workers(2))\n"
