@@ -156,7 +156,7 @@ def _by_joblib(
     import joblib  # noqa: PLC0415  (takes long to import)
 
     n = max(min(workers.jobs or os.cpu_count() or 1, len(works)), 1)
-    job = joblib.delayed(_Job(function, code_version(), os.getpid()))
+    job = joblib.delayed(_Job(function, code_version(), os.getpid() if workers.backend == LOCAL else 0))
     try:
         pool: Any = joblib.Parallel(n, backend=workers.backend, batch_size=1, return_as="generator_unordered")
         outcomes = pool(job(work) for work in works)
@@ -249,7 +249,7 @@ class _Job(Generic[Work, Outcome]):
     Attributes:
         function: function that runs the experiment.
         version: version of the code that the worker must have.
-        parent: process that started the worker; 0: the worker is not ours.
+        parent: process that started the worker, with which the worker ends; 0: the worker is not ours.
     """
 
     function: Callable[[Work], Outcome]
@@ -271,14 +271,17 @@ class _Job(Generic[Work, Outcome]):
 @lru_cache(maxsize=1)
 def _end_with(parent: int) -> None:
     """End this worker process when its parent process has ended, because workers survive if the parent is killed."""
-    if os.getppid() == parent:
-        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+    if os.getpid() == parent:  # jobs run in the main process
+        return
+    if os.getppid() != parent:
+        os._exit(1)
+    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 
 
 def _watch(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(0.5)
-    os._exit(1)  # results are written atomically: only what was half done is lost
+    os._exit(1)  # only the main process saves results: only what was half done is lost
 
 
 def _ignore(_done: int, _total: int) -> None:

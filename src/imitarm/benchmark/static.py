@@ -1,0 +1,264 @@
+"""The avoidance benchmark in static scenes: one experiment is one method in one scene.
+
+``StaticExperiment("S1", 3, 2000, "acfra").run()`` makes the scene, lets the method plan a path, and measures the path.
+"""
+
+from __future__ import annotations
+
+import math
+import time as clock
+import tracemalloc
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.benchmark.controls import CONTROLS
+from imitarm.benchmark.provenance import code_version
+from imitarm.benchmark.static_measures import OUTCOMES, measure, outcome
+from imitarm.benchmark.static_scenes import FAMILIES, StaticCase, static_case
+from imitarm.errors import ImitarmError, InfeasibleError, InputError, UnknownNameError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import find_posture
+from imitarm.kinematics.arm_path import track
+from imitarm.kinematics.pose import Pose
+from imitarm.policies import POLICIES, PathPlan, PathPolicy
+from imitarm.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Options = tuple[tuple[str, float | str], ...]
+
+VARIANTS: Mapping[str, tuple[str, Options]] = {
+    "acfra-literal": ("acfra", (("method", "literal"),)),
+    "acfra-mapf": ("acfra", (("method", "mapf"),)),
+}
+"""Methods with fixed options: ACFRA with the thesis's potential as printed (Eq 4.7), and with the corrected one."""
+_TOOL_ON_ARM = np.array([0.65, 0.0, 0.30])  # [m] where the middle of a path is put in front of the Sawyer
+_POSTURES = 100  # along the path, for torques
+_REACHED = 1e-3  # [m] a posture whose tool is farther away does not reach the path
+
+
+def method_names() -> tuple[str, ...]:
+    """Return the names of all methods: the controls, the policies that plan a whole path, and their variants."""
+    planners = [name for name in POLICIES if issubclass(POLICIES[name], PathPolicy)]
+    return (*CONTROLS, *planners, *VARIANTS)
+
+
+def policy_class(method: str) -> type[PathPolicy]:
+    """Return the class of a method.
+
+    Raises:
+        UnknownNameError: when there is no such method, or it plans no whole path.
+    """
+    name = VARIANTS[method][0] if method in VARIANTS else method
+    if name in CONTROLS:
+        return CONTROLS[name]
+    found = POLICIES.get(name)
+    if found is None or not issubclass(found, PathPolicy):
+        raise UnknownNameError.among("method", method, method_names())
+    return found
+
+
+def build(method: str, case: StaticCase, options: Options = ()) -> PathPolicy:
+    """Return a method for a scene, with options that replace its defaults.
+
+    Raises:
+        InputError: when the method does not take an option.
+    """
+    fixed = VARIANTS[method][1] if method in VARIANTS else ()
+    known = {
+        "tool_spheres": case.tool_spheres,
+        "clearance": case.clearance,
+        "forbidden": case.forbidden,
+        "pinned": case.pinned,
+    }
+    return policy_class(method).build(case.skill, **known, **dict(fixed), **dict(options))
+
+
+@dataclass(frozen=True)
+class StaticExperiment:
+    """One method in one scene; plain values that can be sent to another process or machine.
+
+    Attributes:
+        family: one of :data:`~imitarm.benchmark.static_scenes.FAMILIES`.
+        dimension: 2 when the path may only be displaced horizontally, else 3.
+        seed: number of the scene.
+        method: one of :func:`method_names`.
+        teachers: number of teachers from whom the skill was learned.
+        options: options that replace the defaults of the method, such as those found by tuning.
+        torque: whether the torques of a Sawyer are computed as well, which takes most of the time.
+        memory: whether the peak memory of a second, untimed plan is measured, which takes several times as long.
+
+    Raises:
+        UnknownNameError: when family or method is not known.
+        InputError: when a number is out of range.
+    """
+
+    family: str
+    dimension: int
+    seed: int
+    method: str = "acfra"
+    teachers: int = 1
+    options: Options = ()
+    torque: bool = False
+    memory: bool = False
+
+    def __post_init__(self) -> None:
+        if self.family not in FAMILIES:
+            raise UnknownNameError.among("family", self.family, FAMILIES)
+        if self.dimension not in (2, 3):
+            raise InputError(f"StaticExperiment: dimension must be 2 or 3, got {self.dimension}")
+        if self.seed < 0 or self.teachers < 1:
+            raise InputError(
+                "StaticExperiment: seed must be at least 0 and teachers at least 1, got "
+                f"{self.seed} and {self.teachers}"
+            )
+        policy_class(self.method)
+        object.__setattr__(self, "options", tuple(sorted((str(k), v) for k, v in self.options)))
+
+    @property
+    def scene(self) -> tuple[str, int, int, int]:
+        """What experiments of different methods in the same scene have in common."""
+        return self.family, self.dimension, self.seed, self.teachers
+
+    def case(self) -> StaticCase:
+        """Return the scene."""
+        return static_case(self.family, self.dimension, self.seed, teachers=self.teachers)
+
+    def run(self) -> StaticResult:
+        """Let the method plan in its scene, and measure the planned path.
+
+        Returns:
+            The result. An error of the method is the outcome "failed"; the reason says which one.
+        """
+        values: dict[str, Any] = {}
+        try:
+            case = self.case()
+            values = {"n_obstacles": len(case.scene.obstacles), "must_refuse": case.must_refuse}
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of numerical methods in hard scenes: the path is measured anyway
+                found, reason = self._measured(case, values)
+        except InfeasibleError as refusal:
+            found, reason = "refused", str(refusal)
+        except (ImitarmError, ArithmeticError, ValueError, TypeError, LookupError, np.linalg.LinAlgError) as error:
+            found, reason = "failed", f"{type(error).__name__}: {error}"
+        return StaticResult(self, code_version(), found, reason, values)
+
+    def _measured(self, case: StaticCase, values: dict[str, Any]) -> tuple[str, str]:
+        """Plan, and add the measured values to ``values``; return the outcome and its explanation."""
+        began, cpu = clock.perf_counter(), clock.process_time()
+        policy = build(self.method, case, self.options)
+        values["build_seconds"] = clock.perf_counter() - began
+        began, cpu = clock.perf_counter(), clock.process_time()
+        try:
+            plan = policy.plan_motion(case.scene)
+        finally:
+            values["plan_seconds"] = clock.perf_counter() - began
+            values["plan_cpu"] = clock.process_time() - cpu
+            answer = getattr(policy, "answer", None)
+            if answer is not None:
+                values["answer"] = answer.value
+        measures = measure(case, plan.trajectory)
+        values.update(asdict(measures))
+        if plan.adaptation is not None:
+            values["unmoved"] = plan.adaptation.unmoved_fraction
+        if self.torque:
+            values.update(torques_on_sawyer(plan.trajectory))
+        if self.memory:
+            values["peak_memory"] = self._peak_memory(case)
+        return outcome(case, measures)
+
+    def planned(self) -> tuple[StaticCase, PathPlan | None]:
+        """Return the scene and the plan, for drawing; None if the method refuses or fails."""
+        case = self.case()
+        try:
+            return case, build(self.method, case, self.options).plan_motion(case.scene)
+        except (ImitarmError, ArithmeticError, ValueError, TypeError, LookupError, np.linalg.LinAlgError):
+            return case, None
+
+    def _peak_memory(self, case: StaticCase) -> int:
+        """Return the peak of the memory that Python allocates while the method is built and plans [bytes]."""
+        tracemalloc.start()
+        try:
+            build(self.method, case, self.options).plan_motion(case.scene)
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+
+@dataclass(frozen=True, eq=False)
+class StaticResult:
+    """The result of an experiment, as plain values.
+
+    Attributes:
+        experiment: the experiment that was run.
+        code: version of the code that ran, see :func:`~imitarm.benchmark.provenance.code_version`.
+        outcome: one of :data:`~imitarm.benchmark.static_measures.OUTCOMES`.
+        reason: explanation of the outcome; empty after a success.
+        values: measures by name: those of :class:`~imitarm.benchmark.static_measures.PathMeasures`; ``n_obstacles``;
+            ``must_refuse`` of the scene; ``build_seconds``, ``plan_seconds`` and ``plan_cpu`` (processor time) [s];
+            ``unmoved`` (fraction of the components, for methods with components); ``answer`` of the oracle;
+            ``torque_rms`` [N m], ``torque_peak`` (relative to the rated torque); ``peak_memory`` [bytes].
+    """
+
+    experiment: StaticExperiment
+    code: str
+    outcome: str
+    reason: str
+    values: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        if self.outcome not in OUTCOMES:
+            raise UnknownNameError.among("outcome", self.outcome, OUTCOMES)
+
+    def value(self, name: str) -> float:
+        """Return the measure with this name; nan when it is unknown."""
+        found = self.values.get(name)
+        return math.nan if found is None else float(found)
+
+
+def run_experiment(experiment: StaticExperiment) -> StaticResult:
+    """Run an experiment; a function for worker processes."""
+    return experiment.run()
+
+
+def torques_on_sawyer(trajectory: Trajectory) -> dict[str, float]:
+    """Return the joint torques of a Sawyer whose tool follows a path, by inverse kinematics and inverse dynamics.
+
+    The path is turned by 90 degrees about the vertical axis, so that its x axis runs sideways in front of the arm, and
+    its middle is put 0.65 m in front of the base. The tool points down.
+
+    Returns:
+        ``torque_rms``: root mean square over time of the norm of the joint torques [N m]; ``torque_peak``: largest
+        torque relative to the rated torque of its joint. Both are nan if the arm can't reach the path.
+    """
+    arm = _sawyer()
+    even = trajectory.resample(_POSTURES)
+    x, y, z = even.positions.T
+    turned = np.stack([-y, x, z], axis=1)
+    turned += _TOOL_ON_ARM - 0.5 * (turned.min(axis=0) + turned.max(axis=0))
+    down = np.array([0.0, 1.0, 0.0, 0.0])
+    try:
+        start = find_posture(arm, Pose(turned[0], down))
+    except ImitarmError:
+        return {"torque_rms": math.nan, "torque_peak": math.nan}
+    joints = track(arm, start, turned, np.broadcast_to(down, (_POSTURES, 4)))
+    if np.linalg.norm(arm.tool_path(joints)[0] - turned, axis=1).max() > _REACHED:
+        return {"torque_rms": math.nan, "torque_peak": math.nan}
+    dt = even.duration / (_POSTURES - 1)
+    velocity = np.gradient(joints, dt, axis=0)
+    acceleration = np.gradient(velocity, dt, axis=0)
+    torques = np.array([arm.inverse_dynamics(q, v, a) for q, v, a in zip(joints, velocity, acceleration, strict=True)])
+    return {
+        "torque_rms": float(np.sqrt(np.mean(np.sum(torques**2, axis=1)))),
+        "torque_peak": float((np.abs(torques) / arm.max_torque).max()),
+    }
+
+
+@lru_cache(maxsize=1)
+def _sawyer() -> ArmModel:
+    return ArmModel.load("sawyer", tool="gripper")

@@ -1,0 +1,226 @@
+"""Measures of a planned path of the tool in a static scene; no method that is compared computes any of them.
+
+The true distances are computed at 4000 points of the polyline that would be executed, not at the samples of the plan.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from imitarm.benchmark.refusal_proof import Question, separation
+from imitarm.benchmark.static_scenes import StaticCase
+from imitarm.evaluation.motion import log_dimensionless_jerk, spectral_arc_length
+from imitarm.kinematics.pose import rotate
+from imitarm.policies.component_path import TOLERANCE_FLOOR
+from imitarm.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+DENSE = 4000
+"""Number of points, evenly spaced in time, at which distances are measured."""
+NEAR = 0.10
+"""Distance of the tool on the learned path from an obstacle [m]; samples that are farther away count as unaffected."""
+AT_GOAL = 0.005
+"""Largest distance from start, goal and contact points, and into a forbidden direction [m]."""
+LATEST = 2.0
+"""Longest duration, relative to the learned duration."""
+MAX_SPEED, MAX_ACCELERATION = 1.7, 13.0
+"""Largest speed [m/s] and acceleration [m/s^2] of the tool: the Cartesian limits that the manufacturer states for the
+Panda."""
+SLACK = 0.0005
+"""A path keeps the required clearance if it is at most this much nearer [m]."""
+_SAMPLES = 200  # of the learned path, and of a planned path for speed, acceleration and smoothness
+
+
+@dataclass(frozen=True)
+class PathMeasures:
+    """Measures of one path.
+
+    Attributes:
+        clearance: smallest distance of the tool from an obstacle, at :data:`DENSE` points [m].
+        separation: lower bound of the same distance by supporting planes, which uses no distance function [m].
+        start_error: distance of the first position from the learned start [m].
+        goal_error: distance of the last position from the goal [m].
+        contact_error: largest distance of the path from a pinned point of the learned path [m]; 0 without such points.
+        forbidden: largest displacement from the nearest point of the learned path in a forbidden direction [m].
+        duration_ratio: duration divided by the learned duration.
+        duration: [s].
+        max_speed: largest speed [m/s].
+        max_acceleration: largest acceleration [m/s^2].
+        rmse: root mean square distance from the learned path at equal fractions of the durations [m] (thesis Eq 4.9,
+            with the square root).
+        rmse_unaffected: the same over those samples of the learned path at which the tool is farther than :data:`NEAR`
+            from every obstacle [m]; nan if there is none.
+        path_rmse: root mean square distance of the samples of the learned path from the nearest point of the path,
+            which does not depend on the timing [m].
+        deviation: largest displacement in standard deviations of the demonstrations (Mahalanobis distance).
+        length_ratio: path length divided by that of the learned path.
+        sparc: spectral arc length of the speed; the closer to 0, the smoother.
+        ldlj: logarithmic dimensionless jerk; the closer to 0, the smoother.
+    """
+
+    clearance: float
+    separation: float
+    start_error: float
+    goal_error: float
+    contact_error: float
+    forbidden: float
+    duration_ratio: float
+    duration: float
+    max_speed: float
+    max_acceleration: float
+    rmse: float
+    rmse_unaffected: float
+    path_rmse: float
+    deviation: float
+    length_ratio: float
+    sparc: float
+    ldlj: float
+
+
+def measure(case: StaticCase, trajectory: Trajectory) -> PathMeasures:
+    """Measure a planned path of the tool in its scene."""
+    skill = case.skill
+    times = np.linspace(0.0, skill.duration_, _SAMPLES)
+    nominal = skill.nominal(times, None, case.scene.goal)
+    dense = _dense(trajectory)
+    there = trajectory.at(trajectory.times[0] + times / skill.duration_ * trajectory.duration)[0]
+    offset = there - nominal.positions
+    away = np.linalg.norm(offset, axis=1)
+    free = unaffected(case, nominal)
+    tree = cKDTree(dense.positions)
+    pins = skill.nominal(np.unique([0.0, *case.pinned, skill.duration_]), None, case.scene.goal).positions[1:-1]
+    even = evenly(trajectory)
+    dt = even.duration / (len(even) - 1)
+    speed = np.linalg.norm(np.diff(even.positions, axis=0), axis=1) / dt
+    acceleration = np.linalg.norm(np.diff(even.positions, 2, axis=0), axis=1) / dt**2
+    return PathMeasures(
+        clearance=tool_clearance(case, dense),
+        separation=_separation(case, trajectory),
+        start_error=float(np.linalg.norm(trajectory.positions[0] - nominal.positions[0])),
+        goal_error=float(np.linalg.norm(trajectory.positions[-1] - nominal.positions[-1])),
+        contact_error=float(np.max(tree.query(pins)[0], initial=0.0)),
+        forbidden=_forbidden(case, dense.positions),
+        duration_ratio=trajectory.duration / skill.duration_,
+        duration=trajectory.duration,
+        max_speed=float(speed.max()),
+        max_acceleration=float(acceleration.max()),
+        rmse=_rms(away),
+        rmse_unaffected=_rms(away[free]),
+        path_rmse=_rms(tree.query(nominal.positions)[0]),
+        deviation=_deviation(offset, skill.gmr_.predict(times)[1]),
+        length_ratio=trajectory.path_length / nominal.path_length,
+        sparc=spectral_arc_length(speed, dt),
+        ldlj=log_dimensionless_jerk(even.positions, dt),
+    )
+
+
+def _dense(trajectory: Trajectory) -> Trajectory:
+    """Return the polyline at :data:`DENSE` evenly spaced times, and at its own samples."""
+    times = np.union1d(np.linspace(trajectory.times[0], trajectory.times[-1], DENSE), trajectory.times)
+    return Trajectory(times, *trajectory.at(times))
+
+
+def evenly(trajectory: Trajectory) -> Trajectory:
+    """Return 200 evenly spaced samples of a cubic spline through the samples.
+
+    The same number of samples for every method, so that finite differences treat all methods alike.
+    """
+    times = np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES)
+    return Trajectory(times, CubicSpline(trajectory.times, trajectory.positions)(times))
+
+
+def tool_clearance(case: StaticCase, trajectory: Trajectory) -> float:
+    """Return the smallest distance from the spheres of the tool to an obstacle, at the samples of a path [m]."""
+    return float((_sphere_distances(case, trajectory)).min(initial=np.inf))
+
+
+def _sphere_distances(case: StaticCase, trajectory: Trajectory) -> Array:
+    """Return the distance of each sphere of the tool from the nearest obstacle, shape (n_spheres, n) [m]."""
+    found = []
+    for sphere in case.tool_spheres:
+        centers = trajectory.positions
+        if trajectory.quaternions is not None:
+            centers = centers + rotate(trajectory.quaternions, np.broadcast_to(sphere[:3], centers.shape))
+        found.append(case.scene.clearance(centers) - sphere[3])
+    return np.array(found)
+
+
+def unaffected(case: StaticCase, nominal: Trajectory) -> NDArray[np.bool_]:
+    """Return for each sample of the learned path whether the tool is farther than :data:`NEAR` from all obstacles."""
+    return np.asarray(_sphere_distances(case, nominal).min(axis=0) > NEAR)
+
+
+def _separation(case: StaticCase, trajectory: Trajectory) -> float:
+    if not case.scene.obstacles:
+        return float("inf")
+    if trajectory.quaternions is None and case.tool_spheres[:, :3].any():
+        return float("nan")  # the rotation of the tool is not known
+    question = Question(
+        trajectory,
+        np.empty((len(trajectory), 0)),
+        case.scene.obstacles,
+        case.tool_spheres,
+        0.0,
+        np.empty((0, 3)),
+        (),
+    )
+    return separation(question, trajectory.times, trajectory.positions)
+
+
+def _forbidden(case: StaticCase, positions: Array) -> float:
+    if not case.forbidden:
+        return 0.0
+    learned = case.skill.nominal(np.linspace(0.0, case.skill.duration_, DENSE), None, case.scene.goal).positions
+    nearest = learned[cKDTree(learned).query(positions)[1]]
+    unit = np.array(case.forbidden) / np.linalg.norm(case.forbidden, axis=1, keepdims=True)
+    return float(((positions - nearest) @ unit.T).max(initial=0.0))
+
+
+def _deviation(offset: Array, covariances: Array) -> float:
+    """Return the largest Mahalanobis distance of offsets (n, 3) [m] for covariances (n, 3, 3) [m^2].
+
+    The standard deviation in every direction is at least :data:`TOLERANCE_FLOOR`.
+    """
+    values, vectors = np.linalg.eigh(covariances)
+    along = np.einsum("nde,nd->ne", vectors, offset)
+    return float(np.sqrt((along**2 / np.maximum(values, TOLERANCE_FLOOR**2)).sum(axis=1)).max())
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+def outcome(case: StaticCase, found: PathMeasures) -> tuple[str, str]:
+    """Return the outcome of a planned path, one of :data:`OUTCOMES`, and an explanation."""
+    missed = max(found.start_error, found.goal_error, found.contact_error, found.forbidden)
+    if not found.clearance > 0.0:
+        return "contact", f"the tool is {1e3 * found.clearance:.1f} mm from an obstacle"
+    if missed > AT_GOAL:
+        where = {
+            found.start_error: "from the start",
+            found.goal_error: "from the goal",
+            found.contact_error: "from a contact point",
+            found.forbidden: "away in a forbidden direction",
+        }[missed]
+        return "missed goal", f"the path is {1e3 * missed:.1f} mm {where}"
+    if found.duration_ratio > LATEST:
+        return "late", f"the motion takes {found.duration_ratio:.2f} times the learned duration"
+    if found.max_speed > MAX_SPEED or found.max_acceleration > MAX_ACCELERATION:
+        return "limit", f"{found.max_speed:.2f} m/s, {found.max_acceleration:.1f} m/s^2"
+    if found.clearance < case.clearance - SLACK:
+        return "too near", f"{1e3 * found.clearance:.1f} mm instead of {1e3 * case.clearance:.0f} mm"
+    return "success", ""
+
+
+OUTCOMES = ("success", "too near", "contact", "missed goal", "late", "limit", "refused", "failed")
+"""Possible outcomes: "success"; "too near" (a success, but nearer to an obstacle than required); "contact"; "missed
+goal" (also the start or a contact point, or a displacement in a forbidden direction); "late"; "limit" (speed or
+acceleration); "refused" (before any motion); "failed" (the method raised an error)."""
+SUCCESSES = OUTCOMES[:2]
+"""Outcomes that count as success: no contact, goal reached, in time, within the limits of speed and acceleration."""
