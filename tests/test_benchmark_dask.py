@@ -16,7 +16,10 @@ from imitarm.benchmark.running import DASK, Store, Workers, run_experiments
 from imitarm.errors import InputError, TaskFailedError
 
 Client = pytest.importorskip("distributed").Client
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
+]
 
 
 class Kept(Store):

@@ -7,6 +7,7 @@ other machines, and need no common folder.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import itertools
@@ -17,6 +18,7 @@ import time
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import lru_cache
@@ -192,8 +194,11 @@ def _by_dask(
         if not client.ncores():
             raise TaskFailedError(f"the scheduler at {address} has no workers; start some with 'dask worker {address}'")
         yield from _submitted(client, _Job(function, code_version(), 0), works, distributed)
+    except (asyncio.CancelledError, CancelledError, OSError) as error:  # OSError also when the connection ends
+        raise TaskFailedError(f"the connection to the Dask scheduler was lost; {_RESUME}") from error
     finally:
-        client.close(timeout=2.0)
+        with contextlib.suppress(asyncio.CancelledError, CancelledError, OSError):
+            client.close(timeout=2.0)
 
 
 def _submitted(client: Any, job: _Job[Work, Outcome], works: Sequence[Work], dask: Any) -> Iterator[Any]:
