@@ -166,9 +166,9 @@ class DMP:
 
         Args:
             trajectory: the motion to reproduce.
-            exact_ends: whether to start and end exactly at the first and the last sample and rotation. If False, and
-                noise moves the first or the last sample more than 0.1 mm away from the path that fits all samples, the
-                motion starts or ends on that path instead.
+            exact_ends: whether to start and end exactly at the first and the last sample and rotation. If False, a
+                first or last sample that is more than 0.1 mm away from the path that fits all samples counts as noise,
+                and the motion starts or ends on that path instead.
 
         Raises:
             InputError: when the trajectory has fewer than 3 samples.
