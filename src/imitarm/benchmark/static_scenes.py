@@ -13,8 +13,8 @@
 
 S1 to S6 are scenes around an S-shaped reach, S7 around the sweep of :class:`~imitarm.tasks.sweep.SweepTask`, and S9
 around the reach of :class:`~imitarm.tasks.open_box.OpenBoxTask`. Scenes for the whole arm (S8) are in
-:mod:`imitarm.benchmark.placements`. On the learned path, the tool would touch an obstacle in every scene of every family
-except S6.
+:mod:`imitarm.benchmark.placements`. On the learned path, the tool would touch an obstacle in every scene except those
+of S6.
 """
 
 from __future__ import annotations
