@@ -193,6 +193,15 @@ def test_scenes_can_be_placed_on_the_path_of_any_skill(family):
         assert clearance_without_avoidance(case) < 0.0
 
 
+def test_a_path_that_is_short_gets_as_many_obstacles_as_fit():
+    shown = demonstrations_by(s_shaped_reach(planar=False), 1)
+    skill = Skill(6).fit(
+        align([d.with_trajectory(d.trajectory.with_positions(0.6 * d.trajectory.positions), None) for d in shown])
+    )
+    counts = {len(static_case("S3", 3, seed, skill=skill).scene.obstacles) for seed in range(2000, 2010)}
+    assert 3 not in counts and counts
+
+
 def test_wrong_arguments_are_named():
     with pytest.raises(UnknownNameError, match=r"S0.*S1"):
         static_case("S0", 2, 0)

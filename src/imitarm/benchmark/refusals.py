@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from imitarm.benchmark.avoidance import learn
-from imitarm.benchmark.families import RANDOM_FAMILIES, RandomScene, random_scene
+from imitarm.benchmark.random_scenes import RANDOM_FAMILIES, RandomScene, random_scene
 from imitarm.benchmark.refusal_oracle import Answer, answer, is_solved
 from imitarm.benchmark.refusal_proof import Question, separation
 from imitarm.benchmark.static_scenes import StaticCase

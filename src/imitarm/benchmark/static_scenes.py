@@ -61,6 +61,7 @@ _FREE = 0.01  # [m] beyond the required clearance, that obstacles leave to the t
 _FREE_ENDS = TOOL_RADIUS + CLEARANCE + _FREE  # [m] likewise, for the tool of the reach
 _COMPONENTS = 8  # of a skill
 _DRAWS = 500  # of a scene, before its path counts as too short
+_FAILURES = 6  # to find places for obstacles, likewise
 _SPREAD_DENSE = 0.06  # [m] standard deviation of an obstacle's centre about the path, in dense scenes
 _SKEW = 0.15  # [rad] standard deviation of the angle between a trap and the path
 _TIGHT = 0.002  # [m] a gap with less than this to spare counts as neither solvable nor unsolvable
@@ -189,8 +190,15 @@ def static_case(family: str, dimension: int, seed: int, *, teachers: int = 1, sk
 
 def _blocking(family: _Family, rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
     """Draw scenes until the tool would enter an obstacle on the path, and the points that must not move are free."""
+    failures = 0
     for _ in range(_DRAWS):
-        placed = family.place(rng, path, planar, seed)
+        try:
+            placed = family.place(rng, path, planar, seed)
+        except InputError:  # no place for so many obstacles: perhaps for fewer
+            failures += 1
+            if failures < _FAILURES:
+                continue
+            raise
         if not family.solvable:
             return placed
         scene = Scene(None, placed.obstacles)
