@@ -9,7 +9,7 @@ from .kinematics.ik import IKSolver, solve_ik
 from .kinematics.limits import JointLimits, singularity_limits
 from .kinematics.pose import Pose
 from .kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, TwistTask
-from .policies import ACFRA, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Adaptation, Observation, Policy, adapt
+from .policies import ACFRA, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Adaptation, Observation, Policy, adapt, replan
 from .retarget import RETARGETERS, Correspondence, Retargeter
 from .robots import Robot, SimulatedRobot
 from .safety import SafetyFilter
@@ -90,6 +90,7 @@ __all__ = [
     "load_scene",
     "plot",
     "read",
+    "replan",
     "reproduce",
     "save_scene",
     "singularity_limits",

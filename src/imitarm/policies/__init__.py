@@ -9,6 +9,7 @@ from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.least_detour import PathAdapter
 from imitarm.policies.path_policy import PathPlan, PathPolicy
 from imitarm.policies.policy import Observation, Policy
+from imitarm.policies.replanning import replan
 from imitarm.registry import Registry
 
 POLICIES: Registry[type[Policy]] = Registry(
@@ -41,4 +42,5 @@ __all__ = [
     "PathPolicy",
     "Policy",
     "adapt",
+    "replan",
 ]

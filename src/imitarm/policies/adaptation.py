@@ -146,8 +146,8 @@ def adapt(
             held = np.tile(arm.tool_pose(posture).quaternion, (len(path.nominal), 1))
             path = replace(path, nominal=Trajectory(path.nominal.times, path.nominal.positions, held))
     at_goal = finite_number(goal_tilt, "goal_tilt", "rad", at_least=0.0)
-    limit = _tilt_limits(path, max_tilt, at_goal)
-    allowed = AllowedDirections.without(_unit_rows(forbidden))
+    limit = tilt_limits(path, max_tilt, at_goal)
+    allowed = allowed_directions(forbidden)
     tool = ToolAmongObstacles.along(path.nominal, _spheres(path, tool_radius, tool_spheres, arm), scene.obstacles)
     nominal = tool.clearance_of(path.nominal.positions)
     for more in dict.fromkeys((extra, 0.0)):
@@ -155,7 +155,9 @@ def adapt(
         adaptation, detour = _of_tool(problem, scene, method, adapter, began)
         if arm is not None and posture is not None and adapter.refuses and not _covered(problem, at_goal):
             task = ArmTask(arm, posture, scene, problem.clearance, allowed, limit, at_goal, more)
-            adaptation = _of_whole_arm(adaptation, solve(task, detour), scene, problem.clearance, began)
+            adaptation = of_whole_arm(
+                adaptation, solve(task, detour.path, detour.displacement), scene, problem.clearance, began
+            )
         if adaptation.feasible:
             break
     return adaptation
@@ -170,7 +172,7 @@ def _covered(problem: AvoidanceProblem, goal_tilt: float) -> bool:
     return bool(problem.nominal.distance[:, ends].min(initial=np.inf) < problem.clearance)
 
 
-def _tilt_limits(path: ComponentPath, max_tilt: float | None, goal_tilt: float) -> Array:
+def tilt_limits(path: ComponentPath, max_tilt: float | None, goal_tilt: float) -> Array:
     """Return the largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad]."""
     limit = path.rotation_tolerance
     if max_tilt is not None:
@@ -252,8 +254,16 @@ def _first_posture(arm: ArmModel, nominal: Trajectory, state: ArmState | None) -
     return find_posture(arm, Pose(nominal.positions[0], rotation))
 
 
-def _of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearance: float, began: float) -> Adaptation:
-    """Return the adaptation of the whole arm, given the adaptation of the tool alone."""
+def of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearance: float, began: float) -> Adaptation:
+    """Return the adaptation of the whole arm, given the adaptation of the tool alone, or of a motion that has begun.
+
+    Args:
+        tool: supplies all values that the plan of the whole arm does not change.
+        solution: result of the search for a joint path.
+        scene: the obstacles.
+        clearance: required [m].
+        began: when the computation began, by ``time.perf_counter`` [s].
+    """
     plan, timing, spent = solution.plan, solution.timing, time.perf_counter() - began
     if plan is None or not plan.complete:
         return replace(tool, feasible=False, reason=solution.reason, compute_time=spent)
@@ -284,6 +294,7 @@ def _of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearan
         joints=plan.path.joints,
         tilt=plan.largest_tilt,
         approach=solution.approach,
+        arm_plan=plan,
     )
 
 
@@ -332,15 +343,20 @@ def _spheres(path: ComponentPath, radius: float | None, spheres: ArrayLike | Non
     return rows
 
 
-def _unit_rows(directions: ArrayLike) -> Array:
-    if isinstance(directions, tuple) and not directions:
-        return np.empty((0, 3))
-    rows = finite_array(directions, (None,) if np.size(directions) == 0 else (None, 3), "forbidden (rows x y z)")
+def allowed_directions(forbidden: ArrayLike) -> AllowedDirections:
+    """Return the directions in which components may move, given the forbidden ones, shape (m, 3).
+
+    Raises:
+        InputError: when a direction is zero or not finite.
+    """
+    if isinstance(forbidden, tuple) and not forbidden:
+        return AllowedDirections.without(np.empty((0, 3)))
+    rows = finite_array(forbidden, (None,) if np.size(forbidden) == 0 else (None, 3), "forbidden (rows x y z)")
     rows = rows.reshape(-1, 3)
     length = np.linalg.norm(rows, axis=1, keepdims=True)
     if np.any(length == 0.0) or not np.isfinite(length).all():
         raise InputError("forbidden: a direction is zero or too long; give rows of 3 numbers such as (0, 0, 1)")
-    return np.asarray(rows / length)
+    return AllowedDirections.without(np.asarray(rows / length))
 
 
 def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:

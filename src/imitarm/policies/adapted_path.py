@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.html_table import html_table
+from imitarm.policies.arm_planner import ArmPlan
 from imitarm.policies.whole_arm import Approach
 from imitarm.trajectory import Trajectory
 
@@ -50,6 +51,7 @@ class Adaptation:
         tilt: largest rotation of the tool away from the learned rotation [rad].
         approach: motion of the arm from its start posture to the first posture of ``joints``, to be executed before the
             path; None if the start posture is already the first posture.
+        arm_plan: the plan of the whole arm, from which ``replan`` continues; None when only the tool was planned.
     """
 
     nominal: Trajectory
@@ -75,6 +77,7 @@ class Adaptation:
     joints: Array | None = None
     tilt: float = 0.0
     approach: Approach | None = None
+    arm_plan: ArmPlan | None = None
 
     @property
     def unmoved_fraction(self) -> float:

@@ -23,14 +23,14 @@ from itertools import product
 import daqp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, make_interp_spline
+from scipy.interpolate import make_interp_spline
 
 from imitarm.kinematics.arm_path import ArmPath, right_inverses, self_motions
-from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply
 from imitarm.policies.arm_certificate import ArmAmongObstacles, ArmClearance, lowest_of
 from imitarm.policies.arm_pairs import SELF, Gaps
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.least_detour import UNBOUNDED, AllowedDirections, style_scale
+from imitarm.policies.tilts import Tilts, splines
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -40,7 +40,7 @@ _ROUNDS = 24
 _FINAL_ROUNDS = 10  # with all samples
 _PATIENCE = 7  # rounds without progress, then this attempt is given up
 _PROGRESS = 1e-3  # [m] progress of the smallest distance that counts
-_TILTS, _SELF_MOTIONS = 8, 10  # knots of the splines
+_SELF_MOTIONS = 10  # knots of the splines
 _TILT_SIGMA = 0.15  # [rad] a tilt of this size costs as much as a displacement by one demonstrated sigma
 _TILT_USED, _TILT_TOLERANCE = 0.98, 1e-3  # fraction of the limit of the tilt that is used; accepted excess [rad]
 _REACH = 0.06  # [m] pairs farther apart than the clearance and this have no row
@@ -67,7 +67,8 @@ class ArmPlan:
     Attributes:
         components: the learned path and its components, before they were displaced.
         displacement: displacement of each component's mean, shape (n_components, 3) [m].
-        tilt: coefficients of the tool's rotation away from the learned rotation, shape (n_tilts, 3) [rad].
+        tilts: the rotations of the tool away from the learned rotation that the plan can choose from.
+        tilt: the chosen coefficients of ``tilts``, shape (n_tilts, 3) [rad].
         path: the arm at the samples.
         clearance: the smallest clearance and its place. If it is not negative and ``complete`` is True, it is certified
             for the whole path.
@@ -79,6 +80,7 @@ class ArmPlan:
 
     components: ComponentPath
     displacement: Array
+    tilts: Tilts
     tilt: Array
     path: ArmPath
     clearance: ArmClearance
@@ -93,21 +95,6 @@ class ArmPlan:
         return self.complete and self.clearance.room >= 0.0
 
 
-def splines(times: Array, n_knots: int, *, first: bool, last: bool) -> Array:
-    """Return cubic B-splines in time, shape (n, n_splines).
-
-    Args:
-        times: n increasing times [s].
-        n_knots: number of evenly spaced knots from the first to the last time.
-        first: whether to include the first spline; without it, all splines are 0 at the start.
-        last: whether to include the last spline; without it, all splines are 0 at the end.
-    """
-    inner = np.linspace(times[0], times[-1], n_knots)
-    knots = np.concatenate([[times[0]] * 3, inner, [times[-1]] * 3])
-    basis = BSpline.design_matrix(times, knots, 3).toarray()
-    return np.asarray(basis[:, 0 if first else 1 : None if last else -1])
-
-
 class ArmPlanner:
     """Plans joint paths for one component path among one set of obstacles.
 
@@ -119,7 +106,8 @@ class ArmPlanner:
         allowed: directions in which components may move.
         smoothness: weight of the squared jerk of the displacement (see ``style_scale``).
         free_start: whether the self-motion may change the posture at the start.
-        tilted_goal: whether the tool may be tilted at the goal; if so, ``max_tilt`` limits the tilt at the goal too.
+        tilts: possible rotations of the tool away from the learned rotation; at the goal, ``max_tilt`` limits them too.
+        begun: whether the motion has begun, so that the self-motion must not change the velocity at the start.
 
     Attributes:
         coarse: indices of the few samples that are planned first, before all samples, shape (k,).
@@ -136,36 +124,37 @@ class ArmPlanner:
         allowed: AllowedDirections,
         *,
         smoothness: float = 0.0,
+        tilts: Tilts,
         free_start: bool = False,
-        tilted_goal: bool = False,
+        begun: bool = False,
     ) -> None:
-        self.around, self.arm, self.components, self.free_start = around, around.arm, components, free_start
+        self.around, self.arm, self.components, self.free_start, self.begun = (
+            around,
+            around.arm,
+            components,
+            free_start,
+            begun,
+        )
         self.quaternions, self.max_tilt, self.allowed = quaternions, max_tilt, allowed
         self.times = components.nominal.times
         self.clock = self.times
         n = len(self.times)
         self.coarse = np.unique(np.append(np.arange(0, n, _STRIDE), n - 1))
-        self._tilts = splines(self.times, _TILTS, first=False, last=tilted_goal)
-        self._selves = splines(self.times, _SELF_MOTIONS, first=free_start, last=True)
+        self.tilts = tilts
+        self._selves = splines(self.times, _SELF_MOTIONS, first=free_start, last=True)[:, 1 if begun else 0 :]
         self._scale = style_scale(components, allowed, np.arange(components.n_components), smoothness)
-
-    @property
-    def n_tilts(self) -> int:
-        """Number of splines that describe the tilt, which is the number of rows of its coefficients."""
-        return self._tilts.shape[1]
 
     def poses(self, displacement: Array, tilt: Array, samples: Index) -> tuple[Array, Array]:
         """Return the poses of the tool at samples: positions (k, 3) [m] and quaternions (k, 4)."""
         positions = self.components.nominal.positions[samples] + self.components.basis[samples] @ displacement
-        rotation = quaternion_exp(self._tilts[samples] @ tilt)
-        return positions, quaternion_multiply(rotation, self.quaternions[samples])
+        return positions, self.tilts.turned(self.quaternions, tilt, samples)
 
     def tilt_at_goal(self, rotation: Array) -> Array:
         """Return the coefficients (n_tilts, 3) [rad] of a tilt that ends with a rotation vector (3,) [rad].
 
         The rotation vector must be zero unless the goal may be tilted.
         """
-        tilt = np.zeros((self.n_tilts, 3))
+        tilt = np.zeros((self.tilts.n_tilts, 3))
         tilt[-1] = rotation
         return tilt
 
@@ -180,7 +169,7 @@ class ArmPlanner:
         Returns:
             A feasible plan, or the best attempt; None when the arm can't follow the tool's path.
         """
-        tilt = np.zeros((self.n_tilts, 3)) if tilt is None else tilt
+        tilt = np.zeros((self.tilts.n_tilts, 3)) if tilt is None else tilt
         state = self._closed(joints, displacement, tilt, self.coarse)
         if state is None:
             return None
@@ -213,7 +202,9 @@ class ArmPlanner:
                 best = plan
             if plan.clearance.room >= 0.0:
                 calmed += 1
-            if (plan.clearance.room >= 0.0 and (plan.speed <= _CALM or calmed > _CALMING)) or since > _PATIENCE:
+            if (
+                plan.clearance.room >= 0.0 and (plan.speed <= _CALM or calmed > _CALMING or self.begun)
+            ) or since > _PATIENCE:
                 break
             gaps = self.around.gaps(path, self.clock[samples], _REACH) if gaps is None else gaps
             if plan.complete and plan.clearance.room < 0.0 and gaps.room.min(initial=1.0) >= 0.0:
@@ -238,14 +229,16 @@ class ArmPlanner:
             lowest = replace(lowest, sample=int(samples[lowest.sample]))
         if beyond[sample, joint] < min(lowest.room, 0.0):
             lowest = ArmClearance(float(beyond[sample, joint]), JOINT_LIMIT, int(joint), -1, int(samples[sample]))
-        turned = np.linalg.norm(self._tilts @ tilt, axis=1)
+        turned = np.linalg.norm(self.tilts.vectors(tilt), axis=1)
         tilted = int(np.argmax(turned - self.max_tilt))
         excess = float(turned[tilted] - self.max_tilt[tilted])
         if excess > _TILT_TOLERANCE and -TILT_LEVER * excess < lowest.room:
             lowest = ArmClearance(-TILT_LEVER * excess, TILT_LIMIT, -1, -1, tilted)
         cost = self._cost(displacement, tilt)
         speed = float((np.abs(np.diff(path.joints, axis=0)) / self._longest_steps(samples)).max(initial=0.0))
-        return ArmPlan(self.components, displacement, tilt, path, lowest, complete, cost, float(turned.max()), speed)
+        return ArmPlan(
+            self.components, displacement, self.tilts, tilt, path, lowest, complete, cost, float(turned.max()), speed
+        )
 
     def _longest_steps(self, samples: Index) -> Array:
         """Return how far each joint can move from sample to sample at the learned times, (k - 1, n_joints) [rad]."""
@@ -302,7 +295,7 @@ class ArmPlanner:
             return None
         new, turned, selves = local.unscaled(y, self._scale, self.allowed)
         twist = np.concatenate(
-            [self.components.basis[samples] @ (new - displacement), self._tilts[samples] @ (turned - tilt)], axis=1
+            [self.components.basis[samples] @ (new - displacement), self.tilts.basis[samples] @ (turned - tilt)], axis=1
         )
         change = np.einsum("nji,ni->nj", local.inverse, twist)
         change += np.einsum("nje,ne->nj", local.null, self._selves[samples] @ selves)
@@ -310,19 +303,20 @@ class ArmPlanner:
 
     def _limits(self, n_self: int, tilt: Array) -> tuple[Array, Array]:
         """Return rows that limit the tilt, and rows that prevent displacements in forbidden directions."""
-        n_moved, n_tilts = 3 * self.components.n_components, self.n_tilts
+        n_moved, n_tilts = 3 * self.components.n_components, self.tilts.n_tilts
         at = self.coarse
-        limit, now = _TILT_USED * self.max_tilt[at], self._tilts[at] @ tilt
+        limit, now = _TILT_USED * self.max_tilt[at], self.tilts.vectors(tilt, at)
         length = np.linalg.norm(now, axis=1)
         own = now / np.maximum(length, 1e-9)[:, None]
         # A polyhedron about the sphere of the allowed tilts, and a plane that touches the sphere where the tilt is now.
         sample, facet = np.nonzero((now @ _FACETS.T > 0.3 * limit[:, None]) | _AXES)
         far = np.flatnonzero(length > 0.8 * limit)
         sample, direction = np.append(sample, far), np.concatenate([_FACETS[facet], own[far]])
-        turning = self._tilts[at[sample]][:, :, None] * direction[:, None, :]
+        turning = self.tilts.basis[at[sample]][:, :, None] * direction[:, None, :]
         part = np.zeros((len(sample), n_moved + 3 * n_tilts + n_self))
         part[:, n_moved : n_moved + 3 * n_tilts] = -turning.reshape(len(sample), -1)
-        rows, low = [part], [-limit[sample]]
+        fixed = np.einsum("rd,rd->r", self.tilts.fixed[at[sample]], direction)
+        rows, low = [part], [fixed - limit[sample]]
         for forbidden in self.allowed.forbidden:
             part = np.zeros((self.components.n_components, n_moved + 3 * n_tilts + n_self))
             part[:, :n_moved] = np.kron(np.eye(self.components.n_components), -forbidden)
@@ -359,7 +353,7 @@ class _Local:
         of_self = np.einsum("rj,rje->re", rates, self.null[at])
         parts = (
             (planner.components.basis, of_tool[:, :3]),
-            (planner._tilts, of_tool[:, 3:]),
+            (planner.tilts.basis, of_tool[:, 3:]),
             (planner._selves, of_self),
         )
         columns = [
@@ -375,13 +369,13 @@ class _Local:
         """
         k, axes = self.planner.components.n_components, self.planner.allowed.axes
         moved = (matrix[:, : 3 * k].reshape(-1, k, 3) @ axes).reshape(len(matrix), -1) @ scale
-        n_tilts = 3 * self.planner.n_tilts
+        n_tilts = 3 * self.planner.tilts.n_tilts
         tilted = _TILT_SIGMA * matrix[:, 3 * k : 3 * k + n_tilts]
         return np.concatenate([moved, tilted, matrix[:, 3 * k + n_tilts :]], axis=1)
 
     def unscaled(self, y: Array, scale: Array, allowed: AllowedDirections) -> tuple[Array, Array, Array]:
         """Return displacement, tilt and self-motion for a solution."""
-        n, n_tilts = scale.shape[1], 3 * self.planner.n_tilts
+        n, n_tilts = scale.shape[1], 3 * self.planner.tilts.n_tilts
         moved = allowed.enforced((scale @ y[:n]).reshape(-1, allowed.dimension))
         moved[np.einsum("kd,kd->k", moved, moved) < _NEGLIGIBLE**2] = 0.0
         tilt = (_TILT_SIGMA * y[n : n + n_tilts]).reshape(-1, 3)

@@ -55,8 +55,16 @@ class Timing:
     joint: int = -1
 
 
-def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array, *, path: ArmPath | None = None) -> Timing:
-    """Return the shortest execution times of a path within the limits of an arm, from rest to rest.
+def retimed(
+    arm: ArmModel,
+    joints: Array,
+    parameters: Array,
+    fastest: Array,
+    *,
+    path: ArmPath | None = None,
+    rate: float = 0.0,
+) -> Timing:
+    """Return the shortest execution times of a path within the limits of an arm, until rest.
 
     Args:
         arm: the arm with its tool.
@@ -65,6 +73,7 @@ def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array, *, 
             sample is reached at the time s.
         fastest: largest allowed rate ds/dt at each sample, shape (n,).
         path: the arm in these postures, if it is known already.
+        rate: the rate ds/dt at the first sample, if the limits allow it; otherwise the largest rate that they allow.
     """
     first = np.gradient(joints, parameters, axis=0)
     second = np.gradient(first, parameters, axis=0)
@@ -77,7 +86,7 @@ def retimed(arm: ArmModel, joints: Array, parameters: Array, fastest: Array, *, 
         most = (_VELOCITY * arm.max_velocity / np.abs(first)).min(axis=1)
     most = np.minimum(most, fastest) ** 2
     step = 2.0 * np.diff(parameters)
-    b = _squared_speeds(of_a[:-1] / step[:, None], of_b[:-1], bound[:-1], most)
+    b = _squared_speeds(of_a[:-1] / step[:, None], of_b[:-1], bound[:-1], most, rate**2)
     speeds = np.sqrt(b)
     means = 0.5 * (speeds[1:] + speeds[:-1])
     slow = np.flatnonzero(means <= _SLOWEST)
@@ -113,8 +122,8 @@ def safe_rates(around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Ar
     return fastest
 
 
-def _squared_speeds(of_a: Array, of_b: Array, bound: Array, most: Array) -> Array:
-    """Return the largest squared speeds at n samples, from rest to rest, shape (n,).
+def _squared_speeds(of_a: Array, of_b: Array, bound: Array, most: Array, first: float) -> Array:
+    """Return the largest squared speeds at n samples, until rest, shape (n,).
 
     Two neighbouring squared speeds, b and then c, are allowed if ``of_a * (c - b) + of_b * b <= bound`` in all m rows
     and if neither exceeds ``most``. These pairs (b, c) form a convex polygon that contains (0, 0). Its upper limit of b
@@ -125,6 +134,7 @@ def _squared_speeds(of_a: Array, of_b: Array, bound: Array, most: Array) -> Arra
         of_b: shape (n - 1, m).
         bound: not negative, shape (n - 1, m).
         most: largest squared speed at each sample, shape (n,).
+        first: squared speed at the first sample, if it is allowed.
     """
     of_b = of_b - of_a
     limits = of_b > _NO_EFFECT
@@ -144,7 +154,8 @@ def _squared_speeds(of_a: Array, of_b: Array, bound: Array, most: Array) -> Arra
     divisor = np.where(limits, of_a, 1.0)
     level, fall = np.where(limits, bound / divisor, np.inf), np.where(limits, of_b / divisor, 0.0)
     low, high = _ranges(level, fall, np.array(before[1:]))
-    speeds, now = [0.0], 0.0
+    now = min(first, before[0])
+    speeds = [now]
     for i, (a, b) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
         now = before[i + 1] if a <= now <= b else max(float((level[i] - fall[i] * now).min()), 0.0)
         speeds.append(now)

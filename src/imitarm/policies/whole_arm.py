@@ -30,8 +30,10 @@ from imitarm.policies.arm_pairs import SELF
 from imitarm.policies.arm_planner import JOINT_LIMIT, TILT_LEVER, TILT_LIMIT, ArmPlan, ArmPlanner
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.goal_postures import GoalPosture, GoalSearch, clear_postures
-from imitarm.policies.least_detour import SMOOTHNESS, AllowedDirections, Detour
+from imitarm.policies.least_detour import SMOOTHNESS, AllowedDirections
+from imitarm.policies.remainder import Remainder
 from imitarm.policies.retiming import SELF_CLEARANCE, Timing, retimed, safe_rates
+from imitarm.policies.tilts import Tilts
 from imitarm.scene.clearance import SelfClearance
 from imitarm.scene.scene import Scene
 
@@ -91,6 +93,7 @@ class ArmTask:
         allowed: directions in which the components of the path may be displaced.
         max_tilt: largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad].
         allowance: ``clearance`` minus the clearance that the safety filter keeps [m].
+        rest: the rest of a motion that has begun; None: the motion begins at rest.
     """
 
     arm: ArmModel
@@ -101,21 +104,24 @@ class ArmTask:
     max_tilt: Array
     goal_tilt: float
     allowance: float
+    rest: Remainder | None = None
 
 
-def solve(task: ArmTask, detour: Detour) -> ArmSolution:
+def solve(task: ArmTask, path: ComponentPath, displacement: Array) -> ArmSolution:
     """Find a joint path that moves the tool along a skill's path and around the obstacles.
 
     Args:
         task: the arm and its surroundings.
-        detour: the detour of the tool alone, feasible or not.
+        path: the path of the tool and its components.
+        displacement: displacements of the components to begin with, such as those of the detour of the tool alone,
+            shape (n_components, 3) [m].
     """
-    search = _Search(task, detour)
+    search = _Search(task, path, displacement)
     if search.start.room < 0.0:
         return ArmSolution(None, None, f"at the start, {search.named(search.start)}: move the obstacle or the arm")
     best: ArmPlan | None = None
-    for planner, displacement, joints, tilt in search.attempts():
-        plan = planner.plan(displacement, joints, tilt)
+    for planner, moved, joints, tilt in search.attempts():
+        plan = planner.plan(moved, joints, tilt)
         if plan is None:
             continue
         if plan.feasible:
@@ -146,9 +152,8 @@ class _Attempt(NamedTuple):
 class _Search:
     """The attempts of one search, and the clearance of the best failed attempt."""
 
-    def __init__(self, task: ArmTask, detour: Detour) -> None:
-        self.task, self.detour = task, detour
-        self._components = detour.path
+    def __init__(self, task: ArmTask, path: ComponentPath, displacement: Array) -> None:
+        self.task, self._components, self._displacement = task, path, displacement
         nominal = self._components.nominal
         self._times = nominal.times
         start = task.arm.tool_pose(task.start)
@@ -171,8 +176,10 @@ class _Search:
 
         The order of the attempts is given at the beginning of this module.
         """
-        learned, detour = self._planner(self._components), self.detour.displacement
+        learned, detour, rest = self._planner(self._components), self._displacement, self.task.rest
         begin = self._followed(learned, detour)
+        if rest is not None:
+            begin = _Attempt(learned, detour, rest.joints[learned.coarse], rest.tilt)
         self._first = begin
         yield begin
         path = self._components.nominal
@@ -196,7 +203,7 @@ class _Search:
 
     def _other_starts(self, displacement: Array) -> Iterator[_Attempt]:
         """Yield first guesses for a joint path that ends in a clear posture; its start posture is not prescribed."""
-        if self._moving or self._goals is None:  # among moving obstacles there is no time for an approach
+        if self._moving or self._goals is None or self.task.rest is not None:  # there is no time for an approach
             return
         planner = self._planner(self._components, free_start=True)
         for goal in self._goals.found:
@@ -254,15 +261,18 @@ class _Search:
         )
 
     def _planner(self, components: ComponentPath, *, smoothness: float = 0.0, free_start: bool = False) -> ArmPlanner:
+        rest = self.task.rest
+        tilts = Tilts.between_ends(self._times, tilted_goal=self.task.goal_tilt > 0.0) if rest is None else rest.tilts
         return ArmPlanner(
             self._around,
             components,
             self._quaternions,
             self.task.max_tilt,
             self.task.allowed,
+            tilts=tilts,
             smoothness=smoothness,
             free_start=free_start,
-            tilted_goal=self.task.goal_tilt > 0.0,
+            begun=rest is not None,
         )
 
     def _followed(self, planner: ArmPlanner, displacement: Array, goal: GoalPosture | None = None) -> _Attempt:
@@ -327,7 +337,8 @@ class _Search:
         Each sample is compared with the places of the obstacles at its time in ``clock``.
         """
         fastest = safe_rates(self._around, path, times, clock, self.task.allowance)
-        return retimed(self.task.arm, path.joints, times, fastest, path=path)
+        rate = 0.0 if self.task.rest is None else self.task.rest.rate
+        return retimed(self.task.arm, path.joints, times, fastest, path=path, rate=rate)
 
     def named(self, found: ArmClearance) -> str:
         """Return a text that names the two objects that are too close and their distance, or a joint at its limit."""

@@ -1,0 +1,109 @@
+"""replan: plan the rest of a motion of the whole arm again, from where the arm is now."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel, ArmState
+from imitarm.policies.adaptation import allowed_directions, of_whole_arm, tilt_limits
+from imitarm.policies.adapted_path import Adaptation
+from imitarm.policies.component_path import STILL
+from imitarm.policies.remainder import Remainder
+from imitarm.policies.whole_arm import ArmTask, solve
+from imitarm.scene.scene import Scene
+from imitarm.trajectory import Trajectory
+from imitarm.validation import finite_number, instance
+
+_BEYOND = 1.03  # times the measured tilt: a planner does not use the whole limit
+
+
+def replan(
+    previous: Adaptation,
+    scene: Scene,
+    *,
+    arm: ArmModel,
+    state: ArmState,
+    phase: float,
+    clearance: float = 0.02,
+    forbidden: ArrayLike = (),
+    max_tilt: float | None = None,
+    goal_tilt: float = 0.0,
+    allowance: float = 0.0,
+) -> Adaptation:
+    """Plan the rest of a motion again, for example because an obstacle is not where it was.
+
+    The motion goes on from the measured posture, in the planned direction and with the measured speed. It passes each
+    obstacle on the side that was chosen before, if it can, and is displaced as in ``previous`` where this keeps the
+    clearance. Only the rest of the path is planned; the certificate covers it from the measured posture to the goal.
+    The posture at the start can't be changed any more, and there is no approach.
+
+    The rest begins at time 0. At that time, the obstacles are at the poses given by the scene; from then on, they move
+    with their velocities. To plan once more, pass the result as ``previous``.
+
+    Args:
+        previous: a feasible adaptation of the whole arm (``adapt(..., arm=...)``), or a result of this function.
+        scene: obstacles now; its goal is None, or the goal of ``previous``.
+        arm: the arm with its tool.
+        state: measured state of the arm.
+        phase: present time in ``previous.trajectory``, counted from the end of its approach [s].
+        clearance: required distance from the whole arm to every obstacle [m].
+        forbidden: directions in which no component may move, shape (m, 3); see :func:`adapt`.
+        max_tilt: largest rotation of the tool away from the learned rotation [rad]; see :func:`adapt`.
+        goal_tilt: largest such rotation at the goal [rad]; see :func:`adapt`.
+        allowance: additional clearance for tracking errors, used if ``previous`` has it and a
+            path with this larger clearance is found [m].
+
+    Returns:
+        The adaptation of the rest of the motion; check ``feasible`` before executing it. If it is not feasible, the arm
+        must brake.
+
+    Raises:
+        InputError: when ``previous`` has no plan of the whole arm, the motion is over, or an argument is not valid.
+    """
+    began = time.perf_counter()
+    plan = instance(previous, Adaptation, "previous").arm_plan
+    if plan is None or not previous.feasible:
+        raise InputError("replan: previous must be a feasible adaptation with arm; call adapt(..., arm=...) first")
+    instance(scene, Scene, "scene")
+    q = instance(state, ArmState, "state").q
+    if len(q) != instance(arm, ArmModel, "arm").n_joints:
+        raise InputError(f"replan: state has {len(q)} joints, but {arm.name} has {arm.n_joints}")
+    goal = previous.nominal.positions[-1]
+    if scene.goal is not None and np.abs(scene.goal.position - goal).max() > STILL:
+        raise InputError("replan: the scene has another goal than previous; call adapt for the new goal")
+    clearance = finite_number(clearance, "clearance", "m", at_least=0.0)
+    extra = finite_number(allowance, "allowance", "m", at_least=0.0)
+    at_goal = finite_number(goal_tilt, "goal_tilt", "rad", at_least=0.0)
+    allowed = allowed_directions(forbidden)
+    done, times = previous.trajectory.times, plan.components.nominal.times
+    now = finite_number(phase, "phase", "s", at_least=0.0)
+    if now >= done[-1]:
+        raise InputError(f"replan: the motion is over at {done[-1]:.2f} s; phase is {now:.2f} s")
+    rest = Remainder.of(plan, float(np.interp(now, done, times)), state)
+    limit = tilt_limits(rest.components, max_tilt, at_goal)
+    limit = np.maximum(limit, _BEYOND * np.linalg.norm(rest.tilts.fixed, axis=1))  # where the arm is, it may be
+    positions, quaternions = previous.nominal.at(rest.components.nominal.times + rest.begins)
+    nominal = Trajectory(rest.components.nominal.times, positions, quaternions)
+    unplanned = replace(
+        previous,
+        nominal=nominal,
+        trajectory=nominal,
+        tolerance=rest.components.tolerance,
+        only_on_schedule=any(obstacle.velocity.any() for obstacle in scene.obstacles),
+        joints=None,
+        approach=None,
+        arm_plan=None,
+    )
+    margins = (extra, 0.0) if previous.certified_clearance >= clearance + extra else (0.0,)
+    for more in dict.fromkeys(margins):
+        task = ArmTask(arm, q, scene, clearance + more, allowed, limit, at_goal, more, rest)
+        solution = solve(task, rest.components, rest.displacement)
+        found = of_whole_arm(unplanned, solution, scene, clearance + more, began)
+        if found.feasible:
+            break
+    return found

@@ -1,0 +1,191 @@
+"""Planning again on the way: from where the arm is, on the same side, certified, without a jump."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imitarm import ArmModel, InputError, Pose, Scene, Skill, Sphere, adapt, find_posture, replan
+from imitarm.kinematics.arm import ArmState
+from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply
+from imitarm.policies.remainder import Remainder
+from imitarm.trajectory import Demonstration, Trajectory
+
+ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
+OPTIONS = {"max_tilt": np.deg2rad(30.0), "allowance": 0.005}
+each_arm = pytest.mark.parametrize("name", ARMS)
+
+
+@lru_cache
+def carrying(name) -> tuple[Skill, ArmModel, np.ndarray]:
+    """A skill that carries the tool to the side and turns it, and the posture in which it starts."""
+    arm, rng = ARMS[name], np.random.default_rng(0)
+    home, u = arm.tool_pose(arm.home), np.linspace(0.0, 1.0, 100)
+    rise = u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+    shown = []
+    for _ in range(4):
+        positions = home.position + np.outer(rise, np.array([0.02, 0.4, -0.05]) + 0.01 * rng.normal(size=3))
+        turn = quaternion_exp(np.outer(rise, [0.0, 0.0, 0.5]))
+        rotations = quaternion_multiply(turn, np.tile(home.quaternion, (len(u), 1)))
+        shown.append(Demonstration(Trajectory(6.0 * u, positions, rotations), task="carry"))
+    skill = Skill(8).fit(shown)
+    return skill, arm, find_posture(arm, Pose(skill.start_.position, skill.start_.quaternion))
+
+
+def at(arm, q, velocity=None) -> ArmState:
+    still = np.zeros(arm.n_joints)
+    return ArmState(np.asarray(q), still if velocity is None else velocity, still, 0.0)
+
+
+@lru_cache
+def planned(name):
+    skill, arm, start = carrying(name)
+    path = skill.generate().positions
+    scene = Scene(None, [Sphere(path[len(path) // 2] + [0.0, 0.0, -0.02], 0.04, name="ball")])
+    plan = adapt(skill, scene, arm=arm, state=at(arm, start), **OPTIONS)
+    assert plan.feasible, plan.reason
+    assert plan.moved.any()
+    return scene, plan
+
+
+def on_the_way(arm, plan, phase) -> ArmState:
+    """The state of an arm that follows a plan exactly."""
+
+    def joints(time):
+        return np.array([np.interp(time, plan.trajectory.times, column) for column in plan.joints.T])
+
+    return at(arm, joints(phase), (joints(phase + 1e-3) - joints(phase - 1e-3)) / 2e-3)
+
+
+def clearance_of(arm, scene, plan) -> float:
+    """The smallest distance from the arm's spheres to an obstacle, densely along the joint path."""
+    steps = np.linspace(0.0, len(plan.joints) - 1.0, 600)
+    dense = np.stack([np.interp(steps, np.arange(len(plan.joints)), column) for column in plan.joints.T], axis=1)
+    times = np.interp(steps, np.arange(len(plan.joints)), plan.trajectory.times)
+    lowest = np.inf
+    for q, time in zip(dense, times, strict=True):
+        centers, radii = arm.collision_spheres(q)
+        lowest = min(lowest, *((o.after(time).signed_distance(centers) - radii).min() for o in scene.obstacles))
+    return float(lowest)
+
+
+def towards(arm, ball, plan) -> np.ndarray:
+    """The direction from an obstacle to the part of the arm that comes nearest to it."""
+    places = [arm.collision_spheres(q) for q in plan.joints]
+    gaps = np.array([np.linalg.norm(centers - ball.center, axis=1) - radii for centers, radii in places])
+    sample, sphere = np.unravel_index(np.argmin(gaps), gaps.shape)
+    away = places[sample][0][sphere] - ball.center
+    return away / np.linalg.norm(away)
+
+
+@each_arm
+@settings(max_examples=8)
+@given(share=st.floats(0.02, 0.97))
+def test_where_nothing_has_changed_the_same_path_is_planned_and_certified(name, share):
+    _, arm, _ = carrying(name)
+    scene, plan = planned(name)
+    phase = share * plan.trajectory.duration
+    state = on_the_way(arm, plan, phase)
+    again = replan(plan, scene, arm=arm, state=state, phase=phase, **OPTIONS)
+    assert again.feasible, again.reason
+    assert again.approach is None
+    assert again.certified_clearance >= 0.02
+    np.testing.assert_allclose(again.joints[0], state.q, atol=1e-9)
+    assert again.trajectory.times[0] == 0.0
+    assert again.trajectory.duration == pytest.approx(plan.trajectory.duration - phase, abs=0.2)
+    rest = Remainder.of(plan.arm_plan, np.interp(phase, plan.trajectory.times, plan.nominal.times), state)
+    before = Trajectory(plan.nominal.times, plan.trajectory.positions)
+    expected, _ = before.at(again.nominal.times + rest.begins)
+    np.testing.assert_allclose(again.trajectory.positions, expected, atol=2e-3)
+    velocity = (again.joints[1] - again.joints[0]) / again.trajectory.times[1]
+    assert (np.abs(velocity) <= arm.max_velocity).all()
+    np.testing.assert_allclose(velocity, state.velocity, atol=0.15)
+
+
+@each_arm
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.35])
+def test_around_an_obstacle_that_was_moved_a_new_path_is_certified(name, share):
+    _, arm, _ = carrying(name)
+    scene, plan = planned(name)
+    phase = share * plan.trajectory.duration
+    state = on_the_way(arm, plan, phase)
+    ball = scene.obstacles[0]
+    moved = Scene(None, [replace(ball, center=ball.center + 0.012 * towards(arm, ball, plan))])
+    assert clearance_of(arm, moved, plan) < 0.02  # so that the old plan does not do
+    again = replan(plan, moved, arm=arm, state=state, phase=phase, **OPTIONS)
+    assert again.feasible, again.reason
+    assert again.certified_clearance >= 0.02
+    assert clearance_of(arm, moved, again) >= again.certified_clearance - 1e-6
+    np.testing.assert_allclose(again.joints[0], state.q, atol=1e-9)
+    velocity = (again.joints[1] - again.joints[0]) / again.trajectory.times[1]
+    assert (np.abs(velocity) <= arm.max_velocity).all()
+    np.testing.assert_allclose(velocity, state.velocity, atol=0.15)
+
+
+def test_an_obstacle_that_begins_to_move_is_certified_on_schedule():
+    _, arm, _ = carrying("sawyer")
+    scene, plan = planned("sawyer")
+    phase = 0.2 * plan.trajectory.duration
+    crossing = Scene(None, [replace(scene.obstacles[0], velocity=np.array([0.01, 0.0, 0.0]))])
+    again = replan(plan, crossing, arm=arm, state=on_the_way(arm, plan, phase), phase=phase, **OPTIONS)
+    assert again.feasible, again.reason
+    assert again.only_on_schedule
+    assert "only from 0 to" in again.validity
+    assert clearance_of(arm, crossing, again) >= 0.02 - 1e-6
+
+
+def test_an_arm_beside_its_path_returns_to_it():
+    skill, arm, _ = carrying("panda")
+    scene, plan = planned("panda")
+    phase = 0.5 * plan.trajectory.duration
+    state = on_the_way(arm, plan, phase)
+    aside = at(arm, state.q + 0.01 * np.random.default_rng(3).normal(size=7), state.velocity)
+    again = replan(plan, scene, arm=arm, state=aside, phase=phase, **OPTIONS)
+    assert again.feasible, again.reason
+    np.testing.assert_allclose(again.joints[0], aside.q, atol=1e-9)
+    np.testing.assert_allclose(again.trajectory.positions[-1], skill.goal_.position, atol=1e-4)
+
+
+def test_one_can_plan_again_and_again_until_the_goal():
+    skill, arm, _ = carrying("sawyer")
+    scene, plan = planned("sawyer")
+    goal = plan.trajectory.positions[-1]
+    for _ in range(12):
+        phase = 0.3 * plan.trajectory.duration
+        plan = replan(plan, scene, arm=arm, state=on_the_way(arm, plan, phase), phase=phase, **OPTIONS)
+        assert plan.feasible, plan.reason
+        np.testing.assert_allclose(plan.trajectory.positions[-1], goal, atol=1e-4)
+    assert plan.trajectory.duration < 0.3 * skill.duration_
+
+
+def test_a_goal_that_is_now_blocked_is_refused_and_nothing_of_it_can_be_executed():
+    _, arm, _ = carrying("sawyer")
+    scene, plan = planned("sawyer")
+    phase = 0.4 * plan.trajectory.duration
+    post = Sphere(plan.trajectory.positions[-1], 0.05, name="post")
+    blocked = Scene(None, [*scene.obstacles, post])
+    again = replan(plan, blocked, arm=arm, state=on_the_way(arm, plan, phase), phase=phase, **OPTIONS)
+    assert not again.feasible
+    assert "post" in again.reason
+    assert again.joints is None
+    assert again.approach is None
+
+
+def test_what_cannot_be_planned_again_is_refused_with_the_reason():
+    skill, arm, start = carrying("sawyer")
+    scene, plan = planned("sawyer")
+    tool = adapt(skill, scene, tool_radius=0.05)
+    options = {"arm": arm, "state": at(arm, start)}
+    with pytest.raises(InputError, match=r"call adapt\(\.\.\., arm"):
+        replan(tool, scene, phase=0.0, **options)
+    with pytest.raises(InputError, match="the motion is over"):
+        replan(plan, scene, phase=100.0, **options)
+    with pytest.raises(InputError, match="another goal"):
+        replan(plan, replace(scene, goal=Pose([0.5, 0.0, 0.5], [1.0, 0.0, 0.0, 0.0])), phase=0.0, **options)
+    with pytest.raises(InputError, match="joints"):
+        replan(plan, scene, arm=arm, state=ArmState(np.zeros(6), np.zeros(6), np.zeros(6), 0.0), phase=0.0)
