@@ -129,14 +129,14 @@ def whole_arm() -> Row:
 
 
 def whole_arm_again() -> Row:
-    """The rest of a plan of the whole arm on the way, after obstacles moved, against a plan of the tool alone."""
+    """The rest of a plan of the whole arm, after obstacles have moved, against a plan of the tool alone."""
 
     def check() -> tuple[bool, str]:
         least = min(case.again().certified_clearance for case in _cases())
         return least >= _CLEARANCE, f"certified clearance at least {1e3 * least:.2f} mm (20 mm required)"
 
     return Row(
-        "whole-arm plan again on the way (16 scenes)",
+        "rest of a whole-arm plan, planned again (16 scenes)",
         _median(_Case.again),
         _median(_Case.tool_alone),
         "plan of the tool alone",
