@@ -85,7 +85,7 @@ def take_picture(
         time.sleep(seconds)
         shot = base64.b64decode(ask("Page.captureScreenshot", format="png")["data"])
     aside = picture.with_name(f".{picture.name}.part")
-    aside.write_bytes(_small_enough(shot, max_bytes))
+    aside.write_bytes(small_enough(shot, max_bytes))
     aside.replace(picture)
     return picture
 
@@ -145,7 +145,7 @@ class _Page:
                 return result
 
 
-def _small_enough(shot: bytes, max_bytes: int) -> bytes:
+def small_enough(shot: bytes, max_bytes: int) -> bytes:
     """Return the picture as PNG, with fewer colours if it is too large."""
     from PIL import Image
 

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from imitarm.errors import InputError, TaskFailedError
-from take_picture import _small_enough, take_picture
+from take_picture import small_enough, take_picture
 
 FAKE = """
     #!{python}
@@ -95,11 +95,11 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         take_picture(page, tmp_path / "p.png", browser="no-such-browser")
 
 
-def test_colours_are_reduced_until_the_file_is_small_enough() -> None:
+def test_colours_are_reduced_until_the_file_issmall_enough() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3)).astype(np.uint8)
     file = io.BytesIO()
     Image.fromarray(noise).save(file, "PNG")
-    whole = len(_small_enough(file.getvalue(), 10**6))
-    assert len(_small_enough(file.getvalue(), whole - 1)) < whole
+    whole = len(small_enough(file.getvalue(), 10**6))
+    assert len(small_enough(file.getvalue(), whole - 1)) < whole
     with pytest.raises(TaskFailedError, match="ask for a smaller size"):
-        _small_enough(file.getvalue(), 100)
+        small_enough(file.getvalue(), 100)

@@ -219,7 +219,7 @@ def _draw_swept(axes: Any, grid: Grid, centres: Array, radii: Array) -> None:
     axes.plot([], [], ":", color=palette.ADAPTED, lw=0.9, label="swept by the tool")
 
 
-def _draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance: float, path: Array) -> None:
+def draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance: float, path: Array) -> None:
     """Fill the obstacles, and draw dashed lines around them that the tool must not cross."""
     depths = np.linspace(depth.min(), depth.max(), 9) if np.ptp(depth) > 2e-3 else np.array([depth.mean()])
     for obstacle in scene.obstacles:
@@ -313,7 +313,7 @@ def adaptation(
         if radii.max() > 0.0:
             _draw_swept(axes, grid, shown, radii)
         if scene is not None and obstacles:
-            _draw_obstacles(axes, scene, grid, tool[..., view.depth], clearance, view.of(nominal.positions))
+            draw_obstacles(axes, scene, grid, tool[..., view.depth], clearance, view.of(nominal.positions))
         if means is not None and covariances is not None:
             draw_components(axes, view, means, covariances, displacement, moved)
         if tolerance is not None:

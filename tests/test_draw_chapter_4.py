@@ -1,0 +1,37 @@
+"""The figures of Chapter 4 are drawn again by the script, and the page shows each of them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from draw_chapter_4 import FIGURES, main
+from imitarm.errors import InputError
+
+DOCS = Path(__file__).parents[1] / "docs"
+QUICK = ["4.2", "4.3", "4.4", "4.5"]  # without a simulation
+
+
+def test_the_quick_figures_are_drawn(tmp_path):
+    main([str(tmp_path), "--only", *QUICK])
+    for number in QUICK:
+        path = tmp_path / f"figure_{number.replace('.', '_')}.png"
+        pixels = np.asarray(Image.open(path).convert("L"))
+        assert path.stat().st_size <= 60_000
+        assert pixels.shape[1] > 400 and pixels.std() > 10
+
+
+def test_the_page_shows_every_figure_and_says_what_made_it():
+    page = (DOCS / "chapter_4.md").read_text()
+    shown = re.findall(r"images/figure_4_(\d)\.png", page)
+    assert [f"4.{n}" for n in shown] == list(FIGURES)
+    assert re.findall(r"^\| (4\.\d) \|", page, re.MULTILINE) == list(FIGURES)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(InputError, match="create it first"):
+        main([str(tmp_path / "nowhere")])
