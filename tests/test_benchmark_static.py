@@ -22,7 +22,16 @@ from imitarm.benchmark.static import (
     run_experiment,
     torques_on_sawyer,
 )
-from imitarm.benchmark.static_measures import AT_GOAL, LATEST, MAX_SPEED, NEAR, OUTCOMES, measure, outcome
+from imitarm.benchmark.static_measures import (
+    AT_GOAL,
+    LATEST,
+    MAX_ACCELERATION,
+    MAX_SPEED,
+    NEAR,
+    OUTCOMES,
+    measure,
+    outcome,
+)
 from imitarm.benchmark.static_results import SUFFIX, ResultLines, json_line, read_folders, read_lines, result_of
 from imitarm.benchmark.static_scenes import FAMILIES, SPLITS, static_case
 from imitarm.errors import InfeasibleError, InputError, UnknownNameError
@@ -84,6 +93,16 @@ def test_a_slower_motion_on_the_same_path_has_the_same_deviation(case):
     assert found.max_speed == pytest.approx(first.max_speed / 1.5, rel=1e-9)
     assert found.max_acceleration == pytest.approx(first.max_acceleration / 1.5**2, rel=1e-9)
     assert found.ldlj == pytest.approx(first.ldlj)
+
+
+def test_a_plan_that_is_too_fast_is_executed_more_slowly(case):
+    path = nominal(case)
+    first = measure(case, path)
+    assert first.slowdown == 1.0
+    faster = 1.2 * (MAX_ACCELERATION / first.max_acceleration) ** 0.5
+    found = measure(case, Trajectory(path.times / faster, path.positions))
+    assert found.slowdown == pytest.approx(max(1.2, faster * first.max_speed / MAX_SPEED), rel=1e-6)
+    assert found.duration == pytest.approx(found.slowdown * path.duration / faster, rel=1e-6)
 
 
 def test_speed_and_acceleration_of_a_parabola(case):
@@ -166,7 +185,7 @@ def test_every_outcome_has_its_cause(case):
         "contact": {"clearance": 0.0},
         "missed goal": {"goal_error": 1.01 * AT_GOAL},
         "late": {"duration_ratio": 1.01 * LATEST},
-        "limit": {"max_speed": 1.01 * MAX_SPEED},
+        "limit": {"duration_ratio": 1.01 * LATEST, "slowdown": 1.5},
     }
     for name, change in cases.items():
         assert outcome(case, replace(good, **change))[0] == name

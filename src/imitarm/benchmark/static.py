@@ -37,6 +37,7 @@ VARIANTS: Mapping[str, tuple[str, Options]] = {
     "acfra-mapf": ("acfra", (("method", "mapf"),)),
 }
 """Methods with fixed options: ACFRA with the thesis's potential as printed (Eq 4.7), and with the corrected one."""
+_WHOLE_ARM = ("rrt-connect", "rrt-connect-tilt")  # these plan joints only, so they need an arm
 _TOOL_ON_ARM = np.array([0.65, 0.0, 0.30])  # [m] where the middle of a path is put in front of the Sawyer
 _POSTURES = 100  # along the path, for torques
 _REACHED = 1e-3  # [m] a posture whose tool is farther away does not reach the path
@@ -44,7 +45,7 @@ _REACHED = 1e-3  # [m] a posture whose tool is farther away does not reach the p
 
 def method_names() -> tuple[str, ...]:
     """Return the names of all methods: the controls, the policies that plan a whole path, and their variants."""
-    planners = [name for name in POLICIES if issubclass(POLICIES[name], PathPolicy)]
+    planners = [n for n in POLICIES if n not in _WHOLE_ARM and issubclass(POLICIES[n], PathPolicy)]
     return (*CONTROLS, *planners, *VARIANTS)
 
 
@@ -57,7 +58,7 @@ def policy_class(method: str) -> type[PathPolicy]:
     name = VARIANTS[method][0] if method in VARIANTS else method
     if name in CONTROLS:
         return CONTROLS[name]
-    found = POLICIES.get(name)
+    found = POLICIES[name] if name in POLICIES else None  # noqa: SIM401 (a registry's get raises an error)
     if found is None or not issubclass(found, PathPolicy):
         raise UnknownNameError.among("method", method, method_names())
     return found

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import math
-import shlex
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,12 +18,12 @@ from imitarm.benchmark.placement_results import Setup, load_results
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.refusal_oracle import Answer
-from imitarm.benchmark.running import LOCAL, Workers
-from imitarm.benchmark.tables import Place, Table
+from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, workers_of
+from imitarm.cli.benchmark_static import add_static
 from imitarm.cli.outputs import check_outputs, same_place
 from imitarm.cli.robot_options import add_robot_options
 from imitarm.cli.run_scene import provenance
-from imitarm.cli.screen import progress_bar, remark, say, show_table
+from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.errors import InputError
 from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
@@ -43,6 +41,8 @@ examples:
   imitarm benchmark comparison placements.jsonl
   imitarm benchmark people recordings person.mp4
   imitarm benchmark refusals --scenes 1000
+  imitarm benchmark static --count 100 --out static
+  imitarm benchmark static compare static --report static.html
 
 'mapping' saves each result in the folder --out, and 'placements' in the file --out.
 If one of them was interrupted, the same command continues where it stopped.
@@ -87,12 +87,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     mapping.add_argument("--out", type=Path, metavar="DIR", help="folder of the results; default: benchmark-mapping")
     mapping.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
-    _add_fill(mapping)
+    add_fill(mapping)
     mapping.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
     mapping.add_argument(
         "--reuse", action="store_true", help="use saved results of the same configuration even if other code made them"
     )
-    _add_workers(mapping)
+    add_workers(mapping)
     mapping.set_defaults(benchmark=_mapping)
     other = parsers.add_parser("avoidance", help="measure how often each method keeps its clearance in random scenes")
     other.add_argument(
@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--first", type=int, default=2000, metavar="N", help="first seed; default: 2000, where the test seeds begin"
     )
     other.add_argument("--methods", nargs="+", choices=ADAPTERS, default=list(ADAPTERS))
-    _add_fill(other)
+    add_fill(other)
     other.set_defaults(benchmark=_avoidance)
     third = parsers.add_parser(
         "refusals", help="check in random scenes, with an independent oracle, whether paths and refusals are correct"
@@ -110,9 +110,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     third.add_argument("--scenes", type=int, default=1000, metavar="N", help="how many; default: 1000")
     third.add_argument("--first", type=int, default=0, metavar="N", help="first seed; default: 0")
     third.add_argument("--skills", type=Path, nargs="+", default=[], metavar="FILE", help="additional skills to adapt")
-    _add_fill(third)
+    add_fill(third)
     third.set_defaults(benchmark=_refusals)
     _add_placements(parsers)
+    add_static(parsers)
     people = parsers.add_parser("people", help="retarget recordings of real people to simulated arms")
     people.add_argument(
         "data",
@@ -121,7 +122,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of real recordings, with the subfolders kinect_gestures and mocap_arm",
     )
     people.add_argument("videos", nargs="*", metavar="VIDEO", help="videos or recordings of a person")
-    _add_fill(people)
+    add_fill(people)
     people.set_defaults(benchmark=_people)
 
 
@@ -154,7 +155,7 @@ def _add_placements(parsers: Any) -> None:
         "--reuse", action="store_true", help="use results in --out even if another version of the code measured them"
     )
     add_robot_options(placed)
-    _add_fill(placed)
+    add_fill(placed)
     placed.add_argument(
         "--max-tilt", type=float, metavar="DEG", help="largest tilt of the tool; default: as in the demonstrations"
     )
@@ -168,32 +169,8 @@ def _add_placements(parsers: Any) -> None:
     compared.add_argument(
         "--policy", choices=POLICIES, default="acfra", metavar="NAME", help="policy to compare; default: acfra"
     )
-    _add_fill(compared)
+    add_fill(compared)
     compared.set_defaults(benchmark=_comparison)
-
-
-def _add_workers(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--jobs", type=int, metavar="N", help="number of processes; default: one for each processor")
-    parser.add_argument(
-        "--backend",
-        default=LOCAL,
-        metavar="NAME",
-        help="loky (processes of this machine), dask (with --scheduler), or another backend of joblib",
-    )
-    parser.add_argument(
-        "--scheduler", default="", metavar="ADDRESS", help="Dask scheduler whose workers run the experiments"
-    )
-
-
-def _workers(arguments: argparse.Namespace) -> Workers:
-    if arguments.jobs is not None and arguments.jobs < 1:
-        raise InputError(f"--jobs must be at least 1, got {arguments.jobs}")
-    return Workers(arguments.jobs, arguments.backend, arguments.scheduler)
-
-
-def _add_fill(parser: argparse.ArgumentParser) -> None:
-    text = "put the tables into this document, between the lines '<!-- imitarm benchmark NAME -->' and '<!-- end -->'"
-    parser.add_argument("--fill", type=Path, metavar="FILE", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -212,7 +189,7 @@ def _mapping(arguments: argparse.Namespace) -> int:
     benchmark = _configured(arguments)
     experiments = benchmark.experiments()
     folder: Path = arguments.out or Path("benchmark-mapping")
-    place = _place(arguments, "mapping")
+    place = place_of(arguments, "mapping")
     _check(arguments, folder)
     if not benchmark.data and benchmark.kinds:
         remark(
@@ -224,7 +201,7 @@ def _mapping(arguments: argparse.Namespace) -> int:
         done = run_all(
             experiments,
             folder,
-            _workers(arguments),
+            workers_of(arguments),
             fresh=arguments.fresh,
             reuse=arguments.reuse,
             on_done=lambda finished, of: bar.update(task, completed=finished, total=of),
@@ -235,7 +212,7 @@ def _mapping(arguments: argparse.Namespace) -> int:
         remark(text)
     if set(versions) != {code_version()}:
         remark(origin(versions))
-    _report(found, place, versions)
+    report_tables(found, place, versions)
     for path in write_tables(results, found, folder):
         say(f"wrote {path}")
     if arguments.report is not None:
@@ -253,7 +230,7 @@ def _avoidance(arguments: argparse.Namespace) -> int:
         raise InputError(
             f"--seeds must be at least 1 and --first at least 0, got {arguments.seeds} and {arguments.first}"
         )
-    place = _place(arguments, "avoidance")
+    place = place_of(arguments, "avoidance")
     with progress_bar() as bar:
         task = bar.add_task("avoiding", total=None)
         table = avoidance.success_table(
@@ -262,7 +239,7 @@ def _avoidance(arguments: argparse.Namespace) -> int:
             arguments.methods,
             on_done=lambda finished, of: bar.update(task, completed=finished, total=of),
         )
-    _report([table], place, [code_version()])
+    report_tables([table], place, [code_version()])
     return 0
 
 
@@ -272,7 +249,7 @@ def _refusals(arguments: argparse.Namespace) -> int:
         raise InputError(
             f"--scenes must be at least 1 and --first at least 0, got {arguments.scenes} and {arguments.first}"
         )
-    place = _place(arguments, "refusals")
+    place = place_of(arguments, "refusals")
     with progress_bar() as bar:
         task = bar.add_task("adapting", total=arguments.scenes)
         table, verdicts = refusals.refusal_table(
@@ -281,7 +258,7 @@ def _refusals(arguments: argparse.Namespace) -> int:
             arguments.skills,
             on_done=lambda finished, _: bar.update(task, completed=finished),
         )
-    _report([table], place, [code_version()])
+    report_tables([table], place, [code_version()])
     doubtful = [v for v in verdicts if v.is_violation or (not v.accepted and v.oracle is not Answer.IMPOSSIBLE)]
     for v in doubtful:
         say(f"seed {v.seed} ({v.family}): {'violated' if v.is_violation else f'refused, {v.oracle.value}'}")
@@ -294,7 +271,7 @@ def _placements(arguments: argparse.Namespace) -> int:
         raise InputError("--seeds and --jobs must be at least 1, and --first at least 0")
     if arguments.out is not None and arguments.skill is None:
         raise InputError("--out needs --skill, because the skill that is used without --skill is not a file")
-    place = _place(arguments, "placements")
+    place = place_of(arguments, "placements")
     with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
         if arguments.skill is None:
             setups = [placements.packaged_setup(Path(folder))]
@@ -312,7 +289,7 @@ def _placements(arguments: argparse.Namespace) -> int:
             reuse=arguments.reuse,
             progress=lambda done, of: bar.update(task, completed=done, total=of),
         )
-    _report([placements.placement_table(results)], place, [result.code for result in results])
+    report_tables([placements.placement_table(results)], place, [result.code for result in results])
     for result in results if arguments.list else []:
         if result.outcome != "arrived":
             where = f"{Path(result.setup.skill).stem}, {result.setup.robot}, seed {result.seed}"
@@ -322,36 +299,19 @@ def _placements(arguments: argparse.Namespace) -> int:
 
 def _comparison(arguments: argparse.Namespace) -> int:
     """Print what saved results of placements say about a policy and its baselines."""
-    place = _place(arguments, "comparison")
+    place = place_of(arguments, "comparison")
     results = list(load_results(arguments.results).values())
     tables_found = placement_comparison.comparison_tables(results, arguments.policy)
-    _report(tables_found, place, [result.code for result in results])
+    report_tables(tables_found, place, [result.code for result in results])
     return 0
 
 
 def _people(arguments: argparse.Namespace) -> int:
     """Retarget recordings of real people to the arms, and print the tables."""
-    place = _place(arguments, "people")
+    place = place_of(arguments, "people")
     motions = list(real_motions.real_motions(arguments.data, arguments.videos))
-    _report(real_motions.tables(motions), place, [code_version()])
+    report_tables(real_motions.tables(motions), place, [code_version()])
     return 0
-
-
-def _place(arguments: argparse.Namespace, benchmark: str) -> Place | None:
-    """Return the document to fill with tables, after checking that it can be filled; None if no document is given."""
-    return None if arguments.fill is None else Place(arguments.fill, benchmark)
-
-
-def _report(found: Sequence[Table], place: Place | None, versions: Sequence[str]) -> None:
-    """Print tables, and put them into a document."""
-    for table in found:
-        show_table(table.columns, table.rows, title=table.title)
-        if table.note:
-            say(table.note)
-        say("")
-    if place is not None:
-        place.fill(found, _command(), versions)
-        say(f"filled {place.document}")
 
 
 def _configured(arguments: argparse.Namespace) -> MappingBenchmark:
@@ -368,18 +328,6 @@ def _configured(arguments: argparse.Namespace) -> MappingBenchmark:
         live=not arguments.no_live,
         data="" if data is None or arguments.no_replay else str(data.absolute()),
     )
-
-
-def _command() -> str:
-    """Return the command line without file names that apply only to this machine."""
-    words, places = sys.argv[1:], {"--out", "--report", "--fill", "--jobs", "--backend", "--scheduler"}
-    kept = [
-        w
-        for i, w in enumerate(words)
-        if w not in places | {"--fresh", "--reuse"} and (i == 0 or words[i - 1] not in places)
-    ]
-    named = ["recordings" if i > 0 and kept[i - 1] == "--data" else Path(w).name for i, w in enumerate(kept)]
-    return shlex.join(["imitarm", *named])
 
 
 def _not_done(results: Sequence[Result]) -> list[str]:
@@ -401,7 +349,7 @@ def _given(value: int | None, otherwise: int) -> int:
 
 def _check(arguments: argparse.Namespace, folder: Path) -> None:
     """Check the options now, because a wrong option would otherwise fail only after the long run."""
-    _workers(arguments)
+    workers_of(arguments)
     if arguments.data is not None and not arguments.data.is_dir():
         raise InputError(f"--data {arguments.data}: there is no such folder")
     if folder.exists() and not folder.is_dir():

@@ -1,0 +1,236 @@
+"""Compare the methods of the static benchmark in pairs, and with the thesis: Table 4.1 and Fig 4.9."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.benchmark.controls import CONTROLS
+from imitarm.benchmark.static import StaticResult
+from imitarm.benchmark.static_tables import (
+    N_TASKS,
+    OURS,
+    TASKS_FAMILY,
+    Scene,
+    StaticResults,
+    is_success,
+    mean,
+    place,
+)
+from imitarm.benchmark.tables import Table
+from imitarm.evaluation.intervals import bootstrap, holm
+
+Array = NDArray[np.float64]
+
+PRINTED = {
+    "DMP+AT": (0.0121, 0.0230, 0.0223, 0.0130, 0.0316, 0.0321, 0.0270, 0.0169),
+    "DMP+ANN": (0.0107, 0.0258, 0.0212, 0.0110, 0.0310, 0.0312, 0.0283, 0.0200),
+    "GMM+DMP": (0.0125, 0.0250, 0.0225, 0.0130, 0.0332, 0.0311, 0.0280, 0.0172),
+    "GMM+IRL": (0.0123, 0.0242, 0.0226, 0.0180, 0.0318, 0.0312, 0.0265, 0.0170),
+    "ACFRA": (0.0128, 0.0215, 0.0210, 0.0100, 0.0330, 0.0286, 0.0262, 0.0200),
+}
+"""RMSE of the tasks T1 to T8 in thesis Table 4.1; the thesis states no unit."""
+READINGS = {
+    "DMP+AT": ("dmp-steering", "dmp-potential"),
+    "DMP+ANN": ("dmp-ann",),
+    "GMM+DMP": ("gmm-dmp",),
+    "GMM+IRL": ("gmm-irl",),
+    "ACFRA": ("acfra", "acfra-mapf", "acfra-literal"),
+}
+"""Our methods for each column of Table 4.1."""
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Comparison of :data:`OURS` with another method in the same scenes.
+
+    Attributes:
+        row: the other method.
+        scenes: number of scenes in which both were run.
+        only_ours: number of scenes in which only ours succeeds.
+        only_other: number of scenes in which only the other succeeds.
+        p_success: p-value of McNemar's exact test.
+        both: number of scenes in which both succeed.
+        difference: mean difference of the RMSE in these scenes, ours minus the other [m]; nan without any.
+        low: lower end of its 95 % interval.
+        high: upper end.
+        p_rmse: p-value of Wilcoxon's signed-rank test.
+    """
+
+    row: str
+    scenes: int
+    only_ours: int
+    only_other: int
+    p_success: float
+    both: int
+    difference: float
+    low: float
+    high: float
+    p_rmse: float
+
+
+def mcnemar(only_first: int, only_second: int) -> float:
+    """Return the p-value of McNemar's exact test: a two-sided sign test of the scenes in which two methods differ."""
+    n, k = only_first + only_second, min(only_first, only_second)
+    if n == 0:
+        return 1.0
+    terms = [math.lgamma(n + 1) - math.lgamma(i + 1) - math.lgamma(n - i + 1) - n * math.log(2.0) for i in range(k + 1)]
+    return min(1.0, 2.0 * math.fsum(map(math.exp, terms)))
+
+
+def signed_rank(differences: Array) -> float:
+    """Return the p-value of Wilcoxon's signed-rank test that differences are symmetric about 0; 1 without any."""
+    from scipy.stats import wilcoxon  # noqa: PLC0415 (takes long to import)
+
+    nonzero = differences[differences != 0.0]
+    return float(wilcoxon(nonzero).pvalue) if len(nonzero) else 1.0
+
+
+def pairing(results: StaticResults, row: str, wanted: Callable[[Scene], bool]) -> Pairing:
+    """Compare :data:`OURS` with another row in the scenes that have a solution."""
+    pairs = [
+        (rows[OURS], rows[row])
+        for scene, rows in results.by_scene.items()
+        if OURS in rows and row in rows and results.solvable(scene) and wanted(scene)
+    ]
+    won = [(is_success(ours), is_success(other)) for ours, other in pairs]
+    only_ours, only_other = sum(a and not b for a, b in won), sum(b and not a for a, b in won)
+    differences = np.array(
+        [a.value("rmse") - b.value("rmse") for (a, b), both in zip(pairs, won, strict=True) if all(both)]
+    )
+    low, high = bootstrap(differences) if 0 < len(differences) <= _BOOTSTRAP else _normal(differences)
+    middle = float(differences.mean()) if len(differences) else math.nan
+    return Pairing(
+        row,
+        len(pairs),
+        only_ours,
+        only_other,
+        mcnemar(only_ours, only_other),
+        len(differences),
+        middle,
+        low,
+        high,
+        signed_rank(differences),
+    )
+
+
+_BOOTSTRAP = 2000  # scenes up to which the interval is a bootstrap interval; the bootstrap of more needs much memory
+
+
+def _normal(differences: Array) -> tuple[float, float]:
+    if len(differences) < 2:
+        return math.nan, math.nan
+    half = 1.96 * float(differences.std(ddof=1)) / math.sqrt(len(differences))
+    return float(differences.mean()) - half, float(differences.mean()) + half
+
+
+def pairings(results: StaticResults, wanted: Callable[[Scene], bool]) -> list[Pairing]:
+    """Compare :data:`OURS` with every other method, with p-values after Holm's correction."""
+    others = [row for row in results.rows if row != OURS and row not in CONTROLS]
+    found = [p for row in others if (p := pairing(results, row, wanted)).scenes]
+    success, rmse = holm([p.p_success for p in found]), holm([p.p_rmse for p in found])
+    return [replace(p, p_success=a, p_rmse=b) for p, a, b in zip(found, success, rmse, strict=True)]
+
+
+def paired_table(results: StaticResults) -> Table:
+    """Return a table that compares :data:`OURS` with each other method in pairs, in all families and in each."""
+    rows = []
+    for family in [None, *results.families()]:
+        for p in pairings(results, lambda s, f=family: results.usual(s) and f in (None, s[:2])):  # type: ignore[misc]
+            counts = (str(p.scenes), str(p.only_ours), str(p.only_other), p_value(p.p_success), str(p.both))
+            rows.append((place(family), p.row, *counts, _difference(p), p_value(p.p_rmse) if p.both else "–"))
+    columns = (
+        "family",
+        f"{OURS} against",
+        "scenes>",
+        f"only {OURS} succeeds>",
+        "only the other>",
+        "p, Holm>",
+        "both succeed>",
+        f"RMSE, {OURS} minus other [mm] (95 %)>",
+        "p, Holm>",
+    )
+    note = (
+        "Success: McNemar's exact test. RMSE: Wilcoxon's signed-rank test over the scenes in which both succeed. "
+        "p-values are corrected by Holm's method for the number of methods."
+    )
+    return Table(f"Paired comparison with {OURS}", columns, tuple(rows), note)
+
+
+def _difference(p: Pairing) -> str:
+    if not p.both:
+        return "–"
+    text = f"{1e3 * p.difference:+.1f}"
+    return f"{text} ({1e3 * p.low:+.1f} to {1e3 * p.high:+.1f})" if math.isfinite(p.low) else text
+
+
+def p_value(value: float) -> str:
+    """Return a p-value as text."""
+    return f"{value:.3f}" if value >= 0.001 else "< 0.001"
+
+
+def task_of(scene: Scene) -> str:
+    """Return the name of the sweeping task of a scene, such as "T1"; empty in other families."""
+    return f"T{scene[2] % N_TASKS + 1}" if scene[0] == TASKS_FAMILY else ""
+
+
+def _in_tasks(results: StaticResults, row: str, task: str) -> list[StaticResult]:
+    return results.of(row, lambda s: task_of(s) == task and results.usual(s))
+
+
+def printed_table(results: StaticResults) -> Table:
+    """Return Table 4.1 of the thesis: RMSE of the sweeping tasks T1 to T8, printed and ours."""
+    tasks = [f"T{i + 1}" for i in range(N_TASKS)]
+    rows = []
+    for name, values in PRINTED.items():
+        rows.append((f"{name}, printed", *(f"{v:.4f}" for v in values), f"{np.mean(values):.4f}"))
+        for row in results.rows:
+            if row.split(",")[0] not in READINGS[name]:
+                continue
+            cells, means = [], []
+            for task in tasks:
+                found = _in_tasks(results, row, task)
+                good = [r.value("rmse") for r in found if is_success(r)]
+                cells.append(f"{mean(good, 1.0, 4)} ({len(good)} of {len(found)})")
+                means += [float(np.mean(good))] if good else []
+            if any(not cell.endswith("of 0)") for cell in cells):
+                rows.append((row, *cells, mean(means, 1.0, 4)))
+    note = (
+        "Printed values: thesis Table 4.1, which states no unit, no number of failures and no spread; the printed "
+        "average of DMP+ANN is 0.224, ten times the mean of its column. Ours: mean RMSE of the successes [m], in "
+        "brackets how many of the scenes succeeded; each scene moves the obstacles of its task a little. Values of "
+        "different rows are means over different scenes where methods fail."
+    )
+    return Table(
+        "Table 4.1 of the thesis, and ours: RMSE", ("method", *(f"{t}>" for t in tasks), "average>"), tuple(rows), note
+    )
+
+
+def times_by_task(results: StaticResults, name: str, factor: float = 1.0) -> dict[str, list[float]]:
+    """Return the median of a measure over the successes of each task, for each row (thesis Fig 4.9)."""
+    found = {}
+    for row in results.rows:
+        if row in CONTROLS:
+            continue
+        medians = []
+        for i in range(N_TASKS):
+            good = [r.value(name) for r in _in_tasks(results, row, f"T{i + 1}") if is_success(r)]
+            medians.append(factor * float(np.median(good)) if good else math.nan)
+        if np.isfinite(medians).any():
+            found[row] = medians
+    return found
+
+
+def times_table(results: StaticResults) -> Table:
+    """Return the data of Fig 4.9: time to compute and time to complete the tasks T1 to T8."""
+    rows = []
+    for what, name, factor in (("to compute [ms]", "plan_seconds", 1e3), ("to complete [s]", "duration", 1.0)):
+        for row, found in times_by_task(results, name, factor).items():
+            rows.append((what, row, *(f"{v:.2f}" if math.isfinite(v) else "–" for v in found)))
+    columns = ("time", "method", *(f"T{i + 1}>" for i in range(N_TASKS)))
+    note = "Medians over the successes. Fig 4.9 of the thesis does not say which of the two times it shows."
+    return Table("Fig 4.9 of the thesis: time to compute and time to complete", columns, tuple(rows), note)

@@ -1,0 +1,378 @@
+"""Tables of the static benchmark: scenes, success, refusals, quality of the paths, computing time.
+
+A method with tuned options is a row of its own. The rate of success counts only the scenes that the oracle solves; how
+many scenes that excludes is in the first table.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.benchmark.controls import CONTROLS
+from imitarm.benchmark.static import StaticExperiment, StaticResult
+from imitarm.benchmark.static_measures import MAX_ACCELERATION, MAX_SPEED, NEAR, SUCCESSES
+from imitarm.benchmark.static_tuning import tuned_options
+from imitarm.benchmark.tables import Table
+from imitarm.evaluation.intervals import wilson_interval
+
+Array = NDArray[np.float64]
+Scene = tuple[str, int, int, int]  # family, dimension, seed, number of teachers
+
+OURS = "acfra"
+ORACLE = "oracle"
+POSSIBLE, IMPOSSIBLE, UNDECIDED = "possible", "impossible", "undecided"
+TASKS_FAMILY, N_TASKS = "S7", 8
+"""The family of the sweeping tasks T1 to T8; task T(1 + seed modulo 8)."""
+
+
+def row_name(experiment: StaticExperiment) -> str:
+    """Return the name of a row: the method, and whether its options are tuned."""
+    if not experiment.options:
+        return experiment.method
+    if experiment.options == tuned_options(experiment.method):
+        return f"{experiment.method}, tuned"
+    options = ", ".join(f"{name}={value}" for name, value in experiment.options)
+    return f"{experiment.method}, {options}"
+
+
+class StaticResults:
+    """Results of many experiments, by scene and by row of the tables.
+
+    Args:
+        results: the results; when an experiment has several, the last one counts.
+
+    Attributes:
+        all: all results.
+        rows: names of the rows, the controls last.
+        by_scene: for each scene, the results of the rows.
+    """
+
+    def __init__(self, results: Iterable[StaticResult]) -> None:
+        self.by_scene: dict[Scene, dict[str, StaticResult]] = {}
+        for result in results:
+            self.by_scene.setdefault(result.experiment.scene, {})[row_name(result.experiment)] = result
+        self.by_scene = dict(sorted(self.by_scene.items()))
+        self.all = [result for rows in self.by_scene.values() for result in rows.values()]
+        names = sorted({name for rows in self.by_scene.values() for name in rows})
+        order = [name for name in names if name.split(",")[0] == OURS]
+        order += [name for name in names if name not in order and name not in CONTROLS]
+        self.rows = (*order, *(name for name in CONTROLS if name in names))
+
+    @cached_property
+    def answers(self) -> dict[Scene, str]:
+        """Whether each scene has a solution: the answer of the oracle; where it was not run, what is known otherwise.
+
+        A scene is also known to have a solution when its construction says so, or when a method kept the required
+        clearance.
+        """
+        found = {}
+        for scene, rows in self.by_scene.items():
+            oracle = rows.get(ORACLE)
+            built = next(iter(rows.values())).values.get("must_refuse")
+            if oracle is not None:
+                found[scene] = str(oracle.values.get("answer", UNDECIDED))
+            elif built is not None:
+                found[scene] = IMPOSSIBLE if built else POSSIBLE
+            else:
+                solved = any(r.outcome == "success" for r in rows.values())
+                found[scene] = POSSIBLE if solved else UNDECIDED
+        return found
+
+    def contradictions(self) -> list[StaticResult]:
+        """Return the results that keep the required clearance although the oracle proved that no path does."""
+        return [r for r in self.all if r.outcome == "success" and self.answers[r.experiment.scene] == IMPOSSIBLE]
+
+    def families(self) -> list[tuple[str, int]]:
+        """Return the families with their dimensions."""
+        return list(dict.fromkeys(scene[:2] for scene in self.by_scene))
+
+    def of(self, row: str, wanted: Callable[[Scene], bool]) -> list[StaticResult]:
+        """Return the results of a row in the scenes for which ``wanted`` is true."""
+        return [rows[row] for scene, rows in self.by_scene.items() if row in rows and wanted(scene)]
+
+    def solvable(self, scene: Scene) -> bool:
+        """Return whether a scene is known to have a solution."""
+        return self.answers[scene] == POSSIBLE
+
+    @cached_property
+    def main_teachers(self) -> int:
+        """The number of teachers of the most scenes."""
+        counts = [scene[3] for scene in self.by_scene]
+        return max(set(counts), key=counts.count)
+
+    def usual(self, scene: Scene) -> bool:
+        """Return whether the skill of a scene was learned from the usual number of teachers."""
+        return scene[3] == self.main_teachers
+
+
+def is_success(result: StaticResult) -> bool:
+    """Return whether a result counts as success."""
+    return result.outcome in SUCCESSES
+
+
+def rate(count: int, of: int) -> str:
+    """Return a rate in percent with its Wilson interval (95 %)."""
+    if not of:
+        return "–"
+    low, high = wilson_interval(count, of)
+    return f"{100 * count / of:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def mean(values: Sequence[float], factor: float = 1.0, digits: int = 1) -> str:
+    """Return the mean of the values that are known, as text."""
+    known = [v for v in values if math.isfinite(v)]
+    return f"{factor * float(np.mean(known)):.{digits}f}" if known else "–"
+
+
+def percentile(values: Sequence[float], q: float, factor: float = 1.0, digits: int = 1) -> str:
+    """Return a percentile of the values that are known, as text."""
+    known = [v for v in values if math.isfinite(v)]
+    return f"{factor * float(np.percentile(known, q)):.{digits}f}" if known else "–"
+
+
+def place(family: tuple[str, int] | None) -> str:
+    """Return the name of a family with its dimension; None stands for all families."""
+    return "all" if family is None else f"{family[0]}, {family[1]}-D"
+
+
+def scenes_table(results: StaticResults) -> Table:
+    """Return a table of the scenes, and how many of them have a solution."""
+    rows = []
+    for family in [*results.families(), None]:
+        scenes = [s for s in results.by_scene if results.usual(s) and family in (None, s[:2])]
+        counts = [sum(results.answers[s] == a for s in scenes) for a in (POSSIBLE, IMPOSSIBLE, UNDECIDED)]
+        mixed = [results.by_scene[s] for s in scenes]
+        others = sum(
+            results.answers[s] == UNDECIDED and any(r.outcome == "success" for r in rows_.values())
+            for s, rows_ in zip(scenes, mixed, strict=True)
+        )
+        rows.append((place(family), *map(str, (len(scenes), *counts, others))))
+    wrong = [
+        f"{row_name(r.experiment)} in {place(r.experiment.scene[:2])}, seed {r.experiment.seed}"
+        for r in results.contradictions()
+    ]
+    checked = sum(ORACLE in rows_ for rows_ in results.by_scene.values())
+    verdict = "No method keeps the clearance in a scene that the oracle proves impossible."
+    if wrong:
+        verdict = (
+            f"The oracle is wrong: a method keeps the clearance where it proves that none can: {'; '.join(wrong)}."
+        )
+    note = (
+        f"The oracle was run in {checked} of {len(results.by_scene)} scenes; elsewhere, the construction of the scene "
+        "or a path that keeps the clearance decides. Only the scenes with a solution count in the rates of success. "
+        f"{verdict}"
+    )
+    columns = ("family", "scenes>", "possible>", "impossible>", "undecided>", "undecided, but solved by a method>")
+    return Table("Scenes", columns, tuple(rows), note)
+
+
+def success_table(results: StaticResults, families: Sequence[tuple[str, int] | None] = (None,)) -> Table:
+    """Return a table of the rates of success in the scenes that have a solution.
+
+    Args:
+        results: the results.
+        families: families with their dimensions, one group of rows for each; None stands for all families.
+    """
+    rows = []
+    for family in families:
+        for row in results.rows:
+            found = results.of(
+                row,
+                lambda s, f=family: results.solvable(s) and results.usual(s) and f in (None, s[:2]),  # type: ignore[misc]
+            )
+            if found:
+                rows.append((place(family), row, *_success_cells(found)))
+    columns = (
+        "family",
+        "method",
+        "scenes>",
+        "success % (95 %)>",
+        "keeps the clearance % (95 %)>",
+        *(f"{name}>" for name in _OTHERS),
+        "clearance of successes, 5th percentile [mm]>",
+    )
+    note = (
+        "Success: no contact at 4000 points of the path; start, goal and contact point met within 5 mm; at most twice "
+        f"the learned duration when executed with at most {MAX_SPEED:g} m/s and {MAX_ACCELERATION:g} m/s^2. "
+        "Intervals: Wilson."
+    )
+    return Table("Success" if tuple(families) == (None,) else "Success in each family", columns, tuple(rows), note)
+
+
+def _success_cells(found: Sequence[StaticResult]) -> tuple[str, ...]:
+    good = [r for r in found if is_success(r)]
+    return (
+        str(len(found)),
+        rate(len(good), len(found)),
+        rate(sum(r.outcome == "success" for r in found), len(found)),
+        *(str(sum(r.outcome == name for r in found)) for name in _OTHERS),
+        percentile([r.value("clearance") for r in good], 5, 1e3),
+    )
+
+
+_OTHERS = ("contact", "missed goal", "late", "limit", "refused", "failed")
+
+
+def refusals_table(results: StaticResults) -> Table:
+    """Return a table of right and wrong refusals."""
+    rows = []
+    for row in results.rows:
+        if row == ORACLE:
+            continue
+        hard = results.of(row, lambda s: results.answers[s] == IMPOSSIBLE and results.usual(s))
+        easy = results.of(row, lambda s: results.solvable(s) and results.usual(s))
+        right, wrong = (sum(r.outcome == "refused" for r in found) for found in (hard, easy))
+        open_ = results.of(row, lambda s: results.answers[s] == UNDECIDED and results.usual(s))
+        touched = sum(r.outcome == "contact" for r in hard)
+        rows.append(
+            (
+                row,
+                str(len(hard)),
+                rate(right, len(hard)),
+                str(touched),
+                rate(wrong, len(easy)),
+                f"{sum(r.outcome == 'refused' for r in open_)} of {len(open_)}",
+            )
+        )
+    columns = (
+        "method",
+        "impossible scenes>",
+        "refused, rightly % (95 %)>",
+        "contact in them>",
+        "refused, although possible % (95 %)>",
+        "refused, undecided>",
+    )
+    return Table("Refusals", columns, tuple(rows), "A method that never refuses moves in impossible scenes as well.")
+
+
+def quality_table(results: StaticResults) -> Table:
+    """Return a table of the quality of the paths, over the successes of each method."""
+    rows = []
+    for row in results.rows:
+        found = results.of(row, lambda s: results.solvable(s) and results.usual(s))
+        good = [r for r in found if is_success(r)]
+
+        def column(name: str, good: list[StaticResult] = good) -> list[float]:
+            return [r.value(name) for r in good]
+
+        rows.append(
+            (
+                row,
+                f"{len(good)} of {len(found)}",
+                mean(column("rmse"), 1e3),
+                mean(column("rmse_unaffected"), 1e3),
+                mean(column("path_rmse"), 1e3),
+                mean(column("deviation")),
+                mean(column("unmoved"), 100, 0),
+                mean(column("length_ratio"), 1, 3),
+                mean(column("duration_ratio"), 1, 3),
+                mean(column("sparc"), 1, 2),
+                mean(column("ldlj"), 1, 2),
+                mean(column("torque_rms"), 1, 2),
+            )
+        )
+    columns = (
+        "method",
+        "successes>",
+        "RMSE [mm]>",
+        "RMSE, unaffected samples [mm]>",
+        "RMSE of the path [mm]>",
+        "largest deviation [sigma]>",
+        "components unmoved [%]>",
+        "length>",
+        "duration>",
+        "SPARC>",
+        "LDLJ>",
+        "torque RMS [N m]>",
+    )
+    note = (
+        "Means over the successes of each method, which differ: the paired comparison uses common scenes. RMSE: "
+        "distance from the learned path at equal fractions of the durations (thesis Eq 4.9, with the square root); "
+        f"unaffected: samples at which the tool is farther than {1e2 * NEAR:.0f} cm from every obstacle; of the path: "
+        "from the nearest point. Length and duration of the execution: relative to the learned path."
+    )
+    return Table("Quality of the successful paths", columns, tuple(rows), note)
+
+
+def time_table(results: StaticResults) -> Table:
+    """Return a table of computing time and memory of one path of the tool."""
+    rows = []
+    for row in results.rows:
+        found = results.of(row, results.usual)
+
+        def column(name: str, found: list[StaticResult] = found) -> list[float]:
+            return [r.value(name) for r in found]
+
+        refused = [r.value("plan_seconds") for r in found if r.outcome == "refused"]
+        rows.append(
+            (
+                row,
+                str(len(found)),
+                percentile(column("plan_seconds"), 50, 1e3, 2),
+                percentile(column("plan_seconds"), 99, 1e3, 1),
+                percentile(column("plan_cpu"), 50, 1e3, 2),
+                percentile(refused, 50, 1e3, 2),
+                percentile(column("build_seconds"), 50, 1e3, 2),
+                percentile(column("peak_memory"), 50, 1e-3, 0),
+            )
+        )
+    columns = (
+        "method",
+        "plans>",
+        "time, median [ms]>",
+        "time, 99th percentile [ms]>",
+        "processor time, median [ms]>",
+        "time of a refusal, median [ms]>",
+        "construction, median [ms]>",
+        "peak memory, median [kB]>",
+    )
+    note = (
+        "Time to plan one whole path, without construction; construction includes what a method computes once for a "
+        "skill. Training of networks and cost functions is not included. Peak memory: what Python allocates in a "
+        "separate run."
+    )
+    return Table("Computing time", columns, tuple(rows), note)
+
+
+def obstacles_table(results: StaticResults) -> Table:
+    """Return a table of the rate of success by the number of obstacles."""
+    solvable = [s for s in results.by_scene if results.solvable(s) and results.usual(s)]
+    counts = {s: int(next(iter(results.by_scene[s].values())).value("n_obstacles")) for s in solvable}
+    numbers = sorted(set(counts.values()))
+    rows = []
+    for row in results.rows:
+        cells = []
+        for n in numbers:
+            found = results.of(row, lambda s, n=n: counts.get(s) == n)  # type: ignore[misc]
+            cells.append(rate(sum(map(is_success, found)), len(found)))
+        rows.append((row, *cells))
+    return Table(
+        "Success by the number of obstacles, % (95 %)",
+        ("method", *(f"{n}>" for n in numbers)),
+        tuple(rows),
+        "Scenes of all families that have a solution.",
+    )
+
+
+def teachers_table(results: StaticResults) -> Table:
+    """Return a table of success and deviation by the number of teachers."""
+    teachers = sorted({scene[3] for scene in results.by_scene})
+    common = set.intersection(
+        *({s[:3] for s in results.by_scene if s[3] == n and results.solvable(s)} for n in teachers)
+    )
+    rows = []
+    for row in results.rows:
+        cells = []
+        for n in teachers:
+            found = results.of(row, lambda s, n=n: s[3] == n and s[:3] in common)  # type: ignore[misc]
+            good = [r for r in found if is_success(r)]
+            cells += [rate(len(good), len(found)), mean([r.value("rmse") for r in good], 1e3)]
+        rows.append((row, *cells))
+    columns = [c for n in teachers for c in (f"{n} teachers: success % (95 %)>", f"{n} teachers: RMSE [mm]>")]
+    note = f"{len(common)} seeds, for which the scenes of every number of teachers have a solution."
+    return Table("Number of teachers", ("method", *columns), tuple(rows), note)

@@ -1,0 +1,171 @@
+"""Tuning of the static benchmark: the same random search for every method, on scenes that are not used for testing.
+
+Each option of a method's ``search_space`` is drawn log-uniformly. The best draw is the one with the highest rate of
+success on the validation scenes; among equals, the one with the smallest mean RMSE of its successes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imitarm.benchmark.experiment import plain, write_text
+from imitarm.benchmark.provenance import code_version
+from imitarm.benchmark.running import OnDone, Store, Workers, run_experiments
+from imitarm.benchmark.static import Options, StaticExperiment, StaticResult, policy_class, run_experiment
+from imitarm.benchmark.static_measures import SUCCESSES
+from imitarm.errors import FileFormatError, InputError
+
+FORMAT = "imitarm-tuned-static 1"
+DRAWS = 64
+_SHIPPED = "tuned_static.json"
+
+
+@dataclass(frozen=True)
+class Search:
+    """A random search.
+
+    Attributes:
+        scenes: scenes on which each draw is tried: family, dimension, seed.
+        draws: number of draws for each method, the first of which has the default options.
+        seed: seed of the draws.
+
+    Raises:
+        InputError: when there is nothing to search.
+    """
+
+    scenes: tuple[tuple[str, int, int], ...]
+    draws: int = DRAWS
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.scenes or self.draws < 1:
+            raise InputError("tuning needs at least one scene and one draw")
+
+    def options(self, method: str) -> list[Options]:
+        """Return the options of each draw of a method; only the default when its search space is empty."""
+        space = policy_class(method).search_space
+        rng = np.random.default_rng([self.seed, *method.encode()])
+        drawn: list[Options] = [()]
+        for _ in range(self.draws - 1 if space else 0):
+            chosen = {
+                name: float(f"{np.exp(rng.uniform(math.log(low), math.log(high))):.4g}")
+                for name, (low, high) in sorted(space.items())
+            }
+            drawn.append(tuple(sorted(chosen.items())))
+        return drawn
+
+
+@dataclass(frozen=True)
+class Draw:
+    """The score of one draw.
+
+    Attributes:
+        method: name of the method.
+        number: number of the draw; 0 has the default options.
+        options: options of the draw.
+        success: rate of success.
+        rmse: mean RMSE of the successes [m]; nan without any.
+    """
+
+    method: str
+    number: int
+    options: Options
+    success: float
+    rmse: float
+
+    @property
+    def order(self) -> tuple[float, float]:
+        """Sort key; the best draw has the smallest."""
+        return -self.success, self.rmse if math.isfinite(self.rmse) else math.inf
+
+
+def score(method: str, number: int, options: Options, results: Sequence[StaticResult]) -> Draw:
+    """Return the score of one draw from its results in all scenes."""
+    good = [r.value("rmse") for r in results if r.outcome in SUCCESSES]
+    return Draw(method, number, options, len(good) / len(results), float(np.mean(good)) if good else math.nan)
+
+
+def tune(
+    methods: Sequence[str],
+    search: Search,
+    store: Store[StaticExperiment, StaticResult],
+    workers: Workers | None = None,
+    *,
+    log: Path | None = None,
+    on_done: OnDone | None = None,
+) -> dict[str, Draw]:
+    """Search the options of each method, and return the best draws.
+
+    Args:
+        methods: names of the methods.
+        search: what is searched.
+        store: where the results are saved; an interrupted search continues where it stopped.
+        workers: processes that run the experiments.
+        log: file in which each draw is a line of JSON.
+        on_done: function called with the progress.
+    """
+    drawn = [(method, i, options) for method in methods for i, options in enumerate(search.options(method))]
+    experiments = [
+        StaticExperiment(*scene, method=method, options=options)
+        for method, _, options in drawn
+        for scene in search.scenes
+    ]
+    results = run_experiments(experiments, run_experiment, store, workers, on_done=on_done)
+    n, scored = len(search.scenes), []
+    for k, (method, i, options) in enumerate(drawn):
+        scored.append(score(method, i, options, results[k * n : (k + 1) * n]))
+    if log is not None:
+        write_text(log, "".join(json.dumps(plain(asdict(draw)), allow_nan=False) + "\n" for draw in scored))
+    return {method: min((d for d in scored if d.method == method), key=lambda d: d.order) for method in methods}
+
+
+def write_tuned(best: dict[str, Draw], search: Search, path: Path) -> None:
+    """Write the best options of each method, with the code and the configuration; other methods in the file stay."""
+    try:
+        known = _read(path.read_text(encoding="utf-8"), str(path))["methods"] if path.exists() else {}
+    except OSError as error:
+        raise InputError(f"{path}: can't be read ({error.strerror})") from error
+    seeds = [scene[2] for scene in search.scenes]
+    facts = {
+        "code": code_version(),
+        "draws": search.draws,
+        "seed": search.seed,
+        "families": sorted({f"{family} {dimension}-D" for family, dimension, _ in search.scenes}),
+        "scenes": len(search.scenes),
+        "seeds": [min(seeds), max(seeds)],
+    }
+    for method, draw in best.items():
+        known[method] = {"options": dict(draw.options), "success": draw.success, "rmse": draw.rmse, "search": facts}
+    content = {"format": FORMAT, "methods": plain(dict(sorted(known.items())))}
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+@lru_cache(maxsize=1)
+def _shipped() -> dict[str, Options]:
+    place = resources.files("imitarm.benchmark") / _SHIPPED
+    content = _read(place.read_text(encoding="utf-8"), _SHIPPED)
+    return {name: tuple(sorted(facts["options"].items())) for name, facts in content["methods"].items()}
+
+
+def tuned_options(method: str) -> Options:
+    """Return the tuned options of a method that the package contains; empty if its default options are the best."""
+    return _shipped().get(method, ())
+
+
+def _read(text: str, name: str) -> dict[str, Any]:
+    try:
+        content: dict[str, Any] = json.loads(text)
+        if content["format"] != FORMAT:
+            raise ValueError(f"format {content['format']!r} instead of {FORMAT!r}")
+    except (ValueError, KeyError, TypeError) as error:
+        raise FileFormatError(f"{name}: can't be read as tuned options ({error}); delete it and tune again") from error
+    return content

@@ -1,0 +1,221 @@
+"""``imitarm benchmark static``: run, tune and compare the avoidance methods in static scenes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from imitarm.benchmark.experiment import plain, write_text
+from imitarm.benchmark.provenance import code_version, origin
+from imitarm.benchmark.running import run_experiments
+from imitarm.benchmark.static import StaticExperiment, method_names, run_experiment
+from imitarm.benchmark.static_claims import cost_law, static_tables
+from imitarm.benchmark.static_results import ResultLines, read_folders
+from imitarm.benchmark.static_scenes import FAMILIES, SPLITS
+from imitarm.benchmark.static_tables import OURS, StaticResults, success_table
+from imitarm.benchmark.static_tuning import DRAWS, Search, tune, tuned_options, write_tuned
+from imitarm.cli.benchmark_options import add_fill, add_workers, command_line, place_of, report_tables, workers_of
+from imitarm.cli.outputs import check_outputs
+from imitarm.cli.screen import progress_bar, remark, say
+from imitarm.errors import InputError
+
+_FOLDER = Path("benchmark-static")
+_SETTINGS = ("default", "tuned")
+
+
+def add_static(parsers: Any) -> None:
+    """Add the parser of the command."""
+    static = parsers.add_parser("static", help="compare avoidance methods in random static scenes (thesis Table 4.1)")
+    _add_scenes(static, count=100, split="test")
+    static.add_argument(
+        "--settings",
+        nargs="+",
+        choices=_SETTINGS,
+        default=list(_SETTINGS),
+        help="options of the methods: default, tuned, or both (default: both)",
+    )
+    static.add_argument(
+        "--teachers",
+        type=int,
+        nargs="+",
+        default=[1],
+        metavar="N",
+        help="teachers of the skills; default: 1",
+    )
+    static.add_argument(
+        "--torque", type=int, default=0, metavar="N", help="in the first N scenes of a family, compute torques as well"
+    )
+    static.add_argument(
+        "--memory", type=int, default=0, metavar="N", help="in the first N scenes of a family, measure memory as well"
+    )
+    _add_running(static)
+    static.set_defaults(benchmark=_run)
+    actions = static.add_subparsers(metavar="ACTION", title="actions; without one, the experiments are run")
+    tuning = actions.add_parser("tune", help="search the options of the methods on validation scenes")
+    _add_scenes(tuning, count=20, split="validation")
+    tuning.add_argument("--draws", type=int, default=DRAWS, metavar="N", help=f"for each method; default: {DRAWS}")
+    tuning.add_argument("--save", type=Path, metavar="FILE", help="file of the best options; default: DIR/tuned.json")
+    _add_running(tuning)
+    tuning.set_defaults(benchmark=_tune)
+    comparison = actions.add_parser("compare", help="print the tables of saved results")
+    comparison.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="folders of results")
+    comparison.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
+    comparison.add_argument("--json", type=Path, metavar="FILE", help="write the tables as JSON")
+    comparison.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables as Markdown")
+    comparison.add_argument(
+        "--play",
+        nargs="+",
+        default=[],
+        metavar="FAMILY,DIMENSION,SEED",
+        help="scenes to draw, e.g. S5,3,2004",
+    )
+    add_fill(comparison)
+    comparison.set_defaults(benchmark=_compare)
+
+
+def _add_scenes(parser: argparse.ArgumentParser, *, count: int, split: str) -> None:
+    parser.add_argument(
+        "--methods", nargs="+", metavar="NAME", help="policies that plan a whole path, and controls; default: all"
+    )
+    parser.add_argument(
+        "--families", nargs="+", choices=FAMILIES, default=list(FAMILIES), metavar="NAME", help=" ".join(FAMILIES)
+    )
+    parser.add_argument("--dimensions", nargs="+", type=int, choices=(2, 3), default=[2, 3], help="default: 2 3")
+    parser.add_argument(
+        "--count", type=int, default=count, metavar="N", help=f"scenes of each family and dimension; default: {count}"
+    )
+    first, end = SPLITS[split]
+    text = f"first seed; {first} to {end - 1} are for {split}"
+    parser.add_argument("--first", type=int, default=first, metavar="N", help=text)
+
+
+def _add_running(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, default=_FOLDER, metavar="DIR", help=f"of the results; default: {_FOLDER}")
+    parser.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
+    parser.add_argument("--reuse", action="store_true", help="use saved results even if other code made them")
+    add_workers(parser)
+
+
+def _scenes(arguments: argparse.Namespace) -> list[tuple[str, int, int]]:
+    if arguments.count < 1 or arguments.first < 0:
+        raise InputError(f"--count must be at least 1 and --first at least 0: {arguments.count}, {arguments.first}")
+    seeds = range(arguments.first, arguments.first + arguments.count)
+    return [(family, d, seed) for seed in seeds for family in arguments.families for d in arguments.dimensions]
+
+
+def experiments_of(arguments: argparse.Namespace) -> list[StaticExperiment]:
+    """Return the experiments that the options ask for; those of one scene are neighbours."""
+    found: dict[StaticExperiment, None] = {}
+    for scene in _scenes(arguments):
+        number = scene[2] - arguments.first
+        for teachers in arguments.teachers:
+            for method in arguments.methods or method_names():
+                for setting in arguments.settings:
+                    options = tuned_options(method) if setting == "tuned" else ()
+                    if setting == "tuned" and not options and "default" in arguments.settings:
+                        continue
+                    more = {"torque": number < arguments.torque, "memory": number < arguments.memory}
+                    found[StaticExperiment(*scene, method, teachers, options, **more)] = None
+    return list(found)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Run the experiments; print the rates of success, the speed, and how the time depends on the obstacles."""
+    wanted, workers = experiments_of(arguments), workers_of(arguments)
+    store = ResultLines(arguments.out, reuse=arguments.reuse)
+    began, kept = time.perf_counter(), [0]
+
+    def on_done(done: int, of: int) -> None:
+        if not bar.tasks:
+            kept[0] = done
+            bar.add_task("planning", total=of)
+        bar.update(bar.tasks[0].id, completed=done)
+
+    with progress_bar() as bar:
+        done = run_experiments(wanted, run_experiment, store, workers, fresh=arguments.fresh, on_done=on_done)
+    seconds, ran = time.perf_counter() - began, len(done) - kept[0]
+    results = StaticResults(done)
+    report_tables([success_table(results)], None, [code_version()])
+    speed = 60.0 * ran / seconds
+    say(f"{ran} experiments in {seconds:.0f} s: {speed:.0f} scenes per minute; {kept[0]} were saved before")
+    for row in results.rows:
+        slope, error, n = cost_law(results, row)
+        if row.split(",")[0] == OURS and n > 2:
+            say(f"{row}: processor time ~ obstacles^{slope:.2f}, standard error {error:.2f}")
+    say(f"compare the methods: imitarm benchmark static compare {arguments.out}")
+    return 0
+
+
+def _tune(arguments: argparse.Namespace) -> int:
+    """Search the options of the methods, and write the best ones."""
+    scenes, (_, end) = _scenes(arguments), SPLITS["validation"]
+    if arguments.first < SPLITS["validation"][0] or arguments.first + arguments.count > end:
+        remark("the scenes are not validation scenes: options that are tuned on test scenes must not be tested on them")
+    search = Search(tuple(scenes), arguments.draws)
+    methods = arguments.methods or [m for m in method_names() if len(search.options(m)) > 1]
+    store = ResultLines(arguments.out, reuse=arguments.reuse)
+    path: Path = arguments.save or arguments.out / "tuned.json"
+    log = arguments.out / "draws.json-lines"
+    with progress_bar() as bar:
+        task = bar.add_task("tuning", total=None)
+        best = tune(
+            methods,
+            search,
+            store,
+            workers_of(arguments),
+            log=log,
+            on_done=lambda done, of: bar.update(task, completed=done, total=of),
+        )
+    for method, draw in best.items():
+        options = ", ".join(f"{name} {value:g}" for name, value in draw.options) or "default options"
+        found = f"{100 * draw.success:.1f} % success, RMSE {1e3 * draw.rmse:.1f} mm"
+        say(f"{method}: {found} with {options} (draw {draw.number})")
+    write_tuned(best, search, path)
+    say(f"wrote {log}", f"wrote {path}")
+    return 0
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    """Print the tables of saved results, and write files."""
+    place = place_of(arguments, "static")
+    outputs = [("--report", arguments.report), ("--json", arguments.json), ("--markdown", arguments.markdown)]
+    check_outputs([outputs[0]], [("--fill", arguments.fill), *outputs[1:]], new_folders=True)
+    found = read_folders(arguments.folders)
+    results, versions = StaticResults(found), [r.code for r in found]
+    tables = static_tables(results)
+    if set(versions) != {code_version()}:
+        remark(origin(versions))
+    report_tables(tables, place, versions)
+    if arguments.markdown is not None:
+        write_text(arguments.markdown, "\n".join(table.markdown() for table in tables))
+        say(f"wrote {arguments.markdown}")
+    if arguments.json is not None:
+        content = {
+            "command": command_line(),
+            "code": sorted(set(versions)),
+            "tables": [
+                {"title": t.title, "columns": list(t.columns), "rows": [list(r) for r in t.rows], "note": t.note}
+                for t in tables
+            ],
+        }
+        write_text(arguments.json, json.dumps(plain(content), indent=1, allow_nan=False))
+        say(f"wrote {arguments.json}")
+    if arguments.report is not None:
+        from imitarm.benchmark.static_report import write_static_report  # noqa: PLC0415 (draws: needs an extra)
+        from imitarm.cli.run_scene import provenance  # noqa: PLC0415
+
+        facts = provenance(results=origin(versions), experiments=len(found))
+        chosen = [_scene(text) for text in arguments.play]
+        say(f"wrote {write_static_report(results, tables, arguments.report, provenance=facts, scenes=chosen)}")
+    return 0
+
+
+def _scene(text: str) -> tuple[str, int, int]:
+    try:
+        family, dimension, seed = text.split(",")
+        return family, int(dimension), int(seed)
+    except ValueError as error:
+        raise InputError(f"--play {text}: write family, dimension and seed, such as S5,3,2004") from error
