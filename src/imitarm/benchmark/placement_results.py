@@ -63,9 +63,9 @@ class PlacementResult:
         max_tilt: largest rotation of the tool that was allowed [rad]; None: the policy's default.
         computing: processor time of the planning, which other programs disturb less than ``planning`` [s].
         rmse: distance of the executed path from the mean of the demonstrations, see
-            :class:`~imitarm.evaluation.path_style.PathStyle` [m]; nan unless the motion arrived, as the next two.
-        deviation: largest deviation from the mean, in standard deviations of the demonstrations.
-        tilt: largest rotation of the tool away from the learned rotation [rad].
+            :class:`~imitarm.evaluation.path_style.PathStyle` [m]; nan unless the motion arrived.
+        deviation: largest deviation from the mean, in standard deviations of the demonstrations; nan likewise.
+        tilt: largest rotation of the tool away from the learned rotation [rad]; nan likewise.
         code: version of the code, see :func:`~imitarm.benchmark.provenance.code_version`.
     """
 

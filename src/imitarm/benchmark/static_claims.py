@@ -93,7 +93,7 @@ def _compared(
         smaller = p.difference < 0.0
         parts.append(
             f"{p.row}: {1e3 * p.difference:+.1f} mm in {p.both} scenes (p {p_value(p.p_rmse)}), "
-            f"success only {OURS} {p.only_ours}, only the other {p.only_other}"
+            f"only {OURS} succeeds in {p.only_ours}, only {p.row} in {p.only_other}"
         )
         held.append(smaller == better and p.p_rmse < _LEVEL)
     return "; ".join(parts), _verdict(held)

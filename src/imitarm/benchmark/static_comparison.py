@@ -202,8 +202,8 @@ def printed_table(results: StaticResults) -> Table:
     note = (
         "Printed values: thesis Table 4.1, which states no unit, no number of failures and no spread; the printed "
         "average of DMP+ANN is 0.224, ten times the mean of its column. Ours: mean RMSE of the successes [m], in "
-        "brackets how many of the scenes succeeded; each scene moves the obstacles of its task a little. Values of "
-        "different rows are means over different scenes where methods fail."
+        "brackets how many of the scenes succeeded; each scene moves the obstacles of its task a little. Where a "
+        "method fails, its mean is over fewer scenes than those of the other methods."
     )
     return Table(
         "Table 4.1 of the thesis, and ours: RMSE", ("method", *(f"{t}>" for t in tasks), "average>"), tuple(rows), note

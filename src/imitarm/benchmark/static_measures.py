@@ -27,15 +27,15 @@ DENSE = 4000
 NEAR = 0.10
 """Distance of the tool on the learned path from an obstacle [m]; samples that are farther away count as unaffected."""
 AT_GOAL = 0.005
-"""Largest distance from start, goal and contact points, and into a forbidden direction [m]."""
+"""Largest permitted distance from start, goal and contact points, and into a forbidden direction [m]."""
 LATEST = 2.0
-"""Longest duration, relative to the learned duration."""
+"""Longest permitted duration, relative to the learned duration."""
 MAX_SPEED, MAX_ACCELERATION = 1.7, 13.0
 """Largest speed [m/s] and acceleration [m/s^2] of the tool: the Cartesian limits that the manufacturer states for the
 Panda. A plan that exceeds them is executed more slowly, at all times by the same factor, which does not change the path
 among standing obstacles."""
 SLACK = 0.0005
-"""A path keeps the required clearance if it is at most this much nearer [m]."""
+"""A path also counts as keeping the required clearance if it is nearer to an obstacle by at most this much [m]."""
 _SAMPLES = 200  # of the learned path, and of a planned path for speed, acceleration and smoothness
 
 
@@ -139,7 +139,7 @@ def _dense(trajectory: Trajectory) -> Trajectory:
 def evenly(trajectory: Trajectory) -> Trajectory:
     """Return 200 evenly spaced samples of a cubic spline through the samples.
 
-    The same number of samples for every method, so that finite differences treat all methods alike.
+    All methods get the same number of samples, so that finite differences treat them alike.
     """
     times = np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES)
     return Trajectory(times, CubicSpline(trajectory.times, trajectory.positions)(times))

@@ -1,7 +1,7 @@
 """Tables of the static benchmark: scenes, success, refusals, quality of the paths, computing time.
 
-A method with tuned options is a row of its own. The rate of success counts only the scenes that the oracle solves; how
-many scenes that excludes is in the first table.
+A method with tuned options is a row of its own. The rate of success counts only the scenes that the oracle solves; the
+first table states how many scenes this excludes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ OURS = "acfra"
 ORACLE = "oracle"
 POSSIBLE, IMPOSSIBLE, UNDECIDED = "possible", "impossible", "undecided"
 TASKS_FAMILY, N_TASKS = "S7", 8
-"""The family of the sweeping tasks T1 to T8; task T(1 + seed modulo 8)."""
+"""The family of the sweeping tasks T1 to T8, and their number; the seed s belongs to the task T(1 + s modulo 8)."""
 
 
 def row_name(experiment: StaticExperiment) -> str:
@@ -101,7 +101,7 @@ class StaticResults:
 
     @cached_property
     def main_teachers(self) -> int:
-        """The number of teachers of the most scenes."""
+        """The number of teachers that occurs in the largest number of scenes."""
         counts = [scene[3] for scene in self.by_scene]
         return max(set(counts), key=counts.count)
 

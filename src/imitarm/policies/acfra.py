@@ -43,7 +43,7 @@ class ACFRA(PathPolicy):
     fields (``"mapf"``, ``"literal"``) serve for comparison, so the robot follows their paths even if these paths do not
     keep the clearance.
 
-    Demonstrations may take several different paths, of which each has a skill of its own (see
+    Demonstrations may take several different paths, each of which has its own skill (see
     :func:`~imitarm.demonstrations.group_by_path`). The policy then adapts each of these paths between the same start
     and goal, and follows the feasible path with the smallest displacement in standard deviations of its demonstrations.
 

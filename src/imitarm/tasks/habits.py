@@ -160,7 +160,7 @@ def demonstrations_by(motion: Motion, teachers: int, *, repeats: int = REPEATS) 
 
     Args:
         motion: what to demonstrate.
-        teachers: number of teachers; the first of ten teachers is the same as the only one of one.
+        teachers: number of teachers; the first of ten teachers is the same person as a single teacher.
         repeats: demonstrations by each teacher.
 
     Raises:

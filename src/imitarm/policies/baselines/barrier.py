@@ -23,8 +23,8 @@ _SOFT = 1e6  # weight of the squared violation, if no velocity meets all inequal
 def nearest_velocity(desired: Array, rows: Array, lower: Array) -> Array:
     """Return the velocity nearest to ``desired`` with ``rows @ v >= lower``.
 
-    One violated row that alone decides has the closed form ``v = u + a (b - a . u) / |a|^2``. Otherwise a quadratic
-    program is solved. If no velocity meets all rows, the sum of the squared violations is least.
+    If a single violated row determines the result, the closed form ``v = u + a (b - a . u) / |a|^2`` is used. Otherwise
+    a quadratic program is solved. If no velocity meets all rows, the result has the smallest sum of squared violations.
 
     Args:
         desired: u, shape (d,) [m/s].

@@ -67,7 +67,7 @@ class CoupledMotion(BaselinePolicy):
     duration refuses.
 
     A subclass implements :meth:`term`. A part of ``Phi`` in a forbidden direction is removed. The limit ``a_max`` is
-    not part of any of the methods. It keeps a term that grows without bound near an obstacle from throwing the tool
+    not part of any of the methods. It prevents a term that grows without bound near an obstacle from throwing the tool
     away within one step.
 
     Args:

@@ -45,7 +45,7 @@ class DMPSteering(CoupledMotion):
     ``d`` is the distance of the tool, minus the required clearance.
 
     **Known failure.** The term is 0 for ``theta = 0``: the tool goes straight into an obstacle that it approaches head
-    on. The term also has no bound on the clearance, because it turns the velocity, however near the obstacle is.
+    on. The term also guarantees no clearance, because its rate of rotation is bounded, however near the obstacle is.
 
     Args:
         skill: skill to reproduce.

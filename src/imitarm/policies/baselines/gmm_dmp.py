@@ -66,7 +66,7 @@ class GMMDMP(CoupledMotion):
     scale. Over the phase, one Gaussian covers the whole second half of the motion, and the motion ends beside the goal.
 
     **Known failure.** The repulsion depends on the position alone. In front of a wide obstacle it cancels the spring
-    until the attractor has passed the obstacle, and the tool is then pulled through it, or late to the goal.
+    until the attractor has passed the obstacle, and the tool is then pulled through the obstacle, or arrives late.
 
     Args:
         skill: skill to reproduce.

@@ -28,8 +28,8 @@ def modulated(desired: Array, around: NearObstacles, *, reactivity: float = 1.0,
         q = Gamma^(-1 / reactivity),   Gamma = (1 + gap / (reach size))^2
 
     ``Gamma`` is 1 where the gap is 0, so that the tool does not move along the normal there. For a sphere with
-    ``reach`` and ``reactivity`` 1, ``Gamma`` is the squared distance from the centre in radii and the field is that of
-    the potential flow about the sphere's circles. A tool that is already too close may move away freely.
+    ``reach`` and ``reactivity`` 1, ``Gamma`` is the squared distance from the centre in radii, and in a plane through
+    the centre, the field is the potential flow about a circle. A tool that is already too close may move away freely.
 
     For several obstacles, the norms and the directions of the velocities are averaged with the weights ``w_o =
     prod_(i != o) (Gamma_i - 1)``, normalised to the sum 1. A direction is represented by its angle from ``u``.

@@ -29,7 +29,7 @@ class NearObstacles(NamedTuple):
     """The obstacles as seen from the tool, in the d directions in which the tool may be displaced.
 
     Attributes:
-        gap: distance of the tool to each obstacle less the required clearance, shape (n,) [m].
+        gap: distance of the tool to each obstacle, minus the required clearance, shape (n,) [m].
         normal: outward normals, shape (n, d); shorter than 1 if part of a normal lies in a forbidden direction.
         velocity: velocity of each obstacle at its closest point, shape (n, d) [m/s].
         drift: speed along each normal that the tool has in forbidden directions, shape (n,) [m/s].
