@@ -43,7 +43,7 @@ _SETTLED = 1e-7  # [m] the iteration ends when no sample moves farther
 _KEPT = 1e-5  # [m] a path may violate a constraint by so much: the tolerance of the quadratic programs is 1e-6
 _N_DIRECTIONS = 8  # of the first displacement, around the path
 _MOST_COMBINATIONS = 16  # of directions, if the path hits obstacles in several places
-_FARTHEST = 0.5  # [m] of the first displacement
+_FARTHEST = 0.5  # [m] no sample is displaced farther
 _SAME = 2e-3  # [m] paths whose samples are nearer than this are the same
 _MOST_SAG = 1e-3  # [m] a segment that is closer than this beyond the clearance jumps over an edge
 _DENSE = 8  # points on each segment where a found path is checked
@@ -65,18 +65,19 @@ def expert_paths(nominal: Trajectory, gaps: ToolGaps, *, clearance: float, forbi
 
     Returns:
         Positions at 100 equally spaced times, each of shape (100, 3) [m]; empty if no path was found, for example
-        because the start is too close to an obstacle.
+        because the start is too close to an obstacle. Paths that leave the nominal path by more than 0.5 m are left
+        out: close to the start, least jerk can lead to such paths.
     """
     clearance = finite_number(clearance, "expert_paths: clearance", "m", at_least=0.0)
     directions = finite_array(np.reshape(np.asarray(forbidden, dtype=float), (-1, 3)), (None, 3), "forbidden")
-    problem = _Problem.of(nominal, gaps, clearance, directions)
+    problem = PathProblem.of(nominal, gaps, clearance, directions)
     lowest = problem.gaps_at(problem.nominal)[0].min(axis=0, initial=np.inf)
     if not gaps.n_obstacles or lowest.min() >= clearance:
         return [problem.nominal]
     if min(lowest[:_FIXED].min(), lowest[-_FIXED:].min()) < clearance - _KEPT:
         return []
     found: list[tuple[float, Array]] = []
-    for start in _first_displacements(problem, lowest < clearance):
+    for start in displaced_paths(problem):
         path = _optimised(problem, start)
         if path is not None and all(np.abs(path - other).max() > _SAME for _, other in found):
             found.append((problem.cost(path), path))
@@ -88,18 +89,28 @@ def jerk_cost(positions: Array, dt: float) -> float:
     return float(np.sum(np.diff(positions, 3, axis=0) ** 2) / dt**5)
 
 
-class _Problem(NamedTuple):
-    """One scene: the nominal path, the gaps, and the directions in which the path may be displaced."""
+class PathProblem(NamedTuple):
+    """One scene: the nominal path, the gaps, and the directions in which the path may be displaced.
 
-    nominal: Array  # (100, 3) [m]
-    times: Array  # (100,) [s]
+    Attributes:
+        nominal: positions at equal time steps, shape (100, 3) [m].
+        times: times of the samples since the motion began, shape (100,) [s].
+        gaps: distances to the obstacles.
+        clearance: required gap [m].
+        axes: orthonormal basis of the directions that are not forbidden both ways, as columns, shape (3, d).
+        one_sided: the other forbidden directions in this basis, shape (m, d).
+    """
+
+    nominal: Array
+    times: Array
     gaps: ToolGaps
     clearance: float
-    axes: Array  # orthonormal basis of the directions that are not forbidden both ways, as columns, (3, d)
-    one_sided: Array  # the other forbidden directions in this basis, (m, d)
+    axes: Array
+    one_sided: Array
 
     @classmethod
-    def of(cls, nominal: Trajectory, gaps: ToolGaps, clearance: float, forbidden: Array) -> _Problem:
+    def of(cls, nominal: Trajectory, gaps: ToolGaps, clearance: float, forbidden: Array) -> PathProblem:
+        """Sample the nominal path; ``forbidden`` has shape (m, 3)."""
         times = nominal.times[0] + np.linspace(0.0, nominal.duration, N_SAMPLES)
         axes, one_sided = allowed_axes(forbidden / np.linalg.norm(forbidden, axis=1, keepdims=True))
         return cls(nominal.at(times)[0], times - times[0], gaps, clearance, axes, one_sided)
@@ -110,11 +121,13 @@ class _Problem(NamedTuple):
         return gap[:, :, 0], normal[:, :, 0]
 
     def cost(self, path: Array) -> float:
+        """Return the integral of the squared jerk of the deviation [m^2/s^5]."""
         return jerk_cost(path - self.nominal, float(self.times[1]))
 
     def keeps_clearance(self, path: Array) -> bool:
-        """Whether the samples keep the clearance and the segments between them touch nothing."""
-        if self.gaps_at(path)[0].min() < self.clearance - _KEPT:
+        """Whether the samples keep the clearance and do not stray, and the segments between them jump over nothing."""
+        strays = np.linalg.norm(path - self.nominal, axis=1).max() > _FARTHEST
+        if strays or self.gaps_at(path)[0].min() < self.clearance - _KEPT:
             return False
         u = np.linspace(0.0, N_SAMPLES - 1.0, _DENSE * (N_SAMPLES - 1) + 1)
         dense = np.stack([np.interp(u, np.arange(N_SAMPLES), column) for column in path.T], axis=1)
@@ -151,16 +164,23 @@ def _least_jerk(samples: NDArray[np.intp], directions: Array, lower: Array) -> A
     return _influence() @ np.reshape(y, (-1, k)) if flag == _SOLVED else None
 
 
-def _first_displacements(problem: _Problem, too_close: NDArray[np.bool_]) -> list[Array]:
-    """Return paths (100, 3) that are displaced from the nominal path on the stretches that are too close."""
+def displaced_paths(problem: PathProblem) -> list[Array]:
+    """Return paths (100, 3) on all sides of the obstacles, from which an optimiser can start.
+
+    Each stretch of the nominal path that is too close to an obstacle is lifted off in a direction around the path, by
+    the deviation of least jerk. With several stretches, only the directions of least jerk are combined.
+    """
+    too_close = problem.gaps_at(problem.nominal)[0].min(axis=0, initial=np.inf) < problem.clearance
     edges = np.flatnonzero(np.diff(np.concatenate([[False], too_close, [False]]).astype(int)))
     stretches = [slice(a, b) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)]
-    ranked = [_ranked_bumps(problem, stretch) for stretch in stretches]
+    ranked = [bumps for bumps in (_ranked_bumps(problem, stretch) for stretch in stretches) if bumps]
+    if not ranked:
+        return []
     each = len(ranked[0]) if len(ranked) == 1 else max(int(_MOST_COMBINATIONS ** (1.0 / len(ranked))), 1)
     return [problem.nominal + np.sum(bumps, axis=0) for bumps in product(*[bumps[:each] for bumps in ranked])]
 
 
-def _ranked_bumps(problem: _Problem, stretch: slice) -> list[Array]:
+def _ranked_bumps(problem: PathProblem, stretch: slice) -> list[Array]:
     """Return smooth displacements (100, 3) that lift one stretch off the obstacles, in the order of their jerk."""
     ahead = np.gradient(problem.nominal, axis=0)[(stretch.start + stretch.stop) // 2] @ problem.axes
     bumps = []
@@ -169,8 +189,9 @@ def _ranked_bumps(problem: _Problem, stretch: slice) -> list[Array]:
         if lift is None or np.any(problem.one_sided @ u > 1e-9):
             continue
         samples = np.arange(stretch.start, stretch.stop) - _FIXED
-        height = _least_jerk(samples, np.ones((len(samples), 1)), lift)
-        if height is not None:
+        free = (samples >= 0) & (samples < len(_influence()))
+        height = _least_jerk(samples[free], np.ones((np.count_nonzero(free), 1)), lift[free])
+        if height is not None and height.max() <= _FARTHEST:
             bump = np.zeros((N_SAMPLES, 3))
             bump[_FREE] = height * (problem.axes @ u)
             bumps.append((float(np.sum(np.diff(bump, 3, axis=0) ** 2)), bump))
@@ -187,7 +208,7 @@ def _around(ahead: Array) -> list[Array]:
     return list(np.cos(angles)[:, None] * across[0] + np.sin(angles)[:, None] * across[1])
 
 
-def _lift(problem: _Problem, stretch: slice, u: Array) -> Array | None:
+def _lift(problem: PathProblem, stretch: slice, u: Array) -> Array | None:
     """Return how far each sample of a stretch must move along ``u`` until it keeps the clearance; None if too far."""
     heights = np.linspace(0.0, _FARTHEST, 101)
     points = problem.nominal[stretch, None, :] + heights[:, None] * u
@@ -195,7 +216,7 @@ def _lift(problem: _Problem, stretch: slice, u: Array) -> Array | None:
     return heights[np.argmax(clear, axis=1)] if clear.any(axis=1).all() else None
 
 
-def _optimised(problem: _Problem, path: Array) -> Array | None:
+def _optimised(problem: PathProblem, path: Array) -> Array | None:
     """Return the local optimum that the tangents of ``path`` lead to; None if it does not keep the clearance."""
     for _ in range(_ITERATIONS):
         gap, normal = problem.gaps_at(path)
