@@ -219,6 +219,16 @@ def test_wrong_arguments_are_named():
         static_case("S1", 3, 0, skill=short)
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_dense_scenes_have_as_many_obstacles_as_requested(dimension):
+    for n in (1, 2, 8, 20):
+        case = static_case("S2", dimension, 2000, n_obstacles=n)
+        assert len(case.scene.obstacles) == n
+        assert clearance_without_avoidance(case) < 0.0
+    with pytest.raises(InputError, match="needs the family S2"):
+        static_case("S1", dimension, 2000, n_obstacles=3)
+
+
 def test_the_splits_share_no_seed():
     seeds = [seed for first, end in SPLITS.values() for seed in range(first, end)]
     assert len(seeds) == len(set(seeds))

@@ -109,7 +109,22 @@ class _Placed(NamedTuple):
     contact: float | None = None  # fraction of the duration
 
 
-_Place = Callable[[np.random.Generator, Array, bool, int], _Placed]  # random numbers, path (n, 3), planar, seed
+class _Draw(NamedTuple):
+    """What a scene is drawn from."""
+
+    rng: np.random.Generator
+    path: Array  # (n, 3) [m]
+    planar: bool
+    seed: int
+    n_obstacles: int | None  # None: at random
+
+    def number(self, first: int, last: int) -> int:
+        """Return a random number of obstacles from ``first`` to ``last``, or the requested one."""
+        drawn = int(self.rng.integers(first, last + 1))
+        return drawn if self.n_obstacles is None else self.n_obstacles
+
+
+_Place = Callable[[_Draw], _Placed]
 
 
 class _Family(NamedTuple):
@@ -146,7 +161,15 @@ def learned_path(skill: Skill, n: int = PATH_SAMPLES) -> Array:
     return skill.nominal(np.linspace(0.0, skill.duration_, n)).positions
 
 
-def static_case(family: str, dimension: int, seed: int, *, teachers: int = 1, skill: Skill | None = None) -> StaticCase:
+def static_case(
+    family: str,
+    dimension: int,
+    seed: int,
+    *,
+    teachers: int = 1,
+    skill: Skill | None = None,
+    n_obstacles: int | None = None,
+) -> StaticCase:
     """Return one static scene; the same arguments give the same scene on every machine.
 
     Args:
@@ -155,6 +178,7 @@ def static_case(family: str, dimension: int, seed: int, *, teachers: int = 1, sk
         seed: number of the scene; :data:`SPLITS` says what it may be used for.
         teachers: number of teachers from whom the skill was learned.
         skill: another skill, for the families in :data:`ANY_SKILL`.
+        n_obstacles: number of obstacles, for S2; None: at random.
 
     Raises:
         UnknownNameError: when there is no such family.
@@ -169,10 +193,12 @@ def static_case(family: str, dimension: int, seed: int, *, teachers: int = 1, sk
             f"static_case: scenes of {family} are made for its own skill; with skill=..., choose one of "
             f"{', '.join(ANY_SKILL)}"
         )
+    if n_obstacles is not None and (family != "S2" or n_obstacles < 1):
+        raise InputError(f"static_case: n_obstacles needs the family S2 and at least 1, got {family} and {n_obstacles}")
     rng = np.random.default_rng([int(family[1:]), dimension, seed])
     its = _FAMILIES[family]
     own = learned_skill(family, dimension, teachers) if skill is None else skill
-    placed = _blocking(its, rng, learned_path(own), dimension == 2, seed)
+    placed = _blocking(its, _Draw(rng, learned_path(own), dimension == 2, seed, n_obstacles))
     known = placed.must_refuse if skill is None or placed.must_refuse else None  # another path may come back
     return StaticCase(
         family,
@@ -188,12 +214,12 @@ def static_case(family: str, dimension: int, seed: int, *, teachers: int = 1, sk
     )
 
 
-def _blocking(family: _Family, rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
+def _blocking(family: _Family, draw: _Draw) -> _Placed:
     """Draw scenes until the tool would enter an obstacle on the path, and the points that must not move are free."""
     failures = 0
     for _ in range(_DRAWS):
         try:
-            placed = family.place(rng, path, planar, seed)
+            placed = family.place(draw)
         except InputError:  # no place for so many obstacles: perhaps for fewer
             failures += 1
             if failures < _FAILURES:
@@ -202,44 +228,46 @@ def _blocking(family: _Family, rng: np.random.Generator, path: Array, planar: bo
         if not family.solvable:
             return placed
         scene = Scene(None, placed.obstacles)
-        fixed = [0, -1, *(() if placed.contact is None else (round(placed.contact * (len(path) - 1)),))]
-        blocked = float(np.min(scene.clearance(path))) < family.tool_radius - BLOCKED
-        if blocked and float(np.min(scene.clearance(path[fixed]))) >= family.tool_radius + CLEARANCE + _FREE:
+        fixed = [0, -1, *(() if placed.contact is None else (round(placed.contact * (len(draw.path) - 1)),))]
+        blocked = float(np.min(scene.clearance(draw.path))) < family.tool_radius - BLOCKED
+        if blocked and float(np.min(scene.clearance(draw.path[fixed]))) >= family.tool_radius + CLEARANCE + _FREE:
             return placed
     raise InputError("no scene blocks the path and leaves its ends free; choose the skill of a longer path")
 
 
-def _sparse(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
-    return _Placed(obstacles_apart(rng, path, int(rng.integers(1, 3)), planar=planar, kinds=SIMPLE), False)
+def _sparse(draw: _Draw) -> _Placed:
+    return _Placed(obstacles_apart(draw.rng, draw.path, draw.number(1, 2), planar=draw.planar, kinds=SIMPLE), False)
 
 
-def _mixed(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
-    return _Placed(obstacles_apart(rng, path, int(rng.integers(1, 4)), planar=planar, kinds=ALL_KINDS), False)
+def _mixed(draw: _Draw) -> _Placed:
+    return _Placed(obstacles_apart(draw.rng, draw.path, draw.number(1, 3), planar=draw.planar, kinds=ALL_KINDS), False)
 
 
-def _dense(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
+def _dense(draw: _Draw) -> _Placed:
     """Obstacles about the path, which may overlap; those that cover start or goal are drawn again."""
     made: list[Obstacle] = []
-    n = int(rng.integers(4, 9))
+    n = draw.number(4, 8)
     for _ in range(_DRAWS):
-        aside = _SPREAD_DENSE * rng.normal(size=3) * ([1.0, 1.0, 0.0] if planar else [1.0, 1.0, 1.0])
-        obstacle = random_obstacle(rng, path[rng.integers(len(path))] + aside, planar=planar, kinds=SIMPLE)
-        if obstacle.signed_distance(path[[0, -1]]).min() >= _FREE_ENDS:
+        aside = _SPREAD_DENSE * draw.rng.normal(size=3) * ([1.0, 1.0, 0.0] if draw.planar else [1.0, 1.0, 1.0])
+        obstacle = random_obstacle(
+            draw.rng, draw.path[draw.rng.integers(len(draw.path))] + aside, planar=draw.planar, kinds=SIMPLE
+        )
+        if obstacle.signed_distance(draw.path[[0, -1]]).min() >= _FREE_ENDS:
             made.append(obstacle)
         if len(made) == n:
             break
     return _Placed(tuple(made), None)
 
 
-def _gap(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
+def _gap(draw: _Draw) -> _Placed:
     """A wall with a gap; in 3-D, the gap is a window that is at least as high as it is wide."""
-    width = 2.0 * TOOL_RADIUS * rng.uniform(1.2, 3.0)
-    walls = wall_with_gap(rng, path, width, shift=0.15, height=0.3 if planar else 2.0)
+    width = 2.0 * TOOL_RADIUS * draw.rng.uniform(1.2, 3.0)
+    walls = wall_with_gap(draw.rng, draw.path, width, shift=0.15, height=0.3 if draw.planar else 2.0)
     slack = width - 2.0 * (TOOL_RADIUS + CLEARANCE)
     must_refuse = None if 0.0 <= slack < _TIGHT else bool(slack < 0.0)
-    if planar:
+    if draw.planar:
         return _Placed(walls, must_refuse)
-    height, level = rng.uniform(1.0, 2.0) * width, path[len(path) // 2, 2] + rng.uniform(-0.1, 0.1)
+    height, level = draw.rng.uniform(1.0, 2.0) * width, draw.path[len(draw.path) // 2, 2] + draw.rng.uniform(-0.1, 0.1)
     left, right = walls
     centre, quaternion = 0.5 * (left.pose.position + right.pose.position), left.pose.quaternion
     sills = [
@@ -253,14 +281,14 @@ def _gap(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Pla
     return _Placed((*walls, *sills), must_refuse)
 
 
-def _trap(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
+def _trap(draw: _Draw) -> _Placed:
     """Three boxes in the shape of a U, into which the path leads; the hull of the U leaves start and goal free."""
-    at = int(rng.uniform(*_MIDDLE) * len(path))
-    ahead = path[at + 5] - path[at - 5]
-    yaw = np.arctan2(ahead[1], ahead[0]) + rng.normal(0.0, _SKEW)
-    frame = Pose(path[at], quaternion_exp(np.array([0.0, 0.0, yaw])))
-    depth, thick = rng.uniform(0.05, 0.20), rng.uniform(0.01, 0.03)
-    inside, height = 2.0 * TOOL_RADIUS * rng.uniform(1.2, 2.5), 0.3 if planar else rng.uniform(0.1, 0.3)
+    at = int(draw.rng.uniform(*_MIDDLE) * len(draw.path))
+    ahead = draw.path[at + 5] - draw.path[at - 5]
+    yaw = np.arctan2(ahead[1], ahead[0]) + draw.rng.normal(0.0, _SKEW)
+    frame = Pose(draw.path[at], quaternion_exp(np.array([0.0, 0.0, yaw])))
+    depth, thick = draw.rng.uniform(0.05, 0.20), draw.rng.uniform(0.01, 0.03)
+    inside, height = 2.0 * TOOL_RADIUS * draw.rng.uniform(1.2, 2.5), 0.3 if draw.planar else draw.rng.uniform(0.1, 0.3)
 
     def box(name: str, x: float, y: float, length: float, width: float) -> Box:
         return Box(Pose(frame.apply([x, y, 0.0]), frame.quaternion), np.array([length, width, height]), name=name)
@@ -272,31 +300,40 @@ def _trap(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Pl
         box("right arm", -0.5 * depth, -aside, depth, thick),
     )
     hull = box("hull", 0.5 * (thick - depth), 0.0, depth + thick, outside)
-    return _Placed(boxes if hull.signed_distance(path[[0, -1]]).min() >= _FREE_ENDS else (), False)
+    return _Placed(boxes if hull.signed_distance(draw.path[[0, -1]]).min() >= _FREE_ENDS else (), False)
 
 
-def _over_a_point(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
+def _over_a_point(draw: _Draw) -> _Placed:
     """An obstacle over the start, the goal or a contact point."""
-    where = int(rng.integers(3))
-    contact = float(rng.uniform(*_MIDDLE)) if where == 2 else None
-    sample = round((len(path) - 1) * (0.0, 1.0, contact or 0.0)[where])
+    where = int(draw.rng.integers(3))
+    contact = float(draw.rng.uniform(*_MIDDLE)) if where == 2 else None
+    sample = round((len(draw.path) - 1) * (0.0, 1.0, contact or 0.0)[where])
     if contact is not None:
-        contact = sample / (len(path) - 1)
-    return _Placed((covering_sphere(rng, path[sample], planar=planar),), True, contact)
+        contact = sample / (len(draw.path) - 1)
+    return _Placed((covering_sphere(draw.rng, draw.path[sample], planar=draw.planar),), True, contact)
 
 
-def _sweep(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
+def _sweep(draw: _Draw) -> _Placed:
     """One of the scenes T1 to T8, each obstacle moved and rotated a little; the path must not move at the dirt."""
-    scene = SweepTask.scene(list(NUMBERED_SCENES)[seed % len(NUMBERED_SCENES)])
+    scene = SweepTask.scene(list(NUMBERED_SCENES)[draw.seed % len(NUMBERED_SCENES)])
     made: list[Obstacle] = []
     for obstacle in scene.obstacles:
-        turn = quaternion_exp(np.array([0.0, 0.0, rng.normal(0.0, _ROTATED)]))
-        shift = _MOVED * rng.normal(size=3) * [1.0, 1.0, 0.0]
+        turn = quaternion_exp(np.array([0.0, 0.0, draw.rng.normal(0.0, _ROTATED)]))
+        shift = _MOVED * draw.rng.normal(size=3) * [1.0, 1.0, 0.0]
         assert isinstance(obstacle, PosedObstacle)
         pose = obstacle.pose
         made.append(replace(obstacle, pose=Pose(pose.position + shift, quaternion_multiply(turn, pose.quaternion))))
-    at = int(np.argmin(np.linalg.norm(path - SweepTask.dirt.position, axis=1)))
-    return _Placed(tuple(made), contact=at / (len(path) - 1))
+    at = int(np.argmin(np.linalg.norm(draw.path - SweepTask.dirt.position, axis=1)))
+    return _Placed(tuple(made), contact=at / (len(draw.path) - 1))
+
+
+def _open_box(draw: _Draw) -> _Placed:
+    """The box, and obstacles on the path to it."""
+    boards, n = OpenBoxTask.box(planar=draw.planar), draw.number(1, 3)
+    if draw.planar:
+        before = draw.path[: round(_BEFORE_BOX * len(draw.path))]
+        return _Placed((*boards, *obstacles_apart(draw.rng, before, n, planar=True, kinds=ALL_KINDS)))
+    return _Placed((*boards, *OpenBoxTask.obstacles(draw.rng, n, draw.path)))
 
 
 def _reach(planar: bool) -> Motion:
@@ -309,15 +346,6 @@ def _sweep_motion(planar: bool) -> Motion:
 
 def _box_motion(planar: bool) -> Motion:
     return OpenBoxTask.motion(planar=planar)
-
-
-def _open_box(rng: np.random.Generator, path: Array, planar: bool, seed: int) -> _Placed:
-    """The box, and obstacles on the path to it."""
-    boards, n = OpenBoxTask.box(planar=planar), int(rng.integers(1, 4))
-    if planar:
-        before = path[: round(_BEFORE_BOX * len(path))]
-        return _Placed((*boards, *obstacles_apart(rng, before, n, planar=True, kinds=ALL_KINDS)))
-    return _Placed((*boards, *OpenBoxTask.obstacles(rng, n, path)))
 
 
 _FAMILIES: dict[str, _Family] = {
