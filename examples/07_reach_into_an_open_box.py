@@ -30,10 +30,8 @@ def main() -> None:
         policy = ACFRA(skill, arm=arm, clearance=task.clearance)
         safety = SafetyFilter(arm, clearance=task.clearance)
         rollout = task.evaluate(robot, reproduce(policy, robot, scene.at, safety=safety))
-        print(
-            f"{n_obstacles} obstacles: {rollout.reason}, {1e3 * rollout.details['distance_to_goal']:.1f} mm from the goal, "
-            f"clearance {1e3 * rollout.min_clearance:.0f} mm"
-        )
+        away, nearest = 1e3 * rollout.details["distance_to_goal"], 1e3 * rollout.min_clearance
+        print(f"{n_obstacles} obstacles: {rollout.reason}, {away:.1f} mm from the goal, clearance {nearest:.0f} mm")
 
     # A policy that sees no obstacles, without the safety filter, shows that the obstacles are really in the way.
     robot = task.robot(arm=arm)
