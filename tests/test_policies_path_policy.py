@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 
 from imitarm.benchmark.avoidance import learn
 from imitarm.errors import InfeasibleError
@@ -70,3 +71,26 @@ def test_acfra_plans_the_motion_without_an_arm_and_refuses_what_it_can_not_solve
     assert ToolGaps(Scene(None, [Sphere(middle, 0.03)]), spheres).gaps(plan.trajectory.positions).min() >= 0.02
     with pytest.raises(InfeasibleError, match="goal"):
         policy.plan_motion(Scene(None, [Sphere(PATH[-1], 0.03)]))
+
+
+@given(st.integers(0, 10_000))
+def test_a_plan_is_slowed_down_until_the_tool_is_within_its_limits(seed):
+    rng = np.random.default_rng(seed)
+    times = np.linspace(0.0, 2.0, 150)
+    corners = np.cumsum(0.1 * rng.normal(size=(6, 3)), axis=0)
+    u = 10 * (times / 2) ** 3 - 15 * (times / 2) ** 4 + 6 * (times / 2) ** 5
+    positions = np.stack([np.interp(5 * u, range(6), column) for column in corners.T], axis=1)
+    plan = PathPlan(Trajectory(times, positions), np.zeros(150)).within(0.3, 2.0)
+    path = plan.trajectory
+    np.testing.assert_array_equal(path.positions, positions)
+    even = np.linspace(path.times[0], path.times[-1], 200)
+    smooth = CubicSpline(path.times, path.positions)(even)
+    assert np.linalg.norm(np.diff(smooth, axis=0), axis=1).max() / (even[1] - even[0]) <= 0.3 + 1e-9
+    assert np.linalg.norm(np.diff(smooth, 2, axis=0), axis=1).max() / (even[1] - even[0]) ** 2 <= 2.0 + 1e-9
+    assert plan.within(0.3, 2.0) is plan
+
+
+def test_a_slow_plan_is_not_changed():
+    nominal = SKILL.gmr_.trajectory(100)
+    plan = PathPlan.beside(nominal, nominal)
+    assert plan.within(5.0, 50.0) is plan

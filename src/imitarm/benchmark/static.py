@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from imitarm.benchmark.controls import CONTROLS
 from imitarm.benchmark.provenance import code_version
-from imitarm.benchmark.static_measures import OUTCOMES, measure, outcome
+from imitarm.benchmark.static_measures import MAX_ACCELERATION, MAX_SPEED, OUTCOMES, measure, outcome
 from imitarm.benchmark.static_scenes import FAMILIES, StaticCase, static_case
 from imitarm.errors import ImitarmError, InfeasibleError, InputError, UnknownNameError
 from imitarm.kinematics.arm import ArmModel
@@ -133,6 +133,8 @@ class StaticExperiment:
     def run(self) -> StaticResult:
         """Let the method plan in its scene, and measure the planned path.
 
+        Every plan is slowed down where the tool would exceed its limits of speed or acceleration.
+
         Returns:
             The result. An error of the method is the outcome "failed"; the reason says which one.
         """
@@ -163,6 +165,7 @@ class StaticExperiment:
             answer = getattr(policy, "answer", None)
             if answer is not None:
                 values["answer"] = answer.value
+        plan = plan.within(MAX_SPEED, MAX_ACCELERATION)  # the same for every method
         measures = measure(case, plan.trajectory)
         values.update(asdict(measures))
         if plan.adaptation is not None:

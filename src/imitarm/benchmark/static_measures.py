@@ -27,13 +27,15 @@ DENSE = 4000
 NEAR = 0.10
 """Distance of the tool on the learned path from an obstacle [m]; samples that are farther away count as unaffected."""
 AT_GOAL = 0.005
-"""Largest permitted distance from start, goal and contact points, and into a forbidden direction [m]."""
+"""Largest permitted distance from start and goal, and into a forbidden direction [m]."""
+AT_CONTACT = 0.03
+"""Largest permitted distance from a contact point [m]: the radius of the tool, which then still touches the point."""
 LATEST = 2.0
 """Longest permitted duration, relative to the learned duration."""
 MAX_SPEED, MAX_ACCELERATION = 1.7, 13.0
 """Largest speed [m/s] and acceleration [m/s^2] of the tool: the Cartesian limits that the manufacturer states for the
-Panda. A plan that exceeds them is executed more slowly, at all times by the same factor, which does not change the path
-among standing obstacles."""
+Panda. A plan that exceeds them is first slowed down where it does (:meth:`~imitarm.policies.PathPlan.within`). If that
+does not suffice, it is executed more slowly at all times by the same factor. Neither changes the path."""
 SLACK = 0.0005
 """A path also counts as keeping the required clearance if it is nearer to an obstacle by at most this much [m]."""
 _SAMPLES = 200  # of the learned path, and of a planned path for speed, acceleration and smoothness
@@ -49,7 +51,8 @@ class PathMeasures:
         start_error: distance of the first position from the learned start [m].
         goal_error: distance of the last position from the goal [m].
         contact_error: largest distance of the path from a pinned point of the learned path [m]; 0 without such points.
-        forbidden: largest displacement from the nearest point of the learned path in a forbidden direction [m].
+        forbidden: largest displacement in a forbidden direction [m], from the nearest point of the learned path or from
+            its point at the same fraction of the duration, whichever displacement is smaller.
         max_speed: largest speed as planned [m/s].
         max_acceleration: largest acceleration as planned [m/s^2].
         slowdown: factor by which the execution must be slower than planned, so that speed and acceleration are within
@@ -114,7 +117,7 @@ def measure(case: StaticCase, trajectory: Trajectory) -> PathMeasures:
         start_error=float(np.linalg.norm(trajectory.positions[0] - nominal.positions[0])),
         goal_error=float(np.linalg.norm(trajectory.positions[-1] - nominal.positions[-1])),
         contact_error=float(np.max(tree.query(pins)[0], initial=0.0)),
-        forbidden=_forbidden(case, dense.positions),
+        forbidden=_forbidden(case, dense),
         max_speed=fastest,
         max_acceleration=sudden,
         slowdown=slowdown,
@@ -183,13 +186,16 @@ def _separation(case: StaticCase, trajectory: Trajectory) -> float:
     return separation(question, trajectory.times, trajectory.positions)
 
 
-def _forbidden(case: StaticCase, positions: Array) -> float:
+def _forbidden(case: StaticCase, path: Trajectory) -> float:
     if not case.forbidden:
         return 0.0
+    phase = (path.times - path.times[0]) / path.duration
+    same = case.skill.nominal(phase * case.skill.duration_, None, case.scene.goal).positions
     learned = case.skill.nominal(np.linspace(0.0, case.skill.duration_, DENSE), None, case.scene.goal).positions
-    nearest = learned[cKDTree(learned).query(positions)[1]]
+    nearest = learned[cKDTree(learned).query(path.positions)[1]]
     unit = np.array(case.forbidden) / np.linalg.norm(case.forbidden, axis=1, keepdims=True)
-    return float(((positions - nearest) @ unit.T).max(initial=0.0))
+    by_phase, by_place = ((path.positions - points) @ unit.T for points in (same, nearest))
+    return float(np.minimum(by_phase, by_place).max(initial=0.0))
 
 
 def _deviation(offset: Array, covariances: Array) -> float:
@@ -208,17 +214,16 @@ def _rms(values: Array) -> float:
 
 def outcome(case: StaticCase, found: PathMeasures) -> tuple[str, str]:
     """Return the outcome of a planned path, one of :data:`OUTCOMES`, and an explanation."""
-    missed = max(found.start_error, found.goal_error, found.contact_error, found.forbidden)
     if not found.clearance > 0.0:
         return "contact", f"the tool is {1e3 * found.clearance:.1f} mm from an obstacle"
-    if missed > AT_GOAL:
-        where = {
-            found.start_error: "from the start",
-            found.goal_error: "from the goal",
-            found.contact_error: "from a contact point",
-            found.forbidden: "away in a forbidden direction",
-        }[missed]
-        return "missed goal", f"the path is {1e3 * missed:.1f} mm {where}"
+    for error, limit, where in (
+        (found.start_error, AT_GOAL, "from the start"),
+        (found.goal_error, AT_GOAL, "from the goal"),
+        (found.contact_error, AT_CONTACT, "from a contact point"),
+        (found.forbidden, AT_GOAL, "away in a forbidden direction"),
+    ):
+        if error > limit:
+            return "missed goal", f"the path is {1e3 * error:.1f} mm {where}"
     if found.duration_ratio > LATEST:
         planned = found.duration_ratio / found.slowdown
         if planned <= LATEST:

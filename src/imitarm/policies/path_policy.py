@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from imitarm.command import Command, Status
 from imitarm.errors import InputError
@@ -27,6 +29,10 @@ _LEAST_PATIENCE = 5e-3  # [m] no robot follows more closely than this at all tim
 _SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learned one is the learned one
 _STANDS = 0.05  # speed of the phase below which the motion is said to wait
 _DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
+_EVEN = 200  # evenly spaced samples at which speed and acceleration are computed
+_ROUNDS = 40  # of slowing down
+_SPARE = 0.97  # fraction of the limits that is used
+_WIDTH = 4  # samples: slowing down begins so much before the place where it is needed
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +60,23 @@ class PathPlan:
         phase = (trajectory.times - trajectory.times[0]) / trajectory.duration
         learned, _ = nominal.at(nominal.times[0] + phase * nominal.duration)
         return cls(trajectory, np.linalg.norm(trajectory.positions - learned, axis=1))
+
+    def within(self, max_speed: float, max_acceleration: float) -> PathPlan:
+        """Return the plan, slowed down where the tool would exceed a limit; the path stays the same.
+
+        A plan that is already within the limits, or is valid only on schedule, or has planned joints, is not changed.
+
+        Args:
+            max_speed: largest speed of the tool [m/s].
+            max_acceleration: largest acceleration of the tool [m/s^2].
+        """
+        if self.only_on_schedule or self.joints is not None:
+            return self
+        times = _slowed(self.trajectory, max_speed, max_acceleration)
+        if times is self.trajectory.times:
+            return self
+        path = self.trajectory
+        return replace(self, trajectory=Trajectory(times, path.positions, path.quaternions))
 
 
 class PathPolicy(Policy):
@@ -229,3 +252,27 @@ class PathPolicy(Policy):
 def _at(time: float, times: Array, values: Array) -> Array:
     """Return the row at ``time``, shape (m,), interpolated linearly between the rows of ``values`` (n, m)."""
     return np.array([np.interp(time, times, column) for column in values.T])
+
+
+def _slowed(path: Trajectory, max_speed: float, max_acceleration: float) -> Array:
+    """Return times of the samples at which speed and acceleration are within their limits.
+
+    Each round stretches the time around those samples that exceed a limit: by the ratio for a speed, by the square root
+    of the ratio for an acceleration. The stretching is smoothed, so that the change of speed adds little acceleration.
+    """
+    times = path.times
+    for _ in range(_ROUNDS):
+        even = np.linspace(times[0], times[-1], _EVEN)
+        dt = even[1] - even[0]
+        positions = CubicSpline(times, path.positions)(even)
+        speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) / dt
+        acceleration = np.linalg.norm(np.diff(positions, 2, axis=0), axis=1) / dt**2
+        if speed.max() <= max_speed and acceleration.max() <= max_acceleration:
+            break
+        needed = np.ones(_EVEN)
+        needed[:-1] = np.maximum(needed[:-1], speed / (_SPARE * max_speed))
+        needed[1:-1] = np.maximum(needed[1:-1], np.sqrt(acceleration / (_SPARE * max_acceleration)))
+        stretch = gaussian_filter1d(maximum_filter1d(needed, 2 * _WIDTH + 1), 0.5 * _WIDTH, mode="nearest")
+        clock = np.concatenate([[0.0], np.cumsum(0.5 * (stretch[1:] + stretch[:-1]) * dt)])
+        times = times[0] + np.interp(times, even, clock)
+    return times
