@@ -21,6 +21,7 @@ POLICIES: Registry[type[Policy]] = Registry(
         "dmp-steering": "imitarm.policies.baselines.dmp_steering:DMPSteering",
         "dmp-potential": "imitarm.policies.baselines.dmp_potential:DMPPotential",
         "gmm-dmp": "imitarm.policies.baselines.gmm_dmp:GMMDMP",
+        "dmp-ann": "imitarm.policies.baselines.dmp_ann:DMPANN",
         "barrier": "imitarm.policies.baselines.barrier:Barrier",
         "elastic-band": "imitarm.policies.baselines.elastic_band:ElasticBand",
         "gmm-irl": "imitarm.policies.baselines.gmm_irl:GmmIrl",
