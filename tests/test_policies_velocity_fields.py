@@ -83,6 +83,18 @@ def test_modulated_velocities_do_not_enter_a_surface_that_moves_among_others(see
             assert inwards > -1e-5
 
 
+@given(seeds, st.floats(0.01, 0.4))
+def test_a_tool_that_is_too_close_is_led_out_and_may_leave_freely(seed, depth):
+    rng = np.random.default_rng(seed)
+    n, desired = rng.normal(size=(2, 3))
+    n /= np.linalg.norm(n)
+    v = modulated(desired, about_a_ball((0.5 - depth) * n, np.zeros(3), 0.5))
+    approach = float(desired @ n)
+    assert v @ n == pytest.approx(
+        approach if approach > 0.0 else (1.0 - (1.0 - min(2.0 * depth, 0.5)) ** -2) * approach
+    )
+
+
 def test_modulation_vanishes_far_from_obstacles_and_keeps_the_speed_of_the_mean():
     desired = np.array([0.3, -0.1, 0.2])
     far = about_a_ball(np.zeros(3), np.array([0.0, 1e5, 0.0]), 0.1)

@@ -15,6 +15,7 @@ from imitarm.validation import finite_number
 Array = NDArray[np.float64]
 
 _LEAST_SLOPE = 0.3  # of the reference direction along the normal: a flatter one divides by nearly nothing
+_DEEPEST = -0.5  # sizes: a deeper gap counts as this one
 _TINY = 1e-12
 
 
@@ -29,7 +30,8 @@ def modulated(desired: Array, around: NearObstacles, *, reactivity: float = 1.0,
 
     ``Gamma`` is 1 where the gap is 0, so that the tool does not move along the normal there. For a sphere with
     ``reach`` and ``reactivity`` 1, ``Gamma`` is the squared distance from the centre in radii, and in a plane through
-    the centre, the field is the potential flow about a circle. A tool that is already too close may move away freely.
+    the centre, the field is the potential flow about a circle. Where the tool is already too close, ``q`` is above 1,
+    which leads the tool out; a velocity away from the obstacle is not reduced.
 
     For several obstacles, the norms and the directions of the velocities are averaged with the weights ``w_o =
     prod_(i != o) (Gamma_i - 1)``, normalised to the sum 1. A direction is represented by its angle from ``u``.
@@ -45,7 +47,7 @@ def modulated(desired: Array, around: NearObstacles, *, reactivity: float = 1.0,
     """
     if not len(around.gap):
         return desired
-    gamma = (1.0 + np.maximum(around.gap, 0.0) / (reach * around.size)) ** 2
+    gamma = (1.0 + np.maximum(around.gap / (reach * around.size), _DEEPEST)) ** 2
     q = gamma ** (-1.0 / reactivity)
     normal, reference = _unit(around.normal), _unit(around.outward)
     short = np.sum(reference * normal, axis=1) < _LEAST_SLOPE
