@@ -13,6 +13,8 @@ from functools import partial
 import pytest
 
 from imitarm.benchmark.running import DASK, Store, Workers, run_experiments
+from imitarm.benchmark.static import StaticExperiment, run_experiment
+from imitarm.benchmark.static_results import ResultLines
 from imitarm.errors import InputError, TaskFailedError
 
 Client = pytest.importorskip("distributed").Client
@@ -80,6 +82,13 @@ def test_results_of_two_workers_are_those_of_this_process(tmp_path):
         )
         assert found == run_experiments(works, run, Kept(), Workers(1)) == [2.0**w for w in works]
         assert told[0] == (0, 40) and told[-1] == (40, 40)
+
+        scenes = [StaticExperiment("S1", d, seed, "acfra") for d in (2, 3) for seed in (1000, 1001)]
+        stores = [ResultLines(tmp_path / name) for name in ("here", "there")]
+        here = run_experiments(scenes, run_experiment, stores[0], Workers(1))
+        there = run_experiments(scenes, run_experiment, stores[1], Workers(backend=DASK, scheduler=address))
+        assert [r.values["clearance"] for r in there] == [r.values["clearance"] for r in here]
+        assert [r.values["rmse"] for r in there] == [r.values["rmse"] for r in here]
 
         store = Kept(full_after=5)
         with pytest.raises(TaskFailedError, match=r"No space left.*free some space, then start the benchmark again"):

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from imitarm.benchmark.running import Workers
 from imitarm.benchmark.static import StaticExperiment, StaticResult, policy_class
 from imitarm.benchmark.static_claims import claims_table, cost_law, static_tables
 from imitarm.benchmark.static_comparison import PRINTED, mcnemar, pairing, pairings, printed_table, signed_rank, task_of
-from imitarm.benchmark.static_results import ResultLines, json_line
+from imitarm.benchmark.static_results import ResultLines, json_line, read_lines
+from imitarm.benchmark.static_scaling import Plan, exponent, plan_once, scaling_case
 from imitarm.benchmark.static_tables import (
     StaticResults,
     obstacles_table,
@@ -231,6 +233,58 @@ def test_shipped_options_can_be_given_to_their_methods():
     for method, options in static_tuning._shipped().items():
         space = policy_class(method).search_space
         assert all(space[name][0] * 0.999 <= value <= space[name][1] * 1.001 for name, value in options)
+
+
+# --- many obstacles and spheres ----------------------------------------------------------------------------------
+
+
+def test_the_exponent_is_that_of_a_power_law():
+    plans = [Plan(n, 0.01 * n**0.7, "success") for n in (1, 2, 4, 8, 16)]
+    slope, error = exponent(plans)
+    assert slope == pytest.approx(0.7)
+    assert error == pytest.approx(0.0, abs=1e-7)
+    assert math.isnan(exponent(plans[:1])[0])
+
+
+def test_scenes_of_more_obstacles_contain_those_of_fewer():
+    few, many = (scaling_case(n, 4, 1000) for n in (4, 20))
+    assert len(many.scene.obstacles) == 20
+    assert all(
+        (a.bounds() == b.bounds()).all() for a, b in zip(few.scene.obstacles, many.scene.obstacles[:4], strict=True)
+    )
+    assert few.tool_spheres.shape == (4, 4)
+    blocked = scaling_case(1, 1, 1000)
+    assert StaticResults([]).all == [] and plan_once("no-avoidance", blocked, 1).outcome == "contact"
+    assert plan_once("acfra", blocked, 1).outcome == "success"
+
+
+def test_the_scaling_command_prints_exponents(capsys):
+    words = ["benchmark", "static", "scaling", "--methods"]
+    assert cli.main([*words, "no-avoidance", "--count", "1", "--first", "1000"]) == 0
+    printed = capsys.readouterr().out
+    assert "number of obstacles" in printed and "number of spheres" in printed and "exponent" in printed
+    assert cli.main([*words, "magic"]) == 2
+
+
+# --- a small part, against saved results -------------------------------------------------------------------------
+
+SAVED = Path(__file__).parent / "static_results"
+RENEW = (
+    "if the change is intended, renew the saved results: imitarm benchmark static --first 1190 --count 1 "
+    "--families S1 S3 S4 S7 --settings default --methods METHOD --out tests/static_results"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(path.stem for path in SAVED.glob("*.jsonl")))
+def test_a_small_part_gives_the_saved_results(name):
+    for saved in read_lines(SAVED / f"{name}.jsonl"):
+        found = saved.experiment.run()
+        where = f"{saved.experiment}; {RENEW}"
+        assert (found.outcome, set(found.values)) == (saved.outcome, set(saved.values)), where
+        for key, value in saved.values.items():
+            if key not in {"build_seconds", "plan_seconds", "plan_cpu"} and isinstance(value, float):
+                assert found.values[key] == pytest.approx(value, rel=1e-4, abs=1e-6), f"{key}: {where}"
 
 
 # --- the command -------------------------------------------------------------------------------------------------

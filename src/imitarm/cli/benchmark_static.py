@@ -11,9 +11,10 @@ from typing import Any
 from imitarm.benchmark.experiment import plain, write_text
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.running import run_experiments
-from imitarm.benchmark.static import StaticExperiment, method_names, run_experiment
+from imitarm.benchmark.static import StaticExperiment, method_names, policy_class, run_experiment
 from imitarm.benchmark.static_claims import cost_law, static_tables
 from imitarm.benchmark.static_results import ResultLines, read_folders
+from imitarm.benchmark.static_scaling import scaling_tables
 from imitarm.benchmark.static_scenes import FAMILIES, SPLITS
 from imitarm.benchmark.static_tables import OURS, StaticResults, success_table
 from imitarm.benchmark.static_tuning import DRAWS, Search, tune, tuned_options, write_tuned
@@ -60,6 +61,12 @@ def add_static(parsers: Any) -> None:
     tuning.add_argument("--save", type=Path, metavar="FILE", help="file of the best options; default: DIR/tuned.json")
     _add_running(tuning)
     tuning.set_defaults(benchmark=_tune)
+    scaling = actions.add_parser("scaling", help="measure time and success with 1 to 20 obstacles and 1 to 16 spheres")
+    scaling.add_argument("--methods", nargs="+", default=[OURS], metavar="NAME", help=f"default: {OURS}")
+    scaling.add_argument("--count", type=int, default=10, metavar="N", help="scenes for each number; default: 10")
+    scaling.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
+    add_fill(scaling)
+    scaling.set_defaults(benchmark=_scaling)
     comparison = actions.add_parser("compare", help="print the tables of saved results")
     comparison.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="folders of results")
     comparison.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
@@ -175,6 +182,24 @@ def _tune(arguments: argparse.Namespace) -> int:
         say(f"{method}: {found} with {options} (draw {draw.number})")
     write_tuned(best, search, path)
     say(f"wrote {log}", f"wrote {path}")
+    return 0
+
+
+def _scaling(arguments: argparse.Namespace) -> int:
+    """Print the tables of time and success over the number of obstacles and spheres."""
+    if arguments.count < 1 or arguments.first < 0:
+        raise InputError(f"--count must be at least 1 and --first at least 0: {arguments.count}, {arguments.first}")
+    place = place_of(arguments, "static scaling")
+    for method in arguments.methods:
+        policy_class(method)
+    with progress_bar() as bar:
+        task = bar.add_task("planning", total=None)
+        tables = scaling_tables(
+            arguments.methods,
+            range(arguments.first, arguments.first + arguments.count),
+            on_done=lambda done, of: bar.update(task, completed=done, total=of),
+        )
+    report_tables(tables, place, [code_version()])
     return 0
 
 
