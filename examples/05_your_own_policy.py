@@ -81,8 +81,7 @@ def main() -> None:
     skill = Skill(n_components=7).fit(reaches(start, goal))
 
     # Between two balls the pull along the path and the pushes balance: a local minimum, where a field that considers
-    # only
-    # the nearest points stops or touches. ACFRA considers the whole path.
+    # only the nearest points stops or touches. ACFRA considers the whole path.
     on_path = middle + np.array([0.0, 0.0, 0.05])
     balls = [Sphere(on_path + side * np.array([0.08, 0.0, 0.0]), 0.05) for side in (-1.0, 1.0)]
     scenes = {
@@ -92,11 +91,11 @@ def main() -> None:
     }
     for name, scene in scenes.items():
         print(name)
-        for key, make in POLICIES.items():
+        for key in ("acfra", "repelled"):
             # Where a policy fails, the safety filter can still keep every link clear, whatever the policy commands.
             for clearance in (None, 0.01):
                 robot = SimulatedRobot(arm, scene=scene, q=find_posture(arm, start))
-                policy = make(skill, tool_spheres=[[0.0, 0.0, 0.0, arm.tool_radius]])
+                policy = POLICIES[key](skill, tool_spheres=[[0.0, 0.0, 0.0, arm.tool_radius]])
                 safety = SafetyFilter(arm, clearance=clearance)
                 rollout = reproduce(policy, robot, scene.at, timeout=6.0, safety=safety)
                 near = f"clearance {1e3 * rollout.min_clearance:.0f} mm, " if scene.obstacles else ""
