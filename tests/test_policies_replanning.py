@@ -189,3 +189,58 @@ def test_what_cannot_be_planned_again_is_refused_with_the_reason():
         replan(plan, replace(scene, goal=Pose([0.5, 0.0, 0.5], [1.0, 0.0, 0.0, 0.0])), phase=0.0, **options)
     with pytest.raises(InputError, match="joints"):
         replan(plan, scene, arm=arm, state=ArmState(np.zeros(6), np.zeros(6), np.zeros(6), 0.0), phase=0.0)
+
+
+@each_arm
+def test_at_pinned_times_the_tool_is_where_it_was_shown_and_not_tilted(name):
+    skill, arm, start = carrying(name)
+    scene, free = planned(name)
+    pinned = (0.3 * skill.duration_, 0.75 * skill.duration_)
+    plan = adapt(skill, scene, arm=arm, state=at(arm, start), pinned=pinned, **OPTIONS)
+    assert plan.feasible, plan.reason
+    assert plan.moved.any()
+    nominal = plan.nominal
+    for pin in pinned:
+        i = int(np.argmin(np.abs(nominal.times - pin)))
+        assert nominal.times[i] == pytest.approx(pin)
+        pose = arm.tool_pose(plan.joints[i])
+        np.testing.assert_allclose(pose.position, nominal.positions[i], atol=1e-5)
+        assert np.linalg.norm(pose.error_to(Pose(nominal.positions[i], nominal.quaternions[i]))) < 1e-4
+        away, _ = Trajectory(free.nominal.times, free.trajectory.positions).at([pin])
+        assert np.linalg.norm(away[0] - nominal.positions[i]) > 1e-3  # without the pin, it is displaced there
+    phase = 0.2 * plan.trajectory.duration
+    again = replan(plan, scene, arm=arm, state=on_the_way(arm, plan, phase), phase=phase, **OPTIONS)
+    assert again.feasible, again.reason
+    left = Remainder.of(plan.arm_plan, np.interp(phase, plan.trajectory.times, nominal.times), at(arm, again.joints[0]))
+    for pin in pinned:  # still pinned
+        i = int(np.argmin(np.abs(again.nominal.times + left.begins - pin)))
+        np.testing.assert_allclose(again.trajectory.positions[i], again.nominal.positions[i], atol=1e-5)
+
+
+def test_an_obstacle_at_a_pinned_point_is_refused_with_the_time():
+    skill, arm, start = carrying("sawyer")
+    nominal = skill.generate()
+    pin = 0.5 * skill.duration_
+    place, _ = nominal.at([pin])
+    scene = Scene(None, [Sphere(place[0], 0.03, name="cup")])
+    plan = adapt(skill, scene, arm=arm, state=at(arm, start), pinned=[pin], **OPTIONS)
+    assert not plan.feasible
+    assert "cup" in plan.reason
+    assert "pinned" in plan.reason
+
+
+def test_a_link_at_an_obstacle_at_a_pinned_time_moves_away_by_self_motion_or_the_scene_is_refused():
+    skill, arm, start = carrying("sawyer")
+    free = adapt(skill, Scene(), arm=arm, state=at(arm, start))
+    middle = free.joints[len(free.joints) // 2]
+    centers, radii = arm.collision_spheres(middle)
+    elbow = int(np.flatnonzero(arm.cover.links == 4)[0])
+    post = Sphere(centers[elbow] + [0.0, 0.0, radii[elbow] + 0.04], 0.03, name="lamp")
+    pin = float(free.nominal.times[len(free.joints) // 2])
+    plan = adapt(skill, Scene(None, [post]), arm=arm, state=at(arm, start), pinned=[pin], **OPTIONS)
+    if not plan.feasible:
+        assert "lamp" in plan.reason
+        return
+    i = int(np.argmin(np.abs(plan.nominal.times - pin)))
+    np.testing.assert_allclose(plan.trajectory.positions[i], plan.nominal.positions[i], atol=1e-5)
+    assert clearance_of(arm, Scene(None, [post]), plan) >= 0.02 - 1e-6

@@ -105,7 +105,8 @@ def adapt(
             require it.
         clearance: required distance from the tool, or from the whole arm, to every obstacle [m].
         forbidden: directions in which no component may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
-        pinned: times [s] at which the path must not move, for example contact points.
+        pinned: times [s] at which the path must not move, for example contact points. With ``arm``, the tool is not
+            tilted at these times either.
         start: start of the motion; None: the learned start.
         n_samples: samples along the path; None: 200.
         state: measured state of ``arm``, from whose posture the motion starts; None: a posture near ``arm.home`` with
@@ -164,12 +165,14 @@ def adapt(
 
 
 def _covered(problem: AvoidanceProblem, goal_tilt: float) -> bool:
-    """Return whether the tool is too close at the start, or at a goal at which it may not tilt.
+    """Return whether the tool is too close at the start, at a pinned time, or at a goal at which it may not tilt.
 
     No plan of the whole arm can change this.
     """
-    ends = [0] if goal_tilt > 0.0 else [0, -1]
-    return bool(problem.nominal.distance[:, ends].min(initial=np.inf) < problem.clearance)
+    path = problem.path
+    fixed = np.searchsorted(path.nominal.times, path.fixed_times)
+    still = fixed[:-1] if goal_tilt > 0.0 else fixed
+    return bool(problem.nominal.distance[:, still].min(initial=np.inf) < problem.clearance)
 
 
 def tilt_limits(path: ComponentPath, max_tilt: float | None, goal_tilt: float) -> Array:

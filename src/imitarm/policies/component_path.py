@@ -150,6 +150,12 @@ class ComponentPath:
         """The samples that no displacement of the components can move."""
         return np.flatnonzero(self.lever == 0.0)
 
+    @cached_property
+    def at_pins(self) -> Array:
+        """A factor that is 0 at every pinned time and 1 far from them, shape (n,)."""
+        pins = self.fixed_times[1:-1]
+        return _window(self.nominal.times, pins, PIN_WIDTH) if pins else np.ones(len(self.nominal))
+
     def displaced(self, displacement: Array) -> Array:
         """Return the positions (..., n, 3) when the means move by ``displacement`` (..., n_components, 3) [m]."""
         return self.nominal.positions + self.basis @ displacement

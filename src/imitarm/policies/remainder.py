@@ -117,7 +117,8 @@ class _Join:
         later = old[old > begins + 0.25 * float(np.diff(old).mean())]
         times = np.concatenate([[begins], later])
         if len(times) < _FEWEST:
-            times = np.linspace(begins, old[-1], _FEWEST)
+            pins = [time for time in path.fixed_times[1:-1] if time > begins]
+            times = np.union1d(np.linspace(begins, old[-1], _FEWEST), pins)
         ends = min(begins + _JOIN * (old[-1] - begins), *(time for time in path.fixed_times if time > begins))
         return cls(old, times, 1.0 - quintic_step((times - begins) / (ends - begins))[:, None])
 

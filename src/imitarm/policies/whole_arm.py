@@ -166,6 +166,7 @@ class _Search:
             task.arm, task.scene.obstacles, task.clearance, fixtures=fixtures, contacts=contacts, own=own
         )
         self.start = self._around.clearance_at(ArmPath.of(task.arm, task.start[None]), np.zeros(1), _REACH)
+        self._tilts = Tilts.between_ends(self._times, tilted_goal=task.goal_tilt > 0.0, window=path.at_pins)
         self._moving = any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
         self._first: _Attempt | None = None
         self._worst: ArmClearance | None = None
@@ -262,7 +263,7 @@ class _Search:
 
     def _planner(self, components: ComponentPath, *, smoothness: float = 0.0, free_start: bool = False) -> ArmPlanner:
         rest = self.task.rest
-        tilts = Tilts.between_ends(self._times, tilted_goal=self.task.goal_tilt > 0.0) if rest is None else rest.tilts
+        tilts = self._tilts if rest is None else rest.tilts
         return ArmPlanner(
             self._around,
             components,
