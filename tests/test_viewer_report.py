@@ -8,9 +8,11 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from imitarm import ArmModel
 from imitarm.demonstrations import Finding
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.scene import Scene, Sphere
@@ -213,3 +215,12 @@ def test_names_that_are_no_text_do_not_stop_the_report(tmp_path: Path) -> None:
     learning = replace(make_learning(), findings=[Finding("note", "idle", "rests", name)])
     target = write_report(Report("x", [], learning=learning), tmp_path / "report.html")
     assert "sweep_?.csv" in target.read_text(encoding="utf-8")
+
+
+def test_a_plan_of_the_whole_arm_is_not_described_as_one_sphere() -> None:
+    result, arm = replace(make_result(), tool_radius=0.058, tool_spheres=None), ArmModel.load("sawyer")
+    assert "one sphere" in Page(report_html(replace(make_report(scenes=1), scenes=[result]))).text
+    object.__setattr__(result.adaptation, "arm_plan", SimpleNamespace(path=SimpleNamespace(arm=arm)))
+    text = Page(report_html(replace(make_report(scenes=1), scenes=[result]))).text
+    assert "one sphere" not in text
+    assert f"{len(arm.cover.radii)} spheres, which contain every moving part of the arm" in text

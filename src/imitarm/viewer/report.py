@@ -272,6 +272,9 @@ def _scene_facts(scene: SceneResult) -> dict[str, Any]:
 
 def _tool(scene: SceneResult) -> str:
     """Return a description of the geometry by which the plan modelled the tool."""
+    plan = getattr(scene.adaptation, "arm_plan", None)
+    if plan is not None:
+        return f"{len(plan.path.arm.cover.radii)} spheres, which contain every moving part of the arm and the tool"
     spheres = scene.tool
     reach = float((np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]).max())
     if reach == 0.0:
