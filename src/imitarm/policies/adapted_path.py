@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.html_table import html_table
+from imitarm.policies.approach import Approach
 from imitarm.policies.arm_planner import ArmPlan
-from imitarm.policies.whole_arm import Approach
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]

@@ -39,10 +39,10 @@ _STRIDE = 4  # the rounds look at every fourth sample, the last ones at all
 _ROUNDS = 24
 _FINAL_ROUNDS = 10  # with all samples
 _PATIENCE = 7  # rounds without progress, then this attempt is given up
-_PROGRESS = 1e-3  # [m] progress of the smallest distance that counts
+_PROGRESS, _NEARLY = 1e-3, 0.2  # progress that counts: of the smallest distance [m], or as a fraction of what it lacks
 _SELF_MOTIONS = 10  # knots of the splines
 _TILT_SIGMA = 0.15  # [rad] a tilt of this size costs as much as a displacement by one demonstrated sigma
-_TILT_USED, _TILT_TOLERANCE = 0.98, 1e-3  # fraction of the limit of the tilt that is used; accepted excess [rad]
+_TILT_USED, _TILT_TOLERANCE = 0.995, 1e-3  # fraction of the limit of the tilt that is used; accepted excess [rad]
 _REACH = 0.06  # [m] pairs farther apart than the clearance and this have no row
 _NEAR = 0.01  # [m] every pair nearer than the clearance and this has a row; of the others, the nearest of each link
 _MARGIN = 5e-4  # [m] the rows ask for this much more, because distances are not linear
@@ -197,7 +197,7 @@ class ArmPlanner:
             if len(samples) < len(self.times):
                 gaps = self.around.gaps(path, self.clock[samples], _REACH)
             plan = self._evaluated(path, displacement, tilt, samples, gaps)
-            since = 0 if best is None or plan.clearance.room > best.clearance.room + _PROGRESS else since + 1
+            since = 0 if best is None or plan.clearance.room > _progress(best.clearance.room) else since + 1
             if best is None or _rank(plan) > _rank(best):
                 best = plan
             if plan.clearance.room >= 0.0:
@@ -385,6 +385,11 @@ class _Local:
 def _rank(plan: ArmPlan) -> tuple[float, float]:
     """Return a key that compares plans by their speed if they have enough clearance, otherwise by their clearance."""
     return min(plan.clearance.room, 0.0), -max(plan.speed, _CALM)
+
+
+def _progress(room: float) -> float:
+    """Return the room [m] beyond which a plan is better than one with the given room by so much that it counts."""
+    return room + (min(_PROGRESS, -_NEARLY * room) if room < 0.0 else _PROGRESS)
 
 
 def _chosen(gaps: Gaps) -> Index:

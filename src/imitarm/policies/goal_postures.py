@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _STARTS, _STARTS_TILTED = 24, 6  # random postures from which inverse kinematics begins: for the goal, for each tilt
 _SWEEP, _SWEEP_STEPS = 0.15, 24  # [rad] of self-motion in one step of the search; number of steps
 _REACHED = 1e-5  # [m, rad] error of the tool's pose that is accepted
-_DIFFERENT, _MOST = 0.3, 3  # [rad] difference of a joint between two postures that are returned; number of postures
+_DIFFERENT, _MOST = 0.3, 8  # [rad] difference of a joint between two postures that are returned; number of postures
 _REACH = 0.15  # [m] largest clearance that is reported
 _TILTS = np.concatenate([np.eye(3), -np.eye(3)])
 

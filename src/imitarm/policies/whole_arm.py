@@ -13,10 +13,9 @@ If no attempt succeeds, the reason states which link and obstacle come too close
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_path import ArmPath, track
 from imitarm.kinematics.pose import Pose
+from imitarm.policies.approach import Approach, find_approach
 from imitarm.policies.arm_certificate import ArmAmongObstacles, ArmClearance
 from imitarm.policies.arm_pairs import SELF
 from imitarm.policies.arm_planner import JOINT_LIMIT, TILT_LEVER, TILT_LIMIT, ArmPlan, ArmPlanner
@@ -42,12 +42,13 @@ Index = NDArray[np.intp]
 
 _REACH = 0.15  # [m] largest clearance that is reported
 _RETIMINGS = 4  # among moving obstacles
-_VIAS, _VIA_SPREAD = 60, 0.6  # random via postures of an approach; their standard deviation [rad]
-_LEG_STEP, _LEG_SPEED = 0.05, 0.4  # [rad] between samples of an approach; fraction of the largest speed
 _AHEAD = 0.05  # of the duration: a place this close to the goal is the goal
 _SIDES = 8  # directions tried across the path
 _AWAY = (0.1, 0.2)  # [m] by which the path is moved to another side
 _MOST_SIDES = 5  # that are followed up
+_GOALS = 3  # postures at the goal that are tried first
+_LATE, _MORE = 1.3, 6  # times the learned duration: a plan that takes longer is kept, and so many more are tried
+_NEARLY, _MOST_NEARLY = 0.02, 3  # [m] a failed attempt that lacks less is tried again; number of such attempts
 _LEVER = 0.05  # squared influence of the components; a place with less is not moved
 
 
@@ -67,18 +68,11 @@ class ArmSolution:
     reason: str
     approach: Approach | None = None
 
-
-@dataclass(frozen=True, eq=False)
-class Approach:
-    """A motion of the joints before the motion of the skill begins; it keeps the same clearances as the plan.
-
-    Attributes:
-        joints: joint positions, shape (m, n_joints) [rad]; between two samples the joints move linearly.
-        times: times from 0, shape (m,) [s].
-    """
-
-    joints: Array
-    times: Array
+    @property
+    def duration(self) -> float:
+        """Duration of the approach and of the plan [s]; inf without a timing."""
+        own = np.inf if self.timing is None else float(self.timing.times[-1])
+        return own if self.approach is None else own + float(self.approach.times[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,20 +114,28 @@ def solve(task: ArmTask, path: ComponentPath, displacement: Array) -> ArmSolutio
     if search.start.room < 0.0:
         return ArmSolution(None, None, f"at the start, {search.named(search.start)}: move the obstacle or the arm")
     best: ArmPlan | None = None
+    late: ArmSolution | None = None
+    more = _MORE
     for planner, moved, joints, tilt in search.attempts():
+        if late is not None:
+            more -= 1
+            if more < 0:
+                break
         plan = planner.plan(moved, joints, tilt)
         if plan is None:
             continue
-        if plan.feasible:
-            approach = search.approach(plan.path.joints[0]) if planner.free_start else None
-            timed = search.timed(planner, plan) if approach is not None or not planner.free_start else None
-            if timed is not None:
-                plan, timing = timed
-                return ArmSolution(plan, timing, search.overloaded(timing), approach)
+        if not plan.feasible:
+            best = plan if best is None or _rank(plan) > _rank(best) else best
+            search.failed(planner, plan)
             continue
-        best = plan if best is None or _rank(plan) > _rank(best) else best
-        search.failed(planner, plan)
-    return ArmSolution(best, None, search.refusal(best))
+        found = search.solution(planner, plan)
+        if found is None:
+            continue
+        late = found if late is None or found.duration < late.duration else late
+        if task.rest is not None or found.reason or late.duration <= _LATE * path.nominal.duration:
+            return late
+        search.slow(late)
+    return ArmSolution(best, None, search.refusal(best)) if late is None else late
 
 
 def _rank(plan: ArmPlan) -> tuple[bool, float]:
@@ -170,6 +172,7 @@ class _Search:
         self._moving = any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
         self._first: _Attempt | None = None
         self._worst: ArmClearance | None = None
+        self._failed: list[tuple[ArmPlanner, ArmPlan]] = []
         self._goals: GoalSearch | None = None
 
     def attempts(self) -> Iterator[_Attempt]:
@@ -188,69 +191,79 @@ class _Search:
         self._goals = clear_postures(self._around, goal, end, self.task.start, self.task.goal_tilt)
         if not self._goals.found:
             return
-        if self._at_goal():
-            for posture in self._goals.found:
+        if self._at_goal() or self._late:
+            near, far = self._goals.found[:_GOALS], self._goals.found[_GOALS:]
+            for posture in near:
                 yield self._followed(learned, detour, posture)
             if self._at_goal():
-                yield from self._other_starts(detour)
+                yield from self._other_starts(detour, near)
+                for posture in far:
+                    yield self._followed(learned, detour, posture)
+                yield from self._other_starts(detour, far)
+                yield from self._nearly()
                 return
         narrow = self._planner(self._components.divided, smoothness=SMOOTHNESS)
-        away = learned.components.basis @ detour
-        same: Array = np.asarray(np.linalg.lstsq(narrow.components.basis, away, rcond=1e-6)[0], dtype=np.float64)
-        yield self._followed(narrow, same)
+        yield self._followed(narrow, self._narrowed(narrow, detour, learned.components))
         for planner in (learned, narrow):
             yield from self._sides(planner)
-        yield from self._other_starts(detour)
+        yield from self._other_starts(detour, self._goals.found)
+        yield from self._nearly()
 
-    def _other_starts(self, displacement: Array) -> Iterator[_Attempt]:
+    def _nearly(self) -> Iterator[_Attempt]:
+        """Yield the best failed attempts again, with narrower components."""
+        failed = sorted(self._failed, key=lambda one: -one[1].clearance.room)
+        for planner, plan in failed[:_MOST_NEARLY]:
+            if plan.clearance.room < -_NEARLY:
+                return
+            narrow = self._planner(self._components.divided, smoothness=SMOOTHNESS, free_start=planner.free_start)
+            coarse = narrow.coarse if plan.complete else slice(None)
+            yield _Attempt(
+                narrow, self._narrowed(narrow, plan.displacement, plan.components), plan.path.joints[coarse], plan.tilt
+            )
+
+    def _narrowed(self, narrow: ArmPlanner, displacement: Array, components: ComponentPath) -> Array:
+        """Return displacements of narrower components that displace the path as those of other components do."""
+        away = components.basis @ displacement
+        return np.asarray(np.linalg.lstsq(narrow.components.basis, away, rcond=1e-6)[0], dtype=np.float64)
+
+    def _other_starts(self, displacement: Array, goals: Sequence[GoalPosture]) -> Iterator[_Attempt]:
         """Yield first guesses for a joint path that ends in a clear posture; its start posture is not prescribed."""
-        if self._moving or self._goals is None or self.task.rest is not None:  # there is no time for an approach
+        if self._moving or self.task.rest is not None:  # there is no time for an approach
             return
         planner = self._planner(self._components, free_start=True)
-        for goal in self._goals.found:
+        for goal in goals:
             tilt = planner.tilt_at_goal(goal.tilt)
             positions, quaternions = planner.poses(displacement, tilt, planner.coarse)
             joints = track(self.task.arm, goal.joints, positions[::-1], quaternions[::-1])[::-1]
             yield _Attempt(planner, displacement, joints, tilt)
 
     def approach(self, end: Array) -> Approach | None:
-        """Return a clear motion from the posture of the task to another posture; None if none was found.
+        """Return a clear motion from the posture of the task to another posture; None if none was found."""
+        return find_approach(self._around, self.task.start, end, self.task.allowance)
 
-        The motion is a straight line in joint space, or two straight lines that meet in an intermediate posture.
-        """
-        arm, start = self.task.arm, self.task.start
-        random = np.random.default_rng(1)
-        middle = 0.5 * (start + end)
-        vias = [None, arm.home, *(middle + _VIA_SPREAD * random.normal(size=(_VIAS, arm.n_joints)))]
-        for via in vias:
-            corners = [start, end] if via is None else [start, np.clip(via, arm.lower, arm.upper), end]
-            legs = [self._leg(a, b) for a, b in pairwise(corners)]
-            if all(self._around.clearance_of(leg, np.zeros(len(leg))).room >= 0.0 for leg in legs):
-                return self._timed_legs(legs)
-        return None
+    def solution(self, planner: ArmPlanner, plan: ArmPlan) -> ArmSolution | None:
+        """Return a feasible plan with its execution times and its approach; None if there is none of them."""
+        approach = self.approach(plan.path.joints[0]) if planner.free_start else None
+        if approach is None and planner.free_start:
+            return None
+        timed = self.timed(planner, plan)
+        return None if timed is None else ArmSolution(*timed, self.overloaded(timed[1]), approach)
 
-    def _leg(self, start: Array, end: Array) -> ArmPath:
-        n = 2 + int(np.abs(end - start).max() / _LEG_STEP)
-        return ArmPath.of(self.task.arm, np.linspace(start, end, n + 10))
-
-    def _timed_legs(self, legs: list[ArmPath]) -> Approach | None:
-        """Return the motion along successive straight lines with its execution times; the arm rests between lines."""
-        joints, times, now = [self.task.start[None]], [np.zeros(1)], 0.0
-        for leg in legs:
-            whole = np.abs(leg.joints[-1] - leg.joints[0]) / (_LEG_SPEED * self.task.arm.max_velocity)
-            parameters = np.linspace(0.0, max(float(whole.max()), 0.1), len(leg))
-            timing = self._timing(leg, parameters, np.zeros(len(leg)))
-            if timing.blocked >= 0:
-                return None
-            joints.append(leg.joints[1:])
-            times.append(now + timing.times[1:])
-            now = float(times[-1][-1])
-        return Approach(np.concatenate(joints), np.concatenate(times))
+    def slow(self, found: ArmSolution) -> None:
+        """Remember where a plan is slowest compared with the learned motion, to look for a faster one."""
+        if self._worst is None and found.plan is not None and found.timing is not None:
+            slowest = int(np.argmax(np.diff(found.timing.times) / np.diff(self._times)))
+            self._worst = replace(found.plan.clearance, room=-np.inf, sample=slowest)
 
     def failed(self, planner: ArmPlanner, plan: ArmPlan) -> None:
         """Remember where an attempt failed."""
+        self._failed.append((planner, plan))
         if self._worst is None or plan.clearance.room > self._worst.room:
             self._worst = plan.clearance
+
+    @property
+    def _late(self) -> bool:
+        return self._worst is not None and self._worst.room == -np.inf
 
     def _at_goal(self) -> bool:
         worst = self._worst
