@@ -6,8 +6,10 @@ The search makes the following attempts in turn. Each attempt keeps more of the 
 2. another posture of the arm at the goal;
 3. narrower components, which can bend the path more sharply;
 4. the path on another side of the obstacle, or farther away from it;
-5. another posture at the start, if the arm can reach it by a clear motion before the motion of the skill begins.
+5. another posture at the start, if the arm can reach it by a clear motion before the motion of the skill begins;
+6. the best failed attempts again, with narrower components.
 
+If a plan takes much longer than the learned motion, a few more attempts are made, and the shortest plan is returned.
 If no attempt succeeds, the reason states which link and obstacle come too close in the best attempt, and when.
 """
 
