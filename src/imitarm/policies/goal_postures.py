@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import UnreachableError
+from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.arm_path import ArmPath, self_motions
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
@@ -17,8 +19,9 @@ from imitarm.policies.arm_certificate import ArmAmongObstacles, ArmClearance
 
 Array = NDArray[np.float64]
 
-_STARTS, _STARTS_TILTED = 24, 6  # random postures from which inverse kinematics begins: for the goal, for each tilt
+_STARTS, _TILTED_STARTS = 24, 6  # random postures from which inverse kinematics begins: for the goal, for each tilt
 _SWEEP, _SWEEP_STEPS = 0.15, 24  # [rad] of self-motion in one step of the search; number of steps
+_SAME = 0.03  # [rad] postures that differ by less are one
 _REACHED = 1e-5  # [m, rad] error of the tool's pose that is accepted
 _DIFFERENT, _MOST = 0.3, 8  # [rad] difference of a joint between two postures that are returned; number of postures
 _REACH = 0.15  # [m] largest clearance that is reported
@@ -72,64 +75,73 @@ def clear_postures(around: ArmAmongObstacles, goal: Pose, time: float, start: Ar
     best: ArmClearance | None = None
     for tilt in tilts:
         pose = Pose(goal.position, quaternion_multiply(quaternion_exp(tilt), goal.quaternion))
-        sweep = _Sweep(around, pose, time)
+        path = _postures(around.arm, *_key(pose), _TILTED_STARTS if tilt.any() else _STARTS)
+        if path is None:
+            continue
+        times = np.full(len(path), time)
+        gaps = around.gaps(path, times, 0.0, connected=False)
+        room = np.zeros(len(path))
+        np.minimum.at(room, gaps.sample, gaps.room)
+        top = int(np.argmax(room))
+        if best is None or room[top] > best.room:
+            best = around.clearance_at(ArmPath.of(around.arm, path.joints[top][None]), times[:1], _REACH)
         found: list[Array] = []
-        for q in sweep.run(_STARTS if not tilt.any() else _STARTS_TILTED):
+        for q in path.joints[room >= 0.0]:
             if all(np.abs(q - other).max() > _DIFFERENT for other in found):
                 found.append(q)
-        if sweep.best is not None and (best is None or sweep.best.room > best.room):
-            best = sweep.best
         if found:
             found.sort(key=lambda q: float(np.abs(q - start).max()))
             return GoalSearch(tuple(GoalPosture(q, tilt) for q in found[:_MOST]), best)
     return GoalSearch((), best)
 
 
-class _Sweep:
-    """Postures with the tool at one pose: the best clearance so far, and those that are clear."""
+def _key(pose: Pose) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    return tuple(pose.position.tolist()), tuple(pose.quaternion.tolist())
 
-    def __init__(self, around: ArmAmongObstacles, pose: Pose, time: float) -> None:
-        self._around, self._arm, self._pose, self._time = around, around.arm, pose, time
-        self.best: ArmClearance | None = None
 
-    def run(self, n_starts: int) -> Iterator[Array]:
-        """Yield clear postures, first those that inverse kinematics finds, then those on their self-motions."""
-        starts = self._starts(n_starts)
-        if not len(starts):
-            return
-        poses = np.tile(self._pose.position, (len(starts), 1)), np.tile(self._pose.quaternion, (len(starts), 1))
-        paths = [ArmPath.of(self._arm, starts)] * 2
-        null = self_motions(paths[0].tool_jacobians())
-        headings = [sign * null[:, :, :1].sum(axis=2) for sign in (1.0, -1.0)]
-        for step in range(_SWEEP_STEPS + 1):
-            for path in paths[: 2 if step else 1]:
-                yield from self._clear(path, poses)
-            if not null.shape[2]:
-                return
-            for i, path in enumerate(paths):
-                paths[i], _ = ArmPath.of(self._arm, path.joints + _SWEEP * headings[i]).moved_to(*poses)
-                now = self_motions(paths[i].tool_jacobians())[:, :, 0]
-                headings[i] = now * np.where(np.einsum("kj,kj->k", now, headings[i]) < 0.0, -1.0, 1.0)[:, None]
+@lru_cache(maxsize=64)
+def _postures(
+    arm: ArmModel, position: tuple[float, ...], quaternion: tuple[float, ...], n_starts: int
+) -> ArmPath | None:
+    """Return postures with the tool at a pose; None if there are none.
 
-    def _starts(self, n: int) -> Array:
-        """Return postures with the tool at the pose, shape (k, n_joints) [rad]."""
-        random = np.random.default_rng(0)
-        low, high = np.maximum(self._arm.lower, -np.pi), np.minimum(self._arm.upper, np.pi)
-        found: list[Array] = []
-        for _ in range(n):
-            with contextlib.suppress(UnreachableError):
-                found.append(find_posture(self._arm, self._pose, q0=random.uniform(low, high), restarts=0))
-        return np.array(found).reshape(-1, self._arm.n_joints)
+    First come those that inverse kinematics finds from ``n_starts`` random starts, then those on their self-motions.
+    They do not depend on obstacles, so they are kept for further scenes.
+    """
+    starts = _solutions(arm, Pose(np.array(position), np.array(quaternion)), n_starts)
+    if not len(starts):
+        return None
+    poses = np.tile(position, (len(starts), 1)), np.tile(quaternion, (len(starts), 1))
+    paths = [ArmPath.of(arm, starts)] * 2
+    null = self_motions(paths[0].tool_jacobians())
+    headings = [sign * null[:, :, :1].sum(axis=2) for sign in (1.0, -1.0)]
+    found = [_usable(paths[0], poses)]
+    for _ in range(_SWEEP_STEPS if null.shape[2] else 0):
+        for i, path in enumerate(paths):
+            paths[i], _ = ArmPath.of(arm, path.joints + _SWEEP * headings[i]).moved_to(*poses)
+            now = self_motions(paths[i].tool_jacobians())[:, :, 0]
+            headings[i] = now * np.where(np.einsum("kj,kj->k", now, headings[i]) < 0.0, -1.0, 1.0)[:, None]
+            found.append(_usable(paths[i], poses))
+    kept: list[Array] = []
+    for q in np.concatenate(found):
+        if not kept or np.abs(np.array(kept) - q).max(axis=1).min() > _SAME:
+            kept.append(q)
+    return ArmPath.of(arm, np.array(kept)) if kept else None
 
-    def _clear(self, path: ArmPath, poses: Sequence[Array]) -> Array:
-        """Return the clear ones of several postures, shape (k, n_joints) [rad]."""
-        usable = np.abs(path.errors_to(*poses)).max(axis=1) < _REACHED
-        usable &= ((path.joints >= self._arm.lower) & (path.joints <= self._arm.upper)).all(axis=1)
-        gaps = self._around.gaps(path, np.full(len(path), self._time), 0.0, connected=False)
-        room = np.zeros(len(path))
-        np.minimum.at(room, gaps.sample, gaps.room)
-        best = int(np.argmax(np.where(usable, room, -np.inf)))
-        if usable[best] and (self.best is None or room[best] > self.best.room):
-            one = ArmPath.of(self._arm, path.joints[best][None])
-            self.best = self._around.clearance_at(one, np.array([self._time]), _REACH)
-        return path.joints[usable & (room == 0.0)]
+
+def _solutions(arm: ArmModel, pose: Pose, n: int) -> Array:
+    """Return postures with the tool at a pose, found by inverse kinematics, shape (k, n_joints) [rad]."""
+    random = np.random.default_rng(0)
+    low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
+    found: list[Array] = []
+    for _ in range(n):
+        with contextlib.suppress(UnreachableError):
+            found.append(find_posture(arm, pose, q0=random.uniform(low, high), restarts=0))
+    return np.array(found).reshape(-1, arm.n_joints)
+
+
+def _usable(path: ArmPath, poses: Sequence[Array]) -> Array:
+    """Return those of several postures in which the tool is at its pose and no limit is exceeded, (k, n_joints)."""
+    usable = np.abs(path.errors_to(*poses)).max(axis=1) < _REACHED
+    usable &= ((path.joints >= path.arm.lower) & (path.joints <= path.arm.upper)).all(axis=1)
+    return path.joints[usable]
