@@ -63,7 +63,7 @@ tables: $(VENV)/.dev $(MEDIAPIPE) $(SKILLS)  ## print all tables of docs/ again,
 
 pictures: demo  ## renew the pictures in docs/images, which needs Chromium, Chrome or Edge, and EGL
 	$(BIN)/python scripts/take_picture.py demo/report.html docs/images/report.png --anchor scene-4-boxes-and-cone --seconds 40
-	MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python scripts/draw_chapter_4.py docs/images
+	MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python scripts/draw_thesis_figures.py docs/images
 
 clean:  ## remove the environment and everything made
 	rm -rf $(VENV) .venv-mediapipe .cache demo .pytest_cache .mypy_cache .ruff_cache .hypothesis

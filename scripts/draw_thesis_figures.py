@@ -1,9 +1,9 @@
-"""Draw what thesis Figs 4.2 to 4.8 show, with this library, for docs/chapter_4.md.
+"""Draw what thesis Figs 4.2 to 4.8 and 5.4 show, with this library, for docs/chapter_4.md and docs/simulation.md.
 
-    MUJOCO_GL=egl python scripts/draw_chapter_4.py docs/images
+    MUJOCO_GL=egl python scripts/draw_thesis_figures.py docs/images
 
-Nothing in the figures is drawn by hand: skills are learned, paths are adapted and sweeps are simulated. Figs 4.7 and
-4.8 show the simulated arm, so the simulator must be able to render without a window.
+Nothing in the figures is drawn by hand: skills are learned, paths are adapted and sweeps are simulated. Figs 4.7,
+4.8 and 5.4 show the simulated arm, so the simulator must be able to render without a window.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from imitarm.control_loop import reproduce
+from imitarm.control_loop.reproduce import Step
 from imitarm.demonstrations import align, read
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose, quaternion_exp
@@ -61,7 +62,7 @@ _PANELS = "abcd"
 
 def main(arguments: list[str] | None = None) -> None:
     """Draw the figures into a folder."""
-    parser = argparse.ArgumentParser(prog="python scripts/draw_chapter_4.py", description=main.__doc__)
+    parser = argparse.ArgumentParser(prog="python scripts/draw_thesis_figures.py", description=main.__doc__)
     parser.add_argument("folder", type=Path, help="folder of the pictures")
     parser.add_argument("--only", nargs="+", choices=FIGURES, metavar="NUMBER", help="figures to draw; default: all")
     given = parser.parse_args(arguments)
@@ -118,10 +119,19 @@ def crumbs_of(robot: SimulatedRobot, task: SweepTask) -> Array:
     return np.array([robot.data.body(f"crumb/{i}").xpos[:2] for i in range(task.n_crumbs)])
 
 
-def picture(robot: SimulatedRobot, paths: Sequence[tuple[Array, str]]) -> NDArray[np.uint8]:
-    """Return a picture of the simulated world, with paths (n, 3) [m] drawn as beads of a colour."""
+def picture(
+    robot: SimulatedRobot, paths: Sequence[tuple[Array, str]], look: tuple[float, float] = (215.0, -38.0)
+) -> NDArray[np.uint8]:
+    """Return a picture of the simulated world, with paths (n, 3) [m] drawn as beads of a colour.
+
+    Args:
+        robot: the simulated robot.
+        paths: paths and their colours.
+        look: azimuth and elevation of the line of sight [degrees].
+    """
     camera = mujoco.MjvCamera()
-    camera.lookat, camera.distance, camera.azimuth, camera.elevation = [0.55, -0.02, 0.10], 1.75, 215.0, -38.0
+    camera.lookat, camera.distance = [0.55, -0.02, 0.10], 1.75
+    camera.azimuth, camera.elevation = look
     with mujoco.Renderer(robot.model, _PIXELS[1], _PIXELS[0]) as renderer:
         renderer.update_scene(robot.data, camera)
         for positions, colour in paths:
@@ -306,6 +316,31 @@ def pictured(name: str) -> Figure:
     return figure
 
 
+def figure_5_4() -> Figure:
+    """The simulated Panda at the start, above the obstacles, and at the goal in the open box."""
+    task, arm = OpenBoxTask(seed=4, n_obstacles=3), OpenBoxTask.arm()
+    skill = Skill(8).fit(align(demonstrations_by(task.motion(), 10)))
+    robot, scene, look = task.robot(arm=arm), task.scene(), (155.0, -30.0)
+    policy, pictures = ACFRA(skill, arm=arm, clearance=task.clearance), [picture(robot, [], look)]
+
+    def on_step(step: Step) -> None:
+        if len(pictures) == 1 and step.command.progress > 0.5:
+            pictures.append(picture(robot, [], look))
+
+    safety = SafetyFilter(arm, clearance=task.clearance)
+    rollout = task.evaluate(robot, reproduce(policy, robot, scene.at, safety=safety, on_step=on_step))
+    path = (rollout.trajectory.positions, palette.MEASURED)
+    pictures.append(picture(robot, [path], look))
+    figure = Figure(figsize=(9.0, 2.6), layout="constrained")
+    done = "in the box" if rollout.success else "failed"
+    titles = ("(a) start", "(b) halfway", f"(c) {done}, clearance {1e3 * rollout.min_clearance:.0f} mm")
+    for axes, title, image in zip(figure.subplots(1, 3), titles, pictures, strict=True):
+        axes.imshow(image)
+        axes.set_axis_off()
+        axes.set_title(title)
+    return figure
+
+
 FIGURES = {
     "4.2": figure_4_2,
     "4.3": figure_4_3,
@@ -314,6 +349,7 @@ FIGURES = {
     "4.6": figure_4_6,
     "4.7": lambda: pictured("T1"),
     "4.8": lambda: pictured("T4"),
+    "5.4": figure_5_4,
 }
 
 if __name__ == "__main__":

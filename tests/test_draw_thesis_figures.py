@@ -1,4 +1,4 @@
-"""The figures of Chapter 4 are drawn again by the script, and the page shows each of them."""
+"""Figures of the thesis are drawn again by the script, and the pages show each of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from draw_chapter_4 import FIGURES, main
+from draw_thesis_figures import FIGURES, main
 from imitarm.errors import InputError
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -25,11 +25,11 @@ def test_the_quick_figures_are_drawn(tmp_path):
         assert pixels.shape[1] > 400 and pixels.std() > 10
 
 
-def test_the_page_shows_every_figure_and_says_what_made_it():
-    page = (DOCS / "chapter_4.md").read_text()
-    shown = re.findall(r"images/figure_4_(\d)\.png", page)
-    assert [f"4.{n}" for n in shown] == list(FIGURES)
-    assert re.findall(r"^\| (4\.\d) \|", page, re.MULTILINE) == list(FIGURES)
+def test_the_pages_show_every_figure_and_say_what_made_it():
+    page, other = ((DOCS / name).read_text() for name in ("chapter_4.md", "simulation.md"))
+    shown = re.findall(r"images/figure_(\d_\d)\.png", page + other)
+    assert sorted(number.replace("_", ".") for number in shown) == list(FIGURES)
+    assert re.findall(r"^\| (4\.\d) \|", page, re.MULTILINE) == [number for number in FIGURES if number < "5"]
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
