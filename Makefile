@@ -52,6 +52,8 @@ DATA ?= ../shared/data
 SKILLS := $(addprefix .cache/skills/,pouring.json letter_h.json bottle2shelf.json)
 tables: $(VENV)/.dev $(MEDIAPIPE) $(SKILLS)  ## print all tables of docs/ again, which takes hours; DATA=folder of real recordings
 	$(BIN)/imitarm benchmark mapping --out benchmark-mapping --data $(DATA) --fill docs/mapping_benchmark.md
+	$(BIN)/imitarm benchmark static --count 100 --torque 10 --memory 10 --out benchmark-static
+	$(BIN)/imitarm benchmark static compare benchmark-static --fill docs/static_benchmark.md
 	$(BIN)/imitarm benchmark avoidance --seeds 200 --fill docs/avoidance.md
 	$(BIN)/imitarm benchmark placements --skill $(SKILLS) --robots sawyer panda --tool gripper --seeds 334 --max-tilt 30 \
 		--jobs $(JOBS) --fill docs/avoidance.md
