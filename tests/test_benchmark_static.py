@@ -165,6 +165,15 @@ def test_displacement_in_a_forbidden_direction_is_found():
     assert measure(case, aside).forbidden == pytest.approx(0.0, abs=1e-12)
 
 
+def test_samples_that_nearly_coincide_with_the_dense_times_are_measured():
+    case = static_case("S1", 2, 1000)
+    path = nominal(case)
+    dense = np.linspace(path.times[0], path.times[-1], static_measures.DENSE)
+    times = np.sort(np.append(path.times, np.nextafter(dense[100:3900:100], 10.0)))
+    found = measure(case, Trajectory(times, path.at(times)[0]))
+    assert found.forbidden == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_missed_contact_point_is_found():
     case = next(c for seed in range(1000, 1050) if (c := static_case("S6", 3, seed)).pinned)
     free = in_scene(case)

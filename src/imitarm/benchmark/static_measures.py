@@ -190,9 +190,9 @@ def _forbidden(case: StaticCase, path: Trajectory) -> float:
     if not case.forbidden:
         return 0.0
     phase = (path.times - path.times[0]) / path.duration
-    same = case.skill.nominal(phase * case.skill.duration_, None, case.scene.goal).positions
-    learned = case.skill.nominal(np.linspace(0.0, case.skill.duration_, DENSE), None, case.scene.goal).positions
-    nearest = learned[cKDTree(learned).query(path.positions)[1]]
+    learned = case.skill.nominal(np.linspace(0.0, case.skill.duration_, DENSE), None, case.scene.goal)
+    same = learned.at(phase * case.skill.duration_)[0]
+    nearest = learned.positions[cKDTree(learned.positions).query(path.positions)[1]]
     unit = np.array(case.forbidden) / np.linalg.norm(case.forbidden, axis=1, keepdims=True)
     by_phase, by_place = ((path.positions - points) @ unit.T for points in (same, nearest))
     return float(np.minimum(by_phase, by_place).max(initial=0.0))
