@@ -322,6 +322,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=_STEPS, help="steps of Adam in each round; default: %(default)s")
     parser.add_argument("--out", required=True, help="JSON file to write")
     chosen = parser.parse_args(arguments)
+    code = code_version()  # of the code that now runs
     done = train_network(chosen.seed, n_scenes=chosen.scenes, n_validation=chosen.validation, steps=chosen.steps)
     kept = ", ".join(f"{100 * k:.0f} % (gain {gain:g})" for gain, k in zip(GAINS, done.kept, strict=True))
     losses = ", ".join(f"{loss:.3f}" for loss in done.losses)
@@ -334,7 +335,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = f"--seed {chosen.seed} --scenes {chosen.scenes} --validation {chosen.validation} --steps {chosen.steps}"
     provenance: dict[str, str | float | int] = {
         "command": f"python -m imitarm.benchmark.train_ann {options}",
-        "code": code_version(),
+        "code": code,
         "seed": chosen.seed,
         "training_scenes": chosen.scenes,
         "validation_scenes": chosen.validation,

@@ -116,9 +116,9 @@ class CoupledMotion(BaselinePolicy):
         drives = one.drive @ np.moveaxis(targets_by_step(one, targets), 0, 1)
         learned = nominal.at(np.minimum(nominal.times[0] + T / n * np.arange(n_steps), nominal.times[-1]))[0]
         z = np.stack([nominal.positions[0], self.start_velocity()])
-        path, limit = [z[0]], self._limit * T * T
+        path, limit, slow = [z[0]], self._limit * T * T, _SLOW * nominal.path_length
         for k in range(n_steps):
-            if k >= n and _has_arrived(path, z[1], goal, n // 4, _SLOW * nominal.path_length):
+            if k >= n and _has_arrived(path, z[1], goal, n // 4, slow):
                 break
             phi = self.allowed(self.term(surroundings.state(z, k / n, learned[k])))
             size = float(np.sqrt(phi.dot(phi)))
@@ -140,7 +140,9 @@ def _has_arrived(path: list[Array], velocity: Array, goal: Array, quarter: int, 
     away = float(np.linalg.norm(path[-1] - goal))
     if away < _ARRIVED:
         return float(np.linalg.norm(velocity)) <= slow
-    return away < _NEAR and float(np.max(np.abs(path[-1] - np.stack(path[-quarter - 1 :])))) < _STILL
+    return away < _NEAR and all(
+        float(np.linalg.norm(path[-1] - path[-1 - back])) < _STILL for back in (quarter, quarter // 2, quarter // 4)
+    )
 
 
 class Surroundings:
@@ -165,7 +167,7 @@ class Surroundings:
         x, v = z
         if self._packed.still:
             gap, normal = self._gaps.gaps_and_normals(x)
-            relative = np.broadcast_to(v, normal.shape)
+            relative = v - self._packed.velocities  # 0
         else:
             gap, normal = self._gaps.gaps_and_normals(x[None], [fraction * self._duration])
             gap, normal = gap[:, 0], normal[:, 0]
