@@ -84,6 +84,8 @@ def calls(tmp_path_factory) -> dict[str, Call]:
     shown[0].save(folder / "one.csv")
     path = shown[0].trajectory
     identity = Pose([0.5, 0.0, 0.3], [1.0, 0.0, 0.0, 0.0])
+    planned = imitarm.adapt(skill, Scene(), arm=arm)
+    assert planned.joints is not None
     return {
         "ACFRA": (imitarm.ACFRA, {"skill": skill, "tool_radius": 0.01, "clearance": 0.02, "forbidden": ()}),
         "ArmModel": (ArmModel.load, {"name_or_path": "panda", "tool": "gripper", "flange": None}),
@@ -149,6 +151,12 @@ def calls(tmp_path_factory) -> dict[str, Call]:
         "lint": (imitarm.lint, {"demonstrations": shown}),
         "load_scene": (imitarm.load_scene, {"path": folder / "scene.yaml"}),
         "read": (imitarm.read, {"paths": folder / "one.csv", "units": None, "duration": None, "rate": None}),
+        "replan": (
+            imitarm.replan,
+            {"previous": planned, "scene": Scene(), "arm": arm,
+             "state": ArmState(planned.joints[0], np.zeros(n), np.zeros(n), 0.0), "phase": 0.0, "clearance": 0.02,
+             "forbidden": (), "max_tilt": None, "goal_tilt": 0.0, "allowance": 0.0},
+        ),
         "reproduce": (
             lambda dt, timeout: imitarm.reproduce(
                 imitarm.ACFRA(skill, tool_radius=0.01), SimulatedRobot(arm), lambda t: Scene(), dt=dt, timeout=timeout
