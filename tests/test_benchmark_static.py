@@ -264,6 +264,23 @@ def test_an_error_is_a_failure_with_its_reason_and_a_refusal_is_not(monkeypatch)
         del POLICIES._places()["raises"], POLICIES._places()["refuses"]
 
 
+class Counts(NoAvoidance):
+    plans = 0
+
+    def plan_motion(self, scene, start=None, state=None):
+        Counts.plans += 1
+        return super().plan_motion(scene, start, state)
+
+
+def test_a_method_plans_once_without_a_clock_for_each_skill(monkeypatch):
+    monkeypatch.setitem(POLICIES._loaded, "counts", Counts)
+    monkeypatch.setitem(POLICIES._places(), "counts", "registered")
+    first = replace(ONE, method="counts")
+    for experiment, plans in ((first, 2), (replace(first, seed=1001), 3), (replace(first, dimension=2), 5)):
+        experiment.run()
+        assert Counts.plans == plans
+
+
 def test_options_reach_the_method_and_unknown_ones_are_refused():
     with pytest.raises(InputError, match="magic"):
         build("acfra", static_case("S1", 2, 1000), (("magic", 1.0),))

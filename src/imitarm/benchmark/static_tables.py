@@ -332,9 +332,9 @@ def time_table(results: StaticResults) -> Table:
         "peak memory, median [kB]>",
     )
     note = (
-        "Time to plan one whole path, without construction; construction includes what a method computes once for a "
-        "skill. Training of networks and cost functions is not included. Peak memory: what Python allocates in a "
-        "separate run."
+        "Time to plan one whole path, without construction. In each process, a method first plans once for each skill "
+        "without a clock, so that imports and what it computes once for a skill are not counted. Training of networks "
+        "and cost functions is not included either. Peak memory: what Python allocates in a separate run."
     )
     return Table("Computing time", columns, tuple(rows), note)
 
