@@ -63,7 +63,7 @@ def _sweep() -> Skill:
 
 
 def scaling_case(n_obstacles: int, n_spheres: int, seed: int) -> StaticCase:
-    """Return a scene with this many obstacles and spheres; more obstacles are added to those of fewer."""
+    """Return a scene with these numbers of obstacles and spheres; it contains the obstacles of scenes with fewer."""
     skill, rng = _sweep(), np.random.default_rng([41, seed])
     path = skill.nominal(np.linspace(0.0, skill.duration_, 400)).positions
     free = _RADIUS + _LENGTH + CLEARANCE + _FREE

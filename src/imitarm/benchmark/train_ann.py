@@ -57,7 +57,7 @@ class TrainingScene(NamedTuple):
     """One scene with the expert's paths.
 
     Attributes:
-        policy: the policy whose skill, tool and forbidden directions the scene has.
+        policy: policy with the skill, the tool and the forbidden directions of the scene.
         scene: one obstacle.
         nominal: the learned path, 200 samples.
         deviations: splines of the expert's deviations from the learned path over the fraction of the duration, one for
@@ -140,7 +140,7 @@ def training_scene(number: int, network: MLP, split: str = "train") -> TrainingS
     """Return one scene; None if the expert finds no path.
 
     Args:
-        number: number of the scene; scene after scene, the skills take turns.
+        number: number of the scene; consecutive scenes use the skills in turn.
         network: network of the policy.
         split: name in :data:`~imitarm.benchmark.static_scenes.SPLITS`.
     """
@@ -239,7 +239,7 @@ class Training(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """The gain with which the motion keeps the clearance most often in the validation scenes; the smallest such."""
+        """The gain that keeps the clearance in most validation scenes; among equals, the smallest."""
         return GAINS[int(np.argmax(self.kept))]
 
 

@@ -12,7 +12,7 @@ and its derivative, with ``H_k`` the Hessian of feature ``k``, matches features:
 
 The weights stay positive, because their logarithms are learned, by Fisher scoring: the covariance of the features is
 the second derivative of ``L``, and ``Cov(phi_k, phi_l) = grad phi_k^T H^-1 grad phi_l + 1/2 tr(H^-1 H_k H^-1 H_l)``. A
-normal prior on the logarithms keeps weights finite on which the demonstrations have no influence.
+normal prior on the logarithms keeps those weights finite on which the demonstrations have no influence.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Learned(NamedTuple):
 
 
 def inverse_hessian(cost: PathCost, weights: Array, blocks: Array) -> Array:
-    """Return the inverse of the Hessian of J, shape (94 k, 94 k); an indefinite Hessian is shifted until it is not."""
+    """Return the inverse of the Hessian of J, shape (94 k, 94 k); an indefinite Hessian is made positive definite."""
     band = cost.hessian(weights, blocks)
     for shift in _SHIFTS:
         shifted = band.copy()
@@ -108,7 +108,7 @@ def _times_smoothness(matrix: Array, smoothness: Array, k: int) -> Array:
 
 
 def first_weights(costs: Sequence[PathCost], demonstrated: Array) -> Array:
-    """Return weights under which each feature has an equal part in a cost of half the number of free coordinates."""
+    """Return weights with which all features contribute equally to a cost of half the number of free coordinates."""
     freedom = np.mean([cost.precisions.shape[0] * cost.precisions.shape[1] for cost in costs])
     part = 0.5 * float(freedom) / len(FEATURES)
     return np.asarray(part / np.where(demonstrated > 1e-6, demonstrated, part))
