@@ -50,6 +50,8 @@ bench: $(VENV)/.bench  ## speed against installed peers, as ratios
 
 DATA ?= ../shared/data
 SKILLS := $(addprefix .cache/skills/,pouring.json letter_h.json bottle2shelf.json)
+RESULTS := .cache/placements.jsonl
+COMPARED = --skill $(SKILLS) --robots sawyer panda --tool gripper --out $(RESULTS)
 tables: $(VENV)/.dev $(MEDIAPIPE) $(SKILLS)  ## print all tables of docs/ again, which takes hours; DATA=folder of real recordings
 	$(BIN)/imitarm benchmark mapping --out benchmark-mapping --data $(DATA) --fill docs/mapping_benchmark.md
 	$(BIN)/imitarm benchmark static --count 100 --torque 10 --memory 10 --out benchmark-static
@@ -57,6 +59,10 @@ tables: $(VENV)/.dev $(MEDIAPIPE) $(SKILLS)  ## print all tables of docs/ again,
 	$(BIN)/imitarm benchmark avoidance --seeds 200 --fill docs/avoidance.md
 	$(BIN)/imitarm benchmark placements --skill $(SKILLS) --robots sawyer panda --tool gripper --seeds 334 --max-tilt 30 \
 		--jobs $(JOBS) --fill docs/avoidance.md
+	$(BIN)/imitarm benchmark placements --policies acfra rrt-connect $(COMPARED) --seeds 50 --max-tilt 30
+	$(BIN)/imitarm benchmark placements --policies acfra rrt-connect $(COMPARED) --seeds 50
+	$(BIN)/imitarm benchmark placements --policies rrt-connect-tilt $(COMPARED) --seeds 5
+	$(BIN)/imitarm benchmark comparison $(RESULTS) --fill docs/avoidance.md
 	$(BIN)/imitarm benchmark people $(DATA) $(VIDEOS)/cam01.mp4 $(VIDEOS)/cam02.mp4 --fill docs/real_data.md
 
 .cache/skills/%.json: $(VENV)/.dev
