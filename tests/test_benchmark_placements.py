@@ -98,9 +98,13 @@ def test_pairs_count_only_what_the_baseline_solves():
     style, pairs = comparison_tables(results)
     assert [row[2] for row in style.rows] == ["5", "5"]
     (row,) = pairs.rows
-    assert row[:4] == ("default", "baseline", "default", "3")
-    assert row[4].startswith("2 (66.7 %")
-    assert row[6:] == ("0.50", "0.50", "0.40")
+    assert row[:5] == ("default", "baseline", "default", "skill", "3")
+    assert row[5].startswith("2 (66.7 %")
+    assert row[7:] == ("0.50", "0.50", "0.40")
+    other = replace(SETUP, skill="folder/other.json")
+    more = [replace(one, setup=other) for one in (result(seed=7), result("baseline", 7, computing=0.1))]
+    rows = comparison_tables([*results, *more])[1].rows
+    assert [row[3:5] for row in rows] == [("all", "4"), ("skill", "3"), ("other", "1")]
     with pytest.raises(InputError, match="another policy"):
         comparison_tables(results[:4])
 
@@ -112,7 +116,7 @@ def test_the_comparison_is_printed_from_files_and_put_into_a_document(tmp_path, 
         append_result(file, one)
     assert cli.main(["benchmark", "comparison", str(file), "--fill", str(document)]) == 0
     assert "acfra in the placements that a baseline solves" in capsys.readouterr().out
-    assert "| 30° | rrt-connect | default | 1 |" in document.read_text()
+    assert "| 30° | rrt-connect | default | skill | 1 |" in document.read_text()
     assert cli.main(["benchmark", "comparison", str(tmp_path / "none")]) == 2
     assert cli.main(["benchmark", "placements", "--out", str(file)]) == 2
     assert "--out needs --skill" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -64,7 +65,9 @@ def comparison_tables(results: Iterable[PlacementResult], policy: str = "acfra")
     if not own or not baselines:
         raise InputError(f"comparison: needs results of {policy!r} and of another policy; run the placements with both")
     rows = [_style_row(variant, list(variants[variant].values())) for variant in variants]
-    pairs = [_pair_row(a, variants[a], b, variants[b]) for a in own for b in baselines]
+    skills = dict.fromkeys(setup.skill for found in variants.values() for setup, _ in found)
+    groups = [tuple(skills), *((skill,) for skill in skills)] if len(skills) > 1 else [tuple(skills)]
+    pairs = [_pair_row(a, variants[a], b, variants[b], group) for a in own for b in baselines for group in groups]
     titles = (
         "policy",
         "tilt limit",
@@ -84,6 +87,7 @@ def comparison_tables(results: Iterable[PlacementResult], policy: str = "acfra")
                 f"tilt limit of {policy}",
                 "baseline",
                 "its tilt limit",
+                "skill",
                 "solved by the baseline>",
                 "accepted of these",
                 "solved of these",
@@ -118,9 +122,14 @@ def _pair_row(
     of_own: dict[Place, PlacementResult],
     baseline: Variant,
     of_baseline: dict[Place, PlacementResult],
+    skills: Sequence[str],
 ) -> tuple[str, ...] | None:
-    """Return the comparison of two variants; None if the baseline solved no placement that both had."""
-    pairs = [(of_own[place], other) for place, other in of_baseline.items() if other.arrived and place in of_own]
+    """Return the comparison of two variants with some skills; None if the baseline solved no placement of both."""
+    pairs = [
+        (of_own[place], other)
+        for place, other in of_baseline.items()
+        if other.arrived and place in of_own and place[0].skill in skills
+    ]
     if not pairs:
         return None
     both = [pair for pair in pairs if pair[0].arrived]
@@ -128,6 +137,7 @@ def _pair_row(
         own.limit,
         baseline.policy,
         baseline.limit,
+        Path(skills[0]).stem if len(skills) == 1 else "all",
         str(len(pairs)),
         _share(sum(one.accepted for one, _ in pairs), len(pairs)),
         _share(len(both), len(pairs)),
