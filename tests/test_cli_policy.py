@@ -66,6 +66,7 @@ def test_it_is_listed_reproduces_and_is_in_the_report(package):
     arm = ["--robot", "sawyer", "--tool", "brush"]
     done = imitarm(package, "reproduce", "sweep.json", *arm, "--policy", "plain", "--report", "page.html")
     assert done.returncode == 0, done.stdout + done.stderr
+    assert "nan" not in done.stdout  # a policy without an adaptation has no numbers of one
     page = (package / "page.html").read_text(encoding="utf-8")
     assert "plain" in page
     wrong = imitarm(package, "reproduce", "sweep.json", *arm, "--policy", "plain", "--method", "mapf")

@@ -197,7 +197,7 @@ def show_results(report: Report) -> None:
                 f"{1e3 * scene.min_clearance:.1f}" if np.isfinite(scene.min_clearance) else "-",
                 _certified(scene) if around else "-",
                 f"{1e3 * scene.rmse:.1f}" if np.isfinite(scene.rmse) else "-",
-                f"{100 * scene.unmoved_fraction:.0f} %",
+                f"{100 * scene.unmoved_fraction:.0f} %" if np.isfinite(scene.unmoved_fraction) else "-",
                 f"{1e3 * adaptation.compute_time:.1f}" if adaptation else "-",
             )
         )
