@@ -23,7 +23,7 @@ seeds = st.integers(0, 10_000)
 
 def about_a_ball(x, center, radius, velocity=None):
     """NearObstacles of x (d,) with one ball."""
-    outward = x - center
+    outward = x - np.asarray(center)
     distance = np.linalg.norm(outward)
     velocity = np.zeros(len(x)) if velocity is None else velocity
     return NearObstacles(
@@ -93,6 +93,15 @@ def test_a_tool_that_is_too_close_is_led_out_and_may_leave_freely(seed, depth):
     assert v @ n == pytest.approx(
         approach if approach > 0.0 else (1.0 - (1.0 - min(2.0 * depth, 0.5)) ** -2) * approach
     )
+
+
+def test_velocities_of_two_obstacles_that_are_too_close_are_averaged_by_depth():
+    desired = np.array([-1.0, 0.0, 0.0])
+    parts = [about_a_ball(np.zeros(3), center, 0.5) for center in ([-0.45, 0.0, 0.0], [0.48, 0.0, 0.0])]
+    weights = 1.0 - (1.0 + np.array([-0.05, -0.02]) / 0.5) ** 2
+    expected = weights @ np.stack([modulated(desired, part) for part in parts]) / weights.sum()
+    far = about_a_ball(np.zeros(3), [0.0, 2.0, 0.0], 0.5)
+    np.testing.assert_allclose(modulated(desired, together(*parts, far)), expected, atol=1e-12)
 
 
 def test_modulation_vanishes_far_from_obstacles_and_keeps_the_speed_of_the_mean():

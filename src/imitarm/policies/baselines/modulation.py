@@ -35,6 +35,8 @@ def modulated(desired: Array, around: NearObstacles, *, reactivity: float = 1.0,
 
     For several obstacles, the norms and the directions of the velocities are averaged with the weights ``w_o =
     prod_(i != o) (Gamma_i - 1)``, normalised to the sum 1. A direction is represented by its angle from ``u``.
+    Where the tool is already too close to obstacles, only these have weights, ``1 - Gamma_o``, and the velocities are
+    averaged as vectors.
 
     Args:
         desired: u, shape (d,) [m/s].
@@ -57,7 +59,10 @@ def modulated(desired: Array, around: NearObstacles, *, reactivity: float = 1.0,
     leaving = (around.gap <= 0.0) & (along > 0.0)
     tangential = relative - along[:, None] * reference
     stretched = np.where(leaving, 1.0, 1.0 - q)[:, None] * along[:, None] * reference + (1.0 + q)[:, None] * tangential
-    return _weighted(desired, stretched + around.velocity, 1.0 / np.maximum(gamma - 1.0, _TINY))
+    velocities, depth = stretched + around.velocity, np.maximum(1.0 - gamma, 0.0)
+    if depth.any():
+        return np.asarray(depth @ velocities / depth.sum())
+    return _weighted(desired, velocities, 1.0 / np.maximum(gamma - 1.0, _TINY))
 
 
 def _weighted(desired: Array, velocities: Array, weights: Array) -> Array:
