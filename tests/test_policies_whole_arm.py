@@ -292,3 +292,15 @@ def test_an_arm_without_collision_shapes_is_refused(tmp_path):
     skill = Skill(3).fit([Demonstration(path, task="go")] * 3)
     with pytest.raises(InputError, match="no collision shapes"):
         adapt(skill, Scene(), arm=arm)
+
+
+@pytest.mark.parametrize(("name", "seed"), [("sawyer", 2104), ("sawyer", 2232), ("panda", 2057)])
+def test_narrow_scenes_that_were_refused_are_solved(real_data, name, seed):
+    skill, arm, start = prepared(real_data, name, shelf)
+    scene = placement(skill, arm, seed, start)
+    plan = adapt(skill, scene, arm=arm, state=at_rest(start), max_tilt=TILT)
+    assert plan.feasible, plan.reason
+    assert plan.certified_clearance >= 0.02
+    assert measured_clearance(arm, scene, plan.joints) >= 0.02
+    approach = 0.0 if plan.approach is None else plan.approach.times[-1]
+    assert approach + plan.trajectory.duration <= 1.5 * skill.duration_
