@@ -15,6 +15,7 @@ from scipy.optimize import minimize
 from imitarm.benchmark import families
 from imitarm.benchmark.avoidance import SLACK, evaluate, learn, run_family, wilson_interval
 from imitarm.benchmark.families import CLEARANCE, TOOL_RADIUS
+from imitarm.benchmark.static_scenes import static_case
 from imitarm.kinematics.pose import Pose, quaternion_exp
 from imitarm.policies import HORIZONTAL_ONLY, NOT_DOWN, adapt
 from imitarm.policies.certificate import ToolAmongObstacles
@@ -364,3 +365,12 @@ def test_wilson_interval():
     assert 0.995 < low < 0.9965 and high == 1.0
     low, high = wilson_interval(50, 100)
     assert low == pytest.approx(0.4038, abs=1e-4) and high == pytest.approx(0.5962, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", [2000, 2008])
+def test_a_window_between_the_rays_of_the_roadmap_is_found(seed):
+    case = static_case("S4", 3, seed)  # four walls around a window, a little wider than the tool with its clearance
+    found = adapt(case.skill, case.scene, tool_spheres=case.tool_spheres, clearance=case.clearance)
+    assert found.feasible, found.reason
+    dense = found.trajectory.resample(4000).positions
+    assert case.scene.clearance(dense).min() - case.tool_spheres[0, 3] >= case.clearance - 1e-5

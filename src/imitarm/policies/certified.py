@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.policies.certificate import PathClearance
+from imitarm.policies.certificate import PathClearance, ToolAmongObstacles
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.least_detour import (
     NEGLIGIBLE_LEVER,
@@ -97,7 +97,7 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
     best = search.run(while_cheaper=allowed.dimension < 3)
     roadmap: Roadmap | None = None
     if best is None:  # in a plane the roadmap costs no more than further sides, and often shows that there is no path
-        roadmap = Roadmap(path, tool, clearance, allowed)
+        roadmap = _roadmap(path, tool, clearance, allowed)
         best = search.best() if roadmap.is_hopeless else search.run()
     assert best is not None
     if best.feasible or not allowed.dimension:
@@ -107,7 +107,7 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
         best = best_of((best, divided.shrink(best.clearance))) or best
         if best.feasible:
             return best
-    roadmap = roadmap or Roadmap(path, tool, clearance, allowed)
+    roadmap = roadmap or _roadmap(path, tool, clearance, allowed)
     if roadmap.is_hopeless:
         return best
     learned = LeastDetour(path, tool, clearance, allowed, exact=True)
@@ -118,6 +118,12 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
             if best.feasible:
                 return best
     return best
+
+
+def _roadmap(path: ComponentPath, tool: ToolAmongObstacles, clearance: float, allowed: AllowedDirections) -> Roadmap:
+    """Return a roadmap with a route, if possible by rays that are aimed at gaps between the obstacles."""
+    roadmap = Roadmap(path, tool, clearance, allowed)
+    return Roadmap(path, tool, clearance, allowed, aimed=True) if roadmap.is_hopeless else roadmap
 
 
 @dataclass(order=True)

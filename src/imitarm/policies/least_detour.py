@@ -112,6 +112,10 @@ class AllowedDirections:
                 break
         return np.asarray(reduced @ self.axes.T)
 
+    def projected(self, vectors: Array) -> Array:
+        """Return vectors (..., 3) without their parts along the axes on which components can't move."""
+        return vectors @ self.axes @ self.axes.T
+
     def unit_directions(self, candidates: Array) -> Array:
         """Return the allowed part of each direction (m, 3), scaled to length 1, one row for each direction.
 

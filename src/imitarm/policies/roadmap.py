@@ -4,8 +4,9 @@ The nodes are arranged in layers. Each layer belongs to one time on the nominal 
 directions start at the nominal position of this time. On each ray, the points just outside the inflated obstacles are
 the nodes. Edges lead from each node to the nodes of the next layer on the same and on neighbouring rays. The cost of an
 edge is the change of the displacement, plus a large amount where the two tangents at its ends do not prove the
-clearance. Dynamic programming from both ends computes, for each node, the cheapest route through this node. A route is
-only a proposal: the search for the least detour takes its first tangents along the route.
+clearance. A narrow gap between obstacles may lie between two rays. If no route is found, a second roadmap therefore has
+additional rays that are aimed at gaps. Dynamic programming from both ends computes, for each node, the cheapest route
+through this node. A route is only a proposal: the search for the least detour takes its first tangents along the route.
 """
 
 from __future__ import annotations
@@ -31,6 +32,13 @@ _NEIGHBOURS = {1: 2, 2: 5, 3: 8}  # rays to which edges lead, the same one inclu
 _SLOTS = 4  # nodes on a ray
 _JUST_OUTSIDE = 3e-4  # [m] between an obstacle and the node next to it
 _FARTHER = (0.0, 0.015, 0.05)  # [m] beyond it: round an edge, the straight line between two exits is not free
+_PROBED = 3  # layers at which gaps are searched, those with the largest violation
+_PROBE_RADII = np.arange(0.04, MAX_DISPLACEMENT, 0.04)  # [m] of the points from which the search starts
+_RING = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)  # directions of these points across the path
+_PROBE_STEPS = np.geomspace(0.02, 2e-4, 40)  # [m] of the search, away from the obstacles
+_NEAREST = 0.004  # [m] obstacles that are farther away than the nearest one by much more than this have no weight
+_MAX_AIMED = 12  # rays that are added because they lead into a gap
+_AIMED_APART = np.cos(np.radians(8.0))  # cosine of the least angle between them
 _RADII = (0.005, 0.015, 0.03, 0.05, 0.08, 0.12, 0.16, 0.22, 0.28, 0.36, 0.45)  # [m] further candidates for nodes
 _APART = (0.0, 0.02, 0.06, 0.12)  # [m] least distance of a node from the one before on its ray
 _VIOLATION_COST = 1e5  # [1/m] price of clearance that the tangents of an edge do not prove
@@ -43,17 +51,33 @@ _BLOCKED = 1e9
 class Roadmap:
     """Nodes, edges and the cheapest routes among one set of obstacles.
 
+    Args:
+        path: the nominal path and its components.
+        tool: the tool and the obstacles.
+        clearance: required [m].
+        allowed: directions in which components may move.
+        aimed: whether to add rays that lead into gaps between the obstacles.
+
     Attributes:
         layers: index of the path's sample at each layer, shape (n_layers,).
         nodes: displacements of the nominal positions, shape (n_layers, n_nodes, 3) [m]; node 0 is the nominal position.
     """
 
     def __init__(
-        self, path: ComponentPath, tool: ToolAmongObstacles, clearance: float, allowed: AllowedDirections
+        self,
+        path: ComponentPath,
+        tool: ToolAmongObstacles,
+        clearance: float,
+        allowed: AllowedDirections,
+        *,
+        aimed: bool = False,
     ) -> None:
         self.path, self.tool, self.clearance = path, tool, clearance + _JUST_OUTSIDE
         self.layers = self._layers()
         rays, self.pairs_of_nodes = _graph(allowed)
+        if aimed and allowed.dimension > 1:
+            rays = np.concatenate([rays, self._rays_into_gaps(allowed)])
+            self.pairs_of_nodes = _edges(rays, _NEIGHBOURS[allowed.dimension])
         radii, free = self._radii(rays)
         n_layers, n_rays = len(self.layers), len(rays)
         self.nodes = np.zeros((n_layers, 1 + n_rays * _SLOTS, 3))
@@ -92,6 +116,68 @@ class Roadmap:
             chosen |= {fixed, *(fixed + k for k in _NEAR_FIXED), *(fixed - k for k in _NEAR_FIXED)}
         return np.array(sorted(j for j in chosen if 0 <= j < n), dtype=np.intp)
 
+    def _rays_into_gaps(self, allowed: AllowedDirections) -> Array:
+        """Return unit directions (m, 3) that lead into gaps near the layers at which the nominal path is blocked.
+
+        Points across the path move away from the nearest obstacles until they are in the middle between obstacles.
+        """
+        centre = self.path.nominal.positions[self.layers]
+        apart = [self.tool.distance(pair, centre, self.layers) for pair in range(self.tool.n_pairs)]
+        lowest = np.min(apart, axis=0)
+        blocked = np.argsort(lowest)[:_PROBED]
+        probed = self.layers[blocked[lowest[blocked] < self.clearance]]
+        if not len(probed):
+            return np.empty((0, 3))
+        starts, across, samples = self._probes(probed, allowed)
+        points = starts.copy()
+        for step in _PROBE_STEPS:
+            distance, normal = self._distances_and_normals(points, samples)
+            weight = np.exp((distance.min(axis=0) - distance) / _NEAREST)
+            away = allowed.projected(np.einsum("pm,pmd->md", weight, normal))
+            away -= np.einsum("md,md->m", away, across)[:, None] * across
+            length = np.sqrt(np.einsum("md,md->m", away, away))
+            points += away * (step / np.maximum(length, 1e-3))[:, None]
+        free = self._distances_and_normals(points, samples)[0].min(axis=0) >= self.clearance
+        if not free.any():
+            return np.empty((0, 3))
+        displacement = allowed.enforced((points - self.path.nominal.positions[samples])[free] @ allowed.axes)
+        radius = np.linalg.norm(displacement, axis=1)
+        rank = np.empty(len(radius))
+        for sample in probed:  # the nearest gap of each layer first
+            own = samples[free] == sample
+            rank[own] = np.argsort(np.argsort(radius[own]))
+        chosen: list[Array] = []
+        for i in np.argsort(rank, kind="stable"):
+            if len(chosen) == _MAX_AIMED:
+                break
+            ray = displacement[i] / max(radius[i], 1e-9)
+            if radius[i] > _JUST_OUTSIDE and not (chosen and (np.stack(chosen) @ ray).max() > _AIMED_APART):
+                chosen.append(ray)
+        return np.array(chosen).reshape(-1, 3)
+
+    def _probes(self, probed: Index, allowed: AllowedDirections) -> tuple[Array, Array, Index]:
+        """Return the points (m, 3) from which gaps are searched, the path's tangents (m, 3) and samples (m,)."""
+        positions = self.path.nominal.positions
+        found, tangents, samples = [], [], []
+        for sample in probed:
+            tangent = positions[min(sample + 1, len(positions) - 1)] - positions[max(sample - 1, 0)]
+            tangent = tangent / max(float(np.linalg.norm(tangent)), 1e-12)
+            basis = np.linalg.svd(tangent[None])[2][1:]
+            ring = np.cos(_RING)[:, None] * basis[0] + np.sin(_RING)[:, None] * basis[1]
+            points = positions[sample] + (allowed.unit_directions(ring)[:, None] * _PROBE_RADII[:, None]).reshape(-1, 3)
+            found.append(points)
+            tangents.append(np.broadcast_to(tangent, points.shape))
+            samples.append(np.full(len(points), sample))
+        return np.concatenate(found), np.concatenate(tangents), np.concatenate(samples)
+
+    def _distances_and_normals(self, points: Array, samples: Index) -> tuple[Array, Array]:
+        """Return the distance (n_pairs, m) [m] of each pair at positions of the tip (m, 3), and its gradient."""
+        pairs = [
+            self.tool.distance_and_normal(pair, self.tool.centres(pair, points, samples))
+            for pair in range(self.tool.n_pairs)
+        ]
+        return np.stack([distance for distance, _ in pairs]), np.stack([normal for _, normal in pairs])
+
     def _radii(self, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return the radii (n_layers, n_rays, n_slots) [m] of the nodes, and whether each node exists."""
         centre = self.path.nominal.positions[self.layers]
@@ -101,7 +187,7 @@ class Roadmap:
             exits = np.minimum(self._exits(obstacle, centre, rays), 2.0 * MAX_DISPLACEMENT) + _JUST_OUTSIDE
             candidates += [exits + more for more in _FARTHER]
         radius = np.sort(np.stack(candidates, axis=-1), axis=-1)
-        free = self._free(centre, rays, radius)
+        free = self._free(centre, rays, radius, np.arange(len(centre)))
         slots, exists, last = np.zeros((*shape, _SLOTS)), np.zeros((*shape, _SLOTS), dtype=bool), np.full(shape, -1.0)
         for s in range(_SLOTS):
             fits = free & (radius > (last + _APART[s])[..., None])
@@ -111,13 +197,20 @@ class Roadmap:
             slots[..., s] = last = np.where(exists[..., s], found, np.maximum(last, 0.0))
         return slots, exists
 
-    def _free(self, centre: Array, rays: Array, radius: Array) -> NDArray[np.bool_]:
-        """Return which points at radii (n_layers, n_rays, n_radii) [m] on the rays keep the clearance."""
+    def _free(self, centre: Array, rays: Array, radius: Array, layers: Index) -> NDArray[np.bool_]:
+        """Return which points at radii (n_layers, n_rays, n_radii) [m] on the rays keep the clearance.
+
+        Args:
+            centre: nominal positions at the layers, shape (n_layers, 3) [m].
+            rays: unit directions, shape (n_rays, 3).
+            radius: radii, shape (n_layers, n_rays, n_radii) [m].
+            layers: indices of the layers, shape (n_layers,).
+        """
         left = np.flatnonzero(radius <= MAX_DISPLACEMENT)
         points = centre[:, None, None, :] + radius[..., None] * rays[:, None, :]
         points, layer = points.reshape(-1, 3).take(left, axis=0), left // (radius.shape[1] * radius.shape[2])
         for pair in range(self.tool.n_pairs):
-            kept = np.flatnonzero(self.tool.distance(pair, points, self.layers[layer]) >= self.clearance)
+            kept = np.flatnonzero(self.tool.distance(pair, points, self.layers[layers[layer]]) >= self.clearance)
             if len(kept) < len(left):
                 left, layer, points = left.take(kept), layer.take(kept), points.take(kept, axis=0)
         free = np.zeros(radius.shape, dtype=bool)
