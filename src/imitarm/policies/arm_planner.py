@@ -38,7 +38,8 @@ Index = NDArray[np.intp]
 _STRIDE = 4  # the rounds look at every fourth sample, the last ones at all
 _ROUNDS = 24
 _FINAL_ROUNDS = 10  # with all samples
-_PATIENCE = 7  # rounds without progress, then this attempt is given up
+_PATIENCE, _LESS_PATIENCE = 7, 3  # rounds without progress, then this attempt is given up: usually, and far from clear
+_FAR = 0.02  # [m] an attempt that lacks more is far from clear
 _PROGRESS, _NEARLY = 1e-3, 0.2  # progress that counts: of the smallest distance [m], or as a fraction of what it lacks
 _SELF_MOTIONS = 10  # knots of the splines
 _TILT_SIGMA = 0.15  # [rad] a tilt of this size costs as much as a displacement by one demonstrated sigma
@@ -202,9 +203,9 @@ class ArmPlanner:
                 best = plan
             if plan.clearance.room >= 0.0:
                 calmed += 1
-            if (
-                plan.clearance.room >= 0.0 and (plan.speed <= _CALM or calmed > _CALMING or self.begun)
-            ) or since > _PATIENCE:
+            calm = plan.speed <= _CALM or calmed > _CALMING or self.begun
+            patience = _PATIENCE if best.clearance.room > -_FAR else _LESS_PATIENCE
+            if (plan.clearance.room >= 0.0 and calm) or since > patience:
                 break
             gaps = self.around.gaps(path, self.clock[samples], _REACH) if gaps is None else gaps
             if plan.complete and plan.clearance.room < 0.0 and gaps.room.min(initial=1.0) >= 0.0:
