@@ -49,7 +49,7 @@ _SIDES = 8  # directions tried across the path
 _AWAY = (0.1, 0.2)  # [m] by which the path is moved to another side
 _MOST_SIDES = 5  # that are followed up
 _GOALS = 3  # postures at the goal that are tried first
-_LATE, _MORE = 1.3, 6  # times the learned duration: a plan that takes longer is kept, and so many more are tried
+_LATE, _MORE = 1.45, 6  # times the learned duration: a plan that takes longer is kept, and so many more are tried
 _NEARLY, _MOST_NEARLY = 0.02, 3  # [m] a failed attempt that lacks less is tried again; number of such attempts
 _LEVER = 0.05  # squared influence of the components; a place with less is not moved
 
