@@ -374,3 +374,21 @@ def test_a_window_between_the_rays_of_the_roadmap_is_found(seed):
     assert found.feasible, found.reason
     dense = found.trajectory.resample(4000).positions
     assert case.scene.clearance(dense).min() - case.tool_spheres[0, 3] >= case.clearance - 1e-5
+
+
+@pytest.mark.parametrize(("dimension", "seed"), [(2, 2000), (3, 2006)])
+def test_a_path_does_not_stray_where_the_components_are_wide(dimension, seed):
+    case = static_case("S7", dimension, seed)  # before and after the dirt, at which the path must not move
+    found = adapt(
+        case.skill,
+        case.scene,
+        tool_spheres=case.tool_spheres,
+        clearance=case.clearance,
+        forbidden=case.forbidden,
+        pinned=case.pinned,
+    )
+    away = np.linalg.norm(found.trajectory.positions - found.nominal.positions, axis=1)
+    depth = case.clearance + case.tool_spheres[0, 3] - case.scene.clearance(found.nominal.positions).min()
+    assert found.feasible and found.divided
+    assert away.max() < 1.5 * depth  # 5 times with the learned components
+    assert found.trajectory.path_length < 1.15 * found.nominal.path_length

@@ -18,6 +18,9 @@ The algorithm of :func:`find_detour`:
    narrower ones. If components can move only in a plane, the roadmap is built earlier: as soon as the next choice of
    sides costs more than 70 % of the previous choice. Then the roadmap decides: if it contains no route, the search over
    sides ends, otherwise the search over sides continues.
+5. If the path is displaced by more than twice the depth by which the learned path violates the clearance, the learned
+   components are too wide for this scene, or the side is not a good one. A route of the roadmap is then followed with
+   narrower components, and the path with the smaller mean deviation from the demonstrations is returned.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.policies.certificate import PathClearance, ToolAmongObstacles
-from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.component_path import TOLERANCE_FLOOR, ComponentPath
 from imitarm.policies.least_detour import (
     NEGLIGIBLE_LEVER,
     UNBOUNDED,
@@ -54,6 +57,7 @@ _IDENTITY = np.eye(3)
 _OTHERS = ([1, 2], [0, 2], [0, 1])
 _MAX_CHOICES = 4  # of a side, before all times are searched together
 _HARDLY_CHEAPER = 0.7  # times the cost of the previous choice of sides
+_STRAY_RATIO = 2.0  # a path that is displaced by more than this many depths of the violation is too far away
 _MAX_ROUTES = 3  # through the roadmap
 _ALMOST = 0.003  # [m] an attempt that lacks less clearance than this is tried again with narrower components
 _MAX_ROWS = 12  # violated samples that vote on a direction; the least detour then respects all of them
@@ -100,9 +104,14 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
         roadmap = _roadmap(path, tool, clearance, allowed)
         best = search.best() if roadmap.is_hopeless else search.run()
     assert best is not None
-    if best.feasible or not allowed.dimension:
+    if not allowed.dimension or (best.feasible and not _strays(best, nominal, clearance)):
         return best
     divided = LeastDetour(path.divided, tool, clearance, allowed, exact=True)
+    if best.feasible:
+        roadmap = roadmap or _roadmap(path, tool, clearance, allowed)
+        starts = [] if roadmap.is_hopeless else [tool.clearance_of(path.nominal.positions + next(roadmap.routes(1)))]
+        nearer = divided.shrink(starts[0] if starts else best.clearance)
+        return best if nearer is None or not nearer.feasible else min(best, nearer, key=_deviation)
     if best.lowest > clearance - _ALMOST:
         best = best_of((best, divided.shrink(best.clearance))) or best
         if best.feasible:
@@ -118,6 +127,23 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
             if best.feasible:
                 return best
     return best
+
+
+def _strays(detour: Detour, nominal: PathClearance, clearance: float) -> bool:
+    """Return whether a path is displaced much farther than the obstacles are wide.
+
+    The learned components are then too wide for this scene, or the path passes an obstacle on the wrong side.
+    """
+    away = detour.clearance.positions - detour.path.nominal.positions
+    farthest = np.sqrt(np.einsum("nd,nd->n", away, away).max())
+    return bool(farthest > _STRAY_RATIO * (clearance - nominal.lowest))
+
+
+def _deviation(detour: Detour) -> float:
+    """Return the mean squared displacement of a path, in standard deviations of the demonstrations."""
+    path, away = detour.path, detour.clearance.positions - detour.path.nominal.positions
+    covariance = path.tolerance + TOLERANCE_FLOOR**2 * np.eye(3)
+    return float(np.einsum("nd,nd->n", away, np.linalg.solve(covariance, away[..., None])[..., 0]).mean())
 
 
 def _roadmap(path: ComponentPath, tool: ToolAmongObstacles, clearance: float, allowed: AllowedDirections) -> Roadmap:
