@@ -270,8 +270,8 @@ def test_the_scaling_command_prints_exponents(capsys):
 
 SAVED = Path(__file__).parent / "static_results"
 RENEW = (
-    "if the change is intended, delete the saved results and make them again: imitarm benchmark static --first 1190 --count 1 "
-    "--families S1 S3 S4 S7 --settings default --methods METHOD --out tests/static_results"
+    "if the change is intended, delete the saved results and make them again: imitarm benchmark static --first 1190 "
+    "--count 1 --families S1 S3 S4 S7 --settings default --methods METHOD --out tests/static_results"
 )
 
 
