@@ -184,7 +184,7 @@ def tasks_chart(results: StaticResults, name: str, unit: str) -> str:
         return ""
     size = (5.5, 2.6 + 0.1 * len(found))
     with canvas(f"tasks-{name.replace('_', '-')}", f"{unit} of each sweeping task", size) as drawing:
-        axes = drawing.axes(0.7, 0.5 + 0.1 * len(found), 5.35, size[1] - 0.1)
+        axes = drawing.axes(0.95, 0.5 + 0.1 * len(found), 5.35, size[1] - 0.1)
         for i, (row, medians) in enumerate(found.items()):
             look = {"color": _COLOURS[i % len(_COLOURS)], "marker": _MARKERS[i % len(_MARKERS)], "ms": 4, "lw": 1.2}
             axes.plot(range(N_TASKS), medians, label=row, **look)
