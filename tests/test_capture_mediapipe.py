@@ -78,8 +78,8 @@ def test_the_worker_is_told_what_to_read_and_may_not_import_what_lies_around(wor
     [
         (said("error is not a video that can be read"), InputError, r"film\.mp4: is not a video that can be read$"),
         ("sys.exit('no module named cv2')", InputError, "does not start.*no module named cv2.*rebuild its environment"),
-        (said("hello world"), InputError, "does not send the lines of MediaPipe's process: 'hello world'"),
-        (said("imitarm-mediapipe 2 1280 720"), InputError, "does not send the lines"),
+        (said("hello world"), InputError, "did not answer as the MediaPipe program of imitarm: 'hello world'"),
+        (said("imitarm-mediapipe 2 1280 720"), InputError, "did not answer as"),
         (said("imitarm-mediapipe 1 wide high"), InputError, "no image size"),
         (said("imitarm-mediapipe 1 0 720"), InputError, "needs an image size"),
         (said(HELLO, frame(0)) + "\nos.kill(os.getpid(), signal.SIGKILL)", TaskFailedError, "end.*status -9.*1 image"),

@@ -14,9 +14,9 @@ from imitarm.errors import InputError
 from imitarm.evaluation.intervals import wilson_interval
 
 _STYLE_NOTE = (
-    "Planning times are processor times until a policy accepts or refuses, for all placements; the other columns count "
-    "the motions that arrived, as the simulated arm executed them. RMSE and deviation compare an executed path with "
-    "the mean of the demonstrations as curves (200 points evenly spaced along the arc, matched by dynamic time "
+    "A planning time is the processor time until the policy accepts or refuses; all placements count. The other "
+    "columns use only the motions that arrived. RMSE and deviation compare the path that the simulated arm executed "
+    "with the mean of the demonstrations as curves (200 points evenly spaced along the arc, matched by dynamic time "
     "warping), because a planner's timing is its own. Deviation: largest Mahalanobis distance along the path, with the "
     "covariance of GMR plus (5 mm)² in every direction. Tilt: largest rotation of the tool from the learned rotation "
     "at the nearest point of the learned path. Tilt limit 'default': for acfra and rrt-connect-tilt two standard "

@@ -1,4 +1,4 @@
-"""Measures of a planned path of the tool in a static scene; no method that is compared computes any of them.
+"""Measures of a planned path of the tool in a static scene, computed independently of the compared methods.
 
 The true distances are computed at 4000 points of the polyline that would be executed, not at the samples of the plan.
 """
@@ -51,8 +51,9 @@ class PathMeasures:
         start_error: distance of the first position from the learned start [m].
         goal_error: distance of the last position from the goal [m].
         contact_error: largest distance of the path from a pinned point of the learned path [m]; 0 without such points.
-        forbidden: largest displacement in a forbidden direction [m], from the nearest point of the learned path or from
-            its point at the same fraction of the duration, whichever displacement is smaller.
+        forbidden: largest displacement in a forbidden direction, over all samples [m]. The displacement of a sample is
+            measured from two points of the learned path, the nearest one and the one at the same fraction of the
+            duration, and the smaller of the two values counts.
         max_speed: largest speed as planned [m/s].
         max_acceleration: largest acceleration as planned [m/s^2].
         slowdown: factor by which the execution must be slower than planned, so that speed and acceleration are within

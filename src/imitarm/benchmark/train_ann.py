@@ -60,8 +60,8 @@ class TrainingScene(NamedTuple):
         policy: policy with the skill, the tool and the forbidden directions of the scene.
         scene: one obstacle.
         nominal: the learned path, 200 samples.
-        deviations: splines of the expert's deviations from the learned path over the fraction of the duration, one for
-            each side, best first.
+        deviations: for each expert path, a spline that gives its deviation from the learned path [m] as a function of
+            the elapsed fraction of the duration. The paths pass the obstacle on different sides; the best is first.
     """
 
     policy: DMPANN

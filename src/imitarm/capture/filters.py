@@ -163,7 +163,7 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
 
     1. The whole body is swapped back if :math:`\sum_j g_j > \sum_j m(0.5)` over the pairs of shoulders and hips.
     2. Elbows, wrists and hands are swapped back if :math:`g_j > m(4)` for the elbows and also for the wrists.
-    3. If condition 2 does not hold, only wrists and hands are swapped back if :math:`g_j > m(4)` for the wrists.
+    3. Otherwise, wrists and hands alone are swapped back if :math:`g_j > m(4)` for the wrists.
 
     Conditions 2 and 3 follow the swap of the whole body, if there was one. A joint is used if it is visible, and both
     joints of its pair were visible in the previous frame. If only one joint of a pair is used, :math:`g_j` contains

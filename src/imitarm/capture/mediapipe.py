@@ -336,7 +336,7 @@ class MediaPipeSource(SkeletonSource):
         if words[0] == b"error":
             raise InputError(f"{self._shown_name}: {_text(words[1:])}")
         if words[:2] != [b"imitarm-mediapipe", str(PROTOCOL).encode()] or len(words) != 4:
-            raise InputError(f"{python} does not send the lines of MediaPipe's process: {_text(words)[:80]!r}")
+            raise InputError(f"{python} did not answer as the MediaPipe program of imitarm: {_text(words)[:80]!r}")
         if not (words[2].isdigit() and words[3].isdigit()):
             raise InputError(f"{python} sends no image size: {_text(words)[:80]!r}")
         return int(words[2]), int(words[3])

@@ -54,7 +54,13 @@ class Tilts:
         return np.asarray(self.fixed[samples] + self.basis[samples] @ coefficients)
 
     def turned(self, quaternions: Array, coefficients: Array, samples: Index) -> Array:
-        """Return learned rotations ``quaternions`` (n, 4) at samples after the tilt, tool_to_base, shape (k, 4)."""
+        """Return the tilted rotations of the tool at samples, tool_to_base, shape (k, 4).
+
+        Args:
+            quaternions: learned rotations at all samples of the path, tool_to_base, shape (n, 4).
+            coefficients: coefficients of the tilt, shape (n_tilts, 3) [rad].
+            samples: indices of k samples.
+        """
         return quaternion_multiply(quaternion_exp(self.vectors(coefficients, samples)), quaternions[samples])
 
 
