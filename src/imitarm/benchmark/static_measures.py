@@ -27,9 +27,7 @@ DENSE = 4000
 NEAR = 0.10
 """Distance of the tool on the learned path from an obstacle [m]; samples that are farther away count as unaffected."""
 AT_GOAL = 0.005
-"""Largest permitted distance from start and goal, and into a forbidden direction [m]."""
-AT_CONTACT = 0.03
-"""Largest permitted distance from a contact point [m]: the radius of the tool, which then still touches the point."""
+"""Largest permitted distance from start, goal and contact points, and into a forbidden direction [m]."""
 LATEST = 2.0
 """Longest permitted duration, relative to the learned duration."""
 MAX_SPEED, MAX_ACCELERATION = 1.7, 13.0
@@ -220,7 +218,7 @@ def outcome(case: StaticCase, found: PathMeasures) -> tuple[str, str]:
     for error, limit, where in (
         (found.start_error, AT_GOAL, "from the start"),
         (found.goal_error, AT_GOAL, "from the goal"),
-        (found.contact_error, AT_CONTACT, "from a contact point"),
+        (found.contact_error, AT_GOAL, "from a contact point"),
         (found.forbidden, AT_GOAL, "away in a forbidden direction"),
     ):
         if error > limit:
