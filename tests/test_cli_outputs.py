@@ -58,5 +58,5 @@ def test_no_command_writes_anywhere_else(command, monkeypatch):
     reads = {"--calibration", "--scene", "--points", "--config", "--data", "--tool", "--robot", "--package-path"}
     reads |= {"--skill", "--skills"}
     files = {name for name, action in seen.items() if action.metavar in ("FILE", "FOLDER", "DIR")} - reads
-    own = {"benchmark": {"--out", "--report", "--fill"}, "demo": {"--out"}}
+    own = {"benchmark": {"--out", "--report", "--fill", "--json", "--markdown", "--save"}, "demo": {"--out"}}
     assert files == set(own.get(command, WRITES.get(command, ((), ()))[1]))
