@@ -86,14 +86,16 @@ def static_report_html(
     found = results.of(OURS, results.solvable)
     good = sum(map(is_success, found))
     verdict = f"{OURS} succeeds in {good} of {len(found)} scenes" if found else f"{OURS} was not run"
-    tiles = [
-        Tile(f"{100 * sum(map(is_success, of)) / len(of):.1f}", "%", f"success of {row}")
+    rates = {
+        row: sum(map(is_success, of)) / len(of)
         for row in results.rows
         if row not in CONTROLS and (of := results.of(row, results.solvable))
-    ]
+    }
+    best = sorted(rates, key=lambda row: -rates[row])[:5]
+    tiles = [Tile(f"{100 * rates[row]:.1f}", "%", f"success of {row}") for row in best]
     return render(
         "avoidance.html",
-        Header("Avoidance in static scenes", verdict, bool(found) and good == len(found), "", tiles[:5]),
+        Header("Avoidance in static scenes", verdict, bool(found) and good == len(found), "", tiles),
         data={"tables": [{"title": t.title, "columns": t.columns, "rows": t.rows, "note": t.note} for t in tables]},
         data_name="imitarm-static.json",
         provenance=provenance,
