@@ -109,42 +109,25 @@ def _median(call: Callable[[_Case], Any]) -> Callable[[], float]:
     return lambda: float(np.median([seconds(case) for case in _cases()]))
 
 
-def whole_arm() -> Row:
-    """A plan of the whole arm among three obstacles, against a plan of the tool alone; median of 16 scenes."""
+def _row(name: str, plan: Callable[[_Case], Adaptation], cost: float) -> Row:
+    """A row of a plan of the whole arm, against a plan of the tool alone in the same scenes."""
 
     def check() -> tuple[bool, str]:
-        least = min(case.whole_arm().certified_clearance for case in _cases())
+        least = min(plan(case).certified_clearance for case in _cases())
         return least >= _CLEARANCE, f"certified clearance at least {1e3 * least:.2f} mm (20 mm required)"
 
-    return Row(
-        "whole-arm plan, 3 obstacles (16 scenes)",
-        _median(_Case.whole_arm),
-        _median(_Case.tool_alone),
-        "plan of the tool alone",
-        cost=3.0,
-        check=check,
-        repeats=9,
-        self_timed=True,
-    )
+    times = _median(plan), _median(_Case.tool_alone)
+    return Row(name, *times, "plan of the tool alone", cost=cost, check=check, repeats=9, self_timed=True)
+
+
+def whole_arm() -> Row:
+    """A plan of the whole arm among three obstacles; median of 16 scenes."""
+    return _row("whole-arm plan, 3 obstacles (16 scenes)", _Case.whole_arm, 3.0)
 
 
 def whole_arm_again() -> Row:
-    """The rest of a plan of the whole arm, after obstacles have moved, against a plan of the tool alone."""
-
-    def check() -> tuple[bool, str]:
-        least = min(case.again().certified_clearance for case in _cases())
-        return least >= _CLEARANCE, f"certified clearance at least {1e3 * least:.2f} mm (20 mm required)"
-
-    return Row(
-        "rest of a whole-arm plan, planned again (16 scenes)",
-        _median(_Case.again),
-        _median(_Case.tool_alone),
-        "plan of the tool alone",
-        cost=1.5,
-        check=check,
-        repeats=9,
-        self_timed=True,
-    )
+    """The rest of a plan of the whole arm, after obstacles have moved."""
+    return _row("rest of a whole-arm plan, planned again (16 scenes)", _Case.again, 1.5)
 
 
 ROWS = (whole_arm, whole_arm_again)

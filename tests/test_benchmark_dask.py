@@ -11,13 +11,13 @@ import time
 from functools import partial
 
 import pytest
+from distributed import Client
 
 from imitarm.benchmark.running import DASK, Store, Workers, run_experiments
 from imitarm.benchmark.static import StaticExperiment, run_experiment
 from imitarm.benchmark.static_results import ResultLines
 from imitarm.errors import InputError, TaskFailedError
 
-Client = pytest.importorskip("distributed").Client
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
@@ -57,12 +57,12 @@ def cluster(folder):
     words = ("--scheduler-file", str(file), "--nthreads", "1", "--host", "127.0.0.1", "--no-nanny", *quiet)
     processes += [started("dask_worker", *words, "--local-directory", str(folder / str(i))) for i in range(2)]
     try:
-        for _ in range(600):
+        for _ in range(1200):
             if file.exists() and file.read_text().endswith("}"):
                 break
             time.sleep(0.1)
-        with Client(scheduler_file=str(file), set_as_default=False, timeout=30) as client:
-            client.wait_for_workers(2, timeout=60)
+        with Client(scheduler_file=str(file), set_as_default=False, timeout=120) as client:
+            client.wait_for_workers(2, timeout=120)
             address = client.scheduler.address
         yield address, processes
     finally:

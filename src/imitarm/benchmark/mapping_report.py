@@ -78,7 +78,7 @@ def mapping_report_html(
         words=_WORDS,
         shared=shared,
         figures=_figures(results),
-        tables=[_table(table) for table in tables],
+        tables=[table.for_page() for table in tables],
         players=players,
     )
 
@@ -121,18 +121,6 @@ def _figures(results: Results) -> list[Figure]:
         Figure(accuracy(main, tasks), "Accuracy", bars),
         Figure(limit_violations(main, tasks), "Limit violations", bars),
     ]
-
-
-def _table(table: Table) -> dict[str, Any]:
-    """Return a table for the page template: text columns may wrap, and headings that are symbols keep their case."""
-    columns = [
-        {
-            "title": column.removesuffix(">"),
-            "kind": "words" if not column.endswith(">") else "" if column[:1].isascii() else "symbol",
-        }
-        for column in table.columns
-    ]
-    return {"title": table.title, "note": table.note, "columns": columns, "rows": table.rows}
 
 
 def _players(results: Results, folder: Path | None) -> tuple[tuple[str, str] | None, list[Tab]]:

@@ -102,14 +102,9 @@ def static_report_html(
         words=_WORDS,
         shared=shared,
         figures=_figures(results),
-        tables=[_table(table) for table in tables],
+        tables=[table.for_page() for table in tables],
         scenes=tabs,
     )
-
-
-def _table(table: Table) -> dict[str, Any]:
-    columns = [{"title": c.removesuffix(">"), "kind": "" if c.endswith(">") else "words"} for c in table.columns]
-    return {"title": table.title, "note": table.note, "columns": columns, "rows": table.rows}
 
 
 # --- charts --------------------------------------------------------------------------------------------------------

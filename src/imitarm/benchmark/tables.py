@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from imitarm.benchmark.experiment import write_text
 from imitarm.benchmark.provenance import origin
@@ -28,6 +29,17 @@ class Table:
         lines.append(f"|{'|'.join('--:' if c.endswith('>') else '---' for c in self.columns)}|")
         lines += [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in self.rows]
         return "\n".join([*lines, *(["", self.note] if self.note else []), ""])
+
+    def for_page(self) -> dict[str, Any]:
+        """Return the table for a page template: text columns may wrap; headings that are symbols keep their case."""
+        columns = [
+            {
+                "title": column.removesuffix(">"),
+                "kind": "words" if not column.endswith(">") else "" if column[:1].isascii() else "symbol",
+            }
+            for column in self.columns
+        ]
+        return {"title": self.title, "note": self.note, "columns": columns, "rows": self.rows}
 
 
 @dataclass(frozen=True)

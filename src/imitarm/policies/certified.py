@@ -109,8 +109,10 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
     divided = LeastDetour(path.divided, tool, clearance, allowed, exact=True)
     if best.feasible:
         roadmap = roadmap or _roadmap(path, tool, clearance, allowed)
-        starts = [] if roadmap.is_hopeless else [tool.clearance_of(path.nominal.positions + next(roadmap.routes(1)))]
-        nearer = divided.shrink(starts[0] if starts else best.clearance)
+        start = best.clearance
+        if not roadmap.is_hopeless:
+            start = tool.clearance_of(path.nominal.positions + next(roadmap.routes(1)))
+        nearer = divided.shrink(start)
         return best if nearer is None or not nearer.feasible else min(best, nearer, key=_deviation)
     if best.lowest > clearance - _ALMOST:
         best = best_of((best, divided.shrink(best.clearance))) or best
