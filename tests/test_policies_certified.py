@@ -19,8 +19,9 @@ from imitarm.benchmark.static_scenes import static_case
 from imitarm.kinematics.pose import Pose, quaternion_exp
 from imitarm.policies import HORIZONTAL_ONLY, NOT_DOWN, adapt
 from imitarm.policies.certificate import ToolAmongObstacles
-from imitarm.policies.certified import _SideSearch
-from imitarm.policies.least_detour import UNBOUNDED, least_norm
+from imitarm.policies.certified import CERTIFIED, _SideSearch
+from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.least_detour import UNBOUNDED, AllowedDirections, AvoidanceProblem, least_norm
 from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Scene, Sphere
 
 OPTIONS = {"tool_radius": TOOL_RADIUS, "clearance": CLEARANCE}
@@ -392,3 +393,14 @@ def test_a_path_does_not_stray_where_the_components_are_wide(dimension, seed):
     assert found.feasible and found.divided
     assert away.max() < 1.5 * depth  # 5 times with the learned components
     assert found.trajectory.path_length < 1.15 * found.nominal.path_length
+
+
+def test_a_path_that_is_clear_needs_no_roadmap(learnt, monkeypatch):
+    _, skill, path = learnt
+    components, sphere = ComponentPath.of_skill(skill), np.array([[0.0, 0.0, 0.0, TOOL_RADIUS]])
+    tool = ToolAmongObstacles.along(components.nominal, sphere, [Sphere(path[0] + 1.0, 0.1)])
+    nominal = tool.clearance_of(components.nominal.positions)
+    problem = AvoidanceProblem(components, nominal, CLEARANCE, AllowedDirections.without(np.empty((0, 3))))
+    monkeypatch.setattr("imitarm.policies.certified.Roadmap", lambda *_, **__: pytest.fail("a roadmap was made"))
+    found = CERTIFIED.detour(problem)
+    assert found.feasible and not found.displacement.any()

@@ -138,7 +138,7 @@ def _strays(detour: Detour, nominal: PathClearance, clearance: float) -> bool:
     """
     away = detour.clearance.positions - detour.path.nominal.positions
     farthest = np.sqrt(np.einsum("nd,nd->n", away, away).max())
-    return bool(farthest > _STRAY_RATIO * (clearance - nominal.lowest))
+    return bool(farthest > _STRAY_RATIO * max(clearance - nominal.lowest, 0.0))
 
 
 def _deviation(detour: Detour) -> float:
