@@ -11,8 +11,10 @@ from imitarm import InputError, cli
 from imitarm.benchmark import placements
 from imitarm.benchmark.placement_comparison import comparison_tables
 from imitarm.benchmark.placement_results import PlacementResult, Setup, append_result, load_results, repaired
+from imitarm.benchmark.placement_tables import placement_tables
 from imitarm.benchmark.tables import END
 from imitarm.errors import FileFormatError
+from imitarm.scene import Scene, Sphere
 
 SETUP = Setup("skill.json", "panda", None)
 
@@ -120,3 +122,50 @@ def test_the_comparison_is_printed_from_files_and_put_into_a_document(tmp_path, 
     assert cli.main(["benchmark", "comparison", str(tmp_path / "none")]) == 2
     assert cli.main(["benchmark", "placements", "--out", str(file)]) == 2
     assert "--out needs --skill" in capsys.readouterr().err
+
+
+def test_motions_that_arrived_late_are_listed():
+    results = [result(seed=seed, duration=1.0) for seed in range(2)]
+    (outcomes,) = placement_tables(results)
+    assert outcomes.rows[0][8].startswith("2 (100.0 %")
+    results += [result(seed=2, duration=1.6), result(seed=3, duration=2.5), result(seed=4, outcome="refused")]
+    outcomes, late = placement_tables(results)
+    assert outcomes.rows[0][8].startswith("2 (50.0 %")  # of the accepted
+    assert [row[3:] for row in late.rows] == [("3", "2.50"), ("2", "1.60")]
+
+
+def test_the_rmse_is_compared_with_the_tool_alone_where_both_solve():
+    results = [
+        *(result(seed=seed, rmse=0.060, tool_rmse=0.050) for seed in range(3)),
+        result(seed=3, rmse=0.9, tool_rmse=math.nan),  # the tool alone is refused
+        result(seed=4, outcome="refused", rmse=math.nan),
+    ]
+    _, compared = placement_tables(results)
+    assert compared.rows == (("acfra", "skill", "3", "60.0", "50.0", "1.200 (1.200 to 1.200)"),)
+    other = replace(result(seed=5, rmse=0.01, tool_rmse=0.02), setup=replace(SETUP, skill="folder/other.json"))
+    _, compared = placement_tables([*results, other])
+    assert [row[1:3] for row in compared.rows] == [("all", "4"), ("skill", "3"), ("other", "1")]
+
+
+def test_the_path_of_the_tool_alone_has_the_same_ends_and_leaves_out_the_links(tmp_path):
+    setup = placements.packaged_setup(tmp_path)
+    _, arm, start = placements._prepared(setup)
+    path = placements._tool_path(setup).nominal
+    assert path.positions[0] == pytest.approx(arm.tool_pose(start).position, abs=1e-9)
+    learned, _ = placements._demonstrated(setup)
+    assert path.positions[-1] == pytest.approx(learned.positions[-1], abs=1e-3)
+    alone = placements.tool_alone(setup, Scene())
+    assert alone < 1e-3  # the learned path itself
+    centers, _ = arm.collision_spheres(start)
+    at_a_link = Sphere(centers[0], 0.05)
+    assert placements.tool_alone(setup, Scene(None, (at_a_link,))) == alone
+    on_the_path = Sphere(path.positions[100], 0.03)
+    assert 0.005 < placements.tool_alone(setup, Scene(None, (on_the_path,))) < 0.2
+    at_the_goal = Sphere(path.positions[-1], 0.03)
+    assert math.isnan(placements.tool_alone(setup, Scene(None, (at_the_goal,))))
+
+
+def test_a_placement_that_is_solved_has_both_distances(tmp_path):
+    found = placements.run_placement("acfra", placements.packaged_setup(tmp_path), 0)
+    assert found.outcome == "arrived"
+    assert 0.0 < found.tool_rmse < 2.0 * found.rmse

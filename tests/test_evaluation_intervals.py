@@ -12,6 +12,7 @@ from imitarm.evaluation.intervals import (
     compare,
     holm,
     interval,
+    median_ratio,
     person_means,
     rate_interval,
     sign_flip_p,
@@ -208,3 +209,24 @@ def test_a_rates_interval_covers_the_truth_where_persons_differ(rate, alike):
         by_trials += low <= rate <= high
     assert covered / 400 > 0.86
     assert covered >= by_trials
+
+
+def test_a_ratio_of_medians_is_resampled_in_pairs():
+    theirs = np.exp(np.random.default_rng(0).normal(size=200))
+    assert median_ratio(1.1 * theirs, theirs) == pytest.approx((1.1, 1.1, 1.1))
+    ratio, low, high = median_ratio(np.random.default_rng(1).permutation(1.1 * theirs), theirs)
+    assert ratio == pytest.approx(1.1)
+    assert low < 1.05 < 1.15 < high  # values of different cases vary independently
+    assert median_ratio([2.0], [4.0])[0] == 0.5
+    assert math.isnan(median_ratio([2.0], [4.0])[1])
+    assert all(map(math.isnan, median_ratio([], [])))
+
+
+def test_the_interval_of_a_ratio_of_medians_covers_the_truth_about_as_often_as_it_says():
+    rng, covered = np.random.default_rng(3), 0
+    for seed in range(100):
+        scale = np.exp(rng.normal(size=60))
+        ours, theirs = (scale * np.exp(0.3 * rng.normal(size=60)) for _ in range(2))
+        _, low, high = median_ratio(ours, theirs, seed=seed)
+        covered += low <= 1.0 <= high
+    assert 88 <= covered <= 100

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from imitarm.benchmark.placement_results import PlacementResult, Setup
+from imitarm.benchmark.placement_tables import share
 from imitarm.benchmark.tables import Table
 from imitarm.errors import InputError
-from imitarm.evaluation.intervals import wilson_interval
 
 _STYLE_NOTE = (
     "A planning time is the processor time until the policy accepts or refuses; all placements count. The other "
@@ -108,7 +108,7 @@ def _style_row(variant: Variant, results: Sequence[PlacementResult]) -> tuple[st
         variant.policy,
         variant.limit,
         str(len(results)),
-        _share(len(arrived), len(results)),
+        share(len(arrived), len(results)),
         _median(arrived, lambda result: 1e3 * result.rmse),
         _median(arrived, lambda result: result.deviation),
         _median(arrived, lambda result: float(np.degrees(result.tilt))),
@@ -139,8 +139,8 @@ def _pair_row(
         baseline.limit,
         Path(skills[0]).stem if len(skills) == 1 else "all",
         str(len(pairs)),
-        _share(sum(one.accepted for one, _ in pairs), len(pairs)),
-        _share(len(both), len(pairs)),
+        share(sum(one.accepted for one, _ in pairs), len(pairs)),
+        share(len(both), len(pairs)),
         _ratio(pairs, lambda result: result.computing),
         _ratio(both, lambda result: result.rmse),
         _ratio(both, lambda result: result.deviation),
@@ -159,10 +159,3 @@ def _ratio(
         return "-"
     one, other = (float(np.median([measure(pair[k]) for pair in pairs])) for k in (0, 1))
     return f"{one / other:.2f}" if other > 0.0 else "-"
-
-
-def _share(count: int, of: int) -> str:
-    if not of:
-        return "-"
-    low, high = wilson_interval(count, of)
-    return f"{count} ({100 * count / of:.1f} %, {100 * low:.1f} to {100 * high:.1f})"

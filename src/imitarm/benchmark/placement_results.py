@@ -66,6 +66,8 @@ class PlacementResult:
             :class:`~imitarm.evaluation.path_style.PathStyle` [m]; nan unless the motion arrived.
         deviation: largest deviation from the mean, in standard deviations of the demonstrations; nan likewise.
         tilt: largest rotation of the tool away from the learned rotation [rad]; nan likewise.
+        tool_rmse: distance of the path planned for the tool alone in the same scene and between the same ends, measured
+            like ``rmse`` [m]; nan if no such path was found, or unless the motion arrived.
         code: version of the code, see :func:`~imitarm.benchmark.provenance.code_version`.
     """
 
@@ -82,6 +84,7 @@ class PlacementResult:
     rmse: float = math.nan
     deviation: float = math.nan
     tilt: float = math.nan
+    tool_rmse: float = math.nan
     code: str = ""
 
     @property

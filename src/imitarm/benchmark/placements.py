@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -27,15 +27,14 @@ from imitarm.benchmark.placement_results import (
     repaired,
 )
 from imitarm.benchmark.provenance import code_version
-from imitarm.benchmark.tables import Table
 from imitarm.control_loop import reproduce
 from imitarm.errors import InfeasibleError, InputError, UnreachableError
-from imitarm.evaluation.intervals import wilson_interval
 from imitarm.evaluation.path_style import path_style
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.policies import POLICIES
+from imitarm.policies.adaptation import adapt
 from imitarm.policies.component_path import TOLERANCE_FLOOR, ComponentPath
 from imitarm.policies.whole_arm import links_apart
 from imitarm.robots import SimulatedRobot
@@ -57,7 +56,7 @@ _PATIENCE = 4.0  # a reproduction may take this many times as long as the demons
 _SPREAD = 0.02  # [m] standard deviation of an obstacle's centre about the path
 _FREE_ENDS = 0.01  # [m] beyond the clearance, that an obstacle leaves to the tool at start and goal
 _TRIES = 200
-LATE = 1.5  # times the duration of the skill
+_ALLOWANCE = 0.002  # [m] that ACFRA adds to the clearance when it plans for the tool alone
 
 
 def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
@@ -137,6 +136,7 @@ def run_placement(policy: str, setup: Setup, seed: int, max_tilt: float | None =
     measured: dict[str, float] = {}
     if outcome == "arrived" and rollout is not None:
         measured = asdict(path_style(rollout.trajectory, *_demonstrated(setup)))
+        measured["tool_rmse"] = tool_alone(setup, scene)
     return PlacementResult(
         policy,
         setup,
@@ -151,6 +151,38 @@ def run_placement(policy: str, setup: Setup, seed: int, max_tilt: float | None =
         code=code_version(),
         **measured,
     )
+
+
+def tool_alone(setup: Setup, scene: Scene) -> float:
+    """Return the RMSE of the path that is planned for the tool alone, between the same ends as that of the whole arm.
+
+    Args:
+        setup: the skill and the arm, whose tool keeps the clearance; its links are left out.
+        scene: the obstacles.
+
+    Returns:
+        The distance from the mean of the demonstrations, see :class:`~imitarm.evaluation.path_style.PathStyle` [m]; nan
+        if no path is found.
+    """
+    arm = _prepared(setup)[1]
+    found = adapt(_tool_path(setup), scene, tool_spheres=arm.tool_spheres, clearance=CLEARANCE, allowance=_ALLOWANCE)
+    return path_style(found.trajectory, *_demonstrated(setup)).rmse if found.feasible else np.nan
+
+
+@lru_cache(maxsize=8)
+def _tool_path(setup: Setup) -> ComponentPath:
+    """Return the learned path from the pose of the tool in the start posture, with rotations."""
+    skill, arm, start = _prepared(setup)
+    begins = arm.tool_pose(start)
+    path = ComponentPath.of_skill(skill, start=begins)
+    return replace(path, nominal=_rotated(path.nominal, begins))
+
+
+def _rotated(path: Trajectory, begins: Pose) -> Trajectory:
+    """Return a path with rotations; if none were learned, the tool keeps the rotation that it has at the start."""
+    if path.quaternions is not None:
+        return path
+    return Trajectory(path.times, path.positions, np.tile(begins.quaternion, (len(path), 1)))
 
 
 class _Stopwatch:
@@ -170,11 +202,7 @@ def _demonstrated(setup: Setup) -> tuple[Trajectory, Array]:
     """Return the mean of the demonstrations with rotations, n samples, and its covariances (n, 3, 3) [m^2]."""
     skill, arm, start = _prepared(setup)
     path = ComponentPath.of_skill(skill)
-    mean = path.nominal
-    if mean.quaternions is None:  # the tool keeps the rotation that it has at the start
-        held = np.tile(arm.tool_pose(start).quaternion, (len(mean), 1))
-        mean = Trajectory(mean.times, mean.positions, held)
-    return mean, path.tolerance + TOLERANCE_FLOOR**2 * np.eye(3)
+    return _rotated(path.nominal, arm.tool_pose(start)), path.tolerance + TOLERANCE_FLOOR**2 * np.eye(3)
 
 
 def _outcome(success: bool, reason: str, contact: bool) -> str:
@@ -259,50 +287,6 @@ def _joblib() -> Any:
     except ModuleNotFoundError as error:
         raise InputError("several processes need joblib: pip install 'imitarm[benchmark]', or use --jobs 1") from error
     return joblib
-
-
-def placement_table(results: Sequence[PlacementResult]) -> Table:
-    """Return one row for each policy: the frequency of each outcome, the smallest clearance, and times."""
-    rows = []
-    for policy in dict.fromkeys(result.policy for result in results):
-        own = [result for result in results if result.policy == policy]
-        counts = [sum(result.outcome == outcome for result in own) for outcome in OUTCOMES]
-        accepted, arrived = len(own) - counts[1], [result for result in own if result.outcome == "arrived"]
-        nearest = [1e3 * r.clearance for r in arrived if np.isfinite(r.clearance)]
-        late = sum(result.duration > LATE for result in arrived)
-        times = [[1e3 * r.planning for r in own if (r.outcome == "refused") == refused] for refused in (False, True)]
-        rows.append(
-            (
-                policy,
-                str(len(own)),
-                _rate(accepted, len(own)),
-                _rate(counts[0], accepted),
-                *map(str, counts[2:]),
-                str(late),
-                f"{min(nearest):.1f}" if nearest else "-",
-                *(f"{np.median(t):.0f}" if t else "-" for t in times),
-            )
-        )
-    headings = ("policy", "placements>", "accepted", "arrived, of the accepted", *(f"{name}>" for name in OUTCOMES[2:]))
-    return Table(
-        "Placements of one to three obstacles on the learned path",
-        (
-            *headings,
-            f"arrived after more than {LATE:g} times the learned duration>",
-            "smallest clearance when arrived [mm]>",
-            "time to plan, median [ms]>",
-            "time to refuse, median [ms]>",
-        ),
-        tuple(rows),
-        f"A simulated arm, {1e3 * CLEARANCE:.0f} mm required of every part of it. Intervals: Wilson, 95 %.",
-    )
-
-
-def _rate(count: int, of: int) -> str:
-    if not of:
-        return "-"
-    low, high = wilson_interval(count, of)
-    return f"{count} ({100 * count / of:.1f} %, {100 * low:.1f} to {100 * high:.1f})"
 
 
 def packaged_setup(folder: Path) -> Setup:

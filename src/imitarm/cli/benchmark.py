@@ -15,6 +15,7 @@ from imitarm.benchmark.experiment import METHODS, Result
 from imitarm.benchmark.mapping import MappingBenchmark, run_all, tables, write_tables
 from imitarm.benchmark.mapping_tables import TEST, Results
 from imitarm.benchmark.placement_results import Setup, load_results
+from imitarm.benchmark.placement_tables import placement_tables
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.refusal_oracle import Answer
@@ -289,7 +290,7 @@ def _placements(arguments: argparse.Namespace) -> int:
             reuse=arguments.reuse,
             progress=lambda done, of: bar.update(task, completed=done, total=of),
         )
-    report_tables([placements.placement_table(results)], place, [result.code for result in results])
+    report_tables(placement_tables(results), place, [result.code for result in results])
     for result in results if arguments.list else []:
         if result.outcome != "arrived":
             where = f"{Path(result.setup.skill).stem}, {result.setup.robot}, seed {result.seed}"

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-_DRAWS = 10_000
+_DRAWS, _RESAMPLED = 10_000, 2000
 _EXACT = 14  # largest number of persons for which all sign flips are evaluated; beyond: _DRAWS
 _TINY = 1e-12
 _ALIKE, _COUNTS = 0.3, 2  # prior correlation of one person's trials, and how many persons it counts as
@@ -102,6 +102,35 @@ def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) ->
     widened = x.mean() + (draws - x.mean()) * math.sqrt(n / (n - 1))
     low, high = np.quantile(widened, [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence])
     return float(low), float(high)
+
+
+def median_ratio(
+    ours: ArrayLike, theirs: ArrayLike, *, confidence: float = 0.95, seed: int = 0
+) -> tuple[float, float, float]:
+    """Return the ratio of the medians of two measures of the same cases, and its bootstrap interval.
+
+    The cases are resampled, so that the two values of a case stay together.
+
+    Args:
+        ours: shape (n,).
+        theirs: values for the same cases, shape (n,); positive.
+        confidence: confidence level of the interval.
+        seed: seed of the resampling.
+
+    Returns:
+        ratio, low and high; low and high are nan with fewer than two cases, and all are nan without cases.
+    """
+    x = np.stack([np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float)])
+    n = x.shape[1]
+    if n == 0:
+        return math.nan, math.nan, math.nan
+    one, other = np.median(x, axis=1)
+    if n < 2:
+        return float(one / other), math.nan, math.nan
+    chosen = np.random.default_rng(seed).integers(0, n, (_RESAMPLED, n))
+    first, second = np.median(x[:, chosen], axis=2)
+    low, high = np.quantile(first / second, [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence])
+    return float(one / other), float(low), float(high)
 
 
 @dataclass(frozen=True)
