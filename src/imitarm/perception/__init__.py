@@ -3,5 +3,6 @@
 from __future__ import annotations
 
 from imitarm.perception.depth_frame import DepthFrame, Intrinsics
+from imitarm.perception.detection import Detection
 
-__all__ = ["DepthFrame", "Intrinsics"]
+__all__ = ["DepthFrame", "Detection", "Intrinsics"]
