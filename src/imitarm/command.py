@@ -43,6 +43,7 @@ class Command:
         progress: completed fraction of the motion, 0 to 1; nan if unknown.
         status: state of the reproduction.
         reason: reason why the motion is not nominal, with the name of the obstacle; empty when nominal.
+        opening: opening to which the gripper's fingers move [m]; None: they stay as they were commanded last.
     """
 
     twist: Array
@@ -52,6 +53,7 @@ class Command:
     progress: float = math.nan
     status: Status = Status.NOMINAL
     reason: str = ""
+    opening: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "twist", finite_vector(self.twist, 6, "Command: twist", "m/s, rad/s"))
@@ -62,5 +64,8 @@ class Command:
                 object.__setattr__(self, name, finite_vector(value, max(n, 1), f"Command: {name}", unit))
         if self.elbow is not None:
             object.__setattr__(self, "elbow", finite_number(self.elbow, "Command: elbow", "rad"))
+        if self.opening is not None:
+            opening = finite_number(self.opening, "Command: opening", "m", at_least=0.0)
+            object.__setattr__(self, "opening", opening)
         if not isinstance(self.status, Status):
             raise InputError(f"Command: status must be a Status such as Status.NOMINAL, got {self.status!r}")

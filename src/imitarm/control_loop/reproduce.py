@@ -61,9 +61,9 @@ def reproduce(
 
     In every control period ``dt``, ``observe`` returns the scene, and the policy returns a
     :class:`~imitarm.command.Command`. The :class:`~imitarm.safety.SafetyFilter` converts the command to joint
-    velocities that keep the arm's limits and clearances, and the robot moves. The motion ends when the policy has
-    finished, when the robot has stopped to protect itself, or at ``timeout``. The robot is always braked to a stop,
-    also after an exception.
+    velocities that keep the arm's limits and clearances, and the robot moves. A new opening in the command moves the
+    fingers of the gripper. The motion ends when the policy has finished, when the robot has stopped to protect itself,
+    or at ``timeout``. The robot is always braked to a stop, also after an exception.
 
     Args:
         policy: policy that decides the motion; its ``reset`` is called first.
@@ -103,7 +103,7 @@ def reproduce(
     if log.clearances[0] <= 0.0:
         raise InfeasibleError(f"the arm starts in contact ({_nearest(robot)}): move the obstacle, or start elsewhere")
     policy.reset(Observation(0.0, log.state, log.tool_to_base, observe(0.0)))
-    finished, last = False, Command(np.zeros(6))
+    finished, last, opening = False, Command(np.zeros(6)), float("nan")
     try:
         for k in range(round(timeout / dt) + 1):
             observation = Observation(k * dt, log.state, log.tool_to_base, observe(k * dt))
@@ -113,6 +113,9 @@ def reproduce(
             last = policy.step(observation, dt)
             if not isinstance(last, Command):
                 raise InputError(f"{type(policy).__name__}.step must return a Command, got {last!r}")
+            if last.opening is not None and last.opening != opening:
+                opening = last.opening
+                robot.grasp(opening)
             scene = observation.scene.now(k * dt)
             kept = keeper.step(last, robot.set_point, robot.velocity, scene)
             robot.move(kept.velocity, dt)

@@ -10,6 +10,7 @@ from imitarm.policies.least_detour import PathAdapter
 from imitarm.policies.path_policy import PathPlan, PathPolicy
 from imitarm.policies.policy import Observation, Policy
 from imitarm.policies.replanning import replan
+from imitarm.policies.stages import Stage, StagedPolicy
 from imitarm.registry import Registry
 
 POLICIES: Registry[type[Policy]] = Registry(
@@ -45,6 +46,8 @@ __all__ = [
     "PathPlan",
     "PathPolicy",
     "Policy",
+    "Stage",
+    "StagedPolicy",
     "adapt",
     "replan",
 ]

@@ -96,6 +96,23 @@ class Scene:
         """
         return self if time == self.stamp or self.packed.still else self.at(time)
 
+    def with_goal(self, goal: Pose | None) -> Scene:
+        """Return the same scene with another goal.
+
+        Args:
+            goal: tool_to_base at the end of the motion; None: the learned goal.
+
+        Raises:
+            InputError: when ``goal`` is not a pose.
+        """
+        if goal is not None and not isinstance(goal, Pose):
+            raise InputError(f"Scene: goal must be a Pose or None, got {goal!r}")
+        scene = object.__new__(Scene)
+        scene.__dict__.update(self.__dict__, goal=goal)
+        if "_seen" in self.__dict__:
+            scene.__dict__["_seen"] = self.__dict__["_seen"].with_goal(goal)
+        return scene
+
     def poses(self, time: float) -> tuple[Array, Array]:
         """Return the poses of the obstacles' local frames at ``time`` [s]: positions (n, 3) [m], quaternions (n, 4)."""
         packed = self.packed.after(time - self.stamp)

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from imitarm.tasks.open_box import OpenBoxTask
+from imitarm.tasks.packing import PackingTask
 from imitarm.tasks.stack import StackTask
 from imitarm.tasks.sweep import DEMONSTRATIONS, NUMBERED_SCENES, SCENES, SweepTask
 
-TASKS: dict[str, type[SweepTask] | type[StackTask] | type[OpenBoxTask]] = {
+TASKS: dict[str, type[SweepTask] | type[StackTask] | type[OpenBoxTask] | type[PackingTask]] = {
     "open_box": OpenBoxTask,
+    "packing": PackingTask,
     "stack": StackTask,
     "sweep": SweepTask,
 }
 
-__all__ = ["DEMONSTRATIONS", "NUMBERED_SCENES", "SCENES", "TASKS", "OpenBoxTask", "StackTask", "SweepTask"]
+__all__ = [
+    "DEMONSTRATIONS",
+    "NUMBERED_SCENES",
+    "SCENES",
+    "TASKS",
+    "OpenBoxTask",
+    "PackingTask",
+    "StackTask",
+    "SweepTask",
+]

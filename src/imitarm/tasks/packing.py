@@ -1,0 +1,260 @@
+"""PackingTask: pick a cube, follow a moving packing box and put the cube into it (thesis Fig 5.6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+from imitarm.demonstrations import align
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import find_posture
+from imitarm.kinematics.pose import Pose
+from imitarm.robots.simulated import Control, SimulatedRobot
+from imitarm.robots.world import arm_world
+from imitarm.scene import Box, Cylinder, HalfSpace, MovingScene, Obstacle, Scene, standard_fixtures
+from imitarm.scene.motion import Motion as Movement
+from imitarm.skills.skill import Skill
+from imitarm.tasks.habits import Motion, along, demonstrations_by
+from imitarm.tasks.open_box import LOOKING_DOWN, open_box
+from imitarm.trajectory import Demonstration, Rollout
+
+Array = NDArray[np.float64]
+
+OPEN, CLOSED = 0.08, 0.0  # [m] commanded openings of the gripper; the cube stops the closing fingers earlier
+BOX, BOTTLE, CUBE = "packing box", "bottle", "cube"
+
+_SIDE = 0.04  # [m] of the cube
+_MASS, _FRICTION = 0.05, [0.6, 0.005, 0.0001]
+_STIFF = [0.004, 1.0]  # solref of contacts: two timesteps, critically damped
+_CUBE_AT, _CUBE_OFFSET = (0.56, -0.34), 0.02  # [m] place on the table, and its largest random change
+_INSIDE, _THICK = (0.22, 0.22, 0.09), 0.01  # [m] of the box
+_BOX_AT, _BOX_TRAVEL = (0.58, 0.34), 0.06  # [m] mean place of the box, and amplitude of its motion along x
+_BOX_PERIOD = 8.0, 14.0  # [s]
+_BOTTLE = (0.033, 0.22)  # [m] radius and height
+_BOTTLE_ROOM = ((0.42, 0.76), (-0.14, 0.10))  # [m] ranges of x and y in which the bottle is pushed about
+_PUSH_SPEED = 0.1, 0.3  # [m/s] mean speeds of the pushes
+_PAUSE = 0.3, 1.5  # [s] between two pushes
+_LONGEST = 60.0  # [s] for which motions are drawn
+_FIRST_FREE = 0.14  # [m] least distance of the bottle from the tool at the start
+_RELEASE = 0.055  # [m] of the tool above the rim of the box
+_RISE = 0.26  # [m] of the carrying curve's control points
+_TABLE = (0.50, 0.0), (0.80, 1.30, 0.04)  # [m] its top is at height 0
+
+
+@dataclass(frozen=True)
+class PackingTask:
+    """A Sawyer with a gripper picks a cube and puts it into a packing box that moves, while a bottle is pushed about.
+
+    The box slides back and forth on the table. The bottle is pushed at random times to random places between the cube
+    and the box, often across the path of the gripper. The task succeeds if the cube rests in the box, and the arm has
+    touched neither the bottle nor the box.
+
+    Attributes:
+        seed: seed of the places and the motions.
+        moving: whether box and bottle move.
+    """
+
+    seed: int = 0
+    moving: bool = True
+
+    start: ClassVar[Pose] = Pose(np.array([0.50, -0.16, 0.26]), np.array(LOOKING_DOWN))
+    clearance: ClassVar[float] = 0.02  # [m] required clearance of a reproduction
+    timeout: ClassVar[float] = 40.0  # [s]
+
+    @staticmethod
+    def arm() -> ArmModel:
+        """Load the Sawyer with the gripper."""
+        return ArmModel.load("sawyer", tool="gripper")
+
+    @property
+    def cube(self) -> Array:
+        """Centre of the cube at the start, shape (3,) [m]."""
+        place = np.random.default_rng([560, self.seed]).uniform(-_CUBE_OFFSET, _CUBE_OFFSET, 2)
+        return np.array([*(np.array(_CUBE_AT) + place), 0.5 * _SIDE])
+
+    @property
+    def grasp(self) -> Pose:
+        """Pose of the tool in which the fingers close on the cube."""
+        return Pose(self.cube, np.array(LOOKING_DOWN))
+
+    def box_at(self, time: float) -> Array:
+        """Return the middle of the box's bottom, on its inside, shape (3,) [m], at a time [s]."""
+        rng = np.random.default_rng([561, self.seed])
+        period, angle = rng.uniform(*_BOX_PERIOD), rng.uniform(0.0, 2.0 * np.pi)
+        travel = _BOX_TRAVEL * np.sin(2.0 * np.pi * time / period + angle) if self.moving else 0.0
+        return np.array([_BOX_AT[0] + travel, _BOX_AT[1], _THICK])
+
+    def bottle_at(self, time: float) -> Array:
+        """Return the centre of the bottle, shape (3,) [m], at a time [s]."""
+        course = _pushes(self.seed)
+        x, y = course(np.clip(time, 0.0, _LONGEST) if self.moving else 0.0)
+        return np.array([x, y, 0.5 * _BOTTLE[1]])
+
+    def release(self, scene: Scene) -> Pose | None:
+        """Return the pose of the tool above the middle of the box that is seen in a scene; None if no box is seen."""
+        for obstacle in scene.obstacles:
+            if obstacle.name == BOX:
+                low, high = obstacle.bounds()
+                return Pose(np.array([*(0.5 * (low + high))[:2], high[2] + _RELEASE]), np.array(LOOKING_DOWN))
+        return None
+
+    def truth(self) -> MovingScene:
+        """Return what a sensor can see: the box as one solid, and the bottle, as they really move."""
+        return MovingScene(
+            Scene(None, (self._solid_box(0.0), self._bottle()), fixtures=_fixtures()),
+            {BOX: lambda t: self._solid_box(t).pose.position, BOTTLE: self.bottle_at},
+        )
+
+    def _solid_box(self, time: float) -> Box:
+        x, y, z = _INSIDE
+        outer = np.array([x + 2.0 * _THICK, y + 2.0 * _THICK, z + _THICK])
+        middle = self.box_at(time) + np.array([0.0, 0.0, 0.5 * (z - _THICK)])
+        return Box(Pose(middle, np.array([1.0, 0.0, 0.0, 0.0])), outer, name=BOX)
+
+    def _bottle(self) -> Cylinder:
+        pose = Pose(self.bottle_at(0.0), np.array([1.0, 0.0, 0.0, 0.0]))
+        return Cylinder(pose, *_BOTTLE, name=BOTTLE)
+
+    def robot(self, *, arm: ArmModel | None = None, control: Control = "torque") -> SimulatedRobot:
+        """Return the simulated robot with its open gripper above the table, with cube, box and bottle.
+
+        Args:
+            arm: the arm, if it has been loaded already.
+            control: control mode of the drives. The gripper touches the cube, so the default is computed torque.
+        """
+        arm = self.arm() if arm is None else arm
+        boards = open_box(Pose(self.box_at(0.0), np.array([1.0, 0.0, 0.0, 0.0])), _INSIDE, _THICK)
+        obstacles: tuple[Obstacle, ...] = (*boards, self._bottle())
+        motions: dict[str | int, Movement] = {BOTTLE: self.bottle_at}
+        motions |= {board.name: self._along_with_box(board) for board in boards}
+        robot = SimulatedRobot(
+            arm,
+            scene=Scene(None, obstacles, fixtures=_fixtures()),
+            motion=motions,
+            world=self._world(arm),
+            control=control,
+            q=start_posture(arm),
+        )
+        robot.grasp(OPEN)
+        return robot
+
+    def _along_with_box(self, board: Box) -> Movement:
+        away = board.pose.position - self.box_at(0.0)
+        return lambda time: self.box_at(time) + away
+
+    def _world(self, arm: ArmModel) -> mujoco.MjSpec:
+        """Return the world without obstacles: arm, table and cube."""
+        spec = arm_world(arm, fixtures=_fixtures())
+        spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0  # so that the cube does not slip
+        (x, y), size = _TABLE
+        half = 0.5 * np.array(size)
+        table = spec.worldbody.add_body(name="table top", pos=[x, y, -half[2]])
+        surface = {"friction": _FRICTION, "condim": 4, "solref": _STIFF}
+        shape = mujoco.mjtGeom.mjGEOM_BOX
+        table.add_geom(name="table top", type=shape, size=half, rgba=(0.80, 0.68, 0.52, 1.0), **surface)
+        body = spec.worldbody.add_body(name=CUBE, pos=self.cube)
+        body.add_freejoint(name=CUBE)
+        red = (0.75, 0.18, 0.16, 1.0)
+        body.add_geom(name=CUBE, type=shape, size=[0.5 * _SIDE] * 3, mass=_MASS, rgba=red, **surface)
+        return spec
+
+    def evaluate(self, robot: SimulatedRobot, rollout: Rollout) -> Rollout:
+        """Return ``rollout`` with success or the reasons for failure: cube not in the box, contact, not finished."""
+        away = robot.data.body(CUBE).xpos - self.box_at(robot.time)
+        half = 0.5 * np.array(_INSIDE)
+        inside = bool(np.all(np.abs(away[:2]) < half[:2]) and 0.0 < away[2] < _INSIDE[2])
+        faults = [] if rollout.success else [rollout.reason]
+        if not inside:
+            faults.append(f"the cube is {1e3 * np.linalg.norm(away[:2]):.0f} mm from the middle of the box")
+        return replace(rollout, success=not faults, reason="; ".join(faults) or "the cube is in the box")
+
+
+def start_posture(arm: ArmModel) -> Array:
+    """Return joint angles (n_joints,) [rad] with the tool at the start."""
+    return find_posture(arm, PackingTask.start)
+
+
+def _fixtures() -> tuple[Obstacle, ...]:
+    return (HalfSpace(np.zeros(3), name="table"), *standard_fixtures())
+
+
+@lru_cache(maxsize=64)
+def _pushes(seed: int) -> PchipInterpolator:
+    """Return the place (x, y) of the bottle over time: pushes to random places, at rest between them."""
+    rng = np.random.default_rng([562, seed])
+    low, high = np.array(_BOTTLE_ROOM).T
+    place = rng.uniform(low, high)
+    while np.linalg.norm(place - PackingTask.start.position[:2]) < _FIRST_FREE:
+        place = rng.uniform(low, high)
+    times, places = [0.0], [place]
+    while times[-1] < _LONGEST:
+        times.append(times[-1] + float(rng.uniform(*_PAUSE)))
+        places.append(places[-1])
+        target = rng.uniform(low, high)
+        way = float(np.linalg.norm(target - places[-1]))
+        times.append(times[-1] + way / float(rng.uniform(*_PUSH_SPEED)) + 1e-3)
+        places.append(target)
+    return PchipInterpolator(times, places)  # it rests between two equal places and does not overshoot
+
+
+def reach(start: Array, goal: Array, rise: float) -> Motion:
+    """Return a motion that leaves the start upwards and arrives at the goal from above, a cubic Bezier curve.
+
+    Args:
+        start: shape (3,) [m].
+        goal: shape (3,) [m].
+        rise: height of the curve's control points above start and goal [m].
+    """
+    up = np.array([0.0, 0.0, rise])
+    points = np.stack([start, start + up, goal + up, goal])
+
+    def curve(p: Array) -> Array:
+        q = 1.0 - p
+        return np.stack([q**3, 3.0 * q**2 * p, 3.0 * q * p**2, p**3], axis=1) @ points
+
+    def spread(p: Array) -> Array:
+        loose = np.sin(np.pi * p) ** 2
+        return np.stack([along(0, 0.02 * loose), along(2, 0.015 * loose)])
+
+    def bend(p: Array) -> Array:
+        return along(2, (curve(p) - start - p[:, None] * (goal - start))[:, 2])
+
+    return Motion("reach", curve, bend=bend, spread=spread, free=(1.0, 1.0, 1.0), duration=4.0)
+
+
+@lru_cache(maxsize=4)
+def packing_skills(teachers: int = 3) -> tuple[Skill, Skill]:
+    """Return the two skills of the task, learned from synthetic teachers: reach the cube, and carry it over the box.
+
+    The skills are learned with the cube and the box in the middle of their places, so that each run asks for other
+    goals than those that were shown.
+
+    Args:
+        teachers: number of teachers, with eight demonstrations each.
+
+    Raises:
+        InputError: when ``teachers`` is below 1.
+    """
+    if teachers < 1:
+        raise InputError(f"packing_skills: teachers must be at least 1, got {teachers}")
+    cube = np.array([*_CUBE_AT, 0.5 * _SIDE])
+    over = np.array([*_BOX_AT, _INSIDE[2] + _THICK + _RELEASE])
+    shown = (reach(PackingTask.start.position, cube, 0.10), reach(cube, over, _RISE))
+    first, second = (
+        Skill(8).fit(align([_looking_down(one) for one in demonstrations_by(motion, teachers)])) for motion in shown
+    )
+    return first, second
+
+
+def _looking_down(demonstration: Demonstration) -> Demonstration:
+    """Return the demonstration with the tool's rotation, which is constant."""
+    trajectory = demonstration.trajectory
+    quaternions = np.tile(LOOKING_DOWN, (len(trajectory), 1))
+    return replace(demonstration, trajectory=replace(trajectory, quaternions=quaternions))
