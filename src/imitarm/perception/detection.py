@@ -1,49 +1,126 @@
-"""Detection: one obstacle as a camera measured it at one time."""
+"""Detection: one obstacle as a sensor measured it, with the uncertainty of its position."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import InputError
-from imitarm.scene.obstacle import Obstacle
-from imitarm.validation import finite_array, text
+from imitarm.kinematics.pose import Pose
+from imitarm.scene import Capsule, ConvexHull, HalfSpace, Obstacle, Sphere
+from imitarm.scene.obstacle import PosedObstacle, Solid
+from imitarm.validation import finite_array, instance, text
 
 Array = NDArray[np.float64]
+
+_NEAREST = 1e-3  # [m] depth at which a camera's coordinates are still defined
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """A measured shape at its measured pose; a tracker turns detections into tracks.
+    """A shape at the pose at which a sensor measured it.
+
+    The measured position ``z`` is the origin of the obstacle's local frame (its centre, for most shapes). Its error has
+    zero mean and the covariance ``R``.
 
     Attributes:
-        obstacle: shape and pose in the base frame; its velocity is ignored, because one measurement contains none.
-        covariance: covariance of the measured position (the origin of the obstacle's local frame), shape (3, 3) [m^2].
-        label: name of a known object, for example of the target; empty if unknown.
+        obstacle: the shape at the measured pose in the base frame. Its velocity is ignored. Half-spaces are fixtures
+            and can't be tracked.
+        covariance: covariance ``R`` of the measured position in the base frame, shape (3, 3) [m^2].
+        label: kind of object, for example its colour, if the sensor knows it. Detections with different labels are
+            never taken for the same obstacle; an empty label matches every label.
+        camera_to_base: pose of the camera that took the measurement. Only the extended Kalman filter uses it.
 
     Raises:
-        InputError: when ``obstacle`` is not an obstacle, or ``covariance`` is not a finite, symmetric and positive
-            semi-definite matrix.
+        InputError: when the obstacle can't be tracked, the covariance is not symmetric and positive semi-definite, or
+            the obstacle is behind the camera.
     """
 
     obstacle: Obstacle
     covariance: Array
     label: str = ""
+    camera_to_base: Pose | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.obstacle, Obstacle):
             raise InputError(f"Detection: obstacle must be an obstacle such as Sphere or Box, got {self.obstacle!r}")
-        text(self.label, "Detection: label")
+        if isinstance(self.obstacle, HalfSpace):
+            raise InputError("Detection: a half-space has no centre to track; add it to the fixtures of the scene")
         covariance = np.array(finite_array(self.covariance, (3, 3), "Detection: covariance", "m^2"))
-        scale = np.abs(covariance).max()
-        if np.abs(covariance - covariance.T).max() > 1e-9 * scale or np.linalg.eigvalsh(covariance)[0] < -1e-9 * scale:
+        scale = float(np.abs(covariance).max())
+        skewed = np.abs(covariance - covariance.T).max() > 1e-9 * scale
+        if skewed or (scale > 0.0 and np.linalg.eigvalsh(covariance)[0] < -1e-9 * scale):
             raise InputError("Detection: covariance must be symmetric and positive semi-definite [m^2]")
         covariance.setflags(write=False)
         object.__setattr__(self, "covariance", covariance)
+        if not text(self.label, "Detection: label").isprintable():
+            raise InputError(f"Detection: label must be one line of text, got {self.label!r}")
+        if self.camera_to_base is not None:
+            camera = instance(self.camera_to_base, Pose, "Detection: camera_to_base")
+            depth = float(camera.inverse().apply(self.position)[2])
+            if depth < _NEAREST:
+                raise InputError(
+                    f"Detection: the obstacle is not in front of the camera (depth {depth:.3f} m); camera_to_base maps "
+                    "the camera's frame (z forward) to the base frame"
+                )
+
+    @cached_property
+    def solid(self) -> Solid:
+        """Geometry of the obstacle."""
+        return self.obstacle.solid()
 
     @property
     def position(self) -> Array:
-        """The measured position: the origin of the obstacle's local frame in the base frame, shape (3,) [m]."""
-        return self.obstacle.solid().position
+        """Measured position ``z``: origin of the obstacle's local frame, shape (3,) [m]."""
+        return self.solid.position
+
+
+def resized(obstacle: Obstacle, size: Array) -> Obstacle:
+    """Return the obstacle with another size, at the same pose.
+
+    Args:
+        obstacle: the obstacle; a convex hull is returned unchanged, because its points have no size.
+        size: new size in the form of :class:`~imitarm.scene.distances.PackedObstacles`, shape (3,) [m].
+    """
+    if isinstance(obstacle, Sphere):
+        return replace(obstacle, radius=float(size[0]))
+    if isinstance(obstacle, Capsule):
+        middle, axis = 0.5 * (obstacle.start + obstacle.end), obstacle.end - obstacle.start
+        length = float(np.linalg.norm(axis))
+        half = 0.5 * float(size[1]) / length * axis if length > 0.0 else 0.5 * axis
+        return replace(obstacle, start=middle - half, end=middle + half, radius=float(size[0]))
+    if isinstance(obstacle, ConvexHull) or not isinstance(obstacle, PosedObstacle):
+        return obstacle
+    names = obstacle.lengths
+    values = [np.array(size)] if len(names) == 1 else [float(value) for value in size]
+    changes: dict[str, Any] = dict(zip(names, values, strict=False))
+    return replace(obstacle, **changes)
+
+
+def estimated(
+    obstacle: Obstacle, position: Array, velocity: Array, covariance: Array, track_id: int, name: str
+) -> Obstacle:
+    """Return a detected obstacle at its estimated position, with velocity, covariance, track number and name.
+
+    The values must be valid.
+
+    Args:
+        obstacle: the obstacle; its rotation and size are kept, its angular velocity becomes 0.
+        position: origin of the local frame, shape (3,) [m].
+        velocity: shape (3,) [m/s].
+        covariance: covariance of the position, shape (3, 3) [m^2].
+        track_id: number of the track.
+        name: name of the result.
+    """
+    quaternion = obstacle.solid().quaternion
+    placed = copy.copy(obstacle.placed(position, quaternion, velocity, np.zeros(3)))
+    covariance = covariance.copy()
+    covariance.setflags(write=False)
+    for key, value in {"covariance": covariance, "track_id": track_id, "name": name}.items():
+        object.__setattr__(placed, key, value)
+    return placed

@@ -109,11 +109,18 @@ class PackedObstacles:
         return self._copy(_ahead=(self, dt))  # positions and frames are computed when they are first used
 
     def placed(
-        self, positions: Array, quaternions: Array, velocities: Array, angular_velocities: Array, stamp: float
+        self,
+        positions: Array,
+        quaternions: Array,
+        velocities: Array,
+        angular_velocities: Array,
+        stamp: float | Array,
+        covariances: Array | None = None,
     ) -> PackedObstacles:
-        """Return the same shapes with other poses, seen at ``stamp`` [s].
+        """Return the same shapes with other poses, seen at ``stamp`` [s]: one time, or one for each obstacle (n,).
 
-        Each of the other arguments is the new value of the attribute with the same name.
+        Each of the other arguments is the new value of the attribute with the same name; without ``covariances``, the
+        covariances are kept.
         """
         moved = self._copy(
             positions=positions,
@@ -121,6 +128,7 @@ class PackedObstacles:
             velocities=velocities,
             angular_velocities=angular_velocities,
             stamps=np.full(len(self), stamp),
+            covariances=self.covariances if covariances is None else covariances,
         )
         for name in ("still", "rotating"):
             moved.__dict__.pop(name, None)

@@ -371,6 +371,12 @@ class Obstacle(ABC):
         placed._move(position - before.position, turn)
         return placed
 
+    def with_covariance(self, covariance: Array) -> Self:
+        """Return a copy of the obstacle with another covariance of its position, shape (3, 3) [m^2], which is valid."""
+        copied = copy.copy(self)
+        copied._set(covariance=covariance.copy())
+        return copied
+
     @abstractmethod
     def solid(self) -> Solid:
         """Return the geometry as :mod:`~imitarm.scene.distances` needs it."""

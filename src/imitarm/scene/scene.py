@@ -133,6 +133,8 @@ class Scene:
             strict=True,
         )
         obstacles = tuple(obstacle.placed(*row) for obstacle, *row in rows)
+        if packed.covariances is not seen.packed.covariances:
+            obstacles = tuple(o.with_covariance(c) for o, c in zip(obstacles, packed.covariances, strict=True))
         object.__setattr__(self, "obstacles", obstacles)
         return obstacles
 

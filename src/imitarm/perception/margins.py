@@ -1,0 +1,180 @@
+"""CoverageMargin: how far a predicted obstacle may be from the truth, calibrated by its measured coverage."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.errors import InputError
+from imitarm.html_table import html_table
+from imitarm.validation import finite_array, finite_number, whole_number
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CoverageMargin:
+    """A distance ``m(tau) = a + b tau`` that bounds the error of a prediction by ``tau`` with a given probability.
+
+    The margin is added to the required clearance of an obstacle that is predicted ``tau`` seconds ahead. It is
+    calibrated by split conformal prediction. One *window* is one prediction and the true motion that followed it, with
+    the error ``e(tau_k)`` at several look-ahead times. One score is computed for each window::
+
+        s = max_k e(tau_k) / (a0 + b0 tau_k)
+
+    With n independent windows and the coverage ``1 - alpha``, the margin is ``s* (a0 + b0 tau)``, where ``s*`` is the
+    ``ceil((n + 1) (1 - alpha))``-th smallest score. The error of a new window then stays below the margin at all
+    look-ahead times together with a probability of at least ``1 - alpha``, whatever the distribution of the errors, if
+    the new window and those of the calibration are exchangeable. Among several obstacles, ``alpha`` is divided by their
+    number, so that the coverage holds for all of them together.
+
+    Attributes:
+        offset: ``a``: margin at the time of the prediction [m].
+        growth: ``b``: increase of the margin [m/s].
+
+    Raises:
+        InputError: when a number is negative or not finite.
+    """
+
+    offset: float
+    growth: float = 0.0
+
+    def __post_init__(self) -> None:
+        offset = finite_number(self.offset, "CoverageMargin: offset", "m", at_least=0.0)
+        growth = finite_number(self.growth, "CoverageMargin: growth", "m/s", at_least=0.0)
+        object.__setattr__(self, "offset", offset)
+        object.__setattr__(self, "growth", growth)
+
+    @classmethod
+    def none(cls) -> CoverageMargin:
+        """Return the margin zero: predictions are taken as exact."""
+        return cls(0.0, 0.0)
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether the margin is zero at all times."""
+        return self.offset == 0.0 and self.growth == 0.0
+
+    def at(self, tau: ArrayLike) -> Array:
+        """Return the margin for predictions over ``tau``.
+
+        Args:
+            tau: look-ahead times, shape (...) [s]; times before the prediction count as 0.
+
+        Returns:
+            Shape (...) [m].
+
+        Raises:
+            InputError: when a time is not a finite number.
+        """
+        times = finite_array(tau, (...,), "CoverageMargin.at: tau", "s")
+        return np.asarray(self.offset + self.growth * np.maximum(times, 0.0))
+
+    @classmethod
+    def calibrate(
+        cls,
+        windows: ArrayLike,
+        coverage: float = 0.95,
+        n_obstacles: int = 1,
+        *,
+        times: ArrayLike,
+        shape: tuple[float, float] | None = None,
+    ) -> CoverageMargin:
+        """Return the margin that covers whole windows with the given probability.
+
+        Args:
+            windows: prediction errors of independent windows, shape (n_windows, n_times) [m]. Include the error of the
+                fitted shape.
+            coverage: probability that all obstacles stay within their margins, between 0 and 1.
+            n_obstacles: number of obstacles present at the same time.
+            times: look-ahead times of the errors, shape (n_times,) [s]; at least 0.
+            shape: ``(a0, b0)``, the shape of the margin before it is scaled [m, m/s]. None: it is fitted to a quarter
+                of the windows, which are then left out of the calibration.
+
+        Raises:
+            InputError: when a shape is wrong, a number is invalid, or there are too few windows for the coverage. The
+                message states the required number.
+        """
+        errors, ahead = _checked_windows(windows, times)
+        level = finite_number(coverage, "CoverageMargin: coverage", above=0.0)
+        if level >= 1.0:
+            raise InputError(f"CoverageMargin: coverage must be below 1, got {level:g}")
+        alpha = (1.0 - level) / whole_number(n_obstacles, "CoverageMargin: n_obstacles", at_least=1)
+        if shape is None:
+            quarter = np.arange(len(errors)) % 4 == 0
+            shape, errors = fitted_shape(errors[quarter], ahead, alpha), errors[~quarter]
+        a0, b0 = cls(*shape).offset, cls(*shape).growth
+        scale = conformal_quantile(scores(errors, ahead, a0, b0), alpha)
+        return cls(scale * a0, scale * b0)
+
+    def covered(self, windows: ArrayLike, times: ArrayLike) -> NDArray[np.bool_]:
+        """Return whether the error of each window stays within the margin at all look-ahead times.
+
+        Args:
+            windows: prediction errors, shape (n_windows, n_times) [m].
+            times: look-ahead times of the errors, shape (n_times,) [s].
+
+        Returns:
+            Shape (n_windows,).
+
+        Raises:
+            InputError: when a shape is wrong or a number is invalid.
+        """
+        errors, ahead = _checked_windows(windows, times)
+        return np.asarray((errors <= self.at(ahead)).all(axis=1))
+
+    def _repr_html_(self) -> str:
+        return html_table("CoverageMargin", {"offset": f"{self.offset:.4g} m", "growth": f"{self.growth:.4g} m/s"})
+
+
+def scores(errors: Array, times: Array, offset: float, growth: float) -> Array:
+    """Return the score ``max_k e(tau_k) / (a0 + b0 tau_k)`` of each window, shape (n_windows,)."""
+    allowed = offset + growth * times
+    if allowed.min() <= 0.0:
+        raise InputError("CoverageMargin: the shape (a0, b0) must be positive at all look-ahead times")
+    return np.asarray((errors / allowed).max(axis=1))
+
+
+def conformal_quantile(values: Array, alpha: float) -> float:
+    """Return the ``ceil((n + 1) (1 - alpha))``-th smallest of n values."""
+    n = len(values)
+    rank = math.ceil((n + 1) * (1.0 - alpha) - 1e-9)
+    if rank > n:
+        needed = math.ceil((1.0 - alpha) / alpha - 1e-9)
+        raise InputError(
+            f"CoverageMargin: {n} windows are too few for a miscoverage of {alpha:.3g} per obstacle; at least {needed} "
+            "are needed (and a third more if the shape is fitted too)"
+        )
+    return float(np.partition(values, rank - 1)[rank - 1])
+
+
+def fitted_shape(errors: Array, times: Array, alpha: float) -> tuple[float, float]:
+    """Return the line ``a0 + b0 tau`` with ``a0, b0 >= 0`` that follows the quantile ``1 - alpha`` of the errors.
+
+    Args:
+        errors: shape (n_windows, n_times) [m].
+        times: look-ahead times, shape (n_times,) [s].
+        alpha: fraction of the errors above the quantile.
+    """
+    if not len(errors):
+        raise InputError("CoverageMargin: at least 1 window is required")
+    quantile = np.quantile(errors, 1.0 - alpha, axis=0)
+    spread = times - times.mean()
+    slope = float(spread @ quantile / (spread @ spread)) if spread.any() else 0.0
+    slope = max(slope, 0.0)
+    largest = float(quantile.max())
+    offset = max(float((quantile - slope * times).mean()), 0.05 * largest, 1e-6)
+    return offset, slope
+
+
+def _checked_windows(windows: ArrayLike, times: ArrayLike) -> tuple[Array, Array]:
+    ahead = finite_array(times, (None,), "CoverageMargin: times", "s")
+    if not len(ahead) or ahead.min() < 0.0:
+        raise InputError("CoverageMargin: times must contain at least one look-ahead time, all of at least 0 [s]")
+    errors = finite_array(windows, (None, len(ahead)), "CoverageMargin: windows", "m")
+    if errors.size and errors.min() < 0.0:
+        raise InputError("CoverageMargin: the errors in windows are lengths and must not be negative [m]")
+    return errors, ahead

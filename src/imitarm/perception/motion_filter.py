@@ -1,0 +1,290 @@
+"""MotionFilter: Kalman filters over many obstacles at once, with one or several models of their motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InputError
+from imitarm.validation import choice, finite_number
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+MOTIONS: dict[str, tuple[int, ...]] = {  # order of the highest derivative in the state of each model
+    "constant-velocity": (1,),
+    "ekf": (1,),
+    "constant-acceleration": (2,),
+    "imm": (1, 2),
+}
+DEFAULT_NOISE = (math.nan, 0.05, 10.0)  # by order; [m^2/s^3] and [m^2/s^5]
+DWELL_TIME = 0.5  # [s] mean time for which an obstacle keeps one model of an IMM
+INITIAL_ACCELERATION = 2.0  # [m/s^2] standard deviation of each component of a new obstacle's acceleration
+
+
+class Belief(NamedTuple):
+    """Gaussian beliefs about n obstacles under M models of motion.
+
+    The state of an obstacle is ``[p; v]``, or ``[p; v; a]`` if any model has an acceleration.
+
+    Attributes:
+        mean: shape (n, M, m) [m, m/s, m/s^2].
+        covariance: shape (n, M, m, m).
+        weights: probability of each model, shape (n, M).
+    """
+
+    mean: Array
+    covariance: Array
+    weights: Array
+
+    def rows(self, rows: Indices | Sequence[int]) -> Belief:
+        """Return the beliefs about some of the obstacles."""
+        return Belief(self.mean[rows], self.covariance[rows], self.weights[rows])
+
+    def joined(self, other: Belief) -> Belief:
+        """Return these beliefs, followed by others."""
+        return Belief(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+
+    def combined(self) -> tuple[Array, Array]:
+        """Return mean (n, m) and covariance (n, m, m) over all models (moments of the mixture)."""
+        if self.mean.shape[1] == 1:
+            return self.mean[:, 0], self.covariance[:, 0]
+        mean = np.einsum("nk,nki->ni", self.weights, self.mean)
+        spread = self.mean - mean[:, None]
+        covariance = self.covariance + spread[..., :, None] * spread[..., None, :]
+        return mean, np.einsum("nk,nkij->nij", self.weights, covariance)
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Measured positions of obstacles, one row for each obstacle that was measured.
+
+    A measurement is ``z = h(p) + noise``. ``h`` is the position itself, or, with ``rotations``, the camera's
+    coordinates ``(x/z, y/z, z)`` of the position, of which the extended Kalman filter uses the Jacobian ``H``.
+
+    Attributes:
+        positions: measured positions in the base frame, shape (k, 3) [m].
+        noise: their covariances ``R``, shape (k, 3, 3) [m^2].
+        rotations: base_to_camera rotations, shape (k, 3, 3); None: positions are measured directly. The rotation is nan
+            where a position was measured without a camera.
+        origins: positions of the cameras, shape (k, 3) [m]; None without cameras.
+    """
+
+    positions: Array
+    noise: Array
+    rotations: Array | None = None
+    origins: Array | None = None
+
+    def rows(self, rows: Indices | Sequence[int]) -> Measurements:
+        """Return some of the measurements."""
+        if self.rotations is None or self.origins is None:
+            return Measurements(self.positions[rows], self.noise[rows])
+        return Measurements(self.positions[rows], self.noise[rows], self.rotations[rows], self.origins[rows])
+
+    def innovation(self, predicted: Array) -> tuple[Array, Array | None, Array]:
+        """Return the innovation ``z - h(p)``, the Jacobian ``H = dh/dp`` and the noise, in the units of ``h``.
+
+        Args:
+            predicted: predicted positions ``p``, shape (k, ..., 3) [m].
+
+        Returns:
+            Innovations (k, ..., 3), Jacobians (k, ..., 3, 3) or None for the unit matrix, noise (k, 1..., 3, 3).
+        """
+        extra = (1,) * (predicted.ndim - 2)
+        measured = self.positions.reshape(-1, *extra, 3)
+        noise = self.noise.reshape(-1, *extra, 3, 3)
+        if self.rotations is None or self.origins is None:
+            return measured - predicted, None, noise
+        by_camera = np.isfinite(self.rotations[:, 0, 0]).reshape(-1, *extra)
+        rotations = np.where(by_camera[..., None, None], self.rotations.reshape(-1, *extra, 3, 3), np.eye(3))
+        origins = np.where(by_camera[..., None], self.origins.reshape(-1, *extra, 3), 0.0)
+        seen, _, d_seen = _camera_coordinates(measured, rotations, origins)
+        expected, ahead, jacobian = _camera_coordinates(predicted, rotations, origins)
+        innovation = np.where(ahead[..., None], seen - expected, np.inf)  # nothing is measured behind the camera
+        noise_seen = d_seen @ noise @ d_seen.swapaxes(-1, -2)
+        direct = ~by_camera
+        return (
+            np.where(direct[..., None], measured - predicted, innovation),
+            np.where(direct[..., None, None], np.eye(3), jacobian),
+            np.where(direct[..., None, None], noise, noise_seen),
+        )
+
+
+def _camera_coordinates(points: Array, rotations: Array, origins: Array) -> tuple[Array, NDArray[np.bool_], Array]:
+    """Return ``(x/z, y/z, z)`` of points (..., 3), whether they are in front, and the Jacobian (..., 3, 3)."""
+    q = (rotations @ (points - origins)[..., None])[..., 0]
+    ahead = q[..., 2] > 1e-3
+    depth = np.where(ahead, q[..., 2], 1.0)
+    u, v = q[..., 0] / depth, q[..., 1] / depth
+    jacobian = np.zeros((*q.shape, 3))
+    jacobian[..., 0, 0] = jacobian[..., 1, 1] = 1.0 / depth
+    jacobian[..., 0, 2], jacobian[..., 1, 2] = -u / depth, -v / depth
+    jacobian[..., 2, 2] = 1.0
+    return np.stack([u, v, q[..., 2]], axis=-1), ahead, jacobian @ rotations
+
+
+def inverse_3x3(matrices: Array) -> tuple[Array, Array]:
+    """Return the inverses (..., 3, 3) and determinants (...) of symmetric matrices (..., 3, 3), by cofactors."""
+    a, b, c = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 0, 2]
+    d, e, f = matrices[..., 1, 1], matrices[..., 1, 2], matrices[..., 2, 2]
+    inverse = np.empty(matrices.shape)
+    inverse[..., 0, 0] = d * f - e * e
+    inverse[..., 0, 1] = inverse[..., 1, 0] = c * e - b * f
+    inverse[..., 0, 2] = inverse[..., 2, 0] = b * e - c * d
+    inverse[..., 1, 1] = a * f - c * c
+    inverse[..., 1, 2] = inverse[..., 2, 1] = b * c - a * e
+    inverse[..., 2, 2] = a * d - b * b
+    determinant = a * inverse[..., 0, 0] + b * inverse[..., 0, 1] + c * inverse[..., 0, 2]
+    inverse /= determinant[..., None, None]
+    return inverse, determinant
+
+
+class MotionFilter:
+    """Kalman filters of all obstacles, computed together: every operation acts on arrays over the obstacles.
+
+    A model of order 1 (constant velocity, thesis Eq 5.2 with its noise written as a covariance) has the state ``x = [p;
+    v]``. White noise of spectral density ``q`` [m^2/s^3] disturbs each component of the velocity. Over a time ``dt``::
+
+        F = [I, dt I; 0, I]        Q = q [dt^3/3 I, dt^2/2 I; dt^2/2 I, dt I]
+        x <- F x                   P <- F P F' + Q
+
+    In a model of order 2 (constant acceleration) the state also contains the acceleration, which is disturbed by white
+    noise of spectral density ``q`` [m^2/s^5]. A measured position ``z`` with the covariance ``R`` gives, with ``H =
+    [I, 0]``::
+
+        S = H P H' + R    K = P H' S^-1    x <- x + K (z - H x)    P <- (I - K H) P (I - K H)' + K R K'
+
+    An interacting multiple model (IMM) runs several models and weights them by the likelihood of the measurements. The
+    models are mixed before each prediction; an obstacle keeps its model for ``DWELL_TIME`` on average.
+
+    Attributes:
+        orders: order of the highest derivative in each model.
+        noise: spectral density ``q`` of each model.
+        initial_speed: standard deviation of each component of a new obstacle's velocity [m/s].
+        size: length ``m`` of the state.
+    """
+
+    def __init__(self, motion: str, noise: float | Sequence[float] | None, initial_speed: float) -> None:
+        """Check the arguments; see :class:`~imitarm.perception.ObstacleTracker`."""
+        self.orders = MOTIONS[choice(motion, MOTIONS, "motion")]
+        self.noise = _checked_noise(noise, self.orders)
+        self.initial_speed = finite_number(initial_speed, "ObstacleTracker: initial_speed", "m/s", above=0.0)
+        self.size = m = 3 * (max(self.orders) + 1)
+        models = len(self.orders)
+        self._first, self._second = np.zeros((models, m, m)), np.zeros((models, m, m))  # F = I + dt F1 + dt^2 F2
+        self._noise = np.zeros((5, models, m, m))  # Q = sum_i dt^(i+1) Q_i
+        for k, (order, q) in enumerate(zip(self.orders, self.noise, strict=True)):
+            self._fill(k, order, q)
+        self._identity = np.eye(m)
+        if max(self.orders) > min(self.orders):  # a model of constant velocity has no acceleration
+            self._identity = np.stack([np.diag((np.arange(m) < 3 * (o + 1)).astype(float)) for o in self.orders])
+        self._select = np.eye(m)
+
+    def _fill(self, k: int, order: int, q: float) -> None:
+        """Fill in the matrices of model ``k``; entry ``i, j`` of F is ``dt^(j-i) / (j-i)!``."""
+        eye = np.eye(3)
+        for i in range(order + 1):
+            for j in range(order + 1):
+                block = (k, slice(3 * i, 3 * i + 3), slice(3 * j, 3 * j + 3))
+                if j - i == 1:
+                    self._first[block] = eye
+                elif j - i == 2:
+                    self._second[block] = 0.5 * eye
+                left, right = order - i, order - j  # noise enters the highest derivative and is integrated
+                power = left + right + 1
+                factor = q / (math.factorial(left) * math.factorial(right) * power)
+                self._noise[(power - 1, *block)] = factor * eye
+
+    def transition(self, dt: float) -> tuple[Array, Array]:
+        """Return ``F`` and ``Q`` of each model over a time ``dt`` [s], shape (M, m, m); Q grows with ``|dt|``."""
+        F = self._identity + dt * self._first
+        if self.size > 6:
+            F += dt * dt * self._second
+        ahead = abs(dt)
+        powers = self._noise[: 2 * max(self.orders) + 1]
+        Q = ahead * powers[0]
+        for i in range(1, len(powers)):
+            Q += ahead ** (i + 1) * powers[i]
+        return F, Q if dt >= 0.0 else _mirrored(Q)
+
+    def born(self, positions: Array, noise: Array) -> Belief:
+        """Return the beliefs about new obstacles at measured positions (k, 3) [m] with covariances (k, 3, 3) [m^2]."""
+        k, models, m = len(positions), len(self.orders), self.size
+        mean, covariance = np.zeros((k, models, m)), np.zeros((k, models, m, m))
+        mean[..., :3] = positions[:, None]
+        covariance[..., :3, :3] = noise[:, None]
+        variances = (0.0, self.initial_speed**2, INITIAL_ACCELERATION**2)
+        for model, order in enumerate(self.orders):
+            for i in range(3, 3 * (order + 1)):
+                covariance[:, model, i, i] = variances[i // 3]
+        return Belief(mean, covariance, np.full((k, models), 1.0 / models))
+
+    def predict(self, belief: Belief, dt: float) -> Belief:
+        """Return the beliefs ``dt`` [s] later, or earlier if ``dt`` is negative."""
+        if dt == 0.0 or not len(belief.mean):
+            return belief
+        F, Q = self.transition(dt)
+        mean, covariance, weights = belief if len(self.orders) == 1 else self._mixed(belief, dt)
+        transposed = F.swapaxes(-1, -2)
+        mean = (mean[..., None, :] @ transposed)[..., 0, :]
+        return Belief(mean, F @ covariance @ transposed + Q, weights)
+
+    def _mixed(self, belief: Belief, dt: float) -> Belief:
+        """Return the beliefs with which each model of an IMM starts its prediction."""
+        stay = math.exp(-abs(dt) / DWELL_TIME)
+        models = len(self.orders)
+        change = stay * np.eye(models) + (1.0 - stay) / models  # row: model before, column: model after
+        weights = belief.weights @ change
+        share = belief.weights[:, :, None] * change / weights[:, None, :]  # (n, before, after)
+        mean = np.einsum("nij,nik->njk", share, belief.mean)
+        spread = belief.mean[:, :, None] - mean[:, None]  # (n, before, after, m)
+        covariance = np.einsum("nij,nikl->njkl", share, belief.covariance)
+        covariance += np.einsum("nij,nijk,nijl->njkl", share, spread, spread)
+        return Belief(mean, covariance, weights)
+
+    def update(self, belief: Belief, measured: Measurements) -> Belief:
+        """Return the beliefs after one measurement of each obstacle."""
+        mean, P, weights = belief
+        innovation, jacobian, noise = measured.innovation(mean[..., :3])
+        PHt = P[..., :3] if jacobian is None else P[..., :3] @ jacobian.swapaxes(-1, -2)
+        S = (PHt[..., :3, :] if jacobian is None else jacobian @ PHt[..., :3, :]) + noise
+        inverse, determinant = inverse_3x3(S)
+        K = PHt @ inverse
+        mean = mean + (K @ innovation[..., None])[..., 0]
+        kept = np.repeat(self._select[None], len(mean), axis=0)[:, None] * np.ones((1, P.shape[1], 1, 1))
+        kept[..., :3] -= K if jacobian is None else K @ jacobian
+        P = kept @ P @ kept.swapaxes(-1, -2) + K @ noise @ K.swapaxes(-1, -2)
+        if len(self.orders) > 1:
+            distance = np.einsum("...i,...ij,...j->...", innovation, inverse, innovation)
+            log = -0.5 * (distance + np.log(determinant))
+            weights = weights * np.exp(log - log.max(axis=1, keepdims=True))
+            weights = np.maximum(weights / weights.sum(axis=1, keepdims=True), 1e-6)
+            weights /= weights.sum(axis=1, keepdims=True)
+        return Belief(mean, P, weights)
+
+
+def _mirrored(Q: Array) -> Array:
+    """Return the noise of a step back in time: the velocities of both ends are correlated with the other sign."""
+    sign = np.where(np.arange(Q.shape[-1]) // 3 % 2 == 0, 1.0, -1.0)
+    return Q * sign[:, None] * sign
+
+
+def _checked_noise(noise: float | Sequence[float] | None, orders: tuple[int, ...]) -> tuple[float, ...]:
+    if noise is None:
+        return tuple(DEFAULT_NOISE[order] for order in orders)
+    given = list(noise) if isinstance(noise, Sequence) else [noise]
+    if len(given) != len(orders):
+        raise InputError(
+            f"ObstacleTracker: process_noise must have {len(orders)} number(s), one for each model of motion, got "
+            f"{noise!r}"
+        )
+    units = ("", "m^2/s^3", "m^2/s^5")
+    return tuple(
+        finite_number(q, "ObstacleTracker: process_noise", units[order], at_least=0.0)
+        for q, order in zip(given, orders, strict=True)
+    )

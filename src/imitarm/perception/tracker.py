@@ -1,0 +1,419 @@
+"""ObstacleTracker: positions and velocities of moving obstacles, estimated from noisy and late detections."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.pose import Pose
+from imitarm.perception.association import NO_PAIRS, Pairs, assign, duplicates
+from imitarm.perception.detection import Detection
+from imitarm.perception.motion_filter import Measurements, MotionFilter
+from imitarm.perception.tracks import UNCONFIRMED, TrackedObstacle, Tracks
+from imitarm.scene import Obstacle, Scene
+from imitarm.validation import finite_number, sequence, whole_number
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_FLOOR = 1e-18  # [m^2] smallest variance of a detection: two exact ones at the same time stay solvable
+_RESET = 10.0  # [s] a stamp that goes back by more was given by another clock
+_FULL_COUNT = 10  # detections after which a size is smoothed with a fixed weight
+
+
+class _Step(NamedTuple):
+    """One accepted update: what went in, and what was known afterwards."""
+
+    stamp: float
+    detections: tuple[Detection, ...]
+    tracks: Tracks
+    distances: Array  # normalised innovation squared of each assigned detection
+
+
+class ObstacleTracker:
+    """Tracks many obstacles with Kalman filters: from stamped detections to positions, velocities and uncertainties.
+
+    The motion is predicted with thesis Eq 5.2, without its unknown input ``B u`` and with the noise as a covariance;
+    :class:`~imitarm.perception.motion_filter.MotionFilter` has the equations. Every time step is the difference of two
+    time stamps.
+
+    1. *Assignment.* A detection and a track can belong together if the normalised innovation squared ``d^2 = nu' S^-1
+       nu`` is within the ``gate`` quantile of the chi-square distribution. Confirmed tracks choose first.
+    2. *Birth.* Every other detection starts a track. It is confirmed when ``confirm[0]`` of its first ``confirm[1]``
+       updates had a detection; until then, the track is not reported.
+    3. *Death.* A track without a detection continues with its velocity, and its covariance grows. It ends when it was
+       not seen for more than ``max_unseen`` seconds.
+    4. *Latency.* ``scene(time)`` predicts all tracks from the time of the last detections to ``time``; this
+       prediction compensates the latency of the sensor (thesis Eqs 5.3 and 5.4: the predicted positions with their
+       covariances).
+
+    **Late detections.** Detections may arrive out of order. An update that is late by at most ``history`` seconds is
+    inserted at its own time, and all later updates are repeated; the result is the same as if all had arrived in order.
+    An older update is ignored. :attr:`ignored` counts it as ``"late"``.
+
+    **Other imperfect input.** A second update with the same stamp and the same detections is ignored
+    (``"repeated"``). Two detections of one update that are not significantly apart, one inside the other, are one
+    obstacle: the more accurate one is kept (``"duplicate"``). A detection that jumps out of the gate starts a new
+    track. If there are more than ``max_obstacles`` tracks, those that were not seen for longest are removed
+    (``"removed"``); more detections than ``max_obstacles`` in one update are an error, and nothing changes.
+
+    Rotations are not estimated: a track has the rotation of its last detection and no angular velocity. Sizes are
+    averaged over the detections.
+
+    Args:
+        motion: model of the motion: ``"constant-velocity"``, ``"constant-acceleration"``, ``"imm"`` (both, weighted by
+            their likelihoods) or ``"ekf"``. The last one uses constant velocity and measures in the coordinates of the
+            camera (:attr:`Detection.camera_to_base`).
+        process_noise: spectral density of the noise that changes the velocity [m^2/s^3] or, with constant acceleration,
+            the acceleration [m^2/s^5]; two numbers for ``"imm"``. None: 0.05 and 10.
+        gate: probability that a correct detection is within the gate.
+        confirm: (hits, updates) that confirm a track.
+        max_unseen: time after the last detection at which a track ends [s].
+        max_speed: largest speed of an obstacle [m/s]; a larger estimate is scaled down.
+        max_obstacles: largest number of tracks, and of detections in one update.
+        initial_speed: standard deviation of each component of a new track's velocity [m/s].
+        history: time for which late detections are accepted [s].
+
+    Raises:
+        InputError: when an argument is out of its range.
+    """
+
+    def __init__(
+        self,
+        motion: str = "constant-velocity",
+        *,
+        process_noise: float | Sequence[float] | None = None,
+        gate: float = 0.99,
+        confirm: tuple[int, int] = (2, 3),
+        max_unseen: float = 0.5,
+        max_speed: float = 3.0,
+        max_obstacles: int = 32,
+        initial_speed: float = 0.5,
+        history: float = 0.5,
+    ) -> None:
+        from scipy.special import gammaincinv  # noqa: PLC0415  slow to import
+
+        self.motion = motion
+        self.filter = MotionFilter(motion, process_noise, initial_speed)
+        probability = finite_number(gate, "ObstacleTracker: gate", above=0.0)
+        if probability >= 1.0:
+            raise InputError(f"ObstacleTracker: gate must be a probability below 1, got {gate:g}")
+        self.gate = 2.0 * float(gammaincinv(1.5, probability))  # quantile of chi-square, 3 degrees of freedom
+        self.confirm = _checked_confirm(confirm)
+        self.max_unseen = finite_number(max_unseen, "ObstacleTracker: max_unseen", "s", above=0.0)
+        self.max_speed = finite_number(max_speed, "ObstacleTracker: max_speed", "m/s", above=0.0)
+        self.max_obstacles = whole_number(max_obstacles, "ObstacleTracker: max_obstacles", at_least=1)
+        self.history = finite_number(history, "ObstacleTracker: history", "s", at_least=0.0)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all tracks and counts; track numbers start from 0 again."""
+        self.ignored: Counter[str] = Counter()
+        self._steps: deque[_Step] = deque()
+        self._scene: Scene | None = None
+
+    @property
+    def stamp(self) -> float | None:
+        """Time of the newest accepted update [s]; None before the first one."""
+        return self._steps[-1].stamp if self._steps else None
+
+    @property
+    def tracks(self) -> tuple[TrackedObstacle, ...]:
+        """The confirmed tracks at :attr:`stamp`, in the order of their numbers."""
+        return self._steps[-1].tracks.view if self._steps else ()
+
+    def update(self, stamp: float, detections: Sequence[Detection]) -> tuple[TrackedObstacle, ...]:
+        """Take in what one sensor measured at one time.
+
+        Args:
+            stamp: time of the measurement [s].
+            detections: everything that the sensor detected at that time; may be empty.
+
+        Returns:
+            The confirmed tracks at the newest stamp, in the order of their numbers.
+
+        Raises:
+            InputError: when ``stamp`` is not a finite number or more than 10 s before the newest one, an entry of
+                ``detections`` is not a detection, or there are more than ``max_obstacles``. The tracks are not changed.
+        """
+        stamp = finite_number(stamp, "ObstacleTracker.update: stamp", "s")
+        found = sequence(detections, Detection, "ObstacleTracker.update: detections")
+        if len(found) > self.max_obstacles:
+            raise InputError(
+                f"ObstacleTracker.update: {len(found)} detections are more than max_obstacles = {self.max_obstacles}; "
+                "raise max_obstacles, or leave out detections out of reach"
+            )
+        if self._steps and stamp < self._steps[-1].stamp:
+            self._insert(stamp, found)
+        elif self._steps and stamp == self._steps[-1].stamp and self._repeats(stamp, found):
+            self.ignored["repeated"] += 1
+        else:
+            self._append(stamp, found)
+        return self.tracks
+
+    def scene(self, time: float, *, goal: Pose | None = None, fixtures: Sequence[Obstacle] = ()) -> Scene:
+        """Return the confirmed tracks predicted for ``time`` as the obstacles of a scene.
+
+        Each obstacle has the predicted position and velocity, the covariance of this position at ``time``, and the
+        number of its track. ``packed.stamps`` has the time at which each obstacle was last seen. A track stays in the
+        scene until an update ends it: without updates, obstacles do not disappear.
+
+        Args:
+            time: time for which the obstacles are predicted [s]; the stamp of the scene.
+            goal: goal of the scene.
+            fixtures: fixtures of the scene.
+
+        Raises:
+            InputError: when an argument is invalid.
+        """
+        time = finite_number(time, "ObstacleTracker.scene: time", "s")
+        if not self._steps:
+            return Scene(goal, (), time, tuple(fixtures))
+        base = self._scene
+        if base is None or base.goal is not goal or base.fixtures != tuple(fixtures):
+            obstacles = tuple(track.obstacle for track in self.tracks)
+            self._scene = base = Scene(goal, obstacles, self._steps[-1].stamp, tuple(fixtures))
+        if not len(base.packed):
+            return replace(base, stamp=time)
+        tracks = self._steps[-1].tracks
+        rows = np.array([track.row for track in self.tracks])
+        mean, covariance = tracks.filter.predict(tracks.belief.rows(rows), time - tracks.stamp).combined()
+        packed = base.packed
+        moved = packed.placed(
+            mean[:, :3],
+            packed.quaternions,
+            mean[:, 3:6],
+            packed.angular_velocities,
+            tracks.last_seen[rows],
+            covariance[:, :3, :3],
+        )
+        return Scene.predicted(base, moved, time)
+
+    def _repeats(self, stamp: float, detections: tuple[Detection, ...]) -> bool:
+        """Whether an update with this stamp and the same detections was accepted before."""
+        return any(
+            step.stamp == stamp
+            and len(step.detections) == len(detections)
+            and all(_same(a, b) for a, b in zip(step.detections, detections, strict=True))
+            for step in self._steps
+        )
+
+    def _append(self, stamp: float, detections: tuple[Detection, ...]) -> None:
+        """Take in an update that is not older than any other."""
+        before = self._steps[-1].tracks if self._steps else Tracks.none(self.filter, stamp)
+        self._steps.append(self._advanced(before, stamp, detections))
+        self._scene = None
+        while len(self._steps) > 1 and self._steps[1].stamp <= stamp - self.history:
+            self._steps.popleft()
+
+    def _insert(self, stamp: float, detections: tuple[Detection, ...]) -> None:
+        """Take in a late update: go back to its time, and repeat the later ones."""
+        newest, oldest = self._steps[-1].stamp, self._steps[0].stamp
+        if newest - stamp > _RESET:
+            raise InputError(
+                f"ObstacleTracker.update: stamp {stamp:.3f} s is {newest - stamp:.1f} s before the newest one "
+                f"({newest:.3f} s); all sensors must use one clock. Call reset() after the clock was set back"
+            )
+        if stamp < max(oldest, newest - self.history):
+            self.ignored["late"] += 1
+            return
+        if self._repeats(stamp, detections):
+            self.ignored["repeated"] += 1
+            return
+        later = []
+        while self._steps[-1].stamp > stamp:
+            later.append(self._steps.pop())
+        self._append(stamp, detections)
+        for step in reversed(later):
+            self._append(step.stamp, step.detections)
+
+    def _advanced(self, tracks: Tracks, stamp: float, detections: tuple[Detection, ...]) -> _Step:
+        """Return the tracks after one update."""
+        given = detections
+        tracks = tracks.at(stamp)
+        measured = self._measurements(detections)
+        apart = self._merged(detections, measured)
+        if apart is not None:
+            detections, measured = tuple(detections[i] for i in apart.tolist()), measured.rows(apart)
+        pairs = self._assigned(tracks, detections, measured)
+        tracks = self._corrected(tracks, stamp, pairs, detections, measured)
+        tracks = self._pruned(tracks)
+        if len(pairs.detections) < len(detections):
+            left = np.setdiff1d(np.arange(len(detections)), pairs.detections)
+            born = self._born(stamp, [detections[i] for i in left.tolist()], measured.rows(left))
+            tracks = self._fitted(tracks.joined(born))
+        return _Step(stamp, given, self._confirmed(tracks), pairs.distances)
+
+    def _measurements(self, detections: tuple[Detection, ...]) -> Measurements:
+        """Return the detections as arrays."""
+        k = len(detections)
+        positions = np.array([d.solid.position for d in detections]).reshape(k, 3)
+        noise = np.array([d.covariance for d in detections]).reshape(k, 3, 3)
+        noise.reshape(k, 9)[:, ::4] += _FLOOR
+        if self.motion != "ekf" or all(d.camera_to_base is None for d in detections):
+            return Measurements(positions, noise)
+        unknown = np.full((3, 3), np.nan)
+        cameras = [d.camera_to_base for d in detections]
+        rotations = np.array([unknown if c is None else c.rotation.T for c in cameras])
+        origins = np.array([np.zeros(3) if c is None else c.position for c in cameras])
+        return Measurements(positions, noise, rotations, origins)
+
+    def _merged(self, detections: tuple[Detection, ...], measured: Measurements) -> Indices | None:
+        """Return the detections that remain when one obstacle was detected twice; None: all."""
+        dropped: set[int] = set()
+        for i, j in duplicates(measured, self.gate):
+            first, second = detections[i], detections[j]
+            inside = first.obstacle.signed_distance(second.position) < 0.0
+            if not inside or second.obstacle.signed_distance(first.position) >= 0.0 or dropped & {i, j}:
+                continue
+            dropped.add(i if _accuracy(first) > _accuracy(second) else j)
+        if not dropped:
+            return None
+        self.ignored["duplicate"] += len(dropped)
+        return np.array([i for i in range(len(detections)) if i not in dropped])
+
+    def _assigned(self, tracks: Tracks, detections: tuple[Detection, ...], measured: Measurements) -> Pairs:
+        """Return the assignment; confirmed tracks choose first."""
+        if not len(tracks) or not detections:
+            return NO_PAIRS
+        allowed = _matching_labels(tracks.labels, [d.label for d in detections])
+        mean, covariance = tracks.moments
+        mean, covariance = mean[:, :3], covariance[:, :3, :3]
+        old = tracks.ids != UNCONFIRMED
+        if old.all() or not old.any():
+            return assign(mean, covariance, measured, self.gate, allowed)
+        pairs = NO_PAIRS
+        free = np.ones(len(detections), dtype=bool)
+        for rows in (old.nonzero()[0], (~old).nonzero()[0]):
+            columns = free.nonzero()[0]
+            part = None if allowed is None else allowed[np.ix_(rows, columns)]
+            found = assign(mean[rows], covariance[rows], measured.rows(columns), self.gate, part)
+            found = Pairs(rows[found.tracks], columns[found.detections], found.distances)
+            free[found.detections] = False
+            pairs = pairs.joined(found)
+        return pairs
+
+    def _corrected(
+        self, tracks: Tracks, stamp: float, pairs: Pairs, detections: tuple[Detection, ...], measured: Measurements
+    ) -> Tracks:
+        """Return the tracks after the assigned detections."""
+        hits = tracks.hits << 1 & (1 << self.confirm[1]) - 1
+        rows = pairs.tracks
+        if not len(rows):
+            return replace(tracks, hits=hits, ages=tracks.ages + 1)
+        hits[rows] |= 1
+        belief = self.filter.update(tracks.belief.rows(rows), measured.rows(pairs.detections))
+        belief = belief._replace(mean=self._capped(belief.mean))
+        mean, covariance, weights = (old.copy() for old in tracks.belief)
+        mean[rows], covariance[rows], weights[rows] = belief
+        last_seen, sizes, counts = tracks.last_seen.copy(), tracks.sizes.copy(), tracks.counts.copy()
+        last_seen[rows] = stamp
+        seen, labels = list(tracks.detections), list(tracks.labels)
+        for row, index in zip(rows.tolist(), pairs.detections.tolist(), strict=True):
+            detection = detections[index]
+            counts[row] = counts[row] + 1 if detection.solid.kind == seen[row].solid.kind else 1
+            seen[row], labels[row] = detection, detection.label or labels[row]
+        measured_sizes = np.array([detections[i].solid.size for i in pairs.detections.tolist()])
+        weight = np.where(counts[rows] == 1, 1.0, 1.0 / np.minimum(counts[rows], _FULL_COUNT))
+        sizes[rows] += weight[:, None] * (measured_sizes - sizes[rows])
+        return replace(
+            tracks,
+            belief=type(belief)(mean, covariance, weights),
+            hits=hits,
+            ages=tracks.ages + 1,
+            last_seen=last_seen,
+            sizes=sizes,
+            counts=counts,
+            detections=tuple(seen),
+            labels=tuple(labels),
+        )
+
+    def _capped(self, mean: Array) -> Array:
+        """Return the states (..., m) with speeds of at most ``max_speed``."""
+        velocity = mean[..., 3:6]
+        squared = np.einsum("...i,...i->...", velocity, velocity)
+        if (squared > self.max_speed**2).any():
+            scale = self.max_speed / np.sqrt(np.maximum(squared, self.max_speed**2))
+            mean[..., 3:6] = velocity * scale[..., None]
+        return mean
+
+    def _pruned(self, tracks: Tracks) -> Tracks:
+        """Return the tracks without those that have ended."""
+        needed, window = self.confirm
+        alive = tracks.stamp - tracks.last_seen <= self.max_unseen + 1e-9
+        missed = np.bitwise_count(tracks.hits) < needed
+        alive &= (tracks.ids != UNCONFIRMED) | (tracks.ages < window) | ~missed
+        return tracks if alive.all() else tracks.rows(alive.nonzero()[0])
+
+    def _born(self, stamp: float, detections: list[Detection], measured: Measurements) -> Tracks:
+        """Return new tracks, one for each detection."""
+        k = len(detections)
+        ones = np.ones(k, dtype=np.int64)
+        return Tracks(
+            self.filter,
+            stamp,
+            self.filter.born(measured.positions, measured.noise),
+            ids=np.full(k, UNCONFIRMED, dtype=np.int64),
+            last_seen=np.full(k, stamp),
+            hits=ones,
+            ages=ones,
+            sizes=np.array([d.solid.size for d in detections], dtype=float).reshape(k, 3),
+            counts=ones,
+            detections=tuple(detections),
+            labels=tuple(d.label for d in detections),
+        )
+
+    def _fitted(self, tracks: Tracks) -> Tracks:
+        """Return at most ``max_obstacles`` tracks; those that were not seen for longest are left out."""
+        surplus = len(tracks) - self.max_obstacles
+        if surplus <= 0:
+            return tracks
+        self.ignored["removed"] += surplus
+        order = np.lexsort([tracks.ids != UNCONFIRMED, tracks.last_seen])  # of those equally old, unconfirmed first
+        return tracks.rows(np.sort(order[surplus:]))
+
+    def _confirmed(self, tracks: Tracks) -> Tracks:
+        """Return the tracks with numbers for those that have been detected often enough."""
+        new = (tracks.ids == UNCONFIRMED) & (np.bitwise_count(tracks.hits) >= self.confirm[0])
+        if not new.any():
+            return tracks
+        ids = tracks.ids.copy()
+        count = int(new.sum())
+        ids[new] = tracks.next_id + np.arange(count)
+        return replace(tracks, ids=ids, next_id=tracks.next_id + count)
+
+
+def _checked_confirm(confirm: object) -> tuple[int, int]:
+    if not isinstance(confirm, tuple | list) or len(confirm) != 2:
+        raise InputError(f"ObstacleTracker: confirm must be two numbers (hits, updates), got {confirm!r}")
+    updates = whole_number(confirm[1], "ObstacleTracker: updates of confirm", at_least=1, at_most=32)
+    return whole_number(confirm[0], "ObstacleTracker: hits of confirm", at_least=1, at_most=updates), updates
+
+
+def _same(a: Detection, b: Detection) -> bool:
+    """Whether two detections are copies of each other."""
+    return a is b or (
+        a.solid.kind == b.solid.kind
+        and a.label == b.label
+        and bool((a.position == b.position).all())
+        and bool((a.solid.quaternion == b.solid.quaternion).all())
+        and bool((a.covariance == b.covariance).all())
+    )
+
+
+def _accuracy(detection: Detection) -> tuple[float, ...]:
+    """Return a key by which detections are sorted, the most accurate first, whatever their order was."""
+    return (float(np.trace(detection.covariance)), *detection.position.tolist())
+
+
+def _matching_labels(labels: Sequence[str], others: Sequence[str]) -> NDArray[np.bool_] | None:
+    """Return which labels may belong to the same obstacle, shape (n, m); None: all."""
+    if not any(labels) or not any(others):
+        return None
+    return np.array([[not a or not b or a == b for b in others] for a in labels])

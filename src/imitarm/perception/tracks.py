@@ -1,0 +1,210 @@
+"""Tracks: everything a tracker knows at one time, as arrays; and TrackedObstacle, a view of one of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.html_table import html_table
+from imitarm.perception.detection import Detection, estimated, resized
+from imitarm.perception.motion_filter import Belief, MotionFilter
+from imitarm.scene import Obstacle
+from imitarm.validation import finite_number
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+UNCONFIRMED = -1  # the number of a track that is not confirmed yet
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """n tracks at one time, one row each; never changed, but replaced.
+
+    Attributes:
+        filter: the filter of the beliefs.
+        stamp: time of the beliefs [s].
+        belief: position, velocity (and acceleration) of each obstacle.
+        ids: number of each track, shape (n,); ``UNCONFIRMED`` until it is confirmed.
+        last_seen: time of the last detection of each track, shape (n,) [s].
+        hits: the last updates of each track as bits: 1 for an update with a detection, shape (n,).
+        ages: number of updates of each track, shape (n,).
+        sizes: smoothed size of each shape, shape (n, 3) [m].
+        counts: number of detections of the same kind of shape, shape (n,).
+        detections: last detection of each track, of length n.
+        labels: last label of each track that was not empty, of length n.
+        next_id: number of the next track that is confirmed.
+    """
+
+    filter: MotionFilter
+    stamp: float
+    belief: Belief
+    ids: NDArray[np.int64]
+    last_seen: Array
+    hits: NDArray[np.int64]
+    ages: NDArray[np.int64]
+    sizes: Array
+    counts: NDArray[np.int64]
+    detections: tuple[Detection, ...]
+    labels: tuple[str, ...]
+    next_id: int = 0
+
+    @classmethod
+    def none(cls, motion_filter: MotionFilter, stamp: float, next_id: int = 0) -> Tracks:
+        """Return no tracks."""
+        whole = np.zeros(0, dtype=np.int64)
+        belief = motion_filter.born(np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        sizes = np.zeros((0, 3))
+        return cls(motion_filter, stamp, belief, whole, np.zeros(0), whole, whole, sizes, whole, (), (), next_id)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def confirmed(self) -> Indices:
+        """Indices of the confirmed tracks, shape (k,)."""
+        return (self.ids != UNCONFIRMED).nonzero()[0]
+
+    def rows(self, rows: Indices) -> Tracks:
+        """Return some of the tracks."""
+        chosen = rows.tolist()
+        return replace(
+            self,
+            belief=self.belief.rows(rows),
+            ids=self.ids[rows],
+            last_seen=self.last_seen[rows],
+            hits=self.hits[rows],
+            ages=self.ages[rows],
+            sizes=self.sizes[rows],
+            counts=self.counts[rows],
+            detections=tuple(self.detections[i] for i in chosen),
+            labels=tuple(self.labels[i] for i in chosen),
+        )
+
+    def joined(self, other: Tracks) -> Tracks:
+        """Return these tracks, followed by others of the same time."""
+        return replace(
+            self,
+            belief=self.belief.joined(other.belief),
+            ids=np.concatenate([self.ids, other.ids]),
+            last_seen=np.concatenate([self.last_seen, other.last_seen]),
+            hits=np.concatenate([self.hits, other.hits]),
+            ages=np.concatenate([self.ages, other.ages]),
+            sizes=np.concatenate([self.sizes, other.sizes]),
+            counts=np.concatenate([self.counts, other.counts]),
+            detections=self.detections + other.detections,
+            labels=self.labels + other.labels,
+        )
+
+    def at(self, time: float) -> Tracks:
+        """Return the tracks predicted for another time [s]."""
+        return replace(self, stamp=time, belief=self.filter.predict(self.belief, time - self.stamp))
+
+    @cached_property
+    def moments(self) -> tuple[Array, Array]:
+        """Mean (n, m) and covariance (n, m, m) of each obstacle's state over all models of motion."""
+        return self.belief.combined()
+
+    @cached_property
+    def view(self) -> tuple[TrackedObstacle, ...]:
+        """The confirmed tracks, in the order of their numbers."""
+        rows = self.confirmed
+        order = rows[self.ids[rows].argsort()]
+        return tuple(TrackedObstacle(self, row) for row in order.tolist())
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TrackedObstacle:
+    """The estimate of one obstacle at one time.
+
+    Attributes:
+        tracks: all tracks at that time.
+        row: index of this track in ``tracks``.
+    """
+
+    tracks: Tracks
+    row: int
+
+    @property
+    def track_id(self) -> int:
+        """Number of the track: 0, 1, ... in the order of confirmation."""
+        return int(self.tracks.ids[self.row])
+
+    @property
+    def stamp(self) -> float:
+        """Time of the estimate [s]."""
+        return self.tracks.stamp
+
+    @property
+    def last_seen(self) -> float:
+        """Time of the last detection [s]."""
+        return float(self.tracks.last_seen[self.row])
+
+    @property
+    def label(self) -> str:
+        """Last label that was not empty."""
+        return self.tracks.labels[self.row]
+
+    @property
+    def position(self) -> Array:
+        """Estimated position of the local frame's origin, shape (3,) [m]."""
+        return self.tracks.moments[0][self.row, :3]
+
+    @property
+    def velocity(self) -> Array:
+        """Estimated velocity, shape (3,) [m/s]."""
+        return self.tracks.moments[0][self.row, 3:6]
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of position and velocity, shape (6, 6) [m^2, m^2/s, m^2/s^2]."""
+        return self.tracks.moments[1][self.row, :6, :6]
+
+    @cached_property
+    def obstacle(self) -> Obstacle:
+        """The obstacle at ``stamp``, with velocity, covariance of the position, track number and name.
+
+        Its size is smoothed over the detections. Its rotation is that of the last detection, and its angular velocity
+        is 0: rotations are not estimated.
+        """
+        tracks, row = self.tracks, self.row
+        shape = tracks.detections[row].obstacle
+        if (tracks.sizes[row] != shape.solid().size).any():
+            shape = resized(shape, tracks.sizes[row])
+        name = shape.name or self.label or f"track {self.track_id}"
+        covariance = self.covariance[:3, :3]
+        covariance = 0.5 * (covariance + covariance.T)
+        return estimated(shape, self.position, self.velocity, covariance, self.track_id, name)
+
+    def predict(self, horizon: float) -> TrackedObstacle:
+        """Return the obstacle ``horizon`` seconds later, without new detections; its uncertainty grows.
+
+        Args:
+            horizon: time ahead [s].
+
+        Raises:
+            InputError: when the horizon is not a finite number.
+        """
+        horizon = finite_number(horizon, "TrackedObstacle.predict: horizon", "s")
+        return TrackedObstacle(self.tracks.rows(np.array([self.row])).at(self.stamp + horizon), 0)
+
+    def __repr__(self) -> str:
+        position = np.round(self.position, 3).tolist()
+        return f"TrackedObstacle({self.track_id}, at {position} m, {np.round(self.velocity, 3).tolist()} m/s)"
+
+    def _repr_html_(self) -> str:
+        deviation = 1e3 * np.sqrt(np.diagonal(self.covariance)[:3])
+        return html_table(
+            f"TrackedObstacle {self.track_id}",
+            {
+                "shape": self.obstacle.kind,
+                "label": self.label,
+                "position": f"{np.round(self.position, 4).tolist()} m",
+                "standard deviation": f"{np.round(deviation, 1).tolist()} mm",
+                "velocity": f"{np.round(self.velocity, 3).tolist()} m/s",
+                "stamp, last seen": f"{self.stamp:.3f} s, {self.last_seen:.3f} s",
+            },
+        )
