@@ -157,3 +157,28 @@ def test_tilts_concern_the_plan_of_the_whole_arm(sweep, capsys):
     for option in ("--max-tilt", "--goal-tilt"):
         assert main(["reproduce", str(sweep), "--tool", "brush", "--tool-only", option, "10"]) == 2
         assert f"{option} limits the plan of the whole arm" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_scene_begins_at_its_stamp(sweep, tmp_path, capsys):
+    """A ball that was on the path ten seconds before the stamp of the file is out of the way now."""
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        "format: imitarm-scene\nversion: 1\nstamp: 10\nobstacles:\n"
+        "- {type: sphere, name: ball, center: [0.6, 0.3, 2.0], radius: 0.1, velocity: [0, 0, 0.2]}\n"
+    )
+    assert main(["reproduce", str(sweep), "--tool", "brush", "--keep-height", "--scene", str(scene)]) == 0
+    assert "no contact in 1 of 1 scenes" in capsys.readouterr().out
+
+
+def test_an_obstacle_follows_the_track_of_the_scene_file(sweep, tmp_path, capsys):
+    """The box leaves the path after the plan was made; without its track, the goal would be blocked."""
+    scene, report = tmp_path / "scene.yaml", tmp_path / "report.html"
+    head = "format: imitarm-scene\nversion: 1\nstamp: 5\nobstacles:\n"
+    box = "- {type: box, name: crate, position: [0.9, 0.4, 0.1], size: [0.1, 0.1, 0.2], track: %s}\n"
+    scene.write_text(head + box % "[[5, 0.9, -0.6, 0.1], [6, 0.95, -0.6, 0.1], [8, 0.95, -0.8, 0.1]]")
+    command = ["reproduce", str(sweep), "--tool", "brush", "--keep-height", "--scene", str(scene)]
+    assert main([*command, "--report", str(report)]) == 0
+    assert "no contact in 1 of 1 scenes" in capsys.readouterr().out
+    scene.write_text(head + box % "[[5, 0.9, -0.6, 0.1], [4, 0.95, -0.6, 0.1]]")
+    assert main(command) == 2
+    assert "track: times" in " ".join(capsys.readouterr().err.split())

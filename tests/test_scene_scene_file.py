@@ -12,7 +12,20 @@ from hypothesis import strategies as st
 
 from imitarm.errors import FileFormatError, ImitarmError, InputError
 from imitarm.kinematics.pose import Pose, quaternion_exp, rotate
-from imitarm.scene import OBSTACLES, Box, ConvexHull, HalfSpace, Obstacle, Scene, Sphere, load_scene, save_scene
+from imitarm.scene import (
+    OBSTACLES,
+    Box,
+    ConvexHull,
+    HalfSpace,
+    MovingScene,
+    Obstacle,
+    Scene,
+    Sphere,
+    Track,
+    load_moving_scene,
+    load_scene,
+    save_scene,
+)
 from scene_shapes import KINDS, random_obstacle, random_pose
 
 PAGE = Path(__file__).parents[1] / "docs" / "scene.md"
@@ -531,3 +544,63 @@ def test_a_scene_that_could_not_be_read_back_is_not_written(tmp_path):
     with pytest.raises(InputError, match="are both named"):
         save_scene(scene, tmp_path / "scene.yaml")
     assert not list(tmp_path.iterdir())
+
+
+TRACKED = "obstacles:\n- {type: box, name: tin, position: [0.5, 0, 0], size: [0.1, 0.1, 0.2], track: %s}\n"
+
+
+@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 5), turns=st.booleans())
+def test_tracks_are_read_back_as_written(seed, n, turns, tmp_path):
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(0.5, 1.0, n))
+    quaternions = quaternion_exp(rng.normal(size=(n, 3))) if turns else None
+    track = Track(times, rng.uniform(-1.0, 1.0, (n, 3)), quaternions)
+    scene = Scene(None, [Sphere([0, 0, 1], 0.1, name="ball"), Box(Pose.identity(), [0.1, 0.2, 0.3])], stamp=0.7)
+    save_scene(MovingScene(scene, {1: track}), tmp_path / "scene.yaml")
+    back = load_moving_scene(tmp_path / "scene.yaml")
+    assert list(back.motions) == [1]
+    for time in rng.uniform(0.0, 6.0, 5):
+        for one, other in zip(back.at(time).obstacles, MovingScene(scene, {1: track}).at(time).obstacles, strict=True):
+            np.testing.assert_allclose(one.bounds(), other.bounds(), atol=1e-9)
+    at_stamp = load_scene(tmp_path / "scene.yaml")
+    assert at_stamp.stamp == 0.7
+    np.testing.assert_allclose(at_stamp.packed.positions, back.at(0.7).packed.positions)
+
+
+def test_a_track_is_in_the_units_of_the_file_and_gives_the_velocity_at_the_stamp(tmp_path):
+    text = HEAD + "units: cm\nstamp: 1\n" + TRACKED % "[[0, 50, 0, 10], [2, 50, 40, 10]]"
+    text = text.replace("[0.5, 0, 0], size: [0.1, 0.1, 0.2]", "[50, 0, 0], size: [10, 10, 20]")
+    tin = read(tmp_path, text).obstacles[0]
+    np.testing.assert_allclose(tin.pose.position, [0.5, 0.2, 0.1], atol=1e-12)
+    np.testing.assert_allclose(tin.velocity, [0.0, 0.2, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("track", "words"),
+    [
+        ("[]", "rows [time, x, y, z]"),
+        ("5", "rows [time, x, y, z]"),
+        ("[1, 2, 3, 4]", "rows [time, x, y, z]"),
+        ("[[0, 1, 2]]", "rows [time, x, y, z]"),
+        ("[[0, 1, 2, 3], [1, 1, 2, 3, 1, 0, 0, 0]]", "all of one kind"),
+        ("[[0, 1, 2, soon]]", "must be a number"),
+        ("[[1, 0, 0, 0], [1, 0, 0, 1]]", "times must"),
+        ("[[0, 0, 0, .nan]]", "finite"),
+        ("[[0, 0, 0, 0, 2, 0, 0, 0]]", "quaternion"),
+        ("[[0, 0, 0, 0], [1, 0, 100, 0]]", "speed of 100 m/s"),
+        ("[[0, 0, 40, 0], [9, 0, 41, 0]]", "from the robot's base"),
+        ("[[0, 0, 0, 0]], velocity: [0, 0, 1]", "both velocity and track"),
+    ],
+)
+def test_wrong_tracks_are_refused(tmp_path, track, words):
+    message = message_of(tmp_path, HEAD + TRACKED % track)
+    assert 'obstacles[0] (box "tin")' in message and words in message
+
+
+def test_only_obstacles_have_tracks_and_only_tracks_are_written(tmp_path):
+    fixture = (HEAD + TRACKED % "[[0, 1, 2, 3]]").replace("obstacles", "fixtures")
+    assert 'unknown key "track"' in message_of(tmp_path, fixture)
+    ball = Scene(None, [Sphere([0, 0, 1], 0.1, name="ball")])
+    with pytest.raises(InputError, match="motion of obstacle 'ball'"):
+        save_scene(MovingScene(ball, {"ball": lambda time: [0.0, 0.0, time]}), tmp_path / "scene.yaml")

@@ -22,7 +22,7 @@ from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.policies import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Policy
 from imitarm.robots import SimulatedRobot
-from imitarm.scene import Scene, load_scene, standard_fixtures
+from imitarm.scene import MovingScene, Scene, load_moving_scene, standard_fixtures
 from imitarm.skills import Skill
 from imitarm.trajectory import Demonstration
 from imitarm.validation import finite_number
@@ -126,7 +126,8 @@ def run(arguments: argparse.Namespace) -> int:
     check_outputs([("--out", arguments.out), ("--report", arguments.report)], inputs, force=arguments.force)
     skill = Skill.load(arguments.skill)
     arm = load_robot(arguments)
-    scene = Scene() if arguments.scene is None else load_scene(arguments.scene)
+    tracked = MovingScene(Scene()) if arguments.scene is None else load_moving_scene(arguments.scene).from_stamp()
+    scene = tracked.scene
     if arguments.goal is not None:
         scene = replace(scene, goal=Pose(0.01 * np.array(arguments.goal), skill.goal_.quaternion))
     if not scene.fixtures:
@@ -136,7 +137,8 @@ def run(arguments: argparse.Namespace) -> int:
     if scene.goal is not None:  # said before anything moves
         turn = skill.goal_.quaternion if skill.gmr_.has_orientation_ else start.quaternion
         find_posture(arm, Pose(scene.goal.position, turn))
-    robot = SimulatedRobot(arm, scene=scene, control=arguments.control, q=find_posture(arm, start))
+    motion = tracked.motions or None
+    robot = SimulatedRobot(arm, scene=scene, motion=motion, control=arguments.control, q=find_posture(arm, start))
     spheres = _tool(skill, arm, arguments.tool_radius)
     policy = _policy(arguments, skill, arm, spheres)
     with progress_bar() as progress:
@@ -149,6 +151,7 @@ def run(arguments: argparse.Namespace) -> int:
             clearance=1e-3 * arguments.clearance,
             link_clearance=None if arguments.tool_only else 1e-3 * arguments.clearance,
             tool_spheres=spheres,
+            observe=MovingScene(scene, motion).at if motion else None,
             progress=lambda share: progress.update(moving, completed=share),
         )
     report = Report(title=f"{skill.task_ or 'A skill'} on {arm.name}", scenes=[result], provenance=provenance())

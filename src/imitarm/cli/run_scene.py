@@ -19,6 +19,7 @@ from imitarm.errors import InfeasibleError
 from imitarm.policies import Policy
 from imitarm.robots import SimulatedRobot
 from imitarm.safety import SafetyFilter
+from imitarm.scene import Scene
 from imitarm.skills import Skill
 from imitarm.trajectory import Demonstration, Rollout, Trajectory
 from imitarm.viewer import FrameRecorder, LearningSummary, Report, SceneResult
@@ -45,6 +46,7 @@ def run_scene(
     tool_spheres: Array | None = None,
     demonstrations: Sequence[Demonstration] = (),
     evaluate: Evaluate | None = None,
+    observe: Callable[[float], Scene] | None = None,
     caption: str = "",
     progress: Callable[[float], None] | None = None,
 ) -> SceneResult:
@@ -62,6 +64,8 @@ def run_scene(
             4) [m].
         demonstrations: aligned demonstrations; the measured motion is compared with them.
         evaluate: success test of the task; it returns the rollout with success and reason.
+        observe: function that takes the time since the start [s] and returns the scene that the policy sees; None: the
+            scene at the start, in which obstacles keep their velocities.
         caption: one sentence that describes the scene.
         progress: function called with the fraction of the motion that is done, 0 to 1.
 
@@ -85,7 +89,7 @@ def run_scene(
         done = reproduce(
             policy,
             robot,
-            scene.at,
+            scene.at if observe is None else observe,
             dt=CONTROL_PERIOD,
             safety=SafetyFilter(robot.arm, dt=CONTROL_PERIOD, clearance=link_clearance),
             timeout=TIMEOUT * policy.skill.duration_,

@@ -8,7 +8,7 @@ from imitarm.scene.motion import MovingScene, Track
 from imitarm.scene.obstacle import Obstacle
 from imitarm.scene.rounded import Capsule, Ellipsoid, Sphere
 from imitarm.scene.scene import Scene
-from imitarm.scene.scene_file import load_scene, save_scene
+from imitarm.scene.scene_file import load_moving_scene, load_scene, save_scene
 
 OBSTACLES: dict[str, type[Obstacle]] = {
     shape.kind: shape for shape in (Sphere, Box, Capsule, Cylinder, Cone, Ellipsoid, ConvexHull, HalfSpace)
@@ -28,6 +28,7 @@ __all__ = [
     "Scene",
     "Sphere",
     "Track",
+    "load_moving_scene",
     "load_scene",
     "save_scene",
     "standard_fixtures",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -99,7 +99,16 @@ class MovingScene:
                 )
             moved.append((index, motion))
         object.__setattr__(self, "_moved", tuple(moved))
-        self.at(self.scene.stamp)
+        if moved:  # each motion must return a place
+            self.at(self.scene.stamp)
+
+    def from_stamp(self) -> MovingScene:
+        """Return the same scene and motions on a clock that is 0 at the stamp of the scene."""
+        begins = self.scene.stamp
+        if begins == 0.0:
+            return self
+        motions = {key: lambda time, motion=motion: motion(begins + time) for key, motion in self.motions.items()}
+        return MovingScene(replace(self.scene, stamp=0.0), motions)
 
     def poses(self, time: float) -> tuple[Array, Array]:
         """Return the poses of all obstacles' local frames.

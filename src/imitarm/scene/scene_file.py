@@ -23,6 +23,7 @@ import imitarm.scene  # for its registry, which is complete only once all shapes
 from imitarm.errors import FileFormatError, InputError
 from imitarm.files.document import write_text
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
+from imitarm.scene.motion import MovingScene, Track
 from imitarm.scene.obstacle import Obstacle
 from imitarm.scene.scene import Scene
 from imitarm.validation import file_path, instance
@@ -40,6 +41,7 @@ _POINTS = ("center", "start", "end", "point", "normal", "points")  # keys that a
 _TOP = ("format", "version", "units", "stamp", "goal", "obstacles", "fixtures")
 _ROTATIONS = ("quaternion", "rpy_degrees", "yaw_degrees")
 _COMMON = ("name", "velocity", "angular_velocity")
+_TRACK = "track"  # rows of time and position, or of time, position and quaternion
 _UNWRITTEN = ("covariance", "track_id")  # set by trackers only
 
 
@@ -50,7 +52,26 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         path: YAML file in the format of docs/scene.md.
 
     Returns:
-        The scene in metres, regardless of the file's units.
+        The scene in metres, regardless of the file's units. An obstacle with a track has the pose and the velocity of
+        the track at the scene's stamp; :func:`load_moving_scene` returns the tracks too.
+
+    Raises:
+        InputError: when there is no such file or it can't be read.
+        FileFormatError: when the file is not a scene file or an entry is wrong; the message names the file, the entry
+            and the key, and lists the known keys or values.
+    """
+    moving = load_moving_scene(path)
+    return moving.at(moving.scene.stamp) if moving.motions else moving.scene
+
+
+def load_moving_scene(path: str | os.PathLike[str]) -> MovingScene:
+    """Read a scene file with the tracks of its obstacles.
+
+    Args:
+        path: YAML file in the format of docs/scene.md.
+
+    Returns:
+        The scene in metres, regardless of the file's units. Obstacles without a track keep their velocity.
 
     Raises:
         InputError: when there is no such file or it can't be read.
@@ -70,19 +91,22 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         raise FileFormatError(f"{path}: {error}") from error
 
 
-def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
-    """Write a scene file in metres that :func:`load_scene` reads back to the last digit.
+def save_scene(scene: Scene | MovingScene, path: str | os.PathLike[str]) -> None:
+    """Write a scene file in metres that :func:`load_scene` or :func:`load_moving_scene` reads back to the last digit.
 
     The text is written to a temporary file, which is then renamed, so an existing file survives a failure.
 
     Args:
-        scene: scene whose obstacles have shapes in ``OBSTACLES``.
+        scene: scene whose obstacles have shapes in ``OBSTACLES``. The motions of a moving scene must be tracks.
         path: the file; its folder must exist.
 
     Raises:
-        InputError: when an obstacle's shape is not registered, two obstacles have the same name, or the file can't be
-            written.
+        InputError: when an obstacle's shape is not registered, two obstacles have the same name, a motion is not a
+            track, or the file can't be written.
     """
+    tracks: dict[int, Track] = {}
+    if isinstance(scene, MovingScene):
+        tracks, scene = _tracks(scene), scene.scene
     instance(scene, Scene, "scene")
     path = file_path(path, "path")
     _check_names("obstacles", scene.obstacles)
@@ -92,7 +116,7 @@ def save_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
         content["goal"] = _pose_entry(scene.goal)
     if scene.stamp:
         content["stamp"] = scene.stamp
-    content["obstacles"] = [_obstacle_entry(obstacle) for obstacle in scene.obstacles]
+    content["obstacles"] = [_obstacle_entry(obstacle, tracks.get(i)) for i, obstacle in enumerate(scene.obstacles)]
     if scene.fixtures:
         content["fixtures"] = [_obstacle_entry(fixture) for fixture in scene.fixtures]
     text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
@@ -158,7 +182,7 @@ def _parsed(text: str) -> object:
         raise InputError(f"not readable as YAML: {error}") from error
 
 
-def _scene(content: object) -> Scene:
+def _scene(content: object) -> MovingScene:
     if content is None:
         raise InputError(f'the file is empty; a scene file begins with "format: {FORMAT}"')
     if not isinstance(content, Mapping):
@@ -179,14 +203,55 @@ def _scene(content: object) -> Scene:
     obstacles, fixtures = (_obstacles(content, key, UNITS[units]) for key in ("obstacles", "fixtures"))
     if units != "m":
         _check_distances(pose, (*obstacles, *fixtures), units)
-    return Scene(pose, obstacles, _scaled(content.get("stamp", 0.0), "stamp", 1.0, 0), fixtures)
+    scene = Scene(pose, obstacles, _scaled(content.get("stamp", 0.0), "stamp", 1.0, 0), fixtures)
+    tracks: dict[str | int, Track] = {}
+    for i, entry in enumerate(content.get("obstacles") or []):
+        if _TRACK in entry:
+            tracks[i] = _track(entry, f"obstacles[{i}] ({scene.name_of(i)})", UNITS[units])
+    return MovingScene(scene, tracks)
+
+
+def _track(entry: Mapping[Any, Any], where: str, metres: float) -> Track:
+    """Return the track of an obstacle from rows of time, position and, where it rotates, quaternion."""
+    rows = _scaled(entry[_TRACK], f"{where}: {_TRACK}", 1.0)
+    width = {len(row) if isinstance(row, list) else 0 for row in rows} if isinstance(rows, list) else {0}
+    if len(width) != 1 or not width <= {4, 8}:
+        form = "[time, x, y, z] or [time, x, y, z, qw, qx, qy, qz]"
+        raise InputError(f"{where}: {_TRACK} must be a list of rows {form}, all of one kind")
+    both = [key for key in ("velocity", "angular_velocity") if key in entry]
+    if both:
+        raise InputError(f"{where}: has both {both[0]} and {_TRACK}; remove one")
+    table = np.array(rows)
+    positions = metres * table[:, 1:4]
+    try:
+        track = Track(table[:, 0], positions, table[:, 4:] if width == {8} else None)
+    except InputError as error:
+        raise InputError(f"{where}: {str(error).replace('Track', _TRACK)}") from error
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1) / np.diff(track.times)
+    _check_speed(f"{_TRACK} with a speed", steps.max(initial=0.0), _FASTEST, "m/s", where)
+    nearest = float(np.linalg.norm(positions, axis=1).min())
+    if nearest > _FARTHEST:
+        raise InputError(f"{where}: {_TRACK} stays {nearest:.3g} m from the robot's base; check units")
+    return track
+
+
+def _tracks(moving: MovingScene) -> dict[int, Track]:
+    """Return the tracks of a moving scene by the index of the obstacle."""
+    names = [obstacle.name for obstacle in moving.scene.obstacles]
+    tracks = {}
+    for key, motion in moving.motions.items():
+        if not isinstance(motion, Track):
+            raise InputError(f"a scene file can't hold the motion of obstacle {key!r}, because it is not a Track")
+        tracks[key if isinstance(key, int) else names.index(key)] = motion
+    return tracks
 
 
 def _obstacles(content: Mapping[Any, Any], key: str, metres: float) -> tuple[Obstacle, ...]:
     entries = content.get(key)
     if entries is not None and not isinstance(entries, list):
         raise InputError(f"{key}: must be a list; begin each entry with a dash")
-    obstacles = tuple(_obstacle(entry, f"{key}[{i}]", metres) for i, entry in enumerate(entries or []))
+    may_move = key == "obstacles"
+    obstacles = tuple(_obstacle(entry, f"{key}[{i}]", metres, may_move) for i, entry in enumerate(entries or []))
     _check_names(key, obstacles)
     return obstacles
 
@@ -219,7 +284,7 @@ def _goal(entry: object, metres: float) -> Pose:
     return _pose(entry, "goal", metres)
 
 
-def _obstacle(entry: object, where: str, metres: float) -> Obstacle:
+def _obstacle(entry: object, where: str, metres: float, may_move: bool) -> Obstacle:
     if not isinstance(entry, Mapping):
         raise InputError(f"{where}: must have the key type and the shape's own keys, got {_shown(entry)}")
     shape = _shape(entry.get("type"), where)
@@ -229,7 +294,8 @@ def _obstacle(entry: object, where: str, metres: float) -> Obstacle:
     own = _own_keys(shape)
     posed = "pose" in own
     lengths = [key for key in own if key != "pose"]
-    _check_keys(entry, ("type", *_COMMON, *(("position", *_ROTATIONS) if posed else ()), *lengths), where)
+    common = (*_COMMON, _TRACK) if may_move else _COMMON
+    _check_keys(entry, ("type", *common, *(("position", *_ROTATIONS) if posed else ()), *lengths), where)
     if not isinstance(name, str):
         raise InputError(f'{where}: name must be text; put it in quotes: "{name}"')
     values: dict[str, Any] = {key: _scaled(_required(entry, key, where), f"{where}: {key}", metres) for key in lengths}
@@ -362,7 +428,7 @@ def _pose_entry(pose: Pose) -> dict[str, Any]:
     return {"position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
 
 
-def _obstacle_entry(obstacle: Obstacle) -> dict[str, Any]:
+def _obstacle_entry(obstacle: Obstacle, track: Track | None = None) -> dict[str, Any]:
     known = imitarm.scene.OBSTACLES
     if type(obstacle) is not known.get(obstacle.kind):
         raise InputError(f"a scene file can't hold a {type(obstacle).__name__}; known types: {', '.join(known)}")
@@ -376,4 +442,9 @@ def _obstacle_entry(obstacle: Obstacle) -> dict[str, Any]:
         entry["velocity"] = obstacle.velocity.tolist()
     if obstacle.angular_velocity.any():
         entry["angular_velocity"] = obstacle.angular_velocity.tolist()
+    if track is not None:
+        parts = [track.times[:, None], track.positions, *([] if track.quaternions is None else [track.quaternions])]
+        entry[_TRACK] = np.concatenate(parts, axis=1).tolist()
+        for key in ("velocity", "angular_velocity"):  # the track replaces them
+            entry.pop(key, None)
     return entry
